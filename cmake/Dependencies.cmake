@@ -1,0 +1,44 @@
+# Where the libraries come from. Torch is the one of the Python that runs the build; header-only
+# libraries come from the system (Debian: libeigen3-dev libgtest-dev libtomlplusplus-dev
+# nlohmann-json3-dev libcli11-dev), Eigen also from pip's cmeel-eigen.
+find_package(Python 3.10 REQUIRED COMPONENTS Interpreter)
+
+if(NOT Torch_DIR)
+  execute_process(
+    COMMAND ${Python_EXECUTABLE} -c "import torch; print(torch.utils.cmake_prefix_path)"
+    OUTPUT_VARIABLE torch_prefix OUTPUT_STRIP_TRAILING_WHITESPACE
+    ERROR_QUIET RESULT_VARIABLE no_torch)
+  if(no_torch)
+    message(FATAL_ERROR "prdp: ${Python_EXECUTABLE} has no torch; pip install torch==2.13.0 first")
+  endif()
+  list(APPEND CMAKE_PREFIX_PATH ${torch_prefix})
+endif()
+find_package(Torch REQUIRED)
+execute_process(
+  COMMAND ${Python_EXECUTABLE} -c "import torch; print(torch.__version__)"
+  OUTPUT_VARIABLE torch_version OUTPUT_STRIP_TRAILING_WHITESPACE)
+
+execute_process(
+  COMMAND ${Python_EXECUTABLE} -c "import pathlib, cmeel; print(pathlib.Path(cmeel.__file__).parent.parent / 'cmeel.prefix')"
+  OUTPUT_VARIABLE cmeel_prefix OUTPUT_STRIP_TRAILING_WHITESPACE ERROR_QUIET)
+if(cmeel_prefix)
+  list(APPEND CMAKE_PREFIX_PATH ${cmeel_prefix})
+endif()
+
+find_package(Eigen3 3.4 QUIET NO_MODULE)
+if(NOT Eigen3_FOUND)
+  message(FATAL_ERROR "prdp: Eigen was not found; apt-get install libeigen3-dev or pip install cmeel-eigen")
+endif()
+
+# A header-only library as an imported target, or one sentence about what to install.
+function(prdp_header_library name header debian)
+  find_path(${name}_INCLUDE_DIR ${header})
+  if(NOT ${name}_INCLUDE_DIR)
+    message(FATAL_ERROR "prdp: <${header}> was not found; apt-get install ${debian}")
+  endif()
+  add_library(prdp_${name} INTERFACE)
+  target_include_directories(prdp_${name} SYSTEM INTERFACE ${${name}_INCLUDE_DIR})
+endfunction()
+prdp_header_library(tomlplusplus toml++/toml.h libtomlplusplus-dev)
+prdp_header_library(json nlohmann/json.hpp nlohmann-json3-dev)
+prdp_header_library(cli11 CLI/CLI.hpp libcli11-dev)

@@ -1,0 +1,79 @@
+#include "bindings.h"
+#include "prdp/scenes/data.h"
+#include "prdp/scenes/loss.h"
+#include "prdp/scenes/scene.h"
+
+namespace py = pybind11;
+using namespace prdp;
+
+void bind_scenes(py::module_& m) {
+  py::class_<Scene::Physics>(m, "Physics")
+      .def_readonly("equation", &Scene::Physics::equation)
+      .def_readonly("shape", &Scene::Physics::shape)
+      .def_readonly("nu", &Scene::Physics::nu)
+      .def_readonly("dt", &Scene::Physics::dt);
+  py::class_<Scene::Data>(m, "Data")
+      .def_readonly("modes", &Scene::Data::modes)
+      .def_readonly("train", &Scene::Data::train)
+      .def_readonly("valid", &Scene::Data::valid)
+      .def_readonly("seed", &Scene::Data::seed);
+  py::class_<Scene::Network>(m, "Network")
+      .def_readonly("kind", &Scene::Network::kind)
+      .def_readonly("hidden", &Scene::Network::hidden);
+  py::class_<Scene::Training>(m, "Training")
+      .def_readonly("loss", &Scene::Training::loss)
+      .def_readonly("batch", &Scene::Training::batch)
+      .def_readwrite("epochs", &Scene::Training::epochs)
+      .def_readwrite("updates", &Scene::Training::updates);
+  py::class_<Scene::Compare>(m, "Compare")
+      .def_readonly("seeds", &Scene::Compare::seeds)
+      .def_readonly("constant", &Scene::Compare::constant)
+      .def_readonly("growth", &Scene::Compare::growth)
+      .def_readonly("schedule", &Scene::Compare::schedule)
+      .def_readonly("target", &Scene::Compare::target);
+
+  py::class_<Scene>(m, "Scene")
+      .def_readonly("name", &Scene::name)
+      .def_readonly("path", &Scene::path)
+      .def_readonly("text", &Scene::text)
+      .def_readonly("title", &Scene::title)
+      .def_property_readonly("task",
+                             [](const Scene& s) {
+                               return s.task == Scene::Task::kEmulator ? "emulator" : "parameters";
+                             })
+      .def_readonly("dtype", &Scene::dtype)
+      .def_readonly("physics", &Scene::physics)
+      .def_readonly("data", &Scene::data)
+      .def_readonly("network", &Scene::network)
+      .def_readonly("training", &Scene::training)
+      .def_readonly("compare", &Scene::compare)
+      .def_property_readonly("method", [](const Scene& s) { return name(s.solver.method); })
+      .def_property_readonly("max_iter", [](const Scene& s) { return s.solver.max_iter.expect_int(); })
+      .def_property_readonly("rtol", [](const Scene& s) { return s.solver.rtol; })
+      .def_property(
+          "backward", [](const Scene& s) { return name(s.backward); },
+          [](Scene& s, std::string_view mode) { s.backward = backward_from_name(mode); })
+      .def_property_readonly("prdp",
+                             [](const Scene& s) { return as_dict(s.prdp); })
+      .def("learning_rate", &Scene::learning_rate, py::arg("update"));
+
+  m.def("read_scene", &read_scene, py::arg("path"));
+
+  py::class_<Dataset>(m, "Dataset")
+      .def_readonly("train_start", &Dataset::train_start)
+      .def_readonly("train_end", &Dataset::train_end)
+      .def_readonly("valid_start", &Dataset::valid_start)
+      .def_readonly("valid_end", &Dataset::valid_end);
+  m.def("make_dataset", &make_dataset, py::arg("scene"));
+  py::class_<ParameterProblem>(m, "ParameterProblem")
+      .def_readonly("modes", &ParameterProblem::modes)
+      .def_readonly("start", &ParameterProblem::start)
+      .def_readonly("reference", &ParameterProblem::reference)
+      .def_readonly("solution", &ParameterProblem::solution);
+  m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"));
+
+  m.def("loss", &loss, py::arg("kind"), py::arg("u"), py::arg("reference"));
+  m.def("normalised_mse", &normalised_mse, py::arg("u"), py::arg("reference"));
+  m.def("half_mse", &half_mse, py::arg("u"), py::arg("reference"));
+  m.def("relative_error", &relative_error, py::arg("theta"), py::arg("reference"));
+}

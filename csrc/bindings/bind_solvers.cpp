@@ -1,0 +1,82 @@
+#include "bindings.h"
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/solvers/solve.h"
+
+namespace py = pybind11;
+using namespace prdp;
+
+namespace {
+
+py::tuple as_tuple(const SolveInfo& info) {
+  return py::make_tuple(info.iterations, info.residual, info.status, info.operator_applications);
+}
+
+OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
+                  std::vector<at::Tensor> tensors) {
+  return {std::move(kind), std::move(shape), std::move(parameters), std::move(tensors)};
+}
+
+/// Python's warnings module; a filter may turn the warning into an exception.
+void warn_in_python(const std::string& text) {
+  const py::gil_scoped_acquire gil;
+  if (PyErr_WarnEx(PyExc_UserWarning, text.c_str(), 1) != 0) throw py::error_already_set();
+}
+
+}  // namespace
+
+void bind_solvers(py::module_& m) {
+  set_warning_sink(warn_in_python);
+  m.attr("DEFAULT_RTOL") = kDefaultRtol;
+  py::dict statuses;
+  for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
+  m.attr("SOLVE_STATUSES") = statuses;
+
+  m.def("check_operator",
+        [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
+           std::vector<at::Tensor> tensors) {
+          make_operator(spec(kind, shape, parameters, tensors))->check_parameters();
+        },
+        py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
+  m.def("check_solver",
+        [](std::string who, std::string method, int64_t max_iter, double rtol) {
+          Solver{method_from_name(method), max_iter, rtol}.check(who.c_str());
+        },
+        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"));
+  m.def("check_options",
+        [](std::string who, std::string method, int64_t max_iter, double rtol, std::string backward,
+           std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
+           std::string on_failure) {
+          SolveOptions{{method_from_name(method), max_iter, rtol},
+                       backward_from_name(backward),
+                       adjoint_max_iter,
+                       adjoint_rtol,
+                       on_failure_from_name(on_failure)}
+              .check(who.c_str());
+        },
+        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("backward"),
+        py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"));
+
+  m.def("open_adjoint_log", &adjoint_log::open);
+  m.def("close_adjoint_log", &adjoint_log::close, py::arg("log"));
+  m.def("read_adjoint_log",
+        [](int64_t log) -> std::optional<py::tuple> {
+          const auto info = adjoint_log::read(log);
+          if (!info) return std::nullopt;
+          return as_tuple(*info);
+        },
+        py::arg("log"));
+
+  m.def("solve_with_tensors",
+        [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,
+           std::vector<int64_t> shape, std::vector<double> parameters, bool transposed,
+           std::string solver, int64_t max_iter, double rtol) {
+          auto a = spec(kind, shape, parameters, tensors);
+          a.transposed = transposed;
+          const auto result =
+              solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, {}});
+          return py::make_tuple(result.u, as_tuple(result.info));
+        },
+        "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.",
+        py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"),
+        py::arg("transposed"), py::arg("solver"), py::arg("max_iter"), py::arg("rtol"));
+}

@@ -1,0 +1,110 @@
+#include "prdp/autograd/unrolled_vjp.h"
+
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <torch/csrc/autograd/autograd.h>
+#include <torch/library.h>
+
+#include <array>
+
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+constexpr const char* kSchema =
+    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor[] tensors, int[] needed, str kind, "
+    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, "
+    "Tensor iterations, Tensor status) -> Tensor[]";
+
+/// Iterations whose derivative is taken. b = 0 is solved in none, yet the map has a derivative there:
+/// that of all max_iter.
+at::Tensor differentiated_iterations(const UnrolledSolve& solve) {
+  const auto at_zero = solve.iterations.eq(0).logical_and(
+      solve.status.eq(static_cast<int64_t>(SolveStatus::kConverged)));
+  return solve.iterations.masked_fill(at_zero, solve.solver.max_iter.expect_int());
+}
+
+/// The gradients of the recorded iterations for the inputs that `needed` marks.
+std::vector<at::Tensor> differentiate(const at::Tensor& cotangent, const at::Tensor& b,
+                                      const UnrolledSolve& solve, at::IntArrayRef needed,
+                                      bool create_graph) {
+  // The op may run where autograd is switched off, inside a compiled graph for one; here it is wanted.
+  const auto keys = c10::impl::tls_local_dispatch_key_set();
+  const c10::impl::ForceDispatchKeyGuard with_autograd(
+      keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
+  const at::AutoGradMode record(true);
+  const auto u = solve_recorded(*make_operator(solve.a), b, solve.solver.method,
+                                differentiated_iterations(solve));
+  std::vector<at::Tensor> inputs;
+  if (needed[0]) inputs.push_back(b);
+  for (size_t i = 0; i < solve.a.tensors.size(); ++i)
+    if (needed[i + 1]) inputs.push_back(solve.a.tensors[i]);
+  std::vector<at::Tensor> gradients(inputs.size());
+  if (u.requires_grad())  // not where no sample took an iteration
+    gradients = torch::autograd::grad({u}, inputs, {cotangent}, create_graph, create_graph,
+                                      /*allow_unused=*/true);
+  for (size_t i = 0; i < inputs.size(); ++i)
+    if (!gradients[i].defined()) gradients[i] = at::zeros_like(inputs[i]);
+  return gradients;
+}
+
+std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
+                                   at::TensorList tensors, at::IntArrayRef needed,
+                                   c10::string_view kind, at::IntArrayRef shape,
+                                   at::ArrayRef<double> parameters, bool transposed,
+                                   c10::string_view solver, c10::SymInt max_iter,
+                                   const at::Tensor& iterations, const at::Tensor& status) {
+  UnrolledSolve unrolled{{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
+                         {method_from_name(solver), max_iter, 0.0},
+                         iterations,
+                         status};
+  const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
+  if (unrolled.solver.method == Method::kJacobi && for_b_alone) {
+    // K sweeps from zero are u = Σ_k (I - D⁻¹A)ᵏ D⁻¹ b; transposed, that is K sweeps with Aᵀ.
+    unrolled.a.transposed = !transposed;
+    const auto a = make_operator(unrolled.a);
+    const SolveRequest request{Method::kJacobi, 0, 0.0, differentiated_iterations(unrolled)};
+    return {prdp::solve(*a, cotangent, request).u};
+  }
+  std::vector<at::Tensor> leaves;
+  for (size_t i = 0; i < tensors.size(); ++i)
+    leaves.push_back(needed[i + 1] ? tensors[i].detach().requires_grad_() : tensors[i].detach());
+  unrolled.a.tensors = leaves;
+  return differentiate(cotangent, b.detach().requires_grad_(needed[0] == 1), unrolled, needed, false);
+}
+
+std::vector<at::Tensor> fake_kernel(const at::Tensor&, const at::Tensor& b, at::TensorList tensors,
+                                    at::IntArrayRef needed, c10::string_view, at::IntArrayRef,
+                                    at::ArrayRef<double>, bool, c10::string_view, c10::SymInt,
+                                    const at::Tensor&, const at::Tensor&) {
+  std::vector<at::Tensor> gradients;
+  if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
+  return gradients;
+}
+
+}  // namespace
+
+std::vector<at::Tensor> unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b,
+                                     const UnrolledSolve& solve, at::IntArrayRef needed) {
+  static const auto op = c10::Dispatcher::singleton()
+                             .findSchemaOrThrow("prdp::unrolled_vjp", "")
+                             .typed<decltype(vjp_kernel)>();
+  const auto& a = solve.a;
+  return op.call(cotangent, b, a.tensors, needed, a.kind, a.shape, a.parameters, a.transposed,
+                 name(solve.solver.method), solve.solver.max_iter, solve.iterations, solve.status);
+}
+
+std::vector<at::Tensor> unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
+                                              const UnrolledSolve& solve,
+                                              at::IntArrayRef needed) {
+  return differentiate(cotangent, b, solve, needed, /*create_graph=*/true);
+}
+
+TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("unrolled_vjp", vjp_kernel); }
+TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_vjp", fake_kernel); }
+
+}  // namespace prdp

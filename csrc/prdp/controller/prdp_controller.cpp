@@ -1,0 +1,74 @@
+#include "prdp/controller/prdp_controller.h"
+
+#include <c10/util/Exception.h>
+
+#include <algorithm>
+#include <cmath>
+
+namespace prdp {
+
+PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
+  const auto& s = settings_;
+  TORCH_CHECK_VALUE(std::isfinite(s.tau_step) && s.tau_step > 0.0,
+                    "PRDPController: tau_step must be finite and > 0, got ", s.tau_step);
+  TORCH_CHECK_VALUE(std::isfinite(s.tau_stop) && s.tau_stop > 0.0,
+                    "PRDPController: tau_stop must be finite and > 0, got ", s.tau_stop);
+  TORCH_CHECK_VALUE(s.delta >= 2, "PRDPController: delta must be >= 2, got ", s.delta);
+  TORCH_CHECK_VALUE(s.window >= 1, "PRDPController: window must be >= 1, got ", s.window);
+  TORCH_CHECK_VALUE(s.initial >= 0, "PRDPController: initial must be >= 0, got ", s.initial);
+  TORCH_CHECK_VALUE(s.increment >= 1, "PRDPController: increment must be >= 1, got ", s.increment);
+  TORCH_CHECK_VALUE(!s.maximum || *s.maximum >= s.initial,
+                    "PRDPController: maximum must be >= initial = ", s.initial, ", got ",
+                    s.maximum.value_or(0));
+  TORCH_CHECK_VALUE(std::isfinite(s.growth) && s.growth >= 1.0,
+                    "PRDPController: growth must be finite and >= 1, got ", s.growth);
+  state_.max_iter = s.initial;
+}
+
+bool PRDPController::should_refine() const {
+  const auto& history = state_.history;
+  if (static_cast<int64_t>(history.size()) < settings_.delta + 1) return false;
+  // As products, so that a metric of zero needs no division.
+  constexpr double rounding = 1e-12;
+  const double newest = history.back().smoothed;
+  const double before = history[history.size() - settings_.delta].smoothed;
+  const bool plateau = newest > settings_.tau_step * before;
+  const bool paid = newest < settings_.tau_stop * state_.checkpoint;
+  const bool worse = newest > (1.0 + rounding) * state_.checkpoint;
+  return plateau && (paid || worse);
+}
+
+bool PRDPController::step(double metric, bool converged) {
+  TORCH_CHECK_VALUE(std::isfinite(metric) && metric >= 0.0,
+                    "PRDPController: metric must be finite and >= 0, got ", metric);
+  const double alpha = 2.0 / static_cast<double>(settings_.window + 1);
+  const auto& history = state_.history;
+  const double smoothed =
+      history.empty() ? metric : history.back().smoothed + alpha * (metric - history.back().smoothed);
+  state_.history.push_back({metric, smoothed, state_.max_iter, false});
+
+  const int64_t limit = settings_.maximum.value_or(std::numeric_limits<int64_t>::max());
+  if (converged || state_.max_iter >= limit || !should_refine()) return false;
+  const auto grown = static_cast<int64_t>(
+      std::ceil(settings_.growth * static_cast<double>(state_.max_iter) - 1e-9));
+  state_.checkpoint = smoothed;
+  state_.max_iter = std::min(limit, std::max(state_.max_iter + settings_.increment, grown));
+  state_.history.back().refined = true;
+  return true;
+}
+
+void PRDPController::load_state(State state) {
+  TORCH_CHECK_VALUE(state.max_iter >= settings_.initial &&
+                        (!settings_.maximum || state.max_iter <= *settings_.maximum),
+                    "PRDPController: state has max_iter = ", state.max_iter,
+                    ", below initial or above maximum");
+  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "PRDPController: state has checkpoint = ",
+                    state.checkpoint, ", expected >= 0");
+  for (const auto& record : state.history)
+    TORCH_CHECK_VALUE(std::isfinite(record.metric) && std::isfinite(record.smoothed) &&
+                          record.metric >= 0.0 && record.smoothed >= 0.0,
+                      "PRDPController: state has a metric that is not finite and >= 0");
+  state_ = std::move(state);
+}
+
+}  // namespace prdp

@@ -1,0 +1,65 @@
+#pragma once
+#include <limits>
+#include <optional>
+#include <vector>
+
+#include "prdp/controller/controller.h"
+
+namespace prdp {
+
+/// Settings of PRDP (paper, section 3 and appendix D) under the paper's names.
+struct PRDPSettings {
+  double tau_step = 0.95;   // τ_step: the metric is on a plateau where r > τ_step
+  double tau_stop = 0.9;    // τ_stop: refining still pays where r_c < τ_stop
+  int64_t delta = 3;        // δ: values to look back for r
+  int64_t window = 6;       // of the exponential mean, α = 2 / (window + 1); 1: no smoothing
+  int64_t initial = 1;      // K₀
+  int64_t increment = 1;    // ΔK
+  std::optional<int64_t> maximum;  // K is never raised beyond
+  double growth = 1.0;      // K is raised to growth·K where that is more than K + ΔK
+};
+
+/// Progressively Refined Differentiable Physics: raises K when the smoothed metric L̃ reaches a
+/// plateau, as long as the last refinement has still paid.
+///   r   = L̃[-1] / L̃[-δ] <= τ_step             still improving, keep K
+///   r_c = L̃[-1] / c, c = L̃ at the last refinement, +∞ before the first
+///   r_c < τ_stop or r_c > 1 (beyond rounding)  c ← L̃[-1], refine
+///   otherwise                                  K is enough, keep it
+/// Two more rules keep K: fewer than δ + 1 values so far, and solves that already meet their
+/// tolerance, which more iterations would not change.
+class PRDPController final : public Controller {
+ public:
+  /// What was decided at one call of step().
+  struct Record {
+    double metric;
+    double smoothed;   // L̃ with this metric
+    int64_t max_iter;  // K before the decision
+    bool refined;
+  };
+  /// All that step() depends on beside the settings.
+  struct State {
+    int64_t max_iter;
+    double checkpoint = std::numeric_limits<double>::infinity();  // c
+    std::vector<Record> history;
+  };
+
+  /// Raises ValueError for a setting outside its range, naming it.
+  explicit PRDPController(PRDPSettings settings = {});
+
+  int64_t max_iter() const override { return state_.max_iter; }
+  /// Raises ValueError, and changes nothing, unless the metric is finite and >= 0.
+  bool step(double metric, bool converged = false) override;
+
+  const PRDPSettings& settings() const { return settings_; }
+  const State& state() const { return state_; }
+  /// Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
+  void load_state(State state);
+
+ private:
+  bool should_refine() const;
+
+  PRDPSettings settings_;
+  State state_;
+};
+
+}  // namespace prdp

@@ -1,0 +1,63 @@
+#pragma once
+#include "prdp/grid/grid.h"
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// What Poisson and heat share: A = α I + β L with the Dirichlet Laplacian L, symmetric.
+class LaplacianOperator : public Operator {
+ public:
+  void check_vector(const at::Tensor& b) const override { grid_.check_field(b, 1); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
+  at::Tensor diagonal() const override;
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
+  at::Tensor norm() const override;
+  std::vector<int64_t> vector_shape() const override;
+  KernelParameters kernel() const override;
+
+ protected:
+  explicit LaplacianOperator(Grid grid) : grid_(std::move(grid)) {}
+
+  /// α and β as numbers, for the CPU loops.
+  struct Coefficients {
+    double alpha, beta;
+  };
+  virtual Coefficients coefficients() const = 0;
+  /// α + β x for a tensor x in L's place (its diagonal, its eigenvalues); differentiable.
+  virtual at::Tensor symbol(const at::Tensor& x) const = 0;
+
+  Grid grid_;
+};
+
+/// The Laplacian itself, A = L (negative definite).
+class PoissonOperator final : public LaplacianOperator {
+ public:
+  explicit PoissonOperator(const OperatorSpec& spec);
+  at::Tensor apply(const at::Tensor& v) const override { return laplacian(v, grid_); }
+  std::vector<at::Tensor> product_rule(const at::Tensor&, const at::Tensor&) const override {
+    return {};
+  }
+
+ private:
+  Coefficients coefficients() const override { return {0.0, 1.0}; }
+  at::Tensor symbol(const at::Tensor& x) const override { return x; }
+};
+
+/// One implicit Euler step of the heat equation, A = I - ν Δt L; parameters (dt), tensors (nu).
+class HeatOperator final : public LaplacianOperator {
+ public:
+  explicit HeatOperator(const OperatorSpec& spec);
+  void check_parameters() const override;
+  at::Tensor apply(const at::Tensor& v) const override;
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+
+ private:
+  Coefficients coefficients() const override { return {1.0, -nu_.item<double>() * dt_}; }
+  at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (nu_ * dt_) * x; }
+
+  double dt_;
+  at::Tensor nu_;
+};
+
+}  // namespace prdp

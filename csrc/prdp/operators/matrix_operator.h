@@ -1,0 +1,51 @@
+#pragma once
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// A matrix given by the user as a tensor (n, n) shared by the batch, or (batch, n, n).
+class DenseOperator final : public Operator {
+ public:
+  explicit DenseOperator(const OperatorSpec& spec);
+  void check_vector(const at::Tensor& b) const override;
+  at::Tensor apply(const at::Tensor& v) const override;
+  at::Tensor apply_transpose(const at::Tensor& v) const override;
+  at::Tensor diagonal() const override;
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  at::Tensor norm() const override;
+  int64_t first_nonfinite(int64_t sample) const override;
+  std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
+  KernelParameters kernel() const override;
+
+ private:
+  at::Tensor matrix_;
+};
+
+/// A sparse matrix as compressed rows; tensors (crow, col, values), each (…) or (batch, …); only
+/// `values` carries a gradient. A derivative with respect to A exists on its pattern alone.
+class CsrOperator final : public Operator {
+ public:
+  explicit CsrOperator(const OperatorSpec& spec);
+  void check_vector(const at::Tensor& b) const override;
+  at::Tensor apply(const at::Tensor& v) const override;
+  at::Tensor apply_transpose(const at::Tensor& v) const override;
+  at::Tensor diagonal() const override;
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  at::Tensor norm() const override;
+  int64_t first_nonfinite(int64_t sample) const override;
+  std::vector<int64_t> vector_shape() const override { return {n()}; }
+  KernelParameters kernel() const override;
+
+ private:
+  int64_t n() const { return crow_.size(-1) - 1; }
+  at::Tensor rows() const;
+  at::Tensor to_dense() const;
+
+  at::Tensor crow_, col_, values_;
+};
+
+}  // namespace prdp

@@ -1,0 +1,76 @@
+#include "prdp/operators/operator.h"
+
+#include <numeric>
+
+#include "prdp/operators/laplacian_operator.h"
+#include "prdp/operators/matrix_operator.h"
+
+namespace prdp {
+
+at::Tensor Operator::dense(const at::TensorOptions& options) const {
+  auto shape = vector_shape();
+  const int64_t n = std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies<>());
+  // One unit vector at a time: an operator with a batch axis takes the same one for every sample.
+  const auto batch = norm().dim() == 0 ? 1 : norm().size(0);
+  shape.insert(shape.begin(), batch);
+  std::vector<at::Tensor> columns;
+  for (int64_t j = 0; j < n; ++j) {
+    auto unit = at::zeros({batch, n}, options);
+    unit.select(1, j).fill_(1.0);
+    columns.push_back(apply(unit.view(shape)).reshape({batch, n}));
+  }
+  const auto matrix = at::stack(columns, -1);
+  return batch == 1 && norm().dim() == 0 ? matrix.squeeze(0) : matrix;
+}
+
+namespace {
+
+/// Aᵀ of any operator.
+class Transposed final : public Operator {
+ public:
+  explicit Transposed(std::unique_ptr<Operator> a) : a_(std::move(a)) {}
+  void check_vector(const at::Tensor& b) const override { a_->check_vector(b); }
+  void check_parameters() const override { a_->check_parameters(); }
+  at::Tensor apply(const at::Tensor& v) const override { return a_->apply_transpose(v); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return a_->apply(v); }
+  at::Tensor diagonal() const override { return a_->diagonal(); }
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override {
+    return a_->product_rule(u, lambda);  // ⟨λ, Aᵀ u⟩ = ⟨u, A λ⟩
+  }
+  at::Tensor norm() const override { return a_->norm(); }
+  std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
+  at::Tensor solve_directly(const at::Tensor& b) const override {
+    return a_->solve_transpose_directly(b);
+  }
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
+    return a_->solve_directly(b);
+  }
+  KernelParameters kernel() const override {
+    auto k = a_->kernel();
+    if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;
+    if (auto* csr = std::get_if<CsrParameters>(&k)) csr->transposed = true;
+    return k;
+  }
+
+ private:
+  std::unique_ptr<Operator> a_;
+};
+
+std::unique_ptr<Operator> make_untransposed(const OperatorSpec& spec) {
+  if (spec.kind == "heat") return std::make_unique<HeatOperator>(spec);
+  if (spec.kind == "poisson") return std::make_unique<PoissonOperator>(spec);
+  if (spec.kind == "dense") return std::make_unique<DenseOperator>(spec);
+  if (spec.kind == "csr") return std::make_unique<CsrOperator>(spec);
+  TORCH_CHECK_VALUE(false, "operator: unknown kind '", spec.kind,
+                    "'; allowed: heat, poisson, dense, csr");
+}
+
+}  // namespace
+
+std::unique_ptr<Operator> make_operator(const OperatorSpec& spec) {
+  auto a = make_untransposed(spec);
+  if (spec.transposed) return std::make_unique<Transposed>(std::move(a));
+  return a;
+}
+
+}  // namespace prdp

@@ -1,0 +1,76 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <memory>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include "prdp/kernels/laplacian_parameters.h"
+
+namespace prdp {
+
+/// The flat description of an operator, as it crosses torch's dispatcher: numbers and tensors only.
+struct OperatorSpec {
+  std::string kind;                  // "heat", "poisson", "dense", "csr"
+  std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
+  std::vector<double> parameters;    // plain numbers that carry no gradient, such as dt
+  std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
+  bool transposed = false;
+};
+
+/// A contiguous matrix (n, n) shared by all samples, or (batch, n, n).
+struct DenseParameters {
+  at::Tensor matrix;
+  bool transposed = false;
+};
+
+/// Compressed sparse rows with int64 indices: crow (n + 1), col and values (nnz), contiguous; or
+/// each with a leading batch axis.
+struct CsrParameters {
+  at::Tensor crow, col, values;
+  bool transposed = false;
+};
+
+/// What the CPU loops need to know of an operator; monostate: it has plain tensor operations only.
+using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters,
+                                      CsrParameters>;
+
+/// A linear operator A(g) on batches of fields. Immutable; knows nothing of solvers.
+/// Vectors are batched: (batch, channel, *shape) for stencils, (batch, n) for matrices.
+class Operator {
+ public:
+  virtual ~Operator() = default;
+
+  /// Raises ValueError or TypeError unless b is a right-hand side of this operator.
+  virtual void check_vector(const at::Tensor& b) const = 0;
+  /// Raises ValueError where a parameter is not allowed by its value (a negative nu).
+  virtual void check_parameters() const {}
+
+  /// A v and Aᵀ v, differentiable in v and in the tensors of A.
+  virtual at::Tensor apply(const at::Tensor& v) const = 0;
+  virtual at::Tensor apply_transpose(const at::Tensor& v) const = 0;
+  /// Diagonal of A, broadcastable against a batch of vectors.
+  virtual at::Tensor diagonal() const = 0;
+  /// A⁻¹ b and A⁻ᵀ b by the cheapest exact method that plain tensors allow; differentiable.
+  virtual at::Tensor solve_directly(const at::Tensor& b) const = 0;
+  virtual at::Tensor solve_transpose_directly(const at::Tensor& b) const = 0;
+  /// ∂⟨λ, A(g) u⟩/∂g, one per tensor of A; undefined where there is no derivative. Differentiable.
+  virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
+  /// ‖A‖∞, one value or one per sample.
+  virtual at::Tensor norm() const = 0;
+  /// Flat index i·n + j of the first entry A_ij that is NaN or Inf, for a matrix that has one.
+  virtual int64_t first_nonfinite(int64_t /*sample*/) const { return 0; }
+  /// Shape of one vector without its batch axis.
+  virtual std::vector<int64_t> vector_shape() const = 0;
+
+  virtual KernelParameters kernel() const { return std::monostate{}; }
+
+  /// A as a matrix (n, n), or (batch, n, n) where A differs between the samples.
+  at::Tensor dense(const at::TensorOptions& options) const;
+};
+
+/// Builds the operator that `spec` describes. Raises ValueError for an unknown kind or bad shapes.
+std::unique_ptr<Operator> make_operator(const OperatorSpec& spec);
+
+}  // namespace prdp

@@ -1,0 +1,42 @@
+#include <torch/library.h>
+
+#include "prdp/operators/operator.h"
+
+/// The operators as torch ops, made of plain tensor operations: autograd goes through them.
+namespace prdp {
+
+namespace {
+
+OperatorSpec spec(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                  at::ArrayRef<double> parameters, bool transposed = false) {
+  return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed};
+}
+
+at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view kind,
+                 at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed) {
+  const auto a = make_operator(spec(tensors, kind, shape, parameters, transposed));
+  a->check_vector(v);
+  return a->apply(v);
+}
+
+at::Tensor diagonal(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                    at::ArrayRef<double> parameters) {
+  return make_operator(spec(tensors, kind, shape, parameters))->diagonal();
+}
+
+at::Tensor dense(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                 at::ArrayRef<double> parameters, at::ScalarType dtype) {
+  return make_operator(spec(tensors, kind, shape, parameters))->dense(at::TensorOptions().dtype(dtype));
+}
+
+}  // namespace
+
+TORCH_LIBRARY_FRAGMENT(prdp, m) {
+  m.def("apply(Tensor v, Tensor[] tensors, str kind, int[] shape, float[] parameters, "
+        "bool transposed) -> Tensor", apply);
+  m.def("diagonal(Tensor[] tensors, str kind, int[] shape, float[] parameters) -> Tensor", diagonal);
+  m.def("dense(Tensor[] tensors, str kind, int[] shape, float[] parameters, ScalarType dtype) -> Tensor",
+        dense);
+}
+
+}  // namespace prdp

@@ -1,0 +1,6 @@
+#pragma once
+/// Everything the library offers to C++.
+#include "prdp/autograd/linear_solve.h"
+#include "prdp/controller/linear_schedule.h"
+#include "prdp/controller/prdp_controller.h"
+#include "prdp/steppers/stepper.h"

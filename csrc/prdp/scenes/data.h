@@ -1,0 +1,35 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include "prdp/grid/grid.h"
+#include "prdp/scenes/scene.h"
+
+namespace prdp {
+
+/// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of
+/// sin(2πn·) and cos(2πn·) over the axes, amplitudes U(-1, 1). Shape (samples, 1, *shape), values at
+/// the grid's unknowns; the same seed gives the same series in every language.
+at::Tensor fourier_series(const Grid& grid, int64_t samples, int64_t modes, int64_t seed,
+                          at::ScalarType dtype);
+
+/// Initial states and where two steps of the converged equation take them, at t = 2; each
+/// (samples, 1, *shape).
+struct Dataset {
+  at::Tensor train_start, train_end, valid_start, valid_end;
+};
+Dataset make_dataset(const Scene& scene);
+
+/// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).
+struct ParameterProblem {
+  at::Tensor modes;      // (P, N): the sines at the unknowns
+  at::Tensor start;      // (P,): θ to begin with
+  at::Tensor reference;  // (P,): θ to be found
+  at::Tensor solution;   // (1, 1, N): the exact u of the reference
+};
+ParameterProblem make_parameter_problem(const Scene& scene);
+
+/// The order in which an epoch goes through `samples`, from a generator seeded once per training.
+at::Tensor shuffled(int64_t samples, at::Generator& generator);
+at::Generator make_generator(int64_t seed);
+
+}  // namespace prdp

@@ -1,0 +1,153 @@
+#include "prdp/scenes/scene.h"
+
+#include <cmath>
+#include <filesystem>
+#include <fstream>
+#include <sstream>
+
+#include "prdp/scenes/toml_section.h"
+
+namespace prdp {
+
+namespace {
+
+Scene::Physics read_physics(TomlSection s) {
+  Scene::Physics p;
+  p.equation = s.choice("equation", {"poisson", "heat"});
+  p.shape = s.wholes("shape", 1);
+  if (p.shape.empty() || p.shape.size() > 3) s.fail("shape", "expected 1 to 3 extents");
+  if (p.equation == "heat") {
+    p.nu = s.at_least("nu", 0.0);
+    p.dt = s.above("dt", 0.0);
+  }
+  s.finish();
+  return p;
+}
+
+void read_solver(TomlSection s, Scene& scene) {
+  scene.solver.method = method_from_name(
+      s.choice("method", {"jacobi", "steepest_descent", "cg", "direct"}));
+  scene.solver.max_iter = s.whole("max_iter", 0);
+  scene.solver.rtol = s.at_least("rtol", 0.0);
+  scene.backward = backward_from_name(s.choice("backward", {"implicit", "unrolled", "none"}));
+  s.finish();
+}
+
+Scene::Data read_data(TomlSection s) {
+  Scene::Data d{s.whole("modes", 1), s.whole("train", 1), s.whole("valid", 1), s.whole("seed", 0)};
+  s.finish();
+  return d;
+}
+
+Scene::Network read_network(TomlSection s) {
+  Scene::Network n{s.choice("kind", {"mlp"}), s.wholes("hidden", 1)};
+  s.finish();
+  return n;
+}
+
+Scene::Training read_training(TomlSection s, Scene::Task task) {
+  Scene::Training t;
+  t.learning_rate = s.above("learning_rate", 0.0);
+  if (task == Scene::Task::kEmulator) {
+    t.loss = s.choice("loss", {"nmse", "mse"});
+    t.decay = s.above("decay", 0.0);
+    t.decay_steps = s.whole("decay_steps", 1);
+    t.batch = s.whole("batch", 1);
+    t.epochs = s.whole("epochs", 1);
+  } else {
+    t.updates = s.whole("updates", 1);
+  }
+  s.finish();
+  return t;
+}
+
+Scene::Parameters read_parameters(TomlSection s) {
+  Scene::Parameters p{s.numbers("start"), s.numbers("reference")};
+  if (p.start.empty()) s.fail("start", "expected at least one amplitude");
+  if (p.start.size() != p.reference.size()) s.fail("reference", "expected as many numbers as start");
+  s.finish();
+  return p;
+}
+
+PRDPSettings read_prdp(TomlSection s) {
+  PRDPSettings p;
+  p.tau_step = s.above("tau_step", 0.0);
+  p.tau_stop = s.above("tau_stop", 0.0);
+  p.delta = s.whole("delta", 2);
+  p.window = s.whole("window", 1);
+  p.initial = s.whole("initial", 0);
+  p.increment = s.whole("increment", 1);
+  if (s.has("maximum")) p.maximum = s.whole("maximum", p.initial);
+  if (s.has("growth")) p.growth = s.at_least("growth", 1.0);
+  s.finish();
+  return p;
+}
+
+Scene::Compare read_compare(TomlSection s) {
+  Scene::Compare c;
+  c.seeds = s.whole("seeds", 1);
+  c.constant = s.wholes("constant", 0);
+  if (s.has("growth")) c.growth = s.above("growth", 1.0);
+  if (s.has("target")) c.target = s.above("target", 0.0);
+  if (s.has("schedule")) {
+    c.schedule = s.wholes("schedule", 0);
+    if (c.schedule.size() != 2) s.fail("schedule", "expected two whole numbers, start and step");
+  }
+  s.finish();
+  return c;
+}
+
+}  // namespace
+
+Stepper Scene::stepper(Solver with) const {
+  const auto equation =
+      physics.equation == "heat"
+          ? Equation{"heat", physics.shape, {physics.dt}, {at::scalar_tensor(physics.nu, at::kDouble)}}
+          : Equation{physics.equation, physics.shape, {}, {}};
+  return {equation, {std::move(with), backward, {}, {}, OnFailure::kReturn}};
+}
+
+double Scene::learning_rate(int64_t update) const {
+  const double periods = static_cast<double>(update) / static_cast<double>(training.decay_steps);
+  return training.learning_rate * std::pow(training.decay, periods);
+}
+
+Scene read_scene(const std::string& path) {
+  std::ifstream file(path);
+  TORCH_CHECK_VALUE(file && !std::filesystem::is_directory(path), "scene: cannot read '", path, "'");
+  std::ostringstream text;
+  text << file.rdbuf();
+
+  toml::table table;
+  try {
+    table = toml::parse(text.str(), path);
+  } catch (const toml::parse_error& error) {
+    TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
+  }
+
+  Scene scene;
+  scene.path = path;
+  scene.name = std::filesystem::path(path).stem().string();
+  scene.text = text.str();
+  TomlSection s(table, path, "");
+  scene.title = s.text("title");
+  scene.task = s.choice("task", {"emulator", "parameters"}) == "emulator" ? Scene::Task::kEmulator
+                                                                          : Scene::Task::kParameters;
+  scene.dtype = s.choice("dtype", {"float32", "float64"}) == "float32" ? at::kFloat : at::kDouble;
+  scene.physics = read_physics(s.section("physics"));
+  read_solver(s.section("solver"), scene);
+  scene.training = read_training(s.section("training"), scene.task);
+  if (scene.task == Scene::Task::kEmulator) {
+    scene.data = read_data(s.section("data"));
+    scene.network = read_network(s.section("network"));
+  } else {
+    scene.parameters = read_parameters(s.section("parameters"));
+    if (scene.physics.shape.size() != 1) s.fail("physics", "the task 'parameters' is one-dimensional");
+  }
+  scene.prdp = read_prdp(s.section("prdp"));
+  scene.compare = read_compare(s.section("compare"));
+  s.finish();
+  return scene;
+}
+
+}  // namespace prdp

@@ -1,0 +1,72 @@
+#pragma once
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "prdp/controller/prdp_controller.h"
+#include "prdp/solvers/solver.h"
+#include "prdp/steppers/stepper.h"
+
+namespace prdp {
+
+/// A training experiment as data: what a scene file says. One reader serves both languages.
+struct Scene {
+  enum class Task {
+    kEmulator,    // a network learns one step of the equation (paper, section 4.2)
+    kParameters,  // amplitudes of the right-hand side are found from the solution (section 4.1)
+  };
+  struct Physics {
+    std::string equation;
+    std::vector<int64_t> shape;
+    double nu = 0.0, dt = 0.0;  // heat only
+  };
+  struct Data {
+    int64_t modes = 0, train = 0, valid = 0, seed = 0;
+  };
+  struct Network {
+    std::string kind;
+    std::vector<int64_t> hidden;
+  };
+  struct Training {
+    std::string loss;  // "nmse" or "mse"
+    double learning_rate = 0.0;
+    double decay = 1.0;  // of the learning rate, over decay_steps updates, exponentially
+    int64_t decay_steps = 1;
+    int64_t batch = 0, epochs = 0;  // emulator
+    int64_t updates = 0;            // parameters
+  };
+  struct Parameters {
+    std::vector<double> start, reference;
+  };
+  struct Compare {
+    int64_t seeds = 1;
+    std::vector<int64_t> constant;       // the sweep of constant K
+    std::optional<double> growth;        // PRDP with K ← growth·K, as a row of its own
+    std::vector<int64_t> schedule;       // manual schedule: start, step per interval; empty: none
+    std::optional<double> target;        // iterations are counted until the metric gets there
+  };
+
+  std::string name, path, text;  // text: the file as it was read
+  std::string title;
+  Task task;
+  at::ScalarType dtype;
+  Physics physics;
+  Solver solver;  // converged: max_iter is K_ε
+  Backward backward;
+  Data data;
+  Network network;
+  Training training;
+  Parameters parameters;
+  PRDPSettings prdp;
+  Compare compare;
+
+  /// The scene's step with this solver; a failed sample does not stop a training.
+  Stepper stepper(Solver solver) const;
+  /// The learning rate of an update, counted from 0.
+  double learning_rate(int64_t update) const;
+};
+
+/// Reads a scene file. Raises ValueError naming file, line and what is allowed.
+Scene read_scene(const std::string& path);
+
+}  // namespace prdp

@@ -1,0 +1,43 @@
+#pragma once
+
+namespace prdp {
+
+/// Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators of either sign.
+template <class Space>
+class ConjugateGradientMethod {
+ public:
+  explicit ConjugateGradientMethod(Space& space)
+      : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()) {}
+
+  void start() {
+    space_.fill_zero(x);
+    space_.copy(space_.b(), r_);
+    space_.copy(space_.b(), p_);
+    rr_ = pp_ = space_.b2();
+  }
+  void step() {
+    space_.apply(p_, q_);
+    const auto alpha = space_.step_length(rr_, space_.dot(p_, q_), pp_, space_.dot(q_, q_));
+    const auto rr = space_.descend(alpha, p_, q_, x, r_);
+    const auto beta = space_.ratio(rr, rr_);
+    space_.xpby(r_, beta, p_);
+    pp_ = rr + beta * beta * pp_;  // r and p are orthogonal
+    rr_ = rr;
+  }
+  auto residual2() const { return rr_; }
+  auto recompute_residual() {
+    rr_ = space_.residual(x, r_);
+    space_.copy(r_, p_);  // and start anew along the true residual
+    space_.assign(rr_, pp_);
+    return rr_;
+  }
+
+  typename Space::Vector x;
+
+ private:
+  Space& space_;
+  typename Space::Vector r_, p_, q_;  // residual; search direction; A p
+  typename Space::Scalar rr_{}, pp_{};
+};
+
+}  // namespace prdp

@@ -1,0 +1,40 @@
+#pragma once
+
+namespace prdp {
+
+/// u ← u + A⁻¹(b - A u) by an exact method: the first iteration solves, those after it refine.
+template <class Space>
+class DirectMethod {
+ public:
+  explicit DirectMethod(Space& space)
+      : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
+
+  void start() {
+    space_.fill_zero(x);
+    space_.copy(space_.b(), r_);
+    residual2_ = space_.b2();
+    ready_ = true;
+  }
+  void step() {
+    if (!ready_) space_.residual(x, r_);
+    space_.solve_directly(r_, d_);
+    space_.add(d_, x);
+    ready_ = false;
+  }
+  auto residual2() { return recompute_residual(); }
+  auto recompute_residual() {
+    if (!ready_) residual2_ = space_.residual(x, r_);
+    ready_ = true;
+    return residual2_;
+  }
+
+  typename Space::Vector x;
+
+ private:
+  Space& space_;
+  typename Space::Vector r_, d_;  // residual; its correction
+  typename Space::Scalar residual2_{};
+  bool ready_ = false;  // r_ and residual2_ belong to x
+};
+
+}  // namespace prdp

@@ -1,0 +1,192 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "prdp/solvers/status.h"
+
+/// The one loop around every method: it counts, checks and decides, per sample. A method (jacobi.h,
+/// …) supplies one iteration; a space says what a vector is: one sample in padded memory
+/// (sample_space.h), or a batch of plain tensors (tensor_space.h). Both run these same lines.
+namespace prdp {
+
+/// What the loop knows of one sample.
+struct SampleState {
+  int64_t cap = 0;     // iterations allowed
+  double b2 = 0.0;     // ‖b‖²
+  bool active = true;  // still iterating; a frozen sample's u no longer changes
+  bool claims = false; // its residual has just come below rtol, to be confirmed
+  bool settled = false;  // residual2 is the true one of the returned u, and status is final
+  SolveStatus status = SolveStatus::kMaxIter;
+  int64_t iterations = 0;
+  int64_t applications = 0;
+  double residual2 = 0.0;
+  int64_t best = 0;  // iterations after which the residual was smallest
+  double best2 = std::numeric_limits<double>::infinity();
+  double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
+
+  void stop(SolveStatus why) {
+    status = why;
+    active = false;
+  }
+  /// Back to the start, for another pass of at most `iterations_allowed`.
+  void restart(int64_t iterations_allowed) {
+    cap = iterations_allowed;
+    active = cap > 0;
+    settled = claims = false;
+    status = SolveStatus::kMaxIter;
+    iterations = 0;
+    refuted2 = std::numeric_limits<double>::infinity();
+  }
+};
+
+inline constexpr double kDivergenceBound = 1e13;
+
+namespace detail {
+
+/// The iterates have run away: the last one is of no use.
+inline bool lost(const SampleState& s) {
+  return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
+}
+
+/// A residual of this size is rounding: ε ‖A‖ ‖u‖.
+template <class Space>
+bool at_rounding_floor(const Space& space, const SampleState& s, double norm_a, double u2) {
+  return std::sqrt(s.residual2) <= space.epsilon() * norm_a * std::sqrt(u2);
+}
+
+/// The true residual no longer follows the method's own: a second false claim, after the method has
+/// gone on from the true residual of the first, has not even halved it. Just above rtol that is noise.
+inline bool parted_ways(const SampleState& s, double rtol) {
+  return s.residual2 > 0.25 * s.refuted2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
+}
+
+/// Statuses that follow from a true residual. `rtol` = 0 asks for an exact zero.
+inline void judge(SampleState& s, double rtol) {
+  if (!std::isfinite(s.residual2)) return s.stop(SolveStatus::kOverflow);
+  if (s.residual2 > kDivergenceBound * kDivergenceBound * s.b2) return s.stop(SolveStatus::kDiverged);
+  if (s.residual2 <= rtol * rtol * s.b2) s.stop(SolveStatus::kConverged);
+}
+
+/// Takes the residuals that the method knows. Freezes what diverged, overflowed or broke down, and
+/// confirms what seems converged by the true residual: a recursive one may have drifted from it.
+template <class Space, class Method>
+void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
+  const auto residual2 = space.lanes(method.residual2());
+  const auto broken = space.broken();
+  bool any_claims = false;
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    s.claims = false;
+    if (!s.active) continue;
+    s.residual2 = residual2[i];
+    if (s.residual2 < s.best2) {
+      s.best2 = s.residual2;
+      s.best = s.iterations;
+    }
+    if (broken[i]) {
+      s.stop(SolveStatus::kBreakdown);
+      continue;
+    }
+    judge(s, rtol);
+    if (s.status != SolveStatus::kConverged) continue;
+    s.status = SolveStatus::kMaxIter;  // only a claim so far; with rtol = 0 nothing stops early
+    s.active = true;
+    s.claims = rtol > 0.0;
+    any_claims = any_claims || s.claims;
+  }
+  if (!any_claims) return;
+
+  space.freeze_unless(states, [](const SampleState& s) { return s.claims; });
+  const auto true2 = space.lanes(method.recompute_residual());
+  const auto norm_a = space.operator_norm();
+  const auto u2 = space.lanes(space.dot(method.x, method.x));
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    if (!s.claims) continue;
+    s.residual2 = true2[i];
+    judge(s, rtol);
+    if (s.active && (at_rounding_floor(space, s, norm_a[i], u2[i]) || parted_ways(s, rtol)))
+      s.stop(SolveStatus::kStagnated);
+    s.refuted2 = s.residual2;
+    s.settled = !s.active;
+  }
+}
+
+/// At most `cap` iterations of each active sample. With `track`, every residual is looked at.
+template <class Space, class Method>
+void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+  method.start();
+  for (;;) {
+    if (track) observe(space, method, states, rtol);
+    bool any_active = false;
+    for (auto& s : states) {
+      if (s.iterations >= s.cap) s.active = false;
+      any_active = any_active || s.active;
+    }
+    space.freeze_unless(states, [](const SampleState& s) { return s.active; });
+    if (!any_active) return;
+    method.step();
+    for (auto& s : states) s.iterations += s.active;
+  }
+}
+
+/// Recomputes the residual of what is not settled and gives it its final status.
+template <class Space, class Method>
+void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
+  const auto open = [](const SampleState& s) { return !s.settled; };
+  if (std::none_of(states.begin(), states.end(), open)) return;
+  space.freeze_unless(states, open);
+  const auto residual2 = space.lanes(method.recompute_residual());
+  const auto u2 = space.lanes(space.dot(method.x, method.x));
+  const auto norm_a = space.operator_norm();
+  const auto broken = space.broken();
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    if (s.settled) continue;
+    s.residual2 = residual2[i];
+    if (broken[i]) s.status = SolveStatus::kBreakdown;
+    if (!lost(s)) judge(s, rtol);
+    if (s.status == SolveStatus::kMaxIter && rtol > 0.0 &&
+        at_rounding_floor(space, s, norm_a[i], u2[i]))
+      s.status = SolveStatus::kStagnated;
+    s.active = false;
+    s.settled = true;
+  }
+}
+
+}  // namespace detail
+
+/// Solves every sample that `states` holds active, from zero; the result is method.x. A sample that
+/// overflows or diverges is run again for as many iterations as gave its smallest residual.
+template <class Space, class Method>
+void iterate(Space& space, Method& method, typename Space::States& states, double rtol) {
+  using namespace detail;
+  const auto caps = space.map(states, [](const SampleState& s) { return s.cap; });
+  run(space, method, states, rtol, /*track=*/rtol > 0.0);
+  conclude(space, method, states, rtol);
+  if (std::none_of(states.begin(), states.end(), lost)) return;
+
+  // The cold path: which iterate was best is found by a watched pass where there was none, then
+  // remade. Samples that did not fail keep what they have.
+  const auto first = states;
+  const auto kept = method.x;
+  if (rtol == 0.0) {
+    for (size_t i = 0; i < states.size(); ++i) states[i].restart(lost(first[i]) ? caps[i] : 0);
+    space.restart();
+    run(space, method, states, rtol, /*track=*/true);
+  }
+  const auto watched = states;
+  for (size_t i = 0; i < states.size(); ++i) states[i].restart(lost(first[i]) ? watched[i].best : 0);
+  space.restart();
+  run(space, method, states, 0.0, /*track=*/false);
+  conclude(space, method, states, rtol);
+  for (size_t i = 0; i < states.size(); ++i) {
+    if (lost(first[i])) states[i].status = first[i].status;
+    else states[i] = first[i];
+  }
+  method.x = space.select(space.map(first, lost), kept, method.x);
+}
+
+}  // namespace prdp

@@ -1,0 +1,83 @@
+#include <sstream>
+
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+WarningSink& warning_sink() {
+  static WarningSink sink = [](const std::string& text) { TORCH_WARN(text); };
+  return sink;
+}
+
+/// "(0, 17)" for a flat index into an array of this shape.
+std::string position(int64_t flat, at::IntArrayRef shape) {
+  std::vector<int64_t> index(shape.size());
+  for (size_t d = shape.size(); d-- > 0;) {
+    index[d] = flat % shape[d];
+    flat /= shape[d];
+  }
+  std::ostringstream text;
+  for (size_t d = 0; d < index.size(); ++d) text << (d ? ", " : "(") << index[d];
+  text << ")";
+  return text.str();
+}
+
+/// Flat index of the first true entry.
+int64_t first_true(const at::Tensor& rows) {
+  return rows.reshape(-1).to(at::kByte).argmax().item<int64_t>();
+}
+
+/// Where in b or in A the trouble of this sample sits.
+std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus status, int64_t sample) {
+  std::ostringstream text;
+  if (status == SolveStatus::kNonfiniteInput) {
+    const auto row = b.select(0, sample);
+    text << " at index " << position(first_true(row.isfinite().logical_not()), row.sizes());
+  } else if (status == SolveStatus::kZeroDiagonal) {
+    const auto every = a.diagonal();
+    const auto diagonal = every.dim() > 1 ? every.select(0, sample) : every;
+    text << " in row " << position(first_true(diagonal.eq(0)), diagonal.sizes());
+  } else if (status == SolveStatus::kNonfiniteOperator) {
+    const int64_t n = a.vector_shape()[0];
+    text << " at index " << position(a.first_nonfinite(sample), {n, n});
+  }
+  return text.str();
+}
+
+}  // namespace
+
+void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                     OnFailure on_failure, const char* role) {
+  if (on_failure == OnFailure::kReturn) return;
+  const int64_t batch = info.status.size(0);
+  const auto* status = info.status.const_data_ptr<int64_t>();
+  std::vector<int64_t> failed;
+  for (int64_t i = 0; i < batch; ++i)
+    if (is_failure(static_cast<SolveStatus>(status[i]))) failed.push_back(i);
+  if (failed.empty()) return;
+
+  constexpr size_t named = 4;
+  std::ostringstream text;
+  text << role << ": " << failed.size() << " of " << batch << " samples failed";
+  for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
+    const int64_t i = failed[k];
+    const auto what = static_cast<SolveStatus>(status[i]);
+    text << (k ? "; " : ": ") << "sample " << i << " " << describe(what).name
+         << whereabouts(a, b, what, i);
+    if (!is_refused(what))
+      text << " (the iterate handed out has relative residual " << info.residual[i].item<double>()
+           << " after " << info.iterations[i].item<int64_t>() << " iterations)";
+    text << ", " << describe(what).meaning;
+  }
+  if (failed.size() > named) text << "; and " << failed.size() - named << " more";
+  if (on_failure == OnFailure::kRaise)
+    text << ". on_failure='return' hands out what there is, with the status of each sample";
+  TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, text.str());
+  warning_sink()(text.str());
+}
+
+void set_warning_sink(WarningSink sink) { warning_sink() = sink; }
+
+}  // namespace prdp

@@ -1,0 +1,104 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <optional>
+
+#include "prdp/kernels/direct_factors.h"
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/sample_space.h"
+
+/// The CPU's way through a batch: sample after sample, each to its end.
+namespace prdp {
+
+/// Right-hand sides and results as plain arrays: b and u contiguous (batch, unknowns), the others
+/// (batch,). `caps` gives each sample its own max_iter; null: all have `max_iter`.
+template <class T>
+struct SampleBatch {
+  Method method;
+  int64_t max_iter;
+  double rtol;
+  const int64_t* caps;
+  const T* b;
+  T* u;
+  int64_t* iterations;
+  T* residual;
+  int64_t* status;
+  int64_t* applications;
+};
+
+/// Runs the method on the sample that waits scaled in the workspace; returns where u is.
+template <class Kernel, class Factors, class T>
+const T* run_method(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
+                    const SampleBatch<T>& batch, std::array<SampleState, 1>& states) {
+  SampleSpace<Kernel, Factors> space(kernel, factors, workspace, states);
+  space.begin();
+  states[0].b2 = space.b2();
+  return with_method(batch.method, space, [&](auto method) -> const T* {
+    iterate(space, method, states, batch.rtol);
+    return method.x;
+  });
+}
+
+/// Solves sample `s`. b is scaled by a power of two to the order of one, so that no square over- or
+/// underflows and solve(2^k b) = 2^k solve(b) holds to the last bit.
+template <class Kernel, class Factors, class T>
+void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is_finite,
+                  kernels::Workspace<T>& workspace, const SampleBatch<T>& batch, int64_t s) {
+  const int64_t n = kernel.unknowns();
+  const T* b = batch.b + s * n;
+  T* u = batch.u + s * n;
+  std::array<SampleState, 1> states;
+  SampleState& state = states[0];
+  state.cap = batch.caps ? batch.caps[s] : batch.max_iter;
+
+  const auto finish = [&](SolveStatus status, int64_t iterations, double residual) {
+    batch.status[s] = static_cast<int64_t>(status);
+    batch.iterations[s] = iterations;
+    batch.residual[s] = static_cast<T>(residual);
+    batch.applications[s] = state.applications;
+  };
+  const auto hand_out_zeros = [&](SolveStatus status, double residual) {
+    std::fill(u, u + n, T(0));
+    finish(status, 0, residual);
+  };
+  const T magnitude = kernels::largest_magnitude(b, n);
+  if (!std::isfinite(magnitude))
+    return hand_out_zeros(SolveStatus::kNonfiniteInput, std::numeric_limits<double>::infinity());
+  if (!operator_is_finite)
+    return hand_out_zeros(SolveStatus::kNonfiniteOperator, std::numeric_limits<double>::infinity());
+  if (magnitude == T(0)) return hand_out_zeros(SolveStatus::kConverged, 0.0);
+  if (batch.method == Method::kJacobi && kernel.has_zero_diagonal())
+    return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
+
+  const T scale = kernels::power_of_two_scale(magnitude);
+  kernel.load(b, scale, workspace.vector(0));
+  const T* x = run_method(kernel, factors, workspace, batch, states);
+  kernel.store(x, T(1) / scale, u);
+  if (!kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
+    hand_out_zeros(SolveStatus::kOverflow, 1.0);
+  } else {
+    finish(state.status, state.iterations, std::sqrt(state.residual2 / state.b2));
+  }
+  // Whatever a failure left in the padding must not reach the next sample.
+  if (is_failure(static_cast<SolveStatus>(batch.status[s])))
+    for (int64_t i = 0; i < workspace.count(); ++i) workspace.clear(i);
+}
+
+/// Solves the samples [begin, end) on this thread.
+template <class Kernel, class T>
+void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
+  using Factors = typename kernels::FactorsOf<Kernel>::Type;
+  auto& workspace = kernels::Workspace<T>::local();
+  workspace.prepare(SampleSpace<Kernel, Factors>::kVectors, kernel.length(), kernel.halo());
+  const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
+    const bool finite = a.operator_is_finite();
+    std::optional<Factors> factors;
+    if (batch.method == Method::kDirect && finite) factors.emplace(a);
+    for (int64_t s = from; s < to; ++s)
+      solve_sample(a, factors ? &*factors : nullptr, finite, workspace, batch, s);
+  };
+  if (kernel.is_shared()) return solve(kernel, begin, end);
+  for (int64_t s = begin; s < end; ++s) solve(kernel.sample(s), s, s + 1);
+}
+
+}  // namespace prdp

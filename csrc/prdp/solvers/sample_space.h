@@ -1,0 +1,113 @@
+#pragma once
+#include <array>
+#include <cmath>
+#include <limits>
+#include <utility>
+
+#include "prdp/kernels/vector.h"
+#include "prdp/solvers/iterate.h"
+
+namespace prdp {
+
+/// One sample as a space for iterate(): vectors are padded memory of the thread's workspace, and
+/// every operation is a plain loop in place. `Kernel` is one of kernels/, `Factors` its direct method.
+template <class Kernel, class Factors>
+class SampleSpace {
+ public:
+  using T = typename Kernel::Scalar;
+  using Vector = T*;
+  using Scalar = T;
+  using States = std::array<SampleState, 1>;
+
+  static constexpr int64_t kVectors = 6;  // b, a scratch vector and at most four of the method
+
+  SampleSpace(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
+              States& states)
+      : kernel_(kernel), factors_(factors), workspace_(workspace), state_(states[0]) {}
+
+  /// Takes over b, which the caller has put into the first vector of the workspace.
+  void begin() { b2_ = dot(b(), b()); }
+
+  Vector vector() { return workspace_.vector(used_++); }
+  Vector scratch() { return workspace_.vector(1); }
+  Vector b() { return workspace_.vector(0); }
+  Scalar b2() const { return b2_; }
+  double epsilon() const { return std::numeric_limits<T>::epsilon() / 2; }
+
+  void fill_zero(Vector v) { std::fill(v, v + length(), T(0)); }
+  void copy(const T* from, Vector to) { std::copy(from, from + length(), to); }
+  void assign(Scalar from, Scalar& to) { to = from; }
+  void advance(Vector& x, Vector& next) { std::swap(x, next); }
+  void add(const T* d, Vector x) { kernels::axpy(T(1), d, x, length()); }
+  void xpby(const T* x, Scalar beta, Vector y) { kernels::xpby(x, beta, y, length()); }
+  Scalar dot(const T* a, const T* b) const { return kernels::dot(a, b, length()); }
+  Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
+    return kernels::descend(alpha, p, q, x, r, length());
+  }
+
+  void apply(const T* v, Vector out) {
+    ++state_.applications;
+    kernel_.apply(v, out);
+  }
+  void divide_by_diagonal(const T* b, Vector c) { kernel_.divide_by_diagonal(b, c); }
+  template <bool WithResidual>
+  Scalar jacobi_sweep(const T* c, const T* x, Vector next) {
+    ++state_.applications;
+    return kernel_.template jacobi_sweep<WithResidual>(c, x, next);
+  }
+  /// r = b - A x; returns ‖r‖².
+  Scalar residual(const T* x, Vector r) {
+    apply(x, r);
+    kernels::xpby(b(), T(-1), r, length());
+    return dot(r, r);
+  }
+  void solve_directly(const T* r, Vector d) {
+    if (factors_->solve(r, d)) return;
+    broken_ = true;
+    fill_zero(d);
+  }
+
+  /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
+  /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
+  Scalar step_length(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+    if (num < kNegligible) return 0;
+    if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
+    if (std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2)) {
+      broken_ = true;
+      return 0;
+    }
+    return num / den;
+  }
+  Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
+
+  std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
+  std::array<bool, 1> broken() const { return {broken_}; }
+  std::array<double, 1> operator_norm() const { return {kernel_.norm()}; }
+  template <class Predicate>
+  void freeze_unless(const States&, const Predicate&) {}  // a lone sample stops by leaving the loop
+  template <class Function>
+  auto map(const States& states, const Function& f) const {
+    return std::array{f(states[0])};
+  }
+  Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
+  void restart() {
+    broken_ = false;
+    for (int64_t i = 1; i < kVectors; ++i) workspace_.clear(i);
+  }
+
+ private:
+  /// Squared norms below this are zero to the dtype, b being scaled to the order of one.
+  static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
+
+  int64_t length() const { return kernel_.length(); }
+
+  const Kernel& kernel_;
+  const Factors* factors_;
+  kernels::Workspace<T>& workspace_;
+  SampleState& state_;
+  int64_t used_ = 2;
+  T b2_ = 0;
+  bool broken_ = false;
+};
+
+}  // namespace prdp

@@ -1,0 +1,68 @@
+#include "prdp/solvers/solve.h"
+
+#include <ATen/Parallel.h>
+
+#include "prdp/solvers/solve_cpu.h"
+
+namespace prdp {
+
+namespace {
+
+SolveInfo empty_info(const at::Tensor& b) {
+  const auto counts = at::TensorOptions().dtype(at::kLong).device(at::kCPU);
+  const int64_t batch = b.size(0);
+  return {at::empty({batch}, counts), at::empty({batch}, b.options().device(at::kCPU)),
+          at::empty({batch}, counts), at::empty({batch}, counts)};
+}
+
+/// Samples a thread takes at least: below some 100 µs of work, handing it over costs more than it saves.
+int64_t grain_size(int64_t unknowns, int64_t iterations) {
+  constexpr double nanoseconds_per_point = 0.5, worthwhile = 1e5;
+  const double sample = nanoseconds_per_point * static_cast<double>(unknowns) *
+                        static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
+  return std::max<int64_t>(1, static_cast<int64_t>(worthwhile / sample));
+}
+
+template <class T, class Parameters>
+SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
+  const auto rhs = b.contiguous();
+  SolveResult result{at::empty_like(rhs), empty_info(rhs)};
+  const int64_t size = rhs.size(0);
+  const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
+  const SampleBatch<T> batch{request.method,
+                             request.max_iter,
+                             request.rtol,
+                             caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
+                             rhs.const_data_ptr<T>(),
+                             result.u.mutable_data_ptr<T>(),
+                             result.info.iterations.mutable_data_ptr<int64_t>(),
+                             result.info.residual.mutable_data_ptr<T>(),
+                             result.info.status.mutable_data_ptr<int64_t>(),
+                             result.info.operator_applications.mutable_data_ptr<int64_t>()};
+  const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
+  at::parallel_for(0, size, grain_size(unknowns, request.max_iter), [&](int64_t begin, int64_t end) {
+    solve_range(a, batch, begin, end);
+  });
+  return result;
+}
+
+}  // namespace
+
+SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  const auto parameters = a.kernel();
+  if (!b.is_cpu() || std::holds_alternative<std::monostate>(parameters))
+    return solve_with_tensors(a, b, request);
+  return std::visit(
+      [&](const auto& p) -> SolveResult {
+        if constexpr (std::is_same_v<std::decay_t<decltype(p)>, std::monostate>) {
+          TORCH_INTERNAL_ASSERT(false);
+        } else if (b.scalar_type() == at::kFloat) {
+          return solve_on_cpu<float>(p, b, request);
+        } else {
+          return solve_on_cpu<double>(p, b, request);
+        }
+      },
+      parameters);
+}
+
+}  // namespace prdp

@@ -1,0 +1,137 @@
+#include <ATen/core/grad_mode.h>
+
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve.h"
+#include "prdp/solvers/tensor_space.h"
+
+namespace prdp {
+
+namespace {
+
+/// (batch,) → (batch, 1, …), to multiply a batch of vectors.
+at::Tensor per_sample(const at::Tensor& t, const at::Tensor& like) {
+  std::vector<int64_t> shape(like.dim(), 1);
+  shape[0] = like.size(0);
+  return t.reshape(shape);
+}
+
+/// Power of two per sample that brings its largest magnitude to the order of one.
+at::Tensor power_of_two_scale(const at::Tensor& magnitude) {
+  const int limit = magnitude.scalar_type() == at::kFloat ? 126 : 1022;
+  const auto exponent = std::get<1>(at::frexp(magnitude)).sub(1).clamp(-limit, limit);
+  return at::ldexp(at::ones_like(magnitude), exponent.neg());
+}
+
+/// Says of each sample whether it is settled before iterating, and how; MAX_ITER: it is not.
+std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
+                                           const at::Tensor& magnitude) {
+  const int64_t batch = magnitude.size(0);
+  std::vector<SolveStatus> status(batch, SolveStatus::kMaxIter);
+  const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
+    const auto host = rows.reshape({-1}).expand({batch}).to(at::kCPU).contiguous();
+    for (int64_t i = 0; i < batch; ++i)
+      if (host.const_data_ptr<bool>()[i]) status[i] = why;
+  };
+  // The last mark holds: the order is that of the CPU loops, from the end.
+  if (method == Method::kJacobi) {
+    const auto zero = a.diagonal().eq(0);
+    mark(zero.dim() == 0 ? zero : zero.any(-1), SolveStatus::kZeroDiagonal);
+  }
+  mark(magnitude.eq(0), SolveStatus::kConverged);
+  mark(a.norm().isfinite().logical_not(), SolveStatus::kNonfiniteOperator);
+  mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
+  return status;
+}
+
+SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOptions& real) {
+  const auto batch = static_cast<int64_t>(states.size());
+  const auto counts = at::TensorOptions().dtype(at::kLong);
+  SolveInfo info{at::empty({batch}, counts), at::empty({batch}, at::kDouble),
+                 at::empty({batch}, counts), at::empty({batch}, counts)};
+  for (int64_t i = 0; i < batch; ++i) {
+    const auto& s = states[i];
+    double residual = s.b2 > 0.0 ? std::sqrt(s.residual2 / s.b2) : 0.0;
+    if (s.status == SolveStatus::kZeroDiagonal) residual = 1.0;
+    else if (is_refused(s.status)) residual = std::numeric_limits<double>::infinity();
+    info.iterations.mutable_data_ptr<int64_t>()[i] = s.iterations;
+    info.residual.mutable_data_ptr<double>()[i] = residual;
+    info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(s.status);
+    info.operator_applications.mutable_data_ptr<int64_t>()[i] = s.applications;
+  }
+  info.residual = info.residual.to(real.device(at::kCPU));
+  return info;
+}
+
+/// b with its rows scaled, and rows that do not take part set to zero.
+struct ScaledRhs {
+  at::Tensor b, scale;
+};
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
+  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
+  const auto scale = per_sample(power_of_two_scale(safe), b);
+  const auto rows = per_sample(takes_part, b);
+  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
+}
+
+at::Tensor largest_magnitude(const at::Tensor& b) {
+  return b.detach().abs().reshape({b.size(0), -1}).amax(1);
+}
+
+}  // namespace
+
+SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  const at::NoGradGuard no_grad;
+  const auto magnitude = largest_magnitude(b);
+  const auto status = settle_beforehand(a, request.method, magnitude);
+  auto takes_part = at::empty({b.size(0)}, at::kBool);
+  std::vector<SampleState> states(status.size());
+  const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    s.status = status[i];
+    s.active = s.status == SolveStatus::kMaxIter;
+    s.settled = !s.active;
+    s.cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : request.max_iter;
+    takes_part.mutable_data_ptr<bool>()[i] = s.active;
+  }
+  const auto [rhs, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
+  TensorSpace space(a, rhs, states);
+  const auto b2 = space.lanes(space.b2());
+  for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
+
+  auto u = with_method(request.method, space, [&](auto method) {
+    iterate(space, method, states, request.rtol);
+    return method.x;
+  });
+  u = at::where(per_sample(takes_part.to(b.device()), b), u / scale, at::zeros_like(b));
+  const auto finite = u.isfinite().reshape({b.size(0), -1}).all(1);
+  u = at::where(per_sample(finite, b), u, at::zeros_like(u));
+  const auto finite_rows = finite.to(at::kCPU);
+  for (size_t i = 0; i < states.size(); ++i) {
+    if (finite_rows.const_data_ptr<bool>()[i]) continue;
+    states[i].status = SolveStatus::kOverflow;
+    states[i].iterations = 0;
+    states[i].residual2 = states[i].b2;
+  }
+  return {u.contiguous(), info_of(states, b.options())};
+}
+
+at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method,
+                          const at::Tensor& caps) {
+  // Samples of no iterations (b = 0, or refused) return zero and have no derivative.
+  const auto host_caps = caps.to(at::kCPU).contiguous();
+  std::vector<SampleState> states(b.size(0));
+  for (size_t i = 0; i < states.size(); ++i) {
+    states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
+    states[i].active = states[i].cap > 0;
+  }
+  const auto takes_part = caps.to(b.device()).gt(0);
+  const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), takes_part);
+  TensorSpace space(a, rhs, states);
+  return with_method(method, space, [&](auto m) {
+    detail::run(space, m, states, 0.0, /*track=*/false);
+    return m.x / scale;
+  });
+}
+
+}  // namespace prdp

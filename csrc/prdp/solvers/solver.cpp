@@ -1,0 +1,71 @@
+#include "prdp/solvers/solver.h"
+
+#include <array>
+#include <sstream>
+#include <utility>
+
+namespace prdp {
+
+namespace {
+
+template <class Enum, size_t N>
+using Names = std::array<std::pair<Enum, std::string_view>, N>;
+
+constexpr Names<Method, 4> kMethods{{{Method::kJacobi, "jacobi"},
+                                     {Method::kSteepestDescent, "steepest_descent"},
+                                     {Method::kConjugateGradient, "cg"},
+                                     {Method::kDirect, "direct"}}};
+constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
+                                         {Backward::kUnrolled, "unrolled"},
+                                         {Backward::kNone, "none"}}};
+constexpr Names<OnFailure, 3> kOnFailures{{{OnFailure::kRaise, "raise"},
+                                           {OnFailure::kWarn, "warn"},
+                                           {OnFailure::kReturn, "return"}}};
+
+template <class Enum, size_t N>
+std::string_view to_name(const Names<Enum, N>& names, Enum value) {
+  for (const auto& [known, text] : names)
+    if (known == value) return text;
+  TORCH_CHECK(false, "unnamed enumerator");
+}
+
+template <class Enum, size_t N>
+Enum from_name(const Names<Enum, N>& names, std::string_view wanted, const char* argument) {
+  std::ostringstream allowed;
+  for (const auto& [value, text] : names) {
+    if (text == wanted) return value;
+    allowed << (allowed.tellp() > 0 ? ", " : "") << text;
+  }
+  TORCH_CHECK_VALUE(false, argument, ": unknown name '", wanted, "'; allowed: ", allowed.str());
+}
+
+}  // namespace
+
+std::string_view name(Method method) { return to_name(kMethods, method); }
+std::string_view name(Backward backward) { return to_name(kBackwards, backward); }
+std::string_view name(OnFailure on_failure) { return to_name(kOnFailures, on_failure); }
+Method method_from_name(std::string_view name) { return from_name(kMethods, name, "solver"); }
+Backward backward_from_name(std::string_view name) { return from_name(kBackwards, name, "backward"); }
+OnFailure on_failure_from_name(std::string_view name) {
+  return from_name(kOnFailures, name, "on_failure");
+}
+
+namespace {
+
+void check_budget(const char* who, const char* prefix, const c10::SymInt& max_iter, double rtol) {
+  // A symbolic max_iter is checked when its number is known, as the graph runs.
+  TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() >= 0, who, ": ", prefix,
+                    "max_iter must be >= 0, got ", max_iter);
+  TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
+}
+
+}  // namespace
+
+void Solver::check(const char* who) const { check_budget(who, "", max_iter, rtol); }
+
+void SolveOptions::check(const char* who) const {
+  solver.check(who);
+  check_budget(who, "adjoint_", adjoint_max_iter.value_or(0), adjoint_rtol.value_or(0.0));
+}
+
+}  // namespace prdp

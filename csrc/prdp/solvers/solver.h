@@ -1,0 +1,88 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <optional>
+#include <string>
+#include <string_view>
+
+namespace prdp {
+
+enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kDirect };
+
+/// Relative residual at which an iteration may stop, ε in the paper.
+inline constexpr double kDefaultRtol = 1e-5;
+
+/// A solver and its budget. All start from zero and stop at the first of ‖b - A u‖ <= rtol ‖b‖ or
+/// max_iter iterations; rtol = 0 runs exactly max_iter.
+struct Solver {
+  Method method;
+  c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
+  double rtol = kDefaultRtol;
+
+  /// Raises ValueError unless max_iter >= 0 and rtol >= 0.
+  void check(const char* who) const;
+};
+
+struct Jacobi {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kJacobi, max_iter, rtol}; }
+};
+struct SteepestDescent {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kSteepestDescent, max_iter, rtol}; }
+};
+struct CG {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol}; }
+};
+/// The cheapest exact method of the operator; an iteration is one direct solve, those after the
+/// first refine its result.
+struct Direct {
+  int64_t max_iter = 1;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kDirect, max_iter, rtol}; }
+};
+
+/// How the derivative of a solve is taken.
+enum class Backward {
+  kImplicit,  // one adjoint solve Aᵀ λ = ū with the same method; keeps u only
+  kUnrolled,  // the exact derivative of the iterations that ran
+  kNone,      // u carries no gradient
+};
+
+/// What a failed sample does: raise an error, warn, or only say so in its status.
+enum class OnFailure { kRaise, kWarn, kReturn };
+
+/// Names as users write them; from_name raises ValueError naming the allowed ones.
+std::string_view name(Method method);
+std::string_view name(Backward backward);
+std::string_view name(OnFailure on_failure);
+Method method_from_name(std::string_view name);
+Backward backward_from_name(std::string_view name);
+OnFailure on_failure_from_name(std::string_view name);
+
+/// What a solve says of itself, one value per sample, each tensor of shape (batch,).
+struct SolveInfo {
+  at::Tensor iterations;             // that made the returned u
+  at::Tensor residual;               // ‖b - A u‖ / ‖b‖, recomputed from u
+  at::Tensor status;                 // SolveStatus
+  at::Tensor operator_applications;  // products with A, all told
+};
+
+/// Everything about a solve but the operator and b.
+struct SolveOptions {
+  Solver solver;
+  Backward backward = Backward::kImplicit;
+  std::optional<c10::SymInt> adjoint_max_iter{};  // the primal's where not given
+  std::optional<double> adjoint_rtol{};
+  OnFailure on_failure = OnFailure::kRaise;
+  int64_t adjoint_log = 0;  // where the adjoint solve leaves its SolveInfo (adjoint_log.h); 0: nowhere
+
+  /// Raises ValueError for a budget or tolerance out of range, naming it.
+  void check(const char* who) const;
+};
+
+}  // namespace prdp

@@ -1,0 +1,33 @@
+#pragma once
+
+namespace prdp {
+
+/// α = r·r / r·Ar; u += α r; r -= α A r. Fits definite operators of either sign.
+template <class Space>
+class SteepestDescentMethod {
+ public:
+  explicit SteepestDescentMethod(Space& space)
+      : x(space.vector()), space_(space), r_(space.vector()), q_(space.vector()) {}
+
+  void start() {
+    space_.fill_zero(x);
+    space_.copy(space_.b(), r_);
+    rr_ = space_.b2();
+  }
+  void step() {
+    space_.apply(r_, q_);
+    const auto alpha = space_.step_length(rr_, space_.dot(r_, q_), rr_, space_.dot(q_, q_));
+    rr_ = space_.descend(alpha, r_, q_, x, r_);
+  }
+  auto residual2() const { return rr_; }
+  auto recompute_residual() { return rr_ = space_.residual(x, r_); }
+
+  typename Space::Vector x;
+
+ private:
+  Space& space_;
+  typename Space::Vector r_, q_;  // residual; A r
+  typename Space::Scalar rr_{};
+};
+
+}  // namespace prdp

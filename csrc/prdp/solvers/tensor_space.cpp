@@ -1,0 +1,112 @@
+#include "prdp/solvers/tensor_space.h"
+
+#include <limits>
+
+namespace prdp {
+
+namespace {
+
+struct Limits {
+  double epsilon, smallest_normal;
+};
+
+Limits limits_of(const at::Tensor& t) {
+  if (t.scalar_type() == at::kFloat)
+    return {std::numeric_limits<float>::epsilon(), std::numeric_limits<float>::min()};
+  return {std::numeric_limits<double>::epsilon(), std::numeric_limits<double>::min()};
+}
+
+/// One value per sample, on the host.
+std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
+  const auto flat = t.detach().to(at::kCPU, at::kDouble).reshape(-1).expand(batch).contiguous();
+  return {flat.const_data_ptr<double>(), flat.const_data_ptr<double>() + batch};
+}
+
+}  // namespace
+
+TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states)
+    : a_(a), b_(std::move(b)), diagonal_(a.diagonal()), states_(states) {
+  diagonal_ = diagonal_.to(b_.options());
+  for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
+  b2_ = dot(b_, b_);
+  negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
+}
+
+double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
+
+void TensorSpace::solve_directly(const Vector& r, Vector& d) {
+  const auto solution = a_.solve_directly(r);
+  const auto finite = solution.isfinite().all(/*dim=*/1, /*keepdim=*/true);
+  auto every = finite;
+  for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
+  const auto singular = every.logical_not();
+  broken_ = broken_.defined() ? broken_.logical_or(singular) : singular;
+  d = at::where(every, solution, at::zeros_like(solution));
+}
+
+TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2,
+                                             const Scalar& b2) {
+  // As SampleSpace::step_length; the inner where keeps 0/0 out of the derivative.
+  const auto nothing_left = num.detach() < negligible_;
+  const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
+  const auto vanishes =
+      den.detach().abs().le(bound).logical_and(bound.isfinite()).logical_and(nothing_left.logical_not());
+  broken_ = broken_.defined() ? broken_.logical_or(vanishes) : vanishes;
+  const auto none = nothing_left.logical_or(vanishes);
+  const auto safe = at::where(none, at::ones_like(den), den);
+  return at::where(none, at::zeros_like(num), num / safe);
+}
+
+TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) const {
+  const auto none = den.detach() < negligible_;
+  return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
+}
+
+std::vector<double> TensorSpace::lanes(const Scalar& value) const {
+  return to_host(value, static_cast<int64_t>(states_.size()));
+}
+
+std::vector<bool> TensorSpace::broken() const {
+  std::vector<bool> rows(states_.size());
+  if (!broken_.defined()) return rows;
+  const auto host = to_host(broken_, static_cast<int64_t>(states_.size()));
+  for (size_t i = 0; i < rows.size(); ++i) rows[i] = host[i] != 0.0;
+  return rows;
+}
+
+std::vector<double> TensorSpace::operator_norm() const {
+  return to_host(a_.norm(), static_cast<int64_t>(states_.size()));
+}
+
+TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, const Vector& kept,
+                                        const Vector& remade) const {
+  return at::where(mask_of(remade_rows), remade, kept);
+}
+
+void TensorSpace::restart() {
+  broken_ = at::Tensor();
+  active_mask_ = at::Tensor();
+  active_.clear();
+}
+
+void TensorSpace::set_active(const std::vector<bool>& active) {
+  if (active == active_) return;
+  active_ = active;
+  const bool all = std::all_of(active.begin(), active.end(), [](bool a) { return a; });
+  active_mask_ = all ? at::Tensor() : mask_of(active);
+}
+
+void TensorSpace::count() {
+  for (size_t i = 0; i < states_.size(); ++i)
+    states_[i].applications += active_.empty() || active_[i];
+}
+
+at::Tensor TensorSpace::mask_of(const std::vector<bool>& rows) const {
+  std::vector<int64_t> shape(b_.dim(), 1);
+  shape[0] = static_cast<int64_t>(rows.size());
+  auto mask = at::empty(shape, at::kBool);
+  std::copy(rows.begin(), rows.end(), mask.mutable_data_ptr<bool>());
+  return mask.to(b_.device());
+}
+
+}  // namespace prdp

@@ -1,0 +1,105 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <vector>
+
+#include "prdp/operators/operator.h"
+#include "prdp/solvers/iterate.h"
+
+namespace prdp {
+
+/// A whole batch as a space for iterate(), in plain tensor operations: it serves every device,
+/// operators without CPU loops, and, run under autograd, the derivative of the iterations. Nothing
+/// is written in place. A frozen sample keeps its values by at::where.
+class TensorSpace {
+ public:
+  using Vector = at::Tensor;  // (batch, ...)
+  using Scalar = at::Tensor;  // (batch, 1, ...)
+  using States = std::vector<SampleState>;
+
+  /// b must be finite and scaled to the order of one, or zero.
+  TensorSpace(const Operator& a, at::Tensor b, States& states);
+
+  Vector vector() const { return at::zeros_like(b_); }
+  Vector scratch() const { return vector(); }
+  const Vector& b() const { return b_; }
+  const Scalar& b2() const { return b2_; }
+  double epsilon() const;
+
+  void fill_zero(Vector& v) { v = at::zeros_like(b_); }
+  void copy(const Vector& from, Vector& to) { to = keep_frozen(from, to); }
+  void assign(const Scalar& from, Scalar& to) { to = keep_frozen(from, to); }
+  void advance(Vector& x, const Vector& next) { x = keep_frozen(next, x); }
+  void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
+  void xpby(const Vector& x, const Scalar& beta, Vector& y) { y = keep_frozen(x + beta * y, y); }
+  Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
+  Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
+    x = keep_frozen(x + alpha * p, x);
+    r = keep_frozen(r - alpha * q, r);
+    return dot(r, r);
+  }
+
+  void apply(const Vector& v, Vector& out) {
+    count();
+    out = a_.apply(v);
+  }
+  void divide_by_diagonal(const Vector& b, Vector& c) const { c = b / diagonal_; }
+  template <bool WithResidual>
+  Scalar jacobi_sweep(const Vector& c, const Vector& x, Vector& next) {
+    Vector product;
+    apply(x, product);
+    const auto change = c - product / diagonal_;
+    next = x + change;
+    if constexpr (!WithResidual) return {};
+    const auto r = diagonal_ * change;
+    return dot(r, r);
+  }
+  Scalar residual(const Vector& x, Vector& r) {
+    Vector product;
+    apply(x, product);
+    r = keep_frozen(b_ - product, r);
+    return dot(r, r);
+  }
+  void solve_directly(const Vector& r, Vector& d);
+
+  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
+  Scalar ratio(const Scalar& num, const Scalar& den) const;
+
+  std::vector<double> lanes(const Scalar& value) const;
+  std::vector<bool> broken() const;
+  std::vector<double> operator_norm() const;
+  template <class Predicate>
+  void freeze_unless(const States& states, const Predicate& predicate) {
+    std::vector<bool> wanted;
+    for (const auto& s : states) wanted.push_back(predicate(s));
+    set_active(wanted);
+  }
+  template <class Function>
+  auto map(const States& states, const Function& f) const {
+    std::vector<decltype(f(states[0]))> values;
+    for (const auto& s : states) values.push_back(f(s));
+    return values;
+  }
+  /// Rows of `remade` where a sample was solved again in the last pass, rows of `kept` elsewhere.
+  Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
+  void restart();
+
+ private:
+  at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
+    return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
+  }
+  void set_active(const std::vector<bool>& active);
+  void count();
+  at::Tensor mask_of(const std::vector<bool>& rows) const;
+
+  const Operator& a_;
+  at::Tensor b_, b2_, diagonal_;
+  States& states_;
+  std::vector<int64_t> all_but_batch_;
+  std::vector<bool> active_;
+  at::Tensor active_mask_;  // undefined: every sample is active
+  at::Tensor broken_;       // undefined: no breakdown so far
+  double negligible_;
+};
+
+}  // namespace prdp

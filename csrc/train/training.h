@@ -1,0 +1,40 @@
+#pragma once
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "prdp/controller/controller.h"
+#include "prdp/scenes/scene.h"
+
+/// The C++ trainer: the same loops as prdp_torch/training.py.
+namespace prdp::train {
+
+/// How a training chooses K.
+struct Refinement {
+  std::string label;  // "prdp", "constant_25", "schedule_25_6", "direct"
+  std::function<std::unique_ptr<Controller>()> controller;
+  bool direct = false;
+};
+Refinement prdp(const Scene& scene);
+Refinement schedule(int64_t start, int64_t step, int64_t maximum);
+Refinement constant(int64_t k);
+Refinement direct();
+
+/// What a training leaves, one entry an interval: an epoch, or an update of the task "parameters".
+struct Curves {
+  std::vector<double> update_loss;  // one entry an update
+  std::vector<double> metric;       // starts before the first interval
+  std::vector<int64_t> max_iter;    // K
+  std::vector<int64_t> budget;      // K times the updates, the paper's count
+  std::vector<double> iterations, operator_applications;  // per sample of a batch, summed over updates
+  std::vector<double> seconds;
+};
+
+/// Called after each interval with (how many are done, the metric, K).
+using OnInterval = std::function<void(int64_t, double, int64_t)>;
+
+/// Trains the scene once; `seed` is that of the network's weights and of the shuffling.
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval);
+
+}  // namespace prdp::train

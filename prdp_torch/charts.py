@@ -1,0 +1,217 @@
+"""The pictures of a comparison, each as a matplotlib figure."""
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+# Colours that stay apart in greyscale and for colour-blind readers.
+_FIXED = {
+    "converged": ("#222222", "-"),
+    "direct": ("#7f7f7f", "--"),
+    "prdp": ("#d62728", "-"),
+    "growth": ("#ff9f1c", "-."),
+    "schedule": ("#8c564b", ":"),
+}
+
+
+def _style(row, rows):
+    """Colour and line of a row; constant K run through one colour map, from coarse to fine."""
+    if row.kind in _FIXED:
+        return _FIXED[row.kind]
+    sweep = [r.k for r in rows if r.kind == "constant"]
+    position = sweep.index(row.k) / max(1, len(sweep) - 1)
+    return matplotlib.colormaps["viridis"](0.05 + 0.85 * position), "-"
+
+
+def _figure(panels=1, height=4.2):
+    figure = Figure(figsize=(9.2, height), layout="constrained")
+    return figure, figure.subplots(1, panels, squeeze=False)[0]
+
+
+def _unit(scene):
+    return "epoch" if scene.task == "emulator" else "update"
+
+
+def _metric_name(scene):
+    if scene.task == "emulator":
+        return "validation error at t = 2,\nmean of (‖u − u_ref‖ / ‖u_ref‖)²"
+    return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
+
+
+def _seeds(rows):
+    n = len(rows[0].curves)
+    return "" if n == 1 else f" (line: mean of {n} seeds, band: one standard deviation)"
+
+
+def metric_over_intervals(scene, rows):
+    """Metric over epochs for every way of choosing K: geometric mean and spread over the seeds."""
+    figure, (axes,) = _figure(height=4.8)
+    for row in rows:
+        colour, line = _style(row, rows)
+        logs = np.log10(np.maximum(row.stack("metric"), 1e-300))
+        mean, spread = logs.mean(0), logs.std(0)
+        axes.plot(
+            10**mean,
+            color=colour,
+            ls=line,
+            lw=2.2 if row.kind in _FIXED else 1.3,
+            label=row.title,
+            zorder=3 if row.kind in _FIXED else 2,
+        )
+        if len(logs) > 1:
+            axes.fill_between(
+                range(len(mean)), 10 ** (mean - spread), 10 ** (mean + spread), color=colour, alpha=0.15, lw=0
+            )
+    axes.set(yscale="log", xlabel=_unit(scene), ylabel=_metric_name(scene))
+    axes.margins(x=0.01)
+    axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    return figure
+
+
+def k_over_intervals(scene, rows):
+    """K over epochs: each seed thin, their mean bold."""
+    figure, (axes,) = _figure()
+    for row in rows:
+        if row.kind not in ("prdp", "growth", "schedule"):
+            continue
+        colour, line = _style(row, rows)
+        k = row.stack("max_iter")
+        if len(k) > 1:
+            axes.plot(k.T, color=colour, lw=0.7, alpha=0.35)
+        axes.plot(k.mean(0), color=colour, ls=line, lw=2.2, label=row.title)
+    axes.axhline(scene.max_iter, color="#222222", lw=1.2, label=f"converged, K = {scene.max_iter}")
+    axes.set(xlabel=_unit(scene), ylabel="K, iterations a solve may take", ylim=(0, None))
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    return figure
+
+
+def total_iterations(scene, rows, table):
+    """Iterations of a whole training as bars, with what incomplete convergence (K ends below the
+    converged one) and progressive refinement (K starts lower still) save of the converged run's."""
+    chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
+    figure, (axes,) = _figure(height=1.6 + 0.55 * len(chosen))
+    base = chosen[0]["budget"]
+    for y, entry in enumerate(reversed(chosen)):
+        spent = entry["budget"] / base
+        ic = min(entry["saved_by_incomplete_convergence"], max(0.0, 1 - spent))
+        pr = max(0.0, 1 - spent - ic)
+        parts = (
+            (spent, "#4c72b0", "spent"),
+            (pr, "#dd8452", "saved by progressive refinement (PR)"),
+            (ic, "#f2c6a0", "saved by incomplete convergence (IC)"),
+        )
+        left = 0.0
+        for share, colour, name in parts:
+            axes.barh(y, share, left=left, color=colour, height=0.65, label=name if y == 0 else None)
+            if share > 0.045:
+                axes.text(
+                    left + share / 2,
+                    y,
+                    f"{100 * share:.0f} %",
+                    ha="center",
+                    va="center",
+                    color="white" if colour == "#4c72b0" else "black",
+                    fontsize=10,
+                )
+            left += share
+    axes.set_yticks(range(len(chosen)), [entry["title"] for entry in reversed(chosen)])
+    until = "" if scene.compare.target is None else f" until the error is {scene.compare.target:g}"
+    axes.set_xlabel(f"share of the converged training's {base:,.0f} iterations{until}")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def pareto_front(cost, error):
+    """Indices of the points that no other beats in both, in order of cost."""
+    order = np.lexsort((error, cost))
+    front, best = [], np.inf
+    for i in order:
+        if error[i] < best:
+            front.append(int(i))
+            best = error[i]
+    return front
+
+
+def accuracy_against_cost(scene, rows):
+    """Final metric against operator applications and against wall time, with the Pareto front."""
+    figure, panels = _figure(panels=2, height=4.8)
+    costs = (
+        ("operator_applications", "products with A per sample,\nadjoint solves included"),
+        ("seconds", "wall time of the training in s"),
+    )
+    error = np.array([row.final().mean() for row in rows])
+    for axes, (cost_name, cost_label) in zip(panels, costs, strict=True):
+        cost = np.array([row.total(cost_name).mean() for row in rows])
+        front = pareto_front(cost, error)
+        axes.plot(
+            cost[front], error[front], color="#bbbbbb", lw=5, solid_capstyle="round", zorder=1, label="Pareto front"
+        )
+        for row, x, y in zip(rows, cost, error, strict=True):
+            colour, _ = _style(row, rows)
+            marker = {"prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}.get(row.kind, "o")
+            bars = {}
+            if len(row.curves) > 1:
+                bars = {"xerr": row.total(cost_name).std(ddof=1), "yerr": row.final().std(ddof=1)}
+            axes.errorbar(
+                x,
+                y,
+                **bars,
+                fmt=marker,
+                color=colour,
+                ms=13 if marker == "*" else 8,
+                lw=1,
+                mec="white",
+                mew=0.6,
+                zorder=4 if marker == "*" else 3,
+                label=row.title,
+            )
+        axes.set(yscale="log", xlabel=cost_label)
+        if cost_name == "operator_applications":
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g} k" if x >= 1000 else f"{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+    panels[0].set_ylabel("final " + _metric_name(scene))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    return figure
+
+
+def all_charts(scene, rows, table):
+    """(figure, caption) of every chart, in the order of the report."""
+    seeds = _seeds(rows)
+    yield (
+        metric_over_intervals(scene, rows),
+        (
+            f"The metric over the training{seeds}. Coarse constant K levels off early; PRDP follows the coarse "
+            "curves while they fall and refines where they flatten."
+        ),
+    )
+    yield (
+        k_over_intervals(scene, rows),
+        (
+            "K over the training"
+            + (" (thin: each seed)." if seeds else ".")
+            + " PRDP stops where refining no longer pays."
+        ),
+    )
+    yield (
+        total_iterations(scene, rows, table),
+        (
+            "Iterations that the solver was allowed in all, as shares of the converged training's. K ending below "
+            "the converged one saves by incomplete convergence, K starting lower still by progressive refinement."
+        ),
+    )
+    yield (
+        accuracy_against_cost(scene, rows),
+        (
+            "Accuracy against cost; lower left is better, the grey line joins the runs that no other beats in both. "
+            "Operator applications count the products with A of the forward and the adjoint solves (the reverse "
+            "sweeps of the unrolled mode are not counted); wall time holds the network and the optimiser as well."
+        ),
+    )

@@ -1,0 +1,189 @@
+"""The command `prdp`: list scenes, train them, compare ways of choosing K."""
+
+import functools
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from prdp_torch import compare as comparison
+from prdp_torch import records, report
+from prdp_torch import scenes as scene_files
+from prdp_torch.training import Refinement
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Train through PDE solves that stop early, and see what it saves.",
+)
+console = Console(highlight=False)
+
+SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
+Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for records and report; default runs/SCENE.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
+Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or none, in place of the scene's.")]
+Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
+
+
+def command(function):
+    """A command whose user's errors are one line and exit 2; Ctrl-C exits 130."""
+
+    @functools.wraps(function)
+    def guarded(*args, **kwargs):
+        try:
+            function(*args, **kwargs)
+        except KeyboardInterrupt:
+            print("prdp: interrupted; finished trainings are kept, --resume goes on from them", file=sys.stderr)
+            raise typer.Exit(130) from None
+        except (ValueError, OSError) as error:
+            print(f"prdp: {error}", file=sys.stderr)
+            raise typer.Exit(2) from None
+
+    return app.command(name=function.__name__)(guarded)
+
+
+@command
+def scenes():
+    """List the scenes that come with the project."""
+    known = scene_files.available()
+    for name, path in known.items():
+        print(f"{name:{max(map(len, known))}}  {scene_files.load(path).title}")
+
+
+@command
+def train(
+    scene: SceneName,
+    prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings; the default.")] = False,
+    constant: Annotated[int | None, typer.Option(min=0, metavar="K", help="Constant K.")] = None,
+    schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
+    direct: Annotated[bool, typer.Option("--direct", help="The exact solver.")] = False,
+    seeds: Seeds = None,
+    out: Out = None,
+    resume: Resume = False,
+    backward: Backward = None,
+    intervals: Intervals = None,
+):
+    """Train a scene with one way of choosing K, over seeds; write a record each."""
+    loaded = _load(scene, backward, intervals)
+    chosen = [
+        name
+        for name, given in (
+            ("--prdp", prdp),
+            ("--constant", constant is not None),
+            ("--schedule", schedule is not None),
+            ("--direct", direct),
+        )
+        if given
+    ]
+    if len(chosen) > 1:
+        raise ValueError(f"give one of --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
+    refinement = Refinement.prdp(loaded)
+    if constant is not None:
+        refinement = Refinement.constant(constant)
+    elif direct:
+        refinement = Refinement.exact()
+    elif schedule is not None:
+        refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
+    folder = records.prepare_folder(out or Path("runs") / loaded.name)
+    environment = records.environment()
+    seeds = seeds or 1
+    with _progress() as progress:
+        for seed in range(seeds):
+            task = progress.add_task(f"seed {seed}", total=_intervals(loaded), note="")
+
+            def show(done, metric, k, task=task):
+                progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
+
+            comparison.run_one(loaded, refinement.label, refinement, seed, folder, environment, resume, show)
+    console.print(f"records: {folder / refinement.label}")
+
+
+@command
+def compare(
+    scene: SceneName,
+    seeds: Seeds = None,
+    out: Out = None,
+    resume: Resume = False,
+    backward: Backward = None,
+    intervals: Intervals = None,
+):
+    """Compare converged, exact, PRDP and a sweep of constant K: table, records and an HTML report."""
+    loaded = _load(scene, backward, intervals)
+    folder = records.prepare_folder(out or Path("runs") / loaded.name)
+    seeds = seeds or loaded.compare.seeds
+    per_training = _intervals(loaded)
+    with _progress() as progress:
+        task = progress.add_task("", total=len(comparison.rows_of(loaded)) * seeds * per_training, note="")
+        finished = {}
+
+        def show(row, seed, done):
+            finished[row.label, seed] = done
+            progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
+
+        rows = comparison.run(loaded, seeds, folder, resume, show)
+    table = comparison.summarise(loaded, rows)
+    records.write(
+        folder / "summary.json",
+        {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
+    )
+    report.write_html(loaded, rows, table, folder / "report.html")
+    _print_table(loaded, table)
+    console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
+
+
+def _load(scene, backward, intervals):
+    loaded = scene_files.load(scene)
+    if backward is not None:
+        loaded.backward = backward
+    if intervals is not None:
+        loaded.training.epochs = loaded.training.updates = intervals
+    return loaded
+
+
+def _intervals(scene):
+    return scene.training.epochs if scene.task == "emulator" else scene.training.updates
+
+
+def _schedule(text):
+    parts = text.split(":")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise ValueError(f"--schedule: expected START:STEP, two whole numbers, got '{text}'")
+    return int(parts[0]), int(parts[1])
+
+
+def _progress():
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    return Progress(*columns, console=console)
+
+
+def _print_table(scene, table):
+    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    # Eighty columns hold all but one; the report has it.
+    names = [short for short, _ in report.columns(scene)]
+    kept = [i for i, name in enumerate(names) if name != "taken"]
+    for i in kept:
+        shown.add_column(names[i], justify="right" if i else "left", no_wrap=True)
+    for entry in table:
+        row = report.cells(scene, entry)
+        shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] == "prdp" else None)
+    console.print(shown)
+    console.print(report.notes(scene))
+
+
+def main():
+    app()

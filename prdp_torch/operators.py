@@ -1,0 +1,84 @@
+"""Linear operators A on batches of vectors, matrix-free; also a torch tensor as one.
+
+A vector is (batch, 1, *shape) for the stencils and (batch, n) for matrices. The tensors that an
+operator is made of (nu, a matrix) get gradients through `apply` and through `linear_solve`.
+"""
+
+import torch
+
+from prdp_torch import _C
+
+
+class Operator:
+    """What `linear_solve` takes. `kind`, `shape`, `parameters` and `tensors` describe it to the
+    compiled library."""
+
+    kind: str
+
+    def __init__(self, shape, parameters, tensors):
+        self.shape = [int(n) for n in shape]
+        self.parameters = [float(p) for p in parameters]
+        self.tensors = list(tensors)
+        if not torch.compiler.is_compiling():
+            _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
+
+    def apply(self, v):
+        """A v, differentiable; v as a right-hand side."""
+        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
+
+    def apply_transpose(self, v):
+        """Aᵀ v, differentiable."""
+        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
+
+    def diagonal(self):
+        """The diagonal of A, in a shape that broadcasts against a batch of vectors."""
+        return torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
+
+    def dense(self, dtype=torch.float64):
+        """A as a matrix (n, n), or (batch, n, n) where it differs between samples; for small n."""
+        return torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
+
+
+class Poisson(Operator):
+    """The Laplacian with homogeneous Dirichlet boundaries on `shape` unknowns of the unit domain,
+    dx = 1/(N + 1): Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Negative definite."""
+
+    kind = "poisson"
+
+    def __init__(self, shape):
+        super().__init__(shape, [], [])
+
+
+class Heat(Operator):
+    """One implicit Euler step of the heat equation, I - nu dt L with the Laplacian L of `Poisson`.
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0."""
+
+    kind = "heat"
+
+    def __init__(self, shape, nu, dt):
+        super().__init__(shape, [dt], [as_tensor(nu)])
+
+
+class Matrix(Operator):
+    """A tensor (n, n) or (batch, n, n), dense or sparse CSR. Gradients of a sparse one live on its
+    pattern."""
+
+    def __init__(self, matrix):
+        if matrix.layout == torch.sparse_csr:
+            self.kind = "csr"
+            tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
+        elif matrix.layout == torch.strided:
+            self.kind = "dense"
+            tensors = [matrix]
+        else:
+            raise ValueError(f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}")
+        if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
+            raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
+        super().__init__([], [], tensors)
+
+
+def as_tensor(number):
+    """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
+    if isinstance(number, torch.Tensor):
+        return number
+    return torch.tensor(float(number), dtype=torch.float64)

@@ -1,0 +1,82 @@
+"""Records: what a training was, what it cost and what it reached, as JSON."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from prdp_torch import _C
+
+
+def environment():
+    """Versions, machine and commit, as far as they can be found out."""
+    return {
+        "versions": {"prdp_torch": _C.VERSION, "torch": torch.__version__, "python": platform.python_version()},
+        "machine": {"processor": _processor(), "cores": os.cpu_count(), "threads": torch.get_num_threads()},
+        "commit": _commit(),
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+
+
+def _processor():
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit():
+    folder = Path(__file__).resolve().parent
+    try:
+        answer = subprocess.run(
+            ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return answer.stdout.strip()
+
+
+def settings(scene):
+    """What a record must agree on to be of the same training: the scene as it ran."""
+    return {
+        "scene": scene.name,
+        "text": scene.text,
+        "backward": scene.backward,
+        "epochs": scene.training.epochs,
+        "updates": scene.training.updates,
+    }
+
+
+def write(path, content):
+    """Write JSON (or text) whole or not at all: beside its place, then moved there."""
+    path = Path(path)
+    text = content if isinstance(content, str) else json.dumps(content, indent=1)
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_text(text + "\n")
+    unfinished.replace(path)
+
+
+def read(path):
+    return json.loads(Path(path).read_text())
+
+
+def prepare_folder(path):
+    """Make the folder and see that it can be written to, before any work. ValueError if not."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"--out: cannot write to '{path}': {error.strerror}") from None
+    return path

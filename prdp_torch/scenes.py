@@ -1,0 +1,42 @@
+"""Scenes: training experiments as TOML files, read by the compiled library for both languages."""
+
+from pathlib import Path
+
+from prdp_torch import _C
+from prdp_torch.solvers import CG, Direct, Jacobi, SteepestDescent
+from prdp_torch.steppers import Heat, Poisson
+
+_PACKAGE = Path(__file__).parent
+# In a checkout the scenes lie among the examples; a wheel carries them along.
+_FOLDERS = [_PACKAGE.parent / "examples" / "scenes", _PACKAGE / "scenes"]
+
+_SOLVERS = {solver.method: solver for solver in (Jacobi, SteepestDescent, CG, Direct)}
+
+
+def available():
+    """Paths of the scenes that come with the project, by name."""
+    for folder in _FOLDERS:
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {}
+
+
+def load(scene):
+    """Read a scene by name or by path. ValueError says file, line and what is allowed."""
+    if str(scene).endswith(".toml"):
+        return _C.read_scene(str(scene))
+    known = available()
+    if str(scene) not in known:
+        raise ValueError(f"no scene '{scene}'; available: {', '.join(known)}; or give the path of a .toml file")
+    return _C.read_scene(str(known[str(scene)]))
+
+
+def make_stepper(scene, direct=False):
+    """The scene's step, with its solver or with the exact method. A failed sample is only reported:
+    coarse physics may well diverge early in a training."""
+    solver = Direct() if direct else _SOLVERS[scene.method](scene.max_iter, scene.rtol)
+    physics = scene.physics
+    options = {"solver": solver, "backward": scene.backward, "on_failure": "return"}
+    if physics.equation == "heat":
+        return Heat(physics.shape, physics.nu, physics.dt, **options)
+    return Poisson(physics.shape, **options)

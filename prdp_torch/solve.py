@@ -1,0 +1,106 @@
+"""`linear_solve`, and what a solve says of itself."""
+
+import weakref
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+
+from prdp_torch import _C, operators
+from prdp_torch.solvers import Solver
+
+SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
+SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
+
+
+class AdjointLog:
+    """Where a backward pass leaves the report of its adjoint solve: nobody is there to return it to."""
+
+    def __init__(self):
+        self.number = _C.open_adjoint_log()
+        weakref.finalize(self, _C.close_adjoint_log, self.number)
+
+    def read(self):
+        entry = _C.read_adjoint_log(self.number)
+        return None if entry is None else SolveInfo(*entry)
+
+    def __deepcopy__(self, memo):
+        return AdjointLog()
+
+    def __reduce__(self):
+        return AdjointLog, ()
+
+
+class SolveInfo(NamedTuple):
+    """What a solve says of itself, one value per sample: tensors of shape (batch,)."""
+
+    iterations: torch.Tensor
+    """Iterations that made the returned u (int64)."""
+    residual: torch.Tensor
+    """‖b - A u‖ / ‖b‖, recomputed from the returned u (dtype of u)."""
+    status: torch.Tensor
+    """Why it stopped: `SolveStatus(int(info.status[0])).name` (int64)."""
+    operator_applications: torch.Tensor
+    """Products with A, all told (int64)."""
+    log: AdjointLog | None = None
+
+    @property
+    def adjoint(self):
+        """The same of the adjoint solve, after `backward()` in implicit mode; None before."""
+        return None if self.log is None else self.log.read()
+
+
+def linear_solve(
+    A,
+    b,
+    solver,
+    backward="implicit",
+    adjoint_max_iter=None,
+    adjoint_rtol=None,
+    on_failure="raise",
+):
+    """Solve A u = b, differentiably. Returns (u, info); u has the shape of b.
+
+    Args:
+        A: an operator of `prdp_torch.operators`, or a tensor (n, n) or (batch, n, n), dense or sparse CSR.
+        b: (batch, channel, *shape) for stencil operators, (n,) or (batch, n) for matrices; float32 or
+            float64, any strides.
+        solver: `Jacobi`, `SteepestDescent`, `CG` or `Direct`.
+        backward: "implicit", one adjoint solve with the same method: b̄ = λ with Aᵀλ = ū truncated like
+            the primal, ḡ = -λᵀ ∂(A u)/∂g; "unrolled", the exact derivative of the iterations that ran;
+            "none".
+        adjoint_max_iter, adjoint_rtol: budget of the adjoint solve; the primal's where None.
+        on_failure: "raise" (torch.linalg.LinAlgError naming the samples), "warn" or "return" where a
+            sample diverges, overflows, breaks down or is not finite. Reaching max_iter is no failure.
+
+    Raises:
+        ValueError, TypeError: bad arguments, before any work.
+        torch.linalg.LinAlgError: a failed sample, with on_failure="raise"; in backward too.
+
+    The derivative is that of Paper, section 2.1 (Bhatia, Koehler, Thuerey: PRDP, ICLR 2025).
+    """
+    if isinstance(A, torch.Tensor):
+        A = operators.Matrix(A)
+    if not isinstance(A, operators.Operator):
+        raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}")
+    if not isinstance(solver, Solver):
+        raise TypeError(f"linear_solve: solver must be a Solver such as Jacobi(10), got {solver!r}")
+    log = None if torch.compiler.is_compiling() else AdjointLog()
+    lone_vector = b.dim() == 1
+    u, *report = torch.ops.prdp.linear_solve(
+        b.unsqueeze(0) if lone_vector else b,
+        A.tensors,
+        A.kind,
+        A.shape,
+        A.parameters,
+        False,
+        solver.method,
+        solver.max_iter,
+        solver.rtol,
+        backward,
+        adjoint_max_iter,
+        adjoint_rtol,
+        on_failure,
+        0 if log is None else log.number,
+    )
+    return u.squeeze(0) if lone_vector else u, SolveInfo(*report, log)

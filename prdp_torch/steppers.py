@@ -1,0 +1,156 @@
+"""Steppers: one time step, or one elliptic solve, as an `nn.Module` without weights."""
+
+from dataclasses import dataclass
+
+import torch
+
+from prdp_torch import _C, operators
+from prdp_torch.solve import AdjointLog, SolveInfo
+from prdp_torch.solvers import Solver
+
+
+@dataclass
+class Equation:
+    """A discretised equation as the compiled library takes it."""
+
+    kind: str
+    shape: list
+    parameters: list
+    tensors: list
+
+
+class Stepper(torch.nn.Module):
+    """u → u_next, both (batch, channel, *shape) in float32 or float64 and of any strides, by a linear
+    solve A(u) u_next = b(u) that starts from zero. Derivatives as `linear_solve` describes them.
+
+    Args of every stepper beside its physics:
+        shape: grid of unknowns in the unit domain, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+        solver: `Jacobi`, `SteepestDescent`, `CG` or `Direct`.
+        backward, adjoint_max_iter, adjoint_rtol, on_failure: as in `linear_solve`.
+
+    Attributes:
+        max_iter: K, the solver's budget; set it at any time, by hand or by a controller. A change
+            costs nothing, under `torch.compile` neither.
+        info: `SolveInfo` of the last forward; None before the first.
+        adjoint_info: `SolveInfo` of the last adjoint solve; None before the first backward.
+
+    Raises ValueError or TypeError for arguments out of range, before any work.
+    """
+
+    def __init__(self, equation, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure):
+        super().__init__()
+        name = type(self).__name__
+        if not isinstance(solver, Solver):
+            raise TypeError(f"{name}: solver must be a Solver such as Jacobi(10), got {solver!r}")
+        _C.check_options(
+            name, solver.method, solver.max_iter, solver.rtol, backward, adjoint_max_iter, adjoint_rtol, on_failure
+        )
+        self.equation = equation
+        self.method = solver.method
+        self.rtol = float(solver.rtol)
+        self.backward = backward
+        self.adjoint_max_iter = adjoint_max_iter
+        self.adjoint_rtol = adjoint_rtol
+        self.on_failure = on_failure
+        # A tensor, because torch.compile takes a module's plain numbers for constants.
+        self._max_iter = torch.tensor(solver.max_iter)
+        self._adjoint_log = AdjointLog()
+        self.info = None
+
+    def forward(self, u):
+        u_next, *report = torch.ops.prdp.step(
+            u,
+            self.equation.tensors,
+            self.equation.kind,
+            self.equation.shape,
+            self.equation.parameters,
+            self.method,
+            self._max_iter.item(),
+            self.rtol,
+            self.backward,
+            self.adjoint_max_iter,
+            self.adjoint_rtol,
+            self.on_failure,
+            self._adjoint_log.number,
+        )
+        self.info = SolveInfo(*report, self._adjoint_log)
+        return u_next
+
+    @property
+    def max_iter(self):
+        return int(self._max_iter)
+
+    @max_iter.setter
+    def max_iter(self, k):
+        _C.check_solver(type(self).__name__, self.method, k, self.rtol)
+        self._max_iter.fill_(k)
+
+    @property
+    def adjoint_info(self):
+        return self._adjoint_log.read()
+
+    @property
+    def converged(self):
+        """Whether all samples of the last forward met rtol, and of the last adjoint solve if any."""
+        reports = [report for report in (self.info, self.adjoint_info) if report is not None]
+        return self.info is not None and all(bool((report.status > 0).all()) for report in reports)
+
+    def rhs(self, u):
+        """b(u), the right-hand side of the step from u."""
+        return torch.ops.prdp.rhs(u, self.equation.kind)
+
+    def extra_repr(self):
+        e = self.equation
+        return (
+            f"shape={tuple(e.shape)}, solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, "
+            f"backward={self.backward}"
+        )
+
+
+class Poisson(Stepper):
+    """Δu = -p with u = 0 on the boundary of the unit domain; maps p to u. `shape` unknowns,
+    dx = 1/(N + 1), second-order differences (paper, appendix C.1)."""
+
+    def __init__(
+        self, shape, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
+    ):
+        a = operators.Poisson(shape)
+        super().__init__(
+            Equation(a.kind, a.shape, a.parameters, a.tensors),
+            solver,
+            backward,
+            adjoint_max_iter,
+            adjoint_rtol,
+            on_failure,
+        )
+
+    def operator(self, u=None):
+        """A(u) as an operator; here the same for every u."""
+        return operators.Poisson(self.equation.shape)
+
+
+class Heat(Stepper):
+    """One implicit Euler step of u_t = nu Δu with u = 0 on the boundary of the unit domain:
+    (I - nu dt L) u_next = u, `shape` unknowns, dx = 1/(N + 1) (paper, appendix C.2 to C.4).
+
+    nu >= 0 (length²/time, the domain's side being 1), a number or a 0-dimensional tensor, which then
+    gets a gradient; dt > 0 (time). Only nu dt/dx² matters: Jacobi's iteration count grows with it.
+    """
+
+    def __init__(
+        self, shape, nu, dt, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
+    ):
+        a = operators.Heat(shape, nu, dt)
+        super().__init__(
+            Equation(a.kind, a.shape, a.parameters, a.tensors),
+            solver,
+            backward,
+            adjoint_max_iter,
+            adjoint_rtol,
+            on_failure,
+        )
+
+    def operator(self, u=None):
+        """A(u) as an operator; here the same for every u."""
+        e = self.equation
+        return operators.Heat(e.shape, e.tensors[0], e.parameters[0])

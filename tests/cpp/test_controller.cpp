@@ -1,0 +1,105 @@
+#include <c10/util/Exception.h>
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "prdp/controller/linear_schedule.h"
+#include "prdp/controller/prdp_controller.h"
+
+namespace {
+
+using prdp::PRDPController;
+using prdp::PRDPSettings;
+
+/// A controller that smooths nothing and looks two values back.
+PRDPController plain(PRDPSettings settings = {}) {
+  settings.window = 1;
+  settings.delta = 2;
+  return PRDPController(settings);
+}
+
+TEST(PRDPController, WaitsUntilThereAreDeltaPlusOneValues) {
+  auto controller = plain();
+  EXPECT_FALSE(controller.step(1.0));
+  EXPECT_FALSE(controller.step(1.0));
+  EXPECT_TRUE(controller.step(1.0));
+}
+
+TEST(PRDPController, KeepsKWhileTheMetricFalls) {
+  auto controller = plain();
+  double metric = 1.0;
+  for (int i = 0; i < 50; ++i) EXPECT_FALSE(controller.step(metric *= 0.9));
+  EXPECT_EQ(controller.max_iter(), 1);
+}
+
+TEST(PRDPController, RefinesAConstantMetricOnceOnly) {
+  PRDPController controller;
+  int refinements = 0;
+  for (int i = 0; i < 200; ++i) refinements += controller.step(0.37);
+  EXPECT_EQ(refinements, 1);
+}
+
+TEST(PRDPController, RefinesAgainOnlyWhereTheLastRefinementPaidOrTheMetricGrew) {
+  auto controller = plain();
+  for (const double metric : {1.0, 1.0, 1.0}) controller.step(metric);
+  EXPECT_EQ(controller.max_iter(), 2);
+  for (const double metric : {0.95, 0.95, 0.95}) controller.step(metric);  // above τ_stop · 1.0
+  EXPECT_EQ(controller.max_iter(), 2);
+  for (const double metric : {0.8, 0.8}) controller.step(metric);  // below it
+  EXPECT_EQ(controller.max_iter(), 3);
+  EXPECT_TRUE(controller.step(0.9));  // worse than at the last refinement
+}
+
+TEST(PRDPController, GrowsByAFactorButAtLeastByTheIncrement) {
+  PRDPSettings settings;
+  settings.growth = 1.5;
+  settings.maximum = 40;
+  auto controller = plain(settings);
+  std::vector<int64_t> seen;
+  double metric = 1.0;
+  for (int i = 0; i < 60; ++i) {
+    if (i % 3 == 0) metric *= 0.5;
+    if (controller.step(metric)) seen.push_back(controller.max_iter());
+  }
+  EXPECT_EQ(seen, (std::vector<int64_t>{2, 3, 5, 8, 12, 18, 27, 40}));
+}
+
+TEST(PRDPController, KeepsKWhereSolvesAlreadyMeetTheirTolerance) {
+  auto controller = plain();
+  for (int i = 0; i < 20; ++i) EXPECT_FALSE(controller.step(1.0, /*converged=*/true));
+  EXPECT_EQ(controller.state().checkpoint, std::numeric_limits<double>::infinity());
+  EXPECT_TRUE(controller.step(1.0, /*converged=*/false));
+}
+
+TEST(PRDPController, ABadMetricRaisesAndChangesNothing) {
+  PRDPController controller;
+  controller.step(1.0);
+  for (const double bad : {-1.0, std::nan(""), std::numeric_limits<double>::infinity()}) {
+    EXPECT_THROW(controller.step(bad), c10::ValueError);
+    EXPECT_EQ(controller.state().history.size(), 1u);
+  }
+}
+
+TEST(PRDPController, StaysFiniteOverLongHistories) {
+  PRDPController controller;
+  for (int i = 0; i < 20000; ++i) controller.step(1.0 + 0.5 * std::sin(i));
+  EXPECT_TRUE(std::isfinite(controller.state().history.back().smoothed));
+}
+
+TEST(PRDPController, AMetricOfZeroIsNoTrouble) {
+  PRDPController controller;
+  for (int i = 0; i < 10; ++i) EXPECT_FALSE(controller.step(0.0));
+}
+
+TEST(LinearSchedule, GrowsByItsStepUpToTheMaximum) {
+  prdp::LinearSchedule schedule(25, 6, 40);
+  std::vector<int64_t> seen{schedule.max_iter()};
+  for (int i = 0; i < 4; ++i) {
+    schedule.step();
+    seen.push_back(schedule.max_iter());
+  }
+  EXPECT_EQ(seen, (std::vector<int64_t>{25, 31, 37, 40, 40}));
+  EXPECT_THROW(prdp::LinearSchedule(25, 6, 24), c10::ValueError);
+}
+
+}  // namespace

@@ -1,0 +1,106 @@
+#include <gtest/gtest.h>
+
+#include "helpers.h"
+#include "prdp/operators/operator.h"
+#include "prdp/solvers/solve.h"
+
+/// The CPU loops against the plain-tensor solver, which share only the text of the methods.
+namespace {
+
+using prdp::Method;
+
+const std::vector<std::pair<Method, const char*>> kMethods{{Method::kJacobi, "jacobi"},
+                                                           {Method::kSteepestDescent, "steepest_descent"},
+                                                           {Method::kConjugateGradient, "cg"},
+                                                           {Method::kDirect, "direct"}};
+
+prdp::OperatorSpec heat(std::vector<int64_t> shape) {
+  return {"heat", std::move(shape), {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}};
+}
+
+void expect_same(const prdp::OperatorSpec& spec, const at::Tensor& b, const prdp::SolveRequest& request,
+                 double tolerance) {
+  const auto a = prdp::make_operator(spec);
+  const auto loops = prdp::solve(*a, b, request), tensors = prdp::solve_with_tensors(*a, b, request);
+  const double scale = tensors.u.abs().max().item<double>() + 1e-300;
+  EXPECT_LT((loops.u - tensors.u).abs().max().item<double>(), tolerance * scale);
+  EXPECT_TRUE(at::equal(loops.info.iterations, tensors.info.iterations));
+  // Without a tolerance, converged means a residual of exactly zero: a matter of the last bit.
+  if (request.rtol > 0.0) EXPECT_TRUE(at::equal(loops.info.status, tensors.info.status));
+  EXPECT_TRUE(at::equal(loops.info.operator_applications, tensors.info.operator_applications));
+}
+
+TEST(Solve, LoopsEqualPlainTensorsAtSizesAroundTheVectorWidth) {
+  const std::vector<std::vector<int64_t>> shapes{{1}, {2}, {7}, {8}, {15}, {16}, {17}, {33}, {1, 1},
+                                                 {5, 16}, {16, 5}, {31, 9}, {1, 17}, {2, 3, 4}, {7, 1, 9}};
+  for (const auto& shape : shapes)
+    for (const auto& [method, name] : kMethods) {
+      SCOPED_TRACE(testing::Message() << name << " " << at::IntArrayRef(shape));
+      const auto b = prdp_test::random_field(shape, 4);
+      const int64_t k = method == Method::kDirect ? 1 : 3;
+      expect_same(heat(shape), b, {method, k, 0.0, {}}, 1e-13);
+      expect_same(heat(shape), b.to(at::kFloat), {method, k, 0.0, {}}, 2e-6);
+    }
+}
+
+TEST(Solve, LoopsEqualPlainTensorsUpToTheSameStop) {
+  for (const auto& [method, name] : kMethods) {
+    SCOPED_TRACE(name);
+    expect_same(heat({30}), prdp_test::random_field({30}, 5), {method, 200, 1e-8, {}}, 1e-9);
+    expect_same(heat({12, 9}), prdp_test::random_field({12, 9}, 5), {method, 200, 1e-8, {}}, 1e-9);
+  }
+}
+
+TEST(Solve, EachSampleStopsAtItsOwnCap) {
+  const auto a = prdp::make_operator(heat({20}));
+  const auto b = prdp_test::random_field({20}, 4);
+  const auto caps = at::tensor({0, 1, 5, 9}, at::kLong);
+  for (const auto& [method, name] : kMethods) {
+    SCOPED_TRACE(name);
+    const prdp::SolveRequest request{method, 99, 0.0, caps};
+    for (const auto& result : {prdp::solve(*a, b, request), prdp::solve_with_tensors(*a, b, request)}) {
+      EXPECT_TRUE(at::equal(result.info.iterations, caps));
+      for (int64_t i = 0; i < 4; ++i) {
+        const auto alone = prdp::solve(*a, b.narrow(0, i, 1), {method, caps[i].item<int64_t>(), 0.0, {}});
+        EXPECT_LT((alone.u[0] - result.u[i]).abs().max().item<double>(), 1e-13);
+      }
+    }
+  }
+}
+
+TEST(Solve, CountsProductsWithTheOperator) {
+  const auto a = prdp::make_operator(heat({20}));
+  const auto b = prdp_test::random_field({20}, 1);
+  const auto products = [&](Method method, int64_t k, double rtol) {
+    return prdp::solve(*a, b, {method, k, rtol, {}}).info.operator_applications[0].item<int64_t>();
+  };
+  // From zero the first Jacobi iterate is free, and each solve ends with its true residual.
+  EXPECT_EQ(products(Method::kJacobi, 10, 0.0), 10);
+  EXPECT_EQ(products(Method::kSteepestDescent, 10, 0.0), 11);
+  EXPECT_EQ(products(Method::kConjugateGradient, 10, 0.0), 11);
+  EXPECT_EQ(products(Method::kDirect, 1, 0.0), 1);
+  EXPECT_EQ(products(Method::kJacobi, 10, 1e-30), 11);
+}
+
+TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
+  // Diverges on the first matrix; the second, solved in the same memory, must not see it.
+  auto first = at::full({3, 3}, 0.9, at::kDouble);
+  first.diagonal().fill_(1.0);
+  const auto matrices = at::stack({first, at::eye(3, at::kDouble) * 2.0, first, at::eye(3, at::kDouble) * 4.0});
+  const auto a = prdp::make_operator({"dense", {}, {}, {matrices}});
+  const auto b = at::ones({4, 3}, at::kDouble);
+  const auto result = prdp::solve(*a, b, {Method::kJacobi, 500, 0.0, {}});
+  EXPECT_EQ(result.info.status[0].item<int64_t>(), -3);
+  EXPECT_TRUE(result.u.isfinite().all().item<bool>());
+  EXPECT_TRUE(result.u[1].eq(0.5).all().item<bool>());
+  EXPECT_TRUE(result.u[3].eq(0.25).all().item<bool>());
+}
+
+TEST(Solve, EmptyBatchIsNoTrouble) {
+  const auto a = prdp::make_operator(heat({20}));
+  const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {Method::kJacobi, 3, 1e-5, {}});
+  EXPECT_EQ(result.u.size(0), 0);
+  EXPECT_EQ(result.info.status.numel(), 0);
+}
+
+}  // namespace
