@@ -26,7 +26,9 @@ void expect_same(const prdp::OperatorSpec& spec, const at::Tensor& b, const prdp
   EXPECT_LT((loops.u - tensors.u).abs().max().item<double>(), tolerance * scale);
   EXPECT_TRUE(at::equal(loops.info.iterations, tensors.info.iterations));
   // Without a tolerance, converged means a residual of exactly zero: a matter of the last bit.
-  if (request.rtol > 0.0) EXPECT_TRUE(at::equal(loops.info.status, tensors.info.status));
+  if (request.rtol > 0.0) {
+    EXPECT_TRUE(at::equal(loops.info.status, tensors.info.status));
+  }
   EXPECT_TRUE(at::equal(loops.info.operator_applications, tensors.info.operator_applications));
 }
 

@@ -6,6 +6,7 @@
 
 #include <array>
 
+#include "prdp/autograd/linear_solve.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -14,15 +15,23 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor[] tensors, int[] needed, str kind, "
-    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, "
+    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, float rtol, "
     "Tensor iterations, Tensor status) -> Tensor[]";
 
-/// Iterations whose derivative is taken. b = 0 is solved in none, yet the map has a derivative there:
-/// that of all max_iter.
-at::Tensor differentiated_iterations(const UnrolledSolve& solve) {
+/// b = 0 is solved in no iterations, yet the map has a derivative there: A⁻ᵀ by the same method and
+/// budget, which for linear methods is the derivative of all max_iter iterations. Adds it to b̄.
+void add_derivative_at_zero(std::vector<at::Tensor>& gradients, const at::Tensor& cotangent,
+                            const UnrolledSolve& solve, at::IntArrayRef needed) {
   const auto at_zero = solve.iterations.eq(0).logical_and(
       solve.status.eq(static_cast<int64_t>(SolveStatus::kConverged)));
-  return solve.iterations.masked_fill(at_zero, solve.solver.max_iter.expect_int());
+  if (!needed[0] || !at_zero.any().item<bool>()) return;
+  auto rows = at_zero;
+  while (rows.dim() < cotangent.dim()) rows = rows.unsqueeze(-1);
+  auto a = solve.a;
+  a.transposed = !a.transposed;
+  SolveOptions options{solve.solver, Backward::kImplicit};
+  options.on_failure = OnFailure::kReturn;
+  gradients[0] = gradients[0] + linear_solve(a, cotangent * rows, options).u;
 }
 
 /// The gradients of the recorded iterations for the inputs that `needed` marks.
@@ -35,7 +44,7 @@ std::vector<at::Tensor> differentiate(const at::Tensor& cotangent, const at::Ten
       keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
   const at::AutoGradMode record(true);
   const auto u = solve_recorded(*make_operator(solve.a), b, solve.solver.method,
-                                differentiated_iterations(solve));
+                                solve.iterations);
   std::vector<at::Tensor> inputs;
   if (needed[0]) inputs.push_back(b);
   for (size_t i = 0; i < solve.a.tensors.size(); ++i)
@@ -46,6 +55,7 @@ std::vector<at::Tensor> differentiate(const at::Tensor& cotangent, const at::Ten
                                       /*allow_unused=*/true);
   for (size_t i = 0; i < inputs.size(); ++i)
     if (!gradients[i].defined()) gradients[i] = at::zeros_like(inputs[i]);
+  add_derivative_at_zero(gradients, cotangent, solve, needed);
   return gradients;
 }
 
@@ -53,19 +63,21 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
                                    at::TensorList tensors, at::IntArrayRef needed,
                                    c10::string_view kind, at::IntArrayRef shape,
                                    at::ArrayRef<double> parameters, bool transposed,
-                                   c10::string_view solver, c10::SymInt max_iter,
+                                   c10::string_view solver, c10::SymInt max_iter, double rtol,
                                    const at::Tensor& iterations, const at::Tensor& status) {
   UnrolledSolve unrolled{{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
-                         {method_from_name(solver), max_iter, 0.0},
+                         {method_from_name(solver), max_iter, rtol},
                          iterations,
                          status};
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
   if (unrolled.solver.method == Method::kJacobi && for_b_alone) {
     // K sweeps from zero are u = Σ_k (I - D⁻¹A)ᵏ D⁻¹ b; transposed, that is K sweeps with Aᵀ.
-    unrolled.a.transposed = !transposed;
-    const auto a = make_operator(unrolled.a);
-    const SolveRequest request{Method::kJacobi, 0, 0.0, differentiated_iterations(unrolled)};
-    return {prdp::solve(*a, cotangent, request).u};
+    auto transpose = unrolled.a;
+    transpose.transposed = !transposed;
+    const SolveRequest request{Method::kJacobi, 0, 0.0, iterations};
+    std::vector<at::Tensor> gradients{prdp::solve(*make_operator(transpose), cotangent, request).u};
+    add_derivative_at_zero(gradients, cotangent, unrolled, needed);
+    return gradients;
   }
   std::vector<at::Tensor> leaves;
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -76,7 +88,7 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
 
 std::vector<at::Tensor> fake_kernel(const at::Tensor&, const at::Tensor& b, at::TensorList tensors,
                                     at::IntArrayRef needed, c10::string_view, at::IntArrayRef,
-                                    at::ArrayRef<double>, bool, c10::string_view, c10::SymInt,
+                                    at::ArrayRef<double>, bool, c10::string_view, c10::SymInt, double,
                                     const at::Tensor&, const at::Tensor&) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
@@ -94,7 +106,8 @@ std::vector<at::Tensor> unrolled_vjp(const at::Tensor& cotangent, const at::Tens
                              .typed<decltype(vjp_kernel)>();
   const auto& a = solve.a;
   return op.call(cotangent, b, a.tensors, needed, a.kind, a.shape, a.parameters, a.transposed,
-                 name(solve.solver.method), solve.solver.max_iter, solve.iterations, solve.status);
+                 name(solve.solver.method), solve.solver.max_iter, solve.solver.rtol, solve.iterations,
+                 solve.status);
 }
 
 std::vector<at::Tensor> unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,

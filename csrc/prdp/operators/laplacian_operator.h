@@ -35,6 +35,9 @@ class PoissonOperator final : public LaplacianOperator {
  public:
   explicit PoissonOperator(const OperatorSpec& spec);
   at::Tensor apply(const at::Tensor& v) const override { return laplacian(v, grid_); }
+  std::unique_ptr<Operator> select(const at::Tensor&) const override {
+    return std::make_unique<PoissonOperator>(*this);
+  }
   std::vector<at::Tensor> product_rule(const at::Tensor&, const at::Tensor&) const override {
     return {};
   }
@@ -50,6 +53,9 @@ class HeatOperator final : public LaplacianOperator {
   explicit HeatOperator(const OperatorSpec& spec);
   void check_parameters() const override;
   at::Tensor apply(const at::Tensor& v) const override;
+  std::unique_ptr<Operator> select(const at::Tensor&) const override {
+    return std::make_unique<HeatOperator>(*this);
+  }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
 
  private:

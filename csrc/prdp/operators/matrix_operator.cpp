@@ -27,7 +27,8 @@ int64_t first_nonfinite_entry(const at::Tensor& t) {
 }
 
 at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b) {
-  return at::linalg_solve(matrix, b.unsqueeze(-1)).squeeze(-1);
+  // A singular matrix gives a non-finite solution here, and a status there.
+  return std::get<0>(at::linalg_solve_ex(matrix, b.unsqueeze(-1))).squeeze(-1);
 }
 
 }  // namespace
@@ -68,6 +69,12 @@ std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda,
 
 int64_t DenseOperator::first_nonfinite(int64_t sample) const {
   return first_nonfinite_entry(matrix_.dim() == 3 ? matrix_.select(0, sample) : matrix_);
+}
+
+std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<DenseOperator>(*this);
+  if (matrix_.dim() == 3) chosen->matrix_ = matrix_.index_select(0, index);
+  return chosen;
 }
 
 KernelParameters DenseOperator::kernel() const { return DenseParameters{matrix_.contiguous()}; }
@@ -150,6 +157,15 @@ int64_t CsrOperator::first_nonfinite(int64_t sample) const {
   const auto row = batched ? rows().select(0, sample) : rows();
   const auto col = batched ? col_.select(0, sample) : col_;
   return row[k].item<int64_t>() * n() + col[k].item<int64_t>();
+}
+
+std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<CsrOperator>(*this);
+  if (values_.dim() == 1) return chosen;
+  chosen->crow_ = crow_.index_select(0, index);
+  chosen->col_ = col_.index_select(0, index);
+  chosen->values_ = values_.index_select(0, index);
+  return chosen;
 }
 
 KernelParameters CsrOperator::kernel() const {

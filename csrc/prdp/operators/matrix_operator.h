@@ -16,6 +16,7 @@ class DenseOperator final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
   int64_t first_nonfinite(int64_t sample) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
   KernelParameters kernel() const override;
 
@@ -37,6 +38,7 @@ class CsrOperator final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
   int64_t first_nonfinite(int64_t sample) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {n()}; }
   KernelParameters kernel() const override;
 

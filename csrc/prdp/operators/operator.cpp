@@ -45,6 +45,10 @@ class Transposed final : public Operator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
     return a_->solve_directly(b);
   }
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override {
+    return std::make_unique<Transposed>(a_->select(index));
+  }
+  int64_t first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
   KernelParameters kernel() const override {
     auto k = a_->kernel();
     if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;

@@ -61,6 +61,8 @@ class Operator {
   virtual at::Tensor norm() const = 0;
   /// Flat index i·n + j of the first entry A_ij that is NaN or Inf, for a matrix that has one.
   virtual int64_t first_nonfinite(int64_t /*sample*/) const { return 0; }
+  /// The operator of the samples `index` (int64) alone, differentiable in the same tensors.
+  virtual std::unique_ptr<Operator> select(const at::Tensor& index) const = 0;
   /// Shape of one vector without its batch axis.
   virtual std::vector<int64_t> vector_shape() const = 0;
 

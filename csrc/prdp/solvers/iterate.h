@@ -87,6 +87,7 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     }
     if (broken[i]) {
       s.stop(SolveStatus::kBreakdown);
+      --s.iterations;  // the one that broke down changed nothing
       continue;
     }
     judge(s, rtol);
@@ -163,30 +164,37 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
 template <class Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol) {
   using namespace detail;
+  const bool track = rtol > 0.0;
   const auto caps = space.map(states, [](const SampleState& s) { return s.cap; });
-  run(space, method, states, rtol, /*track=*/rtol > 0.0);
+  run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
-  if (std::none_of(states.begin(), states.end(), lost)) return;
+  const auto again = space.map(states, [&](const SampleState& s) {
+    return lost(s) || (!track && s.status == SolveStatus::kBreakdown);
+  });
+  if (std::find(again.begin(), again.end(), true) == again.end()) return;
 
-  // The cold path: which iterate was best is found by a watched pass where there was none, then
-  // remade. Samples that did not fail keep what they have.
+  // The cold path. Where no residual was looked at, a watched pass finds the best iterate, or the
+  // iteration that broke down; then that iterate is remade. The other samples keep what they have.
   const auto first = states;
   const auto kept = method.x;
-  if (rtol == 0.0) {
-    for (size_t i = 0; i < states.size(); ++i) states[i].restart(lost(first[i]) ? caps[i] : 0);
+  if (!track) {
+    for (size_t i = 0; i < states.size(); ++i) states[i].restart(again[i] ? caps[i] : 0);
     space.restart();
     run(space, method, states, rtol, /*track=*/true);
   }
   const auto watched = states;
-  for (size_t i = 0; i < states.size(); ++i) states[i].restart(lost(first[i]) ? watched[i].best : 0);
+  for (size_t i = 0; i < states.size(); ++i) {
+    const int64_t wanted = lost(first[i]) ? watched[i].best : watched[i].iterations;
+    states[i].restart(again[i] ? wanted : 0);
+  }
   space.restart();
   run(space, method, states, 0.0, /*track=*/false);
   conclude(space, method, states, rtol);
   for (size_t i = 0; i < states.size(); ++i) {
-    if (lost(first[i])) states[i].status = first[i].status;
+    if (again[i]) states[i].status = first[i].status;
     else states[i] = first[i];
   }
-  method.x = space.select(space.map(first, lost), kept, method.x);
+  method.x = space.select(again, kept, method.x);
 }
 
 }  // namespace prdp

@@ -118,15 +118,20 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 
 at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method,
                           const at::Tensor& caps) {
-  // Samples of no iterations (b = 0, or refused) return zero and have no derivative.
+  // Samples of no iterations return zero and have no derivative. They are left out: an operator that
+  // was refused would send NaN backwards even from behind a mask.
+  const auto index = caps.gt(0).nonzero().flatten().to(b.device());
+  if (index.numel() < b.size(0)) {
+    const auto zeros = at::zeros_like(b);
+    if (index.numel() == 0) return zeros;
+    const auto some = solve_recorded(*a.select(index), b.index_select(0, index), method,
+                                     caps.index_select(0, index.to(caps.device())));
+    return zeros.index_copy(0, index, some);
+  }
   const auto host_caps = caps.to(at::kCPU).contiguous();
   std::vector<SampleState> states(b.size(0));
-  for (size_t i = 0; i < states.size(); ++i) {
-    states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
-    states[i].active = states[i].cap > 0;
-  }
-  const auto takes_part = caps.to(b.device()).gt(0);
-  const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), takes_part);
+  for (size_t i = 0; i < states.size(); ++i) states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
+  const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   TensorSpace space(a, rhs, states);
   return with_method(method, space, [&](auto m) {
     detail::run(space, m, states, 0.0, /*track=*/false);
