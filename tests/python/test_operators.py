@@ -26,9 +26,7 @@ def test_stencils_equal_their_matrices(shape):
         np.testing.assert_allclose(a.apply(v).flatten(1), flat @ matrix.T, rtol=1e-12, atol=1e-9)
         np.testing.assert_allclose(a.apply_transpose(v).flatten(1), flat @ matrix, rtol=1e-12, atol=1e-9)
         np.testing.assert_allclose(a.dense(), matrix, rtol=1e-12, atol=1e-9)
-        np.testing.assert_allclose(
-            np.broadcast_to(a.diagonal().numpy(), len(matrix)), np.diag(matrix), rtol=1e-12
-        )
+        np.testing.assert_allclose(np.broadcast_to(a.diagonal().numpy(), len(matrix)), np.diag(matrix), rtol=1e-12)
 
 
 @settings(deadline=None, max_examples=40)

@@ -113,9 +113,7 @@ def test_no_tolerance_goes_on_past_exact_convergence(solver, dtype):
 
 
 @settings(deadline=None, max_examples=60)
-@given(
-    seed=st.integers(0, 10**6), n=st.integers(1, 40), rtol=st.sampled_from([1e-3, 1e-5, 1e-8]), k=st.integers(0, 60)
-)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 40), rtol=st.sampled_from([1e-3, 1e-5, 1e-8]), k=st.integers(0, 60))
 def test_converged_means_a_small_recomputed_residual(seed, n, rtol, k):
     b = field((n,), batch=3, seed=seed)
     matrix = dense_heat((n,))
@@ -222,9 +220,7 @@ def test_loops_equal_plain_tensors(shape, seed, rtol):
     a = operators.Heat(shape, 1e-3, 1.0)
     for solver in SOLVERS:
         u, info = prdp.linear_solve(a, b, solver(6, rtol=rtol))
-        v, report = _C.solve_with_tensors(
-            b, a.tensors, a.kind, a.shape, a.parameters, False, solver.method, 6, rtol
-        )
+        v, report = _C.solve_with_tensors(b, a.tensors, a.kind, a.shape, a.parameters, False, solver.method, 6, rtol)
         torch.testing.assert_close(u, v, rtol=1e-10, atol=1e-12)
         torch.testing.assert_close(info.residual, report[1], rtol=1e-6, atol=1e-13)
 

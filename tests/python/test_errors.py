@@ -1,0 +1,115 @@
+"""Bad input: clear errors before any work, tested by their words."""
+
+import math
+
+import pytest
+import torch
+from helpers import field
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+def heat(**options):
+    options.setdefault("solver", prdp.Jacobi(3))
+    return prdp.Heat((30,), 1e-3, 1.0, **options)
+
+
+@pytest.mark.parametrize(
+    "u, message",
+    [
+        (torch.zeros(25, 30), r"Heat: expected \(batch, 1, 30\), got \(25, 30\)"),
+        (torch.zeros(25, 2, 30), r"Heat: expected \(batch, 1, 30\), got \(25, 2, 30\)"),
+        (torch.zeros(25, 1, 31), r"Heat: expected \(batch, 1, 30\), got \(25, 1, 31\)"),
+        (torch.zeros(25, 1, 30, 1), r"Heat: expected \(batch, 1, 30\), got \(25, 1, 30, 1\)"),
+    ],
+)
+def test_wrong_shapes(u, message):
+    with pytest.raises(ValueError, match=message):
+        heat()(u)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.complex64])
+def test_wrong_dtypes(dtype):
+    with pytest.raises(TypeError, match="Heat: expected float32 or float64, got"):
+        heat()(torch.zeros(2, 1, 30, dtype=dtype))
+
+
+def test_matrix_and_right_hand_side_must_fit():
+    with pytest.raises(ValueError, match=r"a matrix of 3 rows needs b of shape \(3,\) or \(batch, 3\), got \[2, 4\]"):
+        prdp.linear_solve(torch.eye(3), torch.zeros(2, 4), prdp.Jacobi(1))
+    with pytest.raises(ValueError, match="A holds 5 matrices, b holds 2 right-hand sides"):
+        prdp.linear_solve(torch.eye(3).expand(5, 3, 3), torch.zeros(2, 3), prdp.Jacobi(1))
+    with pytest.raises(TypeError, match="A is Double but b is Float"):
+        prdp.linear_solve(torch.eye(3, dtype=torch.float64), torch.zeros(3), prdp.Jacobi(1))
+    with pytest.raises(ValueError, match="A is on meta but b is on cpu"):
+        prdp.linear_solve(torch.eye(3, device="meta"), torch.zeros(3), prdp.Jacobi(1))
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: prdp.Jacobi(-1), "Jacobi: max_iter must be >= 0, got -1"),
+        (lambda: prdp.CG(3, rtol=-1e-5), "CG: rtol must be >= 0, got -1e-05"),
+        (lambda: prdp.SteepestDescent(3, rtol=math.nan), "SteepestDescent: rtol must be >= 0, got nan"),
+        (lambda: heat(backward="adjoint"), "backward: unknown name 'adjoint'; allowed: implicit, unrolled, none"),
+        (lambda: heat(on_failure="ignore"), "on_failure: unknown name 'ignore'; allowed: raise, warn, return"),
+        (lambda: heat(adjoint_max_iter=-2), "Heat: adjoint_max_iter must be >= 0, got -2"),
+        (lambda: heat(adjoint_rtol=-1.0), "Heat: adjoint_rtol must be >= 0, got -1"),
+        (lambda: prdp.Heat((30,), -1e-3, 1.0, prdp.Jacobi(1)), "Heat: nu must be finite and >= 0, got -0.001"),
+        (lambda: prdp.Heat((30,), 1e-3, -1.0, prdp.Jacobi(1)), "Heat: dt must be finite and > 0, got -1"),
+        (lambda: prdp.Poisson((0,), prdp.Jacobi(1)), r"Poisson: every extent of shape must be >= 1, got \[0\]"),
+    ],
+)
+def test_arguments_out_of_range(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_arguments_out_of_range_where_they_reach_the_op():
+    a, b = operators.Heat((5,), 1e-3, 1.0), field((5,))
+    solver = prdp.Jacobi(3)
+    solver.max_iter = -1
+    with pytest.raises(ValueError, match="linear_solve: max_iter must be >= 0, got -1"):
+        prdp.linear_solve(a, b, solver)
+    with pytest.raises(ValueError, match="linear_solve: adjoint_rtol must be >= 0, got -1"):
+        prdp.linear_solve(a, b, prdp.Jacobi(3), adjoint_rtol=-1.0)
+    with pytest.raises(ValueError, match="backward: unknown name 'both'"):
+        prdp.linear_solve(a, b, prdp.Jacobi(3), backward="both")
+
+
+def test_a_viscosity_that_turns_bad_is_found_at_the_step():
+    nu = torch.tensor(1e-3, dtype=torch.float64)
+    step = prdp.Heat((5,), nu, 1.0, solver=prdp.Jacobi(3))
+    nu.fill_(-1.0)
+    with pytest.raises(ValueError, match="Heat: nu must be finite and >= 0, got -1"):
+        step(field((5,)))
+
+
+def test_k_must_stay_a_number_of_iterations():
+    step = heat()
+    with pytest.raises(ValueError, match="Heat: max_iter must be >= 0, got -3"):
+        step.max_iter = -3
+    assert step.max_iter == 3
+
+
+def test_wrong_kinds_of_arguments():
+    with pytest.raises(TypeError, match=r"solver must be a Solver such as Jacobi\(10\), got 'jacobi'"):
+        prdp.linear_solve(torch.eye(2), torch.ones(2), "jacobi")
+    with pytest.raises(TypeError, match=r"Heat: solver must be a Solver such as Jacobi\(10\), got 10"):
+        heat(solver=10)
+    with pytest.raises(TypeError, match="A must be an operator or a tensor, got list"):
+        prdp.linear_solve([[1.0]], torch.ones(1), prdp.Jacobi(1))
+
+
+def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
+    from prdp_torch import _load
+
+    monkeypatch.setattr(_load, "_BUILT_FOR", tmp_path / "built_for_torch.txt")
+    with pytest.raises(ImportError, match="the compiled library is missing; build it with"):
+        _load.check_torch()
+    (tmp_path / "built_for_torch.txt").write_text("2.0.1+cpu\n")
+    with pytest.raises(
+        ImportError, match=r"was built for torch 2.0.1\+cpu, but torch .* is installed; install torch==2.0.1"
+    ):
+        _load.check_torch()

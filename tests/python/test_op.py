@@ -1,0 +1,144 @@
+"""The torch op behind the solves: what torch itself expects of it."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from helpers import SOLVERS, field
+from torch.library import opcheck
+from torch.utils.checkpoint import checkpoint
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+def arguments(backward="implicit", solver="jacobi", requires_grad=True):
+    b = field((5,)).requires_grad_(requires_grad)
+    nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=requires_grad)
+    return b, nu, (solver, 4, 1e-5, backward, None, None, "raise", 0)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled", "none"])
+@pytest.mark.parametrize("solver", ["jacobi", "steepest_descent", "cg", "direct"])
+def test_linear_solve_passes_opcheck(backward, solver):
+    b, nu, options = arguments(backward, solver)
+    result = opcheck(torch.ops.prdp.linear_solve.default, (b, [nu], "heat", [5], [1.0], False, *options))
+    assert set(result.values()) == {"SUCCESS"}
+
+
+# opcheck looks at the intermediate results of unrolled_vjp, which runs autograd inside.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_matrices_and_the_other_ops_pass_opcheck():
+    b, nu, options = arguments()
+    m = torch.eye(5, dtype=torch.float64, requires_grad=True)
+    calls = [
+        (torch.ops.prdp.linear_solve, (b.detach()[:, 0].clone().requires_grad_(), [m], "dense", [], [], False, *options)),
+        (torch.ops.prdp.step, (b, [nu], "heat", [5], [1.0], *options)),
+        (torch.ops.prdp.step, (b, [], "poisson", [5], [], *options)),
+        (torch.ops.prdp.apply, (b, [nu], "heat", [5], [1.0], False)),
+        (torch.ops.prdp.rhs, (b, "poisson")),
+        (
+            torch.ops.prdp.unrolled_vjp,
+            (b.detach(), b.detach(), [nu.detach()], [1, 1], "heat", [5], [1.0], False, "cg", 4, 1e-5,
+             torch.tensor([4, 4]), torch.tensor([-1, -1])),
+        ),
+    ]  # fmt: skip
+    for op, args in calls:
+        assert set(opcheck(op.default, args).values()) == {"SUCCESS"}
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_compiled_step_follows_k_and_compiles_at_most_twice(backward):
+    torch._dynamo.reset()
+    counter = torch._dynamo.testing.CompileCounter()
+    heat = prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(1), backward=backward)
+    eager = prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(1), backward=backward)
+    schedule = prdp.LinearSchedule([heat, eager], initial=1, increment=1, maximum=20)
+    step = torch.compile(heat, fullgraph=True, backend=counter)
+    for _ in range(12):
+        u, v = (field((30,)).requires_grad_() for _ in range(2))
+        (step(u) ** 2).sum().backward()
+        (eager(v) ** 2).sum().backward()
+        assert torch.equal(u.grad, v.grad)
+        assert heat.info.iterations.tolist() == eager.info.iterations.tolist() == [heat.max_iter] * 2
+        schedule.step()
+    assert heat.max_iter == 13
+    assert counter.frame_count <= 2
+
+
+def test_a_compiled_linear_solve_takes_k_as_an_argument():
+    torch._dynamo.reset()
+    counter = torch._dynamo.testing.CompileCounter()
+    a = operators.Heat((12,), 1e-3, 1.0)
+
+    @torch.compile(fullgraph=True, backend=counter)
+    def solve(b, k):
+        return prdp.linear_solve(a, b, prdp.Jacobi(max_iter=k))[0]
+
+    for k in range(1, 12):
+        b = field((12,)).requires_grad_()
+        torch.testing.assert_close(solve(b, k), prdp.linear_solve(a, b, prdp.Jacobi(k))[0])
+    assert counter.frame_count <= 2
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_ahead_of_time_autograd_gives_the_eager_gradients(solver, backward):
+    torch._dynamo.reset()
+    nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
+    heat = prdp.Heat((9,), nu, 1.0, solver=solver(4), backward=backward)
+    gradients = []
+    for step in (heat, torch.compile(heat, fullgraph=True, backend="aot_eager")):
+        b = field((9,)).requires_grad_()
+        nu.grad = None
+        (step(b) ** 2).sum().backward()
+        gradients.append((b.grad, nu.grad))
+    assert torch.equal(gradients[0][0], gradients[1][0]) and gradients[0][1] != 0
+    torch.testing.assert_close(gradients[0][1], gradients[1][1])
+
+
+def test_checkpointing_recomputes_the_solve():
+    heat = prdp.Heat((20,), 1e-3, 1.0, solver=prdp.Jacobi(5))
+    u, v = (field((20,)).requires_grad_() for _ in range(2))
+    checkpoint(lambda w: heat(heat(w)), u, use_reentrant=False).sum().backward()
+    heat(heat(v)).sum().backward()
+    assert torch.equal(u.grad, v.grad)
+
+
+def test_fake_tensors_know_the_shapes():
+    with torch._subclasses.FakeTensorMode():
+        b = torch.empty(7, 1, 4, 5)
+        u, info = prdp.linear_solve(operators.Poisson((4, 5)), b, prdp.CG(3))
+    assert u.shape == b.shape and info.status.shape == (7,) and info.status.dtype == torch.int64
+
+
+def test_functorch_transforms_refuse_in_words():
+    heat = prdp.Heat((5,), 1e-3, 1.0, solver=prdp.Jacobi(3))
+    with pytest.raises(RuntimeError, match=r"cannot use C\+\+ torch::autograd::Function with functorch"):
+        torch.func.grad(lambda u: heat(u).sum())(field((5,)))
+
+
+def test_steppers_are_modules_without_weights_that_copy_and_pickle():
+    heat = prdp.Heat((8,), 1e-3, 1.0, solver=prdp.Jacobi(3))
+    assert list(heat.parameters()) == [] and heat.state_dict() == {}
+    assert "Heat(shape=(8,), solver=jacobi, max_iter=3" in repr(heat)
+    for other in (copy.deepcopy(heat), pickle.loads(pickle.dumps(heat))):
+        assert torch.equal(other(field((8,))), heat(field((8,))))
+        other.max_iter = 7
+        assert heat.max_iter == 3
+        b = field((8,)).requires_grad_()
+        other(b).sum().backward()
+        assert other.adjoint_info is not None and heat.adjoint_info is None
+
+
+def test_reports_of_two_solves_stay_apart():
+    a = operators.Heat((8,), 1e-3, 1.0)
+    b = field((8,)).requires_grad_()
+    u, first = prdp.linear_solve(a, b, prdp.Jacobi(3))
+    v, second = prdp.linear_solve(a, b, prdp.Jacobi(5))
+    assert first.adjoint is None and second.adjoint is None
+    v.sum().backward()
+    assert first.adjoint is None and second.adjoint.iterations.tolist() == [5, 5]
+    u.sum().backward()
+    assert first.adjoint.iterations.tolist() == [3, 3]
