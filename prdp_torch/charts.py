@@ -183,7 +183,7 @@ def accuracy_against_cost(scene, rows):
 
 
 def all_charts(scene, rows, table):
-    """(figure, caption) of every chart, in the order of the report."""
+    """(name, figure, caption) of every chart, in the order of the report."""
     seeds = _seeds(rows)
     yield (
         metric_over_intervals(scene, rows),

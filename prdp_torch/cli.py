@@ -133,7 +133,7 @@ def compare(
         folder / "summary.json",
         {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
     )
-    report.write_html(loaded, rows, table, folder / "report.html")
+    report.write(loaded, rows, table, folder)
     _print_table(loaded, table)
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
 

@@ -83,8 +83,11 @@ def _svg(figure):
     return base64.b64encode(image.getvalue()).decode()
 
 
-def write_html(scene, rows, table, path):
-    """One self-contained file: table, charts and the scene, written whole or not at all."""
+def write(scene, rows, table, folder):
+    """`report.html`, one self-contained file with table, charts and the scene, and each chart as PNG."""
+    drawn = list(charts.all_charts(scene, rows, table))
+    for name, figure, _ in drawn:
+        figure.savefig(folder / f"{name}.png", dpi=120)
     template = jinja2.Environment(autoescape=True).from_string(
         Path(__file__).with_name("report.html.j2").read_text(encoding="utf-8")
     )
@@ -96,6 +99,6 @@ def write_html(scene, rows, table, path):
         columns=[heading for _, heading in columns(scene)],
         cells=[{"kind": entry["kind"], "cells": cells(scene, entry)} for entry in table],
         notes=notes(scene),
-        charts=[{"svg": _svg(f), "caption": caption} for f, caption in charts.all_charts(scene, rows, table)],
+        charts=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in drawn],
     )
-    records.write(path, html)
+    records.write(folder / "report.html", html)

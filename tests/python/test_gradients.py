@@ -1,5 +1,7 @@
 """Derivatives of solves: each mode against what it defines, all in float64."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -145,7 +147,7 @@ def test_modes_differ_below_convergence_and_meet_at_it():
 
     gaps = [float((gradient(k, "implicit") - gradient(k, "unrolled")).norm()) for k in (1, 4, 16, 60)]
     assert gaps[0] > 1e-2
-    assert all(after < before for before, after in zip(gaps, gaps[1:], strict=False))
+    assert all(after < before for before, after in pairwise(gaps))
     assert gaps[-1] < 1e-12
 
 

@@ -32,8 +32,9 @@ def test_linear_solve_passes_opcheck(backward, solver):
 def test_matrices_and_the_other_ops_pass_opcheck():
     b, nu, options = arguments()
     m = torch.eye(5, dtype=torch.float64, requires_grad=True)
+    rhs = torch.ones(2, 5, dtype=torch.float64, requires_grad=True)
     calls = [
-        (torch.ops.prdp.linear_solve, (b.detach()[:, 0].clone().requires_grad_(), [m], "dense", [], [], False, *options)),
+        (torch.ops.prdp.linear_solve, (rhs, [m], "dense", [], [], False, *options)),
         (torch.ops.prdp.step, (b, [nu], "heat", [5], [1.0], *options)),
         (torch.ops.prdp.step, (b, [], "poisson", [5], [], *options)),
         (torch.ops.prdp.apply, (b, [nu], "heat", [5], [1.0], False)),

@@ -98,7 +98,7 @@ def test_operators_say_what_is_wrong():
         operators.Heat((30,), 1e-3, 1.0).apply(torch.zeros(25, 30))
     with pytest.raises(ValueError, match=r"A must have shape \(n, n\) or \(batch, n, n\), got \(2, 3\)"):
         operators.Matrix(torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="A must be a dense or sparse CSR tensor, got torch.sparse_coo"):
+    with pytest.raises(ValueError, match=r"A must be a dense or sparse CSR tensor, got torch\.sparse_coo"):
         operators.Matrix(torch.eye(3).to_sparse())
 
 

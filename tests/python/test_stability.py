@@ -44,7 +44,7 @@ def test_a02_zero_diagonal_and_breakdown():
 
 
 def test_a03_a_cyclic_shift_breaks_steepest_descent_down():
-    u, info = solve("A03", prdp.SteepestDescent(50))
+    _, info = solve("A03", prdp.SteepestDescent(50))
     assert statuses(info) == ["BREAKDOWN"] and info.residual.tolist() == [1.0]
     np.testing.assert_allclose(solve("A03", prdp.Direct())[0], F["A03__u"], atol=1e-14)
 

@@ -1,0 +1,128 @@
+"""Types of the compiled library, for editors."""
+
+from torch import Tensor, dtype
+
+VERSION: str
+DEFAULT_RTOL: float
+SOLVE_STATUSES: dict[str, int]
+
+def check_operator(kind: str, shape: list[int], parameters: list[float], tensors: list[Tensor]) -> None: ...
+def check_solver(who: str, method: str, max_iter: int, rtol: float) -> None: ...
+def check_options(
+    who: str,
+    method: str,
+    max_iter: int,
+    rtol: float,
+    backward: str,
+    adjoint_max_iter: int | None,
+    adjoint_rtol: float | None,
+    on_failure: str,
+) -> None: ...
+def open_adjoint_log() -> int: ...
+def close_adjoint_log(log: int) -> None: ...
+def read_adjoint_log(log: int) -> tuple[Tensor, Tensor, Tensor, Tensor] | None: ...
+def solve_with_tensors(
+    b: Tensor,
+    tensors: list[Tensor],
+    kind: str,
+    shape: list[int],
+    parameters: list[float],
+    transposed: bool,
+    solver: str,
+    max_iter: int,
+    rtol: float,
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]: ...
+
+class PRDPController:
+    def __init__(
+        self,
+        *,
+        tau_step: float = ...,
+        tau_stop: float = ...,
+        delta: int = ...,
+        window: int = ...,
+        initial: int = ...,
+        increment: int = ...,
+        maximum: int | None = ...,
+        growth: float = ...,
+    ) -> None: ...
+    @property
+    def max_iter(self) -> int: ...
+    @property
+    def settings(self) -> dict[str, float | int | None]: ...
+
+class LinearSchedule:
+    def __init__(self, *, initial: int, increment: int, maximum: int) -> None: ...
+    @property
+    def max_iter(self) -> int: ...
+    @property
+    def settings(self) -> dict[str, int]: ...
+
+class Physics:
+    equation: str
+    shape: list[int]
+    nu: float
+    dt: float
+
+class Data:
+    modes: int
+    train: int
+    valid: int
+    seed: int
+
+class Network:
+    kind: str
+    hidden: list[int]
+
+class Training:
+    loss: str
+    batch: int
+    epochs: int
+    updates: int
+
+class Compare:
+    seeds: int
+    constant: list[int]
+    growth: float | None
+    schedule: list[int]
+    target: float | None
+
+class Scene:
+    name: str
+    path: str
+    text: str
+    title: str
+    task: str
+    dtype: dtype
+    physics: Physics
+    data: Data
+    network: Network
+    training: Training
+    compare: Compare
+    method: str
+    max_iter: int
+    rtol: float
+    backward: str
+    prdp: dict[str, float | int | None]
+
+    def learning_rate(self, update: int) -> float: ...
+
+class Dataset:
+    train_start: Tensor
+    train_end: Tensor
+    valid_start: Tensor
+    valid_end: Tensor
+
+class ParameterProblem:
+    modes: Tensor
+    start: Tensor
+    reference: Tensor
+    solution: Tensor
+
+def read_scene(path: str) -> Scene: ...
+def make_dataset(scene: Scene) -> Dataset: ...
+def make_parameter_problem(scene: Scene) -> ParameterProblem: ...
+def loss(kind: str, u: Tensor, reference: Tensor) -> Tensor: ...
+def normalised_mse(u: Tensor, reference: Tensor) -> Tensor: ...
+def half_mse(u: Tensor, reference: Tensor) -> Tensor: ...
+def relative_error(theta: Tensor, reference: Tensor) -> Tensor: ...

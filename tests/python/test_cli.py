@@ -1,0 +1,143 @@
+"""The command `prdp`, run as users run it."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+TRAINER = ROOT / "build" / "prdp_train"
+
+
+def prdp(*arguments, cwd):
+    return subprocess.run([*PRDP, *map(str, arguments)], cwd=cwd, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    done = prdp("compare", "heat_1d", "--seeds", 2, "--intervals", 4, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
+    folder, done = comparison
+    for title in ("converged, K = 25", "direct solver", "PRDP", "PRDP, K ← 1.5 K", "K = 1", "K = 15"):
+        assert title in done.stdout
+    record = json.loads((folder / "runs/heat_1d/prdp/seed_1.json").read_text())
+    assert record["seed"] == 1 and record["versions"]["torch"] and record["machine"]["cores"] >= 1
+    assert "commit" in record and record["settings"]["scene"] == "heat_1d"
+    curves = record["curves"]
+    assert len(curves["metric"]) == 5 and len(curves["update_loss"]) == 32
+    assert set(curves) == {
+        "update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds",
+    }  # fmt: skip
+    summary = json.loads((folder / "runs/heat_1d/summary.json").read_text())
+    by_label = {row["label"]: row for row in summary["rows"]}
+    assert by_label["converged"]["budget"] == 4 * 8 * 25 and by_label["constant_5"]["saved"] == pytest.approx(0.8)
+
+
+def test_the_report_is_one_file_with_labelled_pictures(comparison):
+    folder, _ = comparison
+    html = (folder / "runs/heat_1d/report.html").read_text()
+    assert len(re.findall(r'<img alt="[^"]{30,}" src="data:image/svg\+xml;base64,', html)) == 4
+    assert not re.search(r'(src|href)="(?!data:)', html)  # nothing is fetched from elsewhere
+
+
+def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
+    folder, _ = comparison
+    records = folder / "runs/heat_1d"
+    kept, missing = records / "prdp/seed_0.json", records / "constant_5/seed_1.json"
+    before = kept.stat().st_mtime_ns
+    missing.unlink()
+    done = prdp("compare", "heat_1d", "--seeds", 2, "--intervals", 4, "--resume", cwd=folder)
+    assert done.returncode == 0 and missing.exists() and kept.stat().st_mtime_ns == before
+    other = prdp("train", "heat_1d", "--prdp", "--intervals", 5, "--resume", cwd=folder)
+    assert other.returncode == 0 and kept.stat().st_mtime_ns > before  # other settings: not the same training
+
+
+@pytest.mark.parametrize(
+    "options, label", [([], "prdp"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
+                       (["--direct"], "direct")]
+)  # fmt: skip
+def test_train_writes_one_record_a_seed(tmp_path, options, label):
+    done = prdp("train", "heat_1d", *options, "--seeds", 2, "--intervals", 2, "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "here" / label).iterdir()) == ["seed_0.json", "seed_1.json"]
+
+
+def test_scenes_are_listed(tmp_path):
+    done = prdp("scenes", cwd=tmp_path)
+    assert done.returncode == 0 and "heat_1d" in done.stdout and "poisson_3p_sd" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: heat_1d"),
+        (["compare", "nosuch.toml"], "prdp: scene: cannot read 'nosuch.toml'"),
+        (["train", "heat_1d", "--schedule", "3"], "prdp: --schedule: expected START:STEP, two whole numbers, got '3'"),
+        (["train", "heat_1d", "--prdp", "--direct"], "give one of --prdp, --constant, --schedule and --direct"),
+        (
+            ["train", "heat_1d", "--backward", "both"],
+            "backward: unknown name 'both'; allowed: implicit, unrolled, none",
+        ),
+        (["train", "heat_1d", "--out", "/proc/nothing"], "prdp: --out: cannot write to '/proc/nothing'"),
+        (["train", "heat_1d", "--constant", "-1"], "--constant"),
+        (["train", "heat_1d", "--frobnicate"], "No such option"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_2(tmp_path, arguments, message):
+    done = prdp(*arguments, cwd=tmp_path)
+    assert done.returncode == 2 and message in done.stderr
+    assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [*PRDP, "train", "heat_1d", "--seeds", "100", "--out", "."],
+        [TRAINER, ROOT / "examples/scenes/heat_1d.toml", "--seeds", "100", "--out", "."],
+    ],
+    ids=["python", "cpp"],
+)
+def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    first = tmp_path / "prdp/seed_0.json"
+    for _ in range(600):
+        if first.exists():
+            break
+        time.sleep(0.1)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and b"interrupted" in errors
+    assert json.loads(first.read_text())["curves"]["metric"]
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["nosuch.toml"], "prdp_train: scene: cannot read 'nosuch.toml'"),
+        ([ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"], "expected START:STEP, got '3'"),
+        ([ROOT / "examples/scenes/heat_1d.toml", "--out", "/proc/nothing"], "prdp_train: "),
+    ],
+)
+def test_the_cpp_trainer_says_what_is_wrong(tmp_path, arguments, message):
+    done = subprocess.run([TRAINER, *arguments], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and message in done.stderr and not list(tmp_path.iterdir())
+
+
+def test_the_quickstart_refines(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "examples/quickstart.py"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "K raised to 2" in done.stdout
