@@ -39,11 +39,6 @@ def _metric_name(scene):
     return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
 
 
-def _seeds(rows):
-    n = len(rows[0].curves)
-    return "" if n == 1 else f" (line: mean of {n} seeds, band: one standard deviation)"
-
-
 def metric_over_intervals(scene, rows):
     """Metric over epochs for every way of choosing K: geometric mean and spread over the seeds."""
     figure, (axes,) = _figure(height=4.8)
@@ -184,34 +179,32 @@ def accuracy_against_cost(scene, rows):
 
 def all_charts(scene, rows, table):
     """(name, figure, caption) of every chart, in the order of the report."""
-    seeds = _seeds(rows)
-    yield (
-        metric_over_intervals(scene, rows),
+    seeds = len(rows[0].curves)
+    spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""
+    each = " (thin: each seed)" if seeds > 1 else ""
+    return [
         (
-            f"The metric over the training{seeds}. Coarse constant K levels off early; PRDP follows the coarse "
-            "curves while they fall and refines where they flatten."
+            "metric",
+            metric_over_intervals(scene, rows),
+            f"The metric over the training{spread}. Coarse constant K levels off early; PRDP follows the coarse "
+            "curves while they fall and refines where they flatten.",
         ),
-    )
-    yield (
-        k_over_intervals(scene, rows),
         (
-            "K over the training"
-            + (" (thin: each seed)." if seeds else ".")
-            + " PRDP stops where refining no longer pays."
+            "k",
+            k_over_intervals(scene, rows),
+            f"K over the training{each}. PRDP stops where refining no longer pays.",
         ),
-    )
-    yield (
-        total_iterations(scene, rows, table),
         (
+            "iterations",
+            total_iterations(scene, rows, table),
             "Iterations that the solver was allowed in all, as shares of the converged training's. K ending below "
-            "the converged one saves by incomplete convergence, K starting lower still by progressive refinement."
+            "the converged one saves by incomplete convergence, K starting lower still by progressive refinement.",
         ),
-    )
-    yield (
-        accuracy_against_cost(scene, rows),
         (
-            "Accuracy against cost; lower left is better, the grey line joins the runs that no other beats in both. "
-            "Operator applications count the products with A of the forward and the adjoint solves (the reverse "
-            "sweeps of the unrolled mode are not counted); wall time holds the network and the optimiser as well."
+            "accuracy_against_cost",
+            accuracy_against_cost(scene, rows),
+            "Accuracy against cost; lower left is better, the grey line joins the runs that no other beats in "
+            "both. Products with A are those of the forward and the adjoint solves (the reverse sweeps of the "
+            "unrolled mode are not counted); wall time holds the network and the optimiser as well.",
         ),
-    )
+    ]

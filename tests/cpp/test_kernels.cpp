@@ -14,7 +14,7 @@ TEST(Vector, DotAddsEveryLength) {
   for (int64_t n = 0; n <= 200; ++n) {
     std::vector<double> a(n), b(n, 2.0);
     for (int64_t i = 0; i < n; ++i) a[i] = static_cast<double>(i + 1);
-    EXPECT_EQ(dot(a.data(), b.data(), n), static_cast<double>(n * (n + 1)));
+    EXPECT_EQ(loops<double>().dot(a.data(), b.data(), n), static_cast<double>(n * (n + 1)));
   }
 }
 

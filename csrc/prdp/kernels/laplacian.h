@@ -1,5 +1,8 @@
 #pragma once
+#include <cmath>
+
 #include "prdp/kernels/laplacian_parameters.h"
+#include "prdp/kernels/loops.h"
 #include "prdp/kernels/vector.h"
 
 namespace prdp::kernels {
@@ -20,18 +23,18 @@ class Laplacian {
         row_(round_up_to_lanes<T>(nx_ + 1)),
         plane_((Dim > 2 ? ny_ + 1 : ny_) * row_),
         centre_(static_cast<T>(p.centre)),
-        weights_(8 * row_, T(0)) {
-    // Weights of the padding lanes are zero, so padding stays zero in every product. The second
-    // half is the Jacobi sweep's, -off/centre.
-    for (int64_t i = 0; i < nx_; ++i) {
-      weights_[i] = centre_;
-      for (int d = 0; d < Dim; ++d) {
-        weights_[(d + 1) * row_ + i] = static_cast<T>(p.off[Dim - 1 - d]);
-        weights_[(d + 5) * row_ + i] = static_cast<T>(-p.off[Dim - 1 - d] / p.centre);
+        apply_weights_((Dim + 1) * row_, T(0)),
+        sweep_weights_(Dim * row_, T(0)) {
+    norm_ = std::abs(p.centre);
+    for (int64_t i = 0; i < nx_; ++i) apply_weights_[i] = centre_;
+    for (int d = 0; d < Dim; ++d) {
+      const double off = p.off[Dim - 1 - d];
+      norm_ += 2.0 * std::abs(off);
+      for (int64_t i = 0; i < nx_; ++i) {
+        apply_weights_[(d + 1) * row_ + i] = static_cast<T>(off);
+        sweep_weights_[d * row_ + i] = static_cast<T>(-off / p.centre);
       }
     }
-    norm_ = std::abs(p.centre);
-    for (int d = 0; d < Dim; ++d) norm_ += 2.0 * std::abs(p.off[d]);
   }
 
   const LaplacianParameters& parameters() const { return parameters_; }
@@ -46,72 +49,44 @@ class Laplacian {
 
   /// dst = scale·src, from a contiguous sample into the padded layout; and back.
   void load(const T* src, T scale, T* dst) const {
-    for_each_row([&](int64_t at, int64_t from) {
-      for (int64_t i = 0; i < nx_; ++i) dst[at + i] = scale * src[from + i];
-    });
+    for (int64_t r = 0; r < nz_ * ny_; ++r)
+      for (int64_t i = 0; i < nx_; ++i) dst[padded(r) + i] = scale * src[r * nx_ + i];
   }
   void store(const T* src, T scale, T* dst) const {
-    for_each_row([&](int64_t at, int64_t to) {
-      for (int64_t i = 0; i < nx_; ++i) dst[to + i] = scale * src[at + i];
-    });
+    for (int64_t r = 0; r < nz_ * ny_; ++r)
+      for (int64_t i = 0; i < nx_; ++i) dst[r * nx_ + i] = scale * src[padded(r) + i];
   }
 
   /// out = A v
-  void apply(const T* __restrict v, T* __restrict out) const {
-    const T* w = weights_.data();
-    for_each_row([&](int64_t at, int64_t) {
-      for (int64_t i = 0; i < row_; i += kLanes<T>)
-        for (int64_t l = i; l < i + kLanes<T>; ++l)
-          out[at + l] = w[l] * v[at + l] + neighbours(w, v, at, l);
-    });
-  }
+  void apply(const T* v, T* out) const { loops_.apply[Dim - 1](stencil(apply_weights_), v, out); }
 
   /// c = D⁻¹ b
-  void divide_by_diagonal(const T* __restrict b, T* __restrict c) const {
+  void divide_by_diagonal(const T* b, T* c) const {
     for (int64_t i = 0; i < length(); ++i) c[i] = b[i] / centre_;
   }
 
   /// One Jacobi sweep y = x + D⁻¹(b - A x) with c = D⁻¹ b. Returns ‖b - A x‖² if asked for.
   template <bool WithResidual>
-  T jacobi_sweep(const T* __restrict c, const T* __restrict x, T* __restrict y) const {
-    const T* w = weights_.data() + 4 * row_;
-    T part[kLanes<T>] = {};
-    for_each_row([&](int64_t at, int64_t) {
-      for (int64_t i = 0; i < row_; i += kLanes<T>)
-        for (int64_t l = 0; l < kLanes<T>; ++l) {
-          const T next = c[at + i + l] + neighbours(w, x, at, i + l);
-          if constexpr (WithResidual) {
-            const T change = next - x[at + i + l];
-            part[l] += change * change;
-          }
-          y[at + i + l] = next;
-        }
-    });
-    return WithResidual ? centre_ * centre_ * pairwise_sum(part) : T(0);
+  T jacobi_sweep(const T* c, const T* x, T* y) const {
+    const auto a = stencil(sweep_weights_);
+    if constexpr (WithResidual) return centre_ * centre_ * loops_.sweep_and_measure[Dim - 1](a, c, x, y);
+    loops_.sweep[Dim - 1](a, c, x, y);
+    return T(0);
   }
 
  private:
-  /// Calls body(start of the row in the padded layout, start in the contiguous one).
-  template <class Body>
-  void for_each_row(const Body& body) const {
-    for (int64_t z = 0; z < nz_; ++z)
-      for (int64_t y = 0; y < ny_; ++y) body(z * plane_ + y * row_, (z * ny_ + y) * nx_);
+  /// Where row r (counted over all planes) starts in the padded layout.
+  int64_t padded(int64_t r) const { return r / ny_ * plane_ + r % ny_ * row_; }
+  PaddedStencil<T> stencil(const std::vector<T>& weights) const {
+    return {ny_, nz_, row_, plane_, weights.data()};
   }
 
-  /// Weighted sum of the 2·Dim neighbours of the point `l` of the row that starts at `at`.
-  T neighbours(const T* w, const T* v, int64_t at, int64_t l) const {
-    const int64_t i = at + l;
-    T sum = w[row_ + l] * (v[i - 1] + v[i + 1]);
-    if constexpr (Dim > 1) sum += w[2 * row_ + l] * (v[i - row_] + v[i + row_]);
-    if constexpr (Dim > 2) sum += w[3 * row_ + l] * (v[i - plane_] + v[i + plane_]);
-    return sum;
-  }
-
+  const Loops<T>& loops_ = kernels::loops<T>();
   LaplacianParameters parameters_;
   int64_t nx_, ny_, nz_, row_, plane_;
   T centre_;
   double norm_;
-  std::vector<T> weights_;  // by lane: centre, x, y, z; unused, x, y, z over -centre
+  std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: (centre,) x, y, z
 };
 
 }  // namespace prdp::kernels

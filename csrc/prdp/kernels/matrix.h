@@ -65,11 +65,11 @@ class Dense : public MatrixBase<T, Dense<T>> {
 
   void apply(const T* v, T* out) const {
     if (!transposed_) {
-      for (int64_t i = 0; i < n_; ++i) out[i] = dot(a_ + i * n_, v, n_);
+      for (int64_t i = 0; i < n_; ++i) out[i] = loops_.dot(a_ + i * n_, v, n_);
       return;
     }
     std::fill(out, out + n_, T(0));
-    for (int64_t i = 0; i < n_; ++i) axpy(v[i], a_ + i * n_, out, n_);
+    for (int64_t i = 0; i < n_; ++i) loops_.axpy(v[i], a_ + i * n_, out, n_);
   }
   double norm() const {
     double largest = 0;
@@ -83,6 +83,7 @@ class Dense : public MatrixBase<T, Dense<T>> {
 
  private:
   using MatrixBase<T, Dense<T>>::n_;
+  const Loops<T>& loops_ = kernels::loops<T>();
   const T* a_;
   int64_t sample_stride_;
   bool transposed_;

@@ -5,63 +5,14 @@
 #include <limits>
 #include <vector>
 
-/// Plain loops over the vectors of one sample. Vectors are padded with zeros to a multiple of
-/// kLanes, so that the compiler may use full vector registers without changing any sum.
-namespace prdp::kernels {
+#include "prdp/kernels/loops.h"
 
-template <class T>
-inline constexpr int64_t kLanes = 64 / static_cast<int64_t>(sizeof(T));
+/// Scaling, finiteness and memory of the vectors of one sample.
+namespace prdp::kernels {
 
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
-}
-
-/// Sum of `Width` partial sums, pairwise, so that the order never depends on the vector length.
-template <class T, int64_t Width>
-T pairwise_sum(T (&part)[Width]) {
-  for (int64_t half = Width / 2; half > 0; half /= 2)
-    for (int64_t l = 0; l < half; ++l) part[l] += part[l + half];
-  return part[0];
-}
-
-template <class T>
-T dot(const T* a, const T* b, int64_t n) {
-  constexpr int64_t width = 4 * kLanes<T>;
-  T part[width] = {};
-  int64_t i = 0;
-  for (; i + width <= n; i += width)
-    for (int64_t l = 0; l < width; ++l) part[l] += a[i + l] * b[i + l];
-  for (int64_t l = 0; i + l < n; ++l) part[l] += a[i + l] * b[i + l];
-  return pairwise_sum(part);
-}
-
-/// y += alpha x
-template <class T>
-void axpy(T alpha, const T* __restrict x, T* __restrict y, int64_t n) {
-  for (int64_t i = 0; i < n; ++i) y[i] += alpha * x[i];
-}
-
-/// y = x + beta y
-template <class T>
-void xpby(const T* __restrict x, T beta, T* __restrict y, int64_t n) {
-  for (int64_t i = 0; i < n; ++i) y[i] = x[i] + beta * y[i];
-}
-
-/// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself.
-template <class T>
-T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
-  constexpr int64_t width = kLanes<T>;
-  T part[width] = {};
-  for (int64_t i = 0; i < n; i += width) {
-#pragma GCC ivdep
-    for (int64_t l = 0; l < width; ++l) {
-      x[i + l] += alpha * p[i + l];
-      r[i + l] -= alpha * q[i + l];
-      part[l] += r[i + l] * r[i + l];
-    }
-  }
-  return pairwise_sum(part);
 }
 
 /// Largest magnitude of x as its bits: they order like the numbers, and NaN and Inf come out on top.

@@ -38,11 +38,11 @@ class SampleSpace {
   void copy(const T* from, Vector to) { std::copy(from, from + length(), to); }
   void assign(Scalar from, Scalar& to) { to = from; }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
-  void add(const T* d, Vector x) { kernels::axpy(T(1), d, x, length()); }
-  void xpby(const T* x, Scalar beta, Vector y) { kernels::xpby(x, beta, y, length()); }
-  Scalar dot(const T* a, const T* b) const { return kernels::dot(a, b, length()); }
+  void add(const T* d, Vector x) { loops_.axpy(T(1), d, x, length()); }
+  void xpby(const T* x, Scalar beta, Vector y) { loops_.xpby(x, beta, y, length()); }
+  Scalar dot(const T* a, const T* b) const { return loops_.dot(a, b, length()); }
   Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
-    return kernels::descend(alpha, p, q, x, r, length());
+    return loops_.descend(alpha, p, q, x, r, length());
   }
 
   void apply(const T* v, Vector out) {
@@ -58,7 +58,7 @@ class SampleSpace {
   /// r = b - A x; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(x, r);
-    kernels::xpby(b(), T(-1), r, length());
+    loops_.xpby(b(), T(-1), r, length());
     return dot(r, r);
   }
   void solve_directly(const T* r, Vector d) {
@@ -101,6 +101,7 @@ class SampleSpace {
 
   int64_t length() const { return kernel_.length(); }
 
+  const kernels::Loops<T>& loops_ = kernels::loops<T>();
   const Kernel& kernel_;
   const Factors* factors_;
   kernels::Workspace<T>& workspace_;

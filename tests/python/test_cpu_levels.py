@@ -1,0 +1,61 @@
+"""The instruction sets that the inner loops are compiled for: all agree to rounding."""
+
+import io
+import os
+import subprocess
+import sys
+
+import torch
+from helpers import SOLVERS, field
+
+import prdp_torch as prdp
+
+SOLVE_ALL = """
+import sys; sys.path.insert(0, {folder!r})
+import io, torch
+from test_cpu_levels import solve_all
+buffer = io.BytesIO(); torch.save(solve_all(), buffer)
+sys.stdout.buffer.write(buffer.getvalue())
+"""
+
+
+def solve_all():
+    """Every method on stencils of each dimension and on a matrix, in both precisions."""
+    results = {}
+    for dtype in (torch.float32, torch.float64):
+        for shape in ((33,), (17, 30), (5, 7, 18)):
+            for solver in SOLVERS:
+                u = prdp.Heat(shape, 1e-3, 1.0, solver=solver(7, rtol=0.0))(field(shape, dtype=dtype))
+                results[str((dtype, shape, solver.__name__))] = u
+        m = torch.eye(19, dtype=dtype) * 3 + 0.1
+        results[f"{dtype} matrix"] = prdp.linear_solve(m, field((19,), dtype=dtype)[:, 0], prdp.Jacobi(7))[0]
+    return results
+
+
+def at_level(level):
+    code = SOLVE_ALL.format(folder=os.path.dirname(__file__))
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], env={**os.environ, "PRDP_CPU_LEVEL": level}, capture_output=True
+    )
+
+
+def test_every_level_gives_the_same_results_to_rounding():
+    expected = solve_all()
+    ran = []
+    for level in ("baseline", "x86-64-v3", "x86-64-v4"):
+        done = at_level(level)
+        if done.returncode != 0:  # only what the processor lacks may be refused
+            assert f"this processor has no level '{level}'" in done.stderr.decode() and level != "baseline"
+            continue
+        ran.append(level)
+        results = torch.load(io.BytesIO(done.stdout), weights_only=True)
+        for case, u in expected.items():
+            rtol, atol = (1e-4, 1e-6) if u.dtype == torch.float32 else (1e-11, 1e-13)
+            torch.testing.assert_close(results[case], u, rtol=rtol, atol=atol)
+    assert "baseline" in ran
+
+
+def test_an_unknown_level_is_named_with_those_that_exist():
+    done = at_level("x86-64-v9")
+    assert done.returncode != 0
+    assert "PRDP_CPU_LEVEL: this processor has no level 'x86-64-v9'; allowed: baseline" in done.stderr.decode()
