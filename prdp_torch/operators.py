@@ -22,6 +22,10 @@ class Operator:
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
+    def __repr__(self):
+        tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
+        return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
+
     def apply(self, v):
         """A v, differentiable; v as a right-hand side."""
         return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)

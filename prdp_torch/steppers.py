@@ -18,6 +18,11 @@ class Equation:
     parameters: list
     tensors: list
 
+    @classmethod
+    def of(cls, operator):
+        """An equation whose operator does not depend on the state."""
+        return cls(operator.kind, operator.shape, operator.parameters, operator.tensors)
+
 
 class Stepper(torch.nn.Module):
     """u → u_next, both (batch, channel, *shape) in float32 or float64 and of any strides, by a linear
@@ -37,7 +42,9 @@ class Stepper(torch.nn.Module):
     Raises ValueError or TypeError for arguments out of range, before any work.
     """
 
-    def __init__(self, equation, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure):
+    def __init__(
+        self, equation, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
+    ):
         super().__init__()
         name = type(self).__name__
         if not isinstance(solver, Solver):
@@ -111,18 +118,8 @@ class Poisson(Stepper):
     """Δu = -p with u = 0 on the boundary of the unit domain; maps p to u. `shape` unknowns,
     dx = 1/(N + 1), second-order differences (paper, appendix C.1)."""
 
-    def __init__(
-        self, shape, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
-    ):
-        a = operators.Poisson(shape)
-        super().__init__(
-            Equation(a.kind, a.shape, a.parameters, a.tensors),
-            solver,
-            backward,
-            adjoint_max_iter,
-            adjoint_rtol,
-            on_failure,
-        )
+    def __init__(self, shape, solver, backward="implicit", **options):
+        super().__init__(Equation.of(operators.Poisson(shape)), solver, backward, **options)
 
     def operator(self, u=None):
         """A(u) as an operator; here the same for every u."""
@@ -137,18 +134,8 @@ class Heat(Stepper):
     gets a gradient; dt > 0 (time). Only nu dt/dx² matters: Jacobi's iteration count grows with it.
     """
 
-    def __init__(
-        self, shape, nu, dt, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
-    ):
-        a = operators.Heat(shape, nu, dt)
-        super().__init__(
-            Equation(a.kind, a.shape, a.parameters, a.tensors),
-            solver,
-            backward,
-            adjoint_max_iter,
-            adjoint_rtol,
-            on_failure,
-        )
+    def __init__(self, shape, nu, dt, solver, backward="implicit", **options):
+        super().__init__(Equation.of(operators.Heat(shape, nu, dt)), solver, backward, **options)
 
     def operator(self, u=None):
         """A(u) as an operator; here the same for every u."""

@@ -13,37 +13,25 @@ extern const Loops<double> double_loops_baseline;
 #ifdef PRDP_X86_LEVELS
 extern const Loops<float> float_loops_v3, float_loops_v4;
 extern const Loops<double> double_loops_v3, double_loops_v4;
+#define PRDP_ALL_LEVELS(type) {&type##_loops_baseline, &type##_loops_v3, &type##_loops_v4}
+#else
+#define PRDP_ALL_LEVELS(type) {&type##_loops_baseline}
 #endif
 
 namespace {
 
-/// What this processor can run, best last.
-template <class T>
-std::vector<const Loops<T>*> available();
-
-template <>
-std::vector<const Loops<float>*> available() {
-  std::vector<const Loops<float>*> levels{&float_loops_baseline};
+/// How many of the levels, from the lowest, this processor has.
+size_t supported() {
 #ifdef PRDP_X86_LEVELS
-  if (__builtin_cpu_supports("x86-64-v3")) levels.push_back(&float_loops_v3);
-  if (__builtin_cpu_supports("x86-64-v4")) levels.push_back(&float_loops_v4);
+  if (__builtin_cpu_supports("x86-64-v4")) return 3;
+  if (__builtin_cpu_supports("x86-64-v3")) return 2;
 #endif
-  return levels;
-}
-
-template <>
-std::vector<const Loops<double>*> available() {
-  std::vector<const Loops<double>*> levels{&double_loops_baseline};
-#ifdef PRDP_X86_LEVELS
-  if (__builtin_cpu_supports("x86-64-v3")) levels.push_back(&double_loops_v3);
-  if (__builtin_cpu_supports("x86-64-v4")) levels.push_back(&double_loops_v4);
-#endif
-  return levels;
+  return 1;
 }
 
 template <class T>
-const Loops<T>& choose() {
-  const auto levels = available<T>();
+const Loops<T>& choose(std::vector<const Loops<T>*> levels) {
+  levels.resize(supported());
   const char* wanted = std::getenv("PRDP_CPU_LEVEL");
   if (!wanted || !*wanted) return *levels.back();
   std::string names;
@@ -56,12 +44,15 @@ const Loops<T>& choose() {
 
 }  // namespace
 
-template <class T>
-const Loops<T>& loops() {
-  static const Loops<T>& chosen = choose<T>();
+template <>
+const Loops<float>& loops() {
+  static const auto& chosen = choose<float>(PRDP_ALL_LEVELS(float));
   return chosen;
 }
-template const Loops<float>& loops<float>();
-template const Loops<double>& loops<double>();
+template <>
+const Loops<double>& loops() {
+  static const auto& chosen = choose<double>(PRDP_ALL_LEVELS(double));
+  return chosen;
+}
 
 }  // namespace prdp::kernels

@@ -43,5 +43,9 @@ struct Loops {
 /// name. Raises ValueError for a level that does not exist or that the processor lacks.
 template <class T>
 const Loops<T>& loops();
+template <>
+const Loops<float>& loops();
+template <>
+const Loops<double>& loops();
 
 }  // namespace prdp::kernels

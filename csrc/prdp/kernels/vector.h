@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <type_traits>
 #include <vector>
 
 #include "prdp/kernels/loops.h"
@@ -15,34 +16,20 @@ int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
 }
 
-/// Largest magnitude of x as its bits: they order like the numbers, and NaN and Inf come out on top.
-inline uint32_t largest_bits(const float* x, int64_t n) {
-  uint32_t largest = 0;
-  for (int64_t i = 0; i < n; ++i) {
-    uint32_t bits;
-    std::memcpy(&bits, x + i, sizeof bits);
-    bits &= 0x7fffffffu;
-    largest = bits > largest ? bits : largest;
-  }
-  return largest;
-}
-inline uint64_t largest_bits(const double* x, int64_t n) {
-  uint64_t largest = 0;
-  for (int64_t i = 0; i < n; ++i) {
-    uint64_t bits;
-    std::memcpy(&bits, x + i, sizeof bits);
-    bits &= 0x7fffffffffffffffu;
-    largest = bits > largest ? bits : largest;
-  }
-  return largest;
-}
-
-/// max |x_i|; NaN or Inf if any x_i is not finite.
+/// max |x_i|; NaN or Inf if any x_i is not finite. Compares the bits without their sign, which order
+/// like the numbers and have NaN and Inf on top, so that nothing slips through a comparison with NaN.
 template <class T>
 T largest_magnitude(const T* x, int64_t n) {
-  const auto bits = largest_bits(x, n);
+  using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+  Bits largest = 0;
+  for (int64_t i = 0; i < n; ++i) {
+    Bits bits;
+    std::memcpy(&bits, x + i, sizeof bits);
+    bits &= ~Bits(0) >> 1;
+    largest = bits > largest ? bits : largest;
+  }
   T value;
-  std::memcpy(&value, &bits, sizeof value);
+  std::memcpy(&value, &largest, sizeof value);
   return value;
 }
 

@@ -74,7 +74,7 @@ ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::
 }
 
 at::Tensor largest_magnitude(const at::Tensor& b) {
-  return b.detach().abs().reshape({b.size(0), -1}).amax(1);
+  return b.detach().abs().flatten(1).amax(1);
 }
 
 }  // namespace
@@ -104,7 +104,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     return method.x;
   });
   u = at::where(per_sample(takes_part.to(b.device()), b), u / scale, at::zeros_like(b));
-  const auto finite = u.isfinite().reshape({b.size(0), -1}).all(1);
+  const auto finite = u.isfinite().flatten(1).all(1);
   u = at::where(per_sample(finite, b), u, at::zeros_like(u));
   const auto finite_rows = finite.to(at::kCPU);
   for (size_t i = 0; i < states.size(); ++i) {
