@@ -1,18 +1,24 @@
 # make demo   set everything up, then compare PRDP with constant K on the 1D heat equation
 # make test   set everything up, then run all C++ and Python tests
-# Each step leaves a stamp, so that a second call does no work twice.
+# What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
 BIN := .venv/bin
 STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
 
-.PHONY: demo test build clean
+.PHONY: demo test clean
 
-demo: build
+demo: $(STAMPS)/configure
+	@echo "prdp: building the library (from scratch some 3 minutes on two cores)"
+	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
+	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/prdp compare heat_1d
 
-test: build
+test: $(STAMPS)/configure
+	@echo "prdp: building library, trainer and tests (from scratch some 4 minutes on two cores)"
+	$(BIN)/cmake --build build --parallel $$(nproc)
+	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
 	$(BIN)/ctest --test-dir build --output-on-failure
 	$(BIN)/pytest
@@ -23,6 +29,7 @@ $(STAMPS)/system:
 	@mkdir -p $(STAMPS) && touch $@
 
 $(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "prdp: needs Python 3.11 or newer; make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "prdp: this Python cannot make virtual environments; apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv .venv
 
@@ -30,13 +37,14 @@ $(STAMPS)/python: requirements.txt | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.txt
 	@mkdir -p $(STAMPS) && touch $@
 
-$(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/system $(STAMPS)/python
+$(STAMPS)/configure: $(STAMPS)/system $(STAMPS)/python
+	$(BIN)/cmake -S . -B build -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python > build.log 2>&1 || { cat build.log; exit 1; }
+	@mv build.log build/configure.log && touch $@
+
+# After the build, so that pip only has to register what is there.
+$(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
 	@touch $@
-
-build: $(STAMPS)/install
-	$(BIN)/cmake --build build --parallel $$(nproc)
-	@$(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 
 clean:
 	rm -rf .venv .stamps build runs prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -16,7 +17,7 @@ BUILD = Path(os.environ.get("PRDP_BUILD_DIR", ROOT / "build"))
 class CMakeBuild(build_ext):
     def build_extension(self, ext):
         package = Path(self.get_ext_fullpath(ext.name)).resolve().parent
-        configure = ["cmake", "-S", ROOT, "-B", BUILD]
+        configure = ["cmake", "-S", ROOT, "-B", BUILD, f"-DPython_EXECUTABLE={sys.executable}"]
         if shutil.which("ninja") and not (BUILD / "CMakeCache.txt").exists():
             configure += ["-G", "Ninja"]
         subprocess.run(configure, check=True)

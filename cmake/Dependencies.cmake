@@ -1,7 +1,7 @@
 # Where the libraries come from. Torch is the one of the Python that runs the build; header-only
 # libraries come from the system (Debian: libeigen3-dev libgtest-dev libtomlplusplus-dev
 # nlohmann-json3-dev libcli11-dev), Eigen also from pip's cmeel-eigen.
-find_package(Python 3.10 REQUIRED COMPONENTS Interpreter)
+find_package(Python 3.11 REQUIRED COMPONENTS Interpreter)
 
 if(NOT Torch_DIR)
   execute_process(

@@ -5,6 +5,7 @@ from torch import Tensor, dtype
 VERSION: str
 DEFAULT_RTOL: float
 SOLVE_STATUSES: dict[str, int]
+PRDP_DEFAULTS: dict[str, float | int | None]
 
 def check_operator(kind: str, shape: list[int], parameters: list[float], tensors: list[Tensor]) -> None: ...
 def check_solver(who: str, method: str, max_iter: int, rtol: float) -> None: ...
@@ -37,14 +38,14 @@ class PRDPController:
     def __init__(
         self,
         *,
-        tau_step: float = ...,
-        tau_stop: float = ...,
-        delta: int = ...,
-        window: int = ...,
-        initial: int = ...,
-        increment: int = ...,
-        maximum: int | None = ...,
-        growth: float = ...,
+        tau_step: float,
+        tau_stop: float,
+        delta: int,
+        window: int,
+        initial: int,
+        increment: int,
+        maximum: int | None,
+        growth: float,
     ) -> None: ...
     @property
     def max_iter(self) -> int: ...
@@ -77,8 +78,7 @@ class Network:
 class Training:
     loss: str
     batch: int
-    epochs: int
-    updates: int
+    intervals: int
 
 class Compare:
     seeds: int
@@ -93,6 +93,7 @@ class Scene:
     text: str
     title: str
     task: str
+    unit: str
     dtype: dtype
     physics: Physics
     data: Data

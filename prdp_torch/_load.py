@@ -17,7 +17,7 @@ def check_torch():
     built_for = _BUILT_FOR.read_text().strip()
     if torch.__version__ != built_for:
         raise ImportError(
-            f"prdp_torch was built for torch {built_for}, but torch {torch.__version__} is installed; "
-            f"install torch=={built_for.split('+')[0]}, or rebuild prdp_torch with "
-            "'pip install --no-build-isolation -e .'"
+            f"prdp_torch was built for torch {built_for}, but torch {torch.__version__} is installed; install "
+            f"torch {built_for}, or rebuild prdp_torch for this one with 'pip install --no-build-isolation "
+            "--force-reinstall --no-deps .' in the project's folder"
         )

@@ -3,7 +3,7 @@
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 # Colours that stay apart in greyscale and for colour-blind readers.
 _FIXED = {
@@ -27,10 +27,6 @@ def _style(row, rows):
 def _figure(panels=1, height=4.2):
     figure = Figure(figsize=(9.2, height), layout="constrained")
     return figure, figure.subplots(1, panels, squeeze=False)[0]
-
-
-def _unit(scene):
-    return "epoch" if scene.task == "emulator" else "update"
 
 
 def _metric_name(scene):
@@ -58,7 +54,7 @@ def metric_over_intervals(scene, rows):
             axes.fill_between(
                 range(len(mean)), 10 ** (mean - spread), 10 ** (mean + spread), color=colour, alpha=0.15, lw=0
             )
-    axes.set(yscale="log", xlabel=_unit(scene), ylabel=_metric_name(scene))
+    axes.set(yscale="log", xlabel=scene.unit, ylabel=_metric_name(scene))
     axes.margins(x=0.01)
     axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
@@ -77,7 +73,7 @@ def k_over_intervals(scene, rows):
             axes.plot(k.T, color=colour, lw=0.7, alpha=0.35)
         axes.plot(k.mean(0), color=colour, ls=line, lw=2.2, label=row.title)
     axes.axhline(scene.max_iter, color="#222222", lw=1.2, label=f"converged, K = {scene.max_iter}")
-    axes.set(xlabel=_unit(scene), ylabel="K, iterations a solve may take", ylim=(0, None))
+    axes.set(xlabel=scene.unit, ylabel="K, iterations a solve may take", ylim=(0, None))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
@@ -90,32 +86,25 @@ def total_iterations(scene, rows, table):
     chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
     figure, (axes,) = _figure(height=1.6 + 0.55 * len(chosen))
     base = chosen[0]["budget"]
-    for y, entry in enumerate(reversed(chosen)):
-        spent = entry["budget"] / base
-        ic = min(entry["saved_by_incomplete_convergence"], max(0.0, 1 - spent))
-        pr = max(0.0, 1 - spent - ic)
-        parts = (
-            (spent, "#4c72b0", "spent"),
-            (pr, "#dd8452", "saved by progressive refinement (PR)"),
-            (ic, "#f2c6a0", "saved by incomplete convergence (IC)"),
-        )
-        left = 0.0
-        for share, colour, name in parts:
-            axes.barh(y, share, left=left, color=colour, height=0.65, label=name if y == 0 else None)
-            if share > 0.045:
-                axes.text(
-                    left + share / 2,
-                    y,
-                    f"{100 * share:.0f} %",
-                    ha="center",
-                    va="center",
-                    color="white" if colour == "#4c72b0" else "black",
-                    fontsize=10,
-                )
-            left += share
-    axes.set_yticks(range(len(chosen)), [entry["title"] for entry in reversed(chosen)])
+    spent = np.array([entry["budget"] / base for entry in chosen])
+    saved = np.maximum(0.0, 1 - spent)
+    ic = np.minimum([entry["saved_by_incomplete_convergence"] for entry in chosen], saved)
+    left = np.zeros(len(chosen))
+    rows_down = np.arange(len(chosen))[::-1]
+    for shares, colour, name in (
+        (spent, "#4c72b0", "spent"),
+        (saved - ic, "#dd8452", "saved by progressive refinement (PR)"),
+        (ic, "#f2c6a0", "saved by incomplete convergence (IC)"),
+    ):
+        if not shares.any():
+            continue
+        bars = axes.barh(rows_down, 100 * shares, left=100 * left, color=colour, height=0.65, label=name)
+        texts = [f"{100 * share:.0f} %" if share > 0.045 else "" for share in shares]
+        axes.bar_label(bars, texts, label_type="center", color="white" if name == "spent" else "black")
+        left += shares
+    axes.set_yticks(rows_down, [entry["title"] for entry in chosen])
     until = "" if scene.compare.target is None else f" until the error is {scene.compare.target:g}"
-    axes.set_xlabel(f"share of the converged training's {base:,.0f} iterations{until}")
+    axes.set_xlabel(f"% of the converged training's {base:,.0f} iterations{until}")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     return figure
@@ -132,68 +121,95 @@ def pareto_front(cost, error):
     return front
 
 
-def accuracy_against_cost(scene, rows):
-    """Final metric against operator applications and against wall time, with the Pareto front."""
+_COSTS = (
+    ("operator_applications", "products with A per sample,\nadjoint solves included"),
+    ("seconds", "wall time of the training in s"),
+)
+
+
+def _cost_panels(scene, draw):
+    """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one."""
     figure, panels = _figure(panels=2, height=4.8)
-    costs = (
-        ("operator_applications", "products with A per sample,\nadjoint solves included"),
-        ("seconds", "wall time of the training in s"),
-    )
+    for axes, (cost, label) in zip(panels, _COSTS, strict=True):
+        draw(axes, cost)
+        axes.set(yscale="log", xlabel=label, xlim=(0, None))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        if cost == "operator_applications":
+            axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+    panels[0].set_ylabel(_metric_name(scene))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    return figure
+
+
+def accuracy_against_cost(scene, rows):
+    """Final metric against what the training cost, one point a row, with the Pareto front as stairs."""
     error = np.array([row.final().mean() for row in rows])
-    for axes, (cost_name, cost_label) in zip(panels, costs, strict=True):
-        cost = np.array([row.total(cost_name).mean() for row in rows])
-        front = pareto_front(cost, error)
-        axes.plot(
-            cost[front], error[front], color="#bbbbbb", lw=5, solid_capstyle="round", zorder=1, label="Pareto front"
-        )
+
+    def draw(axes, name):
+        cost = np.array([row.total(name).mean() for row in rows])
         for row, x, y in zip(rows, cost, error, strict=True):
-            colour, _ = _style(row, rows)
             marker = {"prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}.get(row.kind, "o")
             bars = {}
             if len(row.curves) > 1:
-                bars = {"xerr": row.total(cost_name).std(ddof=1), "yerr": row.final().std(ddof=1)}
+                bars = {"xerr": row.total(name).std(ddof=1), "yerr": row.final().std(ddof=1)}
             axes.errorbar(
-                x,
-                y,
-                **bars,
-                fmt=marker,
-                color=colour,
-                ms=13 if marker == "*" else 8,
-                lw=1,
-                mec="white",
-                mew=0.6,
-                zorder=4 if marker == "*" else 3,
-                label=row.title,
-            )
-        axes.set(yscale="log", xlabel=cost_label)
-        if cost_name == "operator_applications":
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g} k" if x >= 1000 else f"{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(alpha=0.3, which="both", lw=0.4)
-    panels[0].set_ylabel("final " + _metric_name(scene))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
-    return figure
+                x, y, **bars, fmt=marker, color=_style(row, rows)[0], ms=13 if marker == "*" else 8, lw=1,
+                mec="white", mew=0.6, zorder=4 if marker == "*" else 3, label=row.title,
+            )  # fmt: skip
+        front = pareto_front(cost, error)
+        if front:  # every row may have diverged
+            right = axes.get_xlim()[1]
+            axes.step(
+                [*cost[front], right], [*error[front], error[front[-1]]], where="post", color="#bbbbbb", lw=4,
+                zorder=1, label="Pareto front",
+            )  # fmt: skip
+            axes.set_xlim(right=right)
+
+    return _cost_panels(scene, draw)
+
+
+def error_against_cost(scene, rows):
+    """The error as the cost of the training grows, one curve a row: means over the seeds."""
+
+    def draw(axes, name):
+        for row in rows:
+            colour, line = _style(row, rows)
+            cost = np.concatenate([[0.0], np.cumsum(row.stack(name).mean(0))])
+            lead = row.kind in _FIXED
+            axes.plot(
+                cost, row.stack("metric").mean(0), color=colour, ls=line, lw=2.2 if lead else 1.3, label=row.title,
+                zorder=3 if lead else 2,
+            )  # fmt: skip
+        if scene.compare.target is not None:
+            axes.axhline(scene.compare.target, color="#bbbbbb", lw=4, zorder=1, label="error to reach")
+
+    return _cost_panels(scene, draw)
+
+
+def _k_caption(scene, rows):
+    """Where K went, in words, from the runs themselves."""
+    ends = next(row for row in rows if row.kind == "prdp").last_k()
+    each = " (thin: each seed)" if len(ends) > 1 else ""
+    ended = f"{ends.min():.0f}" if ends.min() == ends.max() else f"{ends.min():.0f} to {ends.max():.0f}"
+    place = "below" if ends.max() < scene.max_iter else "at" if ends.min() == scene.max_iter else "around"
+    return f"K over the training{each}. PRDP ends at K = {ended}, {place} the converged solver's {scene.max_iter}."
 
 
 def all_charts(scene, rows, table):
     """(name, figure, caption) of every chart, in the order of the report."""
     seeds = len(rows[0].curves)
     spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""
-    each = " (thin: each seed)" if seeds > 1 else ""
+    if scene.task == "emulator":
+        cost = (
+            accuracy_against_cost(scene, rows),
+            "Accuracy against cost; lower left is better, the grey stairs join the runs that no other beats in both.",
+        )
+    else:
+        cost = (error_against_cost(scene, rows), "The error against the cost so far; lower left is better.")
     return [
-        (
-            "metric",
-            metric_over_intervals(scene, rows),
-            f"The metric over the training{spread}. Coarse constant K levels off early; PRDP follows the coarse "
-            "curves while they fall and refines where they flatten.",
-        ),
-        (
-            "k",
-            k_over_intervals(scene, rows),
-            f"K over the training{each}. PRDP stops where refining no longer pays.",
-        ),
+        ("metric", metric_over_intervals(scene, rows), f"The metric over the training{spread}."),
+        ("k", k_over_intervals(scene, rows), _k_caption(scene, rows)),
         (
             "iterations",
             total_iterations(scene, rows, table),
@@ -202,9 +218,8 @@ def all_charts(scene, rows, table):
         ),
         (
             "accuracy_against_cost",
-            accuracy_against_cost(scene, rows),
-            "Accuracy against cost; lower left is better, the grey line joins the runs that no other beats in "
-            "both. Products with A are those of the forward and the adjoint solves (the reverse sweeps of the "
+            cost[0],
+            f"{cost[1]} Products with A are those of the forward and the adjoint solves (the reverse sweeps of the "
             "unrolled mode are not counted); wall time holds the network and the optimiser as well.",
         ),
     ]

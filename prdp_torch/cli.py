@@ -1,6 +1,7 @@
 """The command `prdp`: list scenes, train them, compare ways of choosing K."""
 
 import functools
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -26,10 +27,13 @@ console = Console(highlight=False)
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
-Out = Annotated[Path | None, typer.Option(help="Folder for records and report; default runs/SCENE.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
-Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or none, in place of the scene's.")]
+Backward = Annotated[str | None, typer.Option(help="implicit or unrolled, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
+
+
+def out(default):
+    return Annotated[Path | None, typer.Option(help=f"Folder for the results; default {default}.")]
 
 
 def command(function):
@@ -42,6 +46,8 @@ def command(function):
         except KeyboardInterrupt:
             print("prdp: interrupted; finished trainings are kept, --resume goes on from them", file=sys.stderr)
             raise typer.Exit(130) from None
+        except BrokenPipeError:  # whoever read the output has left
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         except (ValueError, OSError) as error:
             print(f"prdp: {error}", file=sys.stderr)
             raise typer.Exit(2) from None
@@ -61,16 +67,16 @@ def scenes():
 def train(
     scene: SceneName,
     prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings; the default.")] = False,
-    constant: Annotated[int | None, typer.Option(min=0, metavar="K", help="Constant K.")] = None,
+    constant: Annotated[int | None, typer.Option(min=1, metavar="K", help="Constant K.")] = None,
     schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
     direct: Annotated[bool, typer.Option("--direct", help="The exact solver.")] = False,
     seeds: Seeds = None,
-    out: Out = None,
+    out: out("runs/SCENE-train") = None,
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
 ):
-    """Train a scene with one way of choosing K, over seeds; write a record each."""
+    """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
     loaded = _load(scene, backward, intervals)
     chosen = [
         name
@@ -91,25 +97,31 @@ def train(
         refinement = Refinement.exact()
     elif schedule is not None:
         refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
-    folder = records.prepare_folder(out or Path("runs") / loaded.name)
+    folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment()
-    seeds = seeds or 1
+    diverged = {}
     with _progress() as progress:
-        for seed in range(seeds):
-            task = progress.add_task(f"seed {seed}", total=_intervals(loaded), note="")
+        for seed in range(seeds or 1):
+            task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
             def show(done, metric, k, task=task):
                 progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
 
-            comparison.run_one(loaded, refinement.label, refinement, seed, folder, environment, resume, show)
-    console.print(f"records: {folder / refinement.label}")
+            curves = comparison.run_one(loaded, refinement.label, refinement, seed, folder, environment, resume, show)
+            if "diverged" in curves:
+                diverged[seed] = curves["diverged"]
+    console.print(f"records: {folder / refinement.label}", soft_wrap=True)
+    for seed, why in diverged.items():
+        print(f"prdp: seed {seed} diverged, {why}", file=sys.stderr)
+    if diverged:
+        raise typer.Exit(1)
 
 
 @command
 def compare(
     scene: SceneName,
     seeds: Seeds = None,
-    out: Out = None,
+    out: out("runs/SCENE") = None,
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
@@ -118,9 +130,9 @@ def compare(
     loaded = _load(scene, backward, intervals)
     folder = records.prepare_folder(out or Path("runs") / loaded.name)
     seeds = seeds or loaded.compare.seeds
-    per_training = _intervals(loaded)
     with _progress() as progress:
-        task = progress.add_task("", total=len(comparison.rows_of(loaded)) * seeds * per_training, note="")
+        trainings = len(comparison.rows_of(loaded)) * seeds
+        task = progress.add_task("", total=trainings * loaded.training.intervals, note="")
         finished = {}
 
         def show(row, seed, done):
@@ -143,12 +155,8 @@ def _load(scene, backward, intervals):
     if backward is not None:
         loaded.backward = backward
     if intervals is not None:
-        loaded.training.epochs = loaded.training.updates = intervals
+        loaded.training.intervals = intervals
     return loaded
-
-
-def _intervals(scene):
-    return scene.training.epochs if scene.task == "emulator" else scene.training.updates
 
 
 def _schedule(text):
@@ -174,7 +182,7 @@ def _progress():
 def _print_table(scene, table):
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     # Eighty columns hold all but one; the report has it.
-    names = [short for short, _ in report.columns(scene)]
+    names = [column.short for column in report.columns(scene)]
     kept = [i for i, name in enumerate(names) if name != "taken"]
     for i in kept:
         shown.add_column(names[i], justify="right" if i else "left", no_wrap=True)
@@ -182,7 +190,7 @@ def _print_table(scene, table):
         row = report.cells(scene, entry)
         shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] == "prdp" else None)
     console.print(shown)
-    console.print(report.notes(scene))
+    console.print(report.notes(scene, kept))
 
 
 def main():

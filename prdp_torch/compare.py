@@ -1,5 +1,6 @@
 """`prdp compare`: the converged solver, the exact one, PRDP and a sweep of constant K, over seeds."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +38,10 @@ class Row:
     def total(self, name, target=None):
         """Sum of a cost over the intervals that count, one value a seed."""
         return np.array([sum(c[name][:n]) for c, n in zip(self.curves, self.counted(target), strict=True)])
+
+    def diverged(self):
+        """How many seeds were lost."""
+        return sum("diverged" in c for c in self.curves)
 
     def last_k(self):
         return self.stack("max_iter")[:, -1]
@@ -95,11 +100,13 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     if resume and path.exists():
         record = records.read(path)
         if record["settings"] == records.settings(scene):
-            intervals = len(record["curves"]["seconds"])
-            on_interval(intervals, record["curves"]["metric"][-1], record["curves"]["max_iter"][-1])
-            return record["curves"]
+            curves = record["curves"]
+            curves["metric"] = [math.nan if value is None else value for value in curves["metric"]]
+            on_interval(len(curves["seconds"]), curves["metric"][-1], curves["max_iter"][-1])
+            return curves
     path.parent.mkdir(parents=True, exist_ok=True)
     curves = train(scene, refinement, seed, on_interval=on_interval)
+    on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
     records.write(
         path,
         {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves},
@@ -120,6 +127,7 @@ def summarise(scene, rows):
                 "label": row.label,
                 "title": row.title,
                 "kind": row.kind,
+                "diverged": row.diverged(),
                 "metric": float(final.mean()),
                 "metric_std": float(final.std(ddof=1)) if len(final) > 1 else 0.0,
                 "last_k": float(row.last_k().mean()),

@@ -1,8 +1,11 @@
 """Controllers: how many iterations K the solver gets, from one training interval to the next."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
-from prdp_torch import _C
+import torch
+
+from prdp_torch import _C, _check
 
 
 class Record(NamedTuple):
@@ -19,12 +22,14 @@ class Record(NamedTuple):
 class _Attached:
     """Hands K on to the steppers."""
 
-    def _attach(self, steppers):
+    def _take(self, steppers):
+        who = type(self).__name__
+        if not isinstance(steppers, Iterable):
+            raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
         for stepper in self.steppers:
             if not hasattr(stepper, "max_iter"):
-                raise TypeError(f"{type(self).__name__}: a stepper must have max_iter, got {stepper!r}")
-        self._push()
+                raise TypeError(f"{who}: a stepper must have max_iter, got {stepper!r}")
 
     def _push(self):
         for stepper in self.steppers:
@@ -33,13 +38,40 @@ class _Attached:
     def _solves_converge(self):
         return bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
 
+    def load_state_dict(self, state):
+        """Continue exactly where `state_dict()` was taken. ValueError for anything else."""
+        wanted = self.state_dict().keys()
+        if not isinstance(state, dict) or state.keys() != wanted:
+            raise ValueError(f"{type(self).__name__}: expected a state of {', '.join(wanted)}, got {state!r:.80}")
+        self._load(**state)
+        self._push()
+
+
+def _number(who, metric):
+    """A metric as a float; a tensor of one element is one."""
+    if isinstance(metric, torch.Tensor) and metric.numel() == 1:
+        return metric.item()
+    return _check.real(who, "metric", metric)
+
+
+def _checked(who, settings, defaults):
+    """The settings over the defaults; a setting is a real number where its default is one."""
+    for name, value in settings.items():
+        if name not in defaults:
+            raise TypeError(f"{who}: unknown setting '{name}'; allowed: {', '.join(defaults)}")
+        check = _check.real if isinstance(defaults[name], float) else _check.whole
+        if value is not defaults[name]:
+            check(who, name, value)
+    return {**defaults, **settings}
+
 
 class PRDPController(_C.PRDPController, _Attached):
     """Progressively Refined Differentiable Physics: raise K when the metric stops improving, until
     raising it no longer pays (paper, section 3).
 
     Args:
-        steppers: whose `max_iter` follows K; may be empty, then read `.max_iter`.
+        steppers: whose `max_iter` follows K: set to `initial` now, raised with K later; may be empty,
+            then read `.max_iter`.
         tau_step: τ_step, plateau where L̃[-1]/L̃[-δ] > tau_step.
         tau_stop: τ_stop, refine on a plateau where L̃[-1] < tau_stop · (L̃ at the last refinement), or
             where the metric has grown since.
@@ -49,12 +81,13 @@ class PRDPController(_C.PRDPController, _Attached):
         growth: refine to K ← growth·K where that is more than K + increment.
 
     K stays where every solve of the attached steppers already meets its tolerance.
-    Raises ValueError for a setting or a metric out of range.
+    Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
     """
 
     def __init__(self, steppers=(), **settings):
-        super().__init__(**settings)
-        self._attach(steppers)
+        super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
+        self._take(steppers)
+        self._push()
 
     def step(self, metric, converged=None):
         """Take the metric (finite, >= 0; smaller is better) of an interval. True if K was raised.
@@ -62,7 +95,7 @@ class PRDPController(_C.PRDPController, _Attached):
         converged: that the solves meet their tolerance; asked of the steppers where None.
         """
         converged = self._solves_converge() if converged is None else converged
-        refined = self._step(float(metric), converged)
+        refined = self._step(_number("PRDPController", metric), bool(converged))
         self._push()
         return refined
 
@@ -73,11 +106,6 @@ class PRDPController(_C.PRDPController, _Attached):
 
     def state_dict(self):
         return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
-
-    def load_state_dict(self, state):
-        """Continue exactly where `state_dict()` was taken."""
-        self._load(**state)
-        self._push()
 
     def __repr__(self):
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items() if value is not None)
@@ -90,21 +118,19 @@ class LinearSchedule(_C.LinearSchedule, _Attached):
     is a constant K. The same interface as `PRDPController`; the metric is not looked at."""
 
     def __init__(self, steppers=(), *, initial, increment, maximum):
-        super().__init__(initial=initial, increment=increment, maximum=maximum)
-        self._attach(steppers)
+        settings = {"initial": initial, "increment": increment, "maximum": maximum}
+        super().__init__(**{name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()})
+        self._take(steppers)
+        self._push()
 
     def step(self, metric=0.0, converged=None):
         """Go one step of the schedule. True if K was raised."""
-        raised = self._step(float(metric), bool(converged))
+        raised = self._step(_number("LinearSchedule", metric), bool(converged))
         self._push()
         return raised
 
     def state_dict(self):
         return {"max_iter": self.max_iter}
-
-    def load_state_dict(self, state):
-        self._load(**state)
-        self._push()
 
     def __repr__(self):
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())

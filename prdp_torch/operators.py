@@ -6,7 +6,7 @@ operator is made of (nu, a matrix) get gradients through `apply` and through `li
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, _check
 
 
 class Operator:
@@ -16,9 +16,9 @@ class Operator:
     kind: str
 
     def __init__(self, shape, parameters, tensors):
-        self.shape = [int(n) for n in shape]
-        self.parameters = [float(p) for p in parameters]
-        self.tensors = list(tensors)
+        self.shape = shape
+        self.parameters = parameters
+        self.tensors = tensors
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
@@ -50,7 +50,7 @@ class Poisson(Operator):
     kind = "poisson"
 
     def __init__(self, shape):
-        super().__init__(shape, [], [])
+        super().__init__(_check.shape("Poisson", shape), [], [])
 
 
 class Heat(Operator):
@@ -60,7 +60,7 @@ class Heat(Operator):
     kind = "heat"
 
     def __init__(self, shape, nu, dt):
-        super().__init__(shape, [dt], [as_tensor(nu)])
+        super().__init__(_check.shape("Heat", shape), [_check.real("Heat", "dt", dt)], [real_tensor("Heat", "nu", nu)])
 
 
 class Matrix(Operator):
@@ -68,6 +68,8 @@ class Matrix(Operator):
     pattern."""
 
     def __init__(self, matrix):
+        if not isinstance(matrix, torch.Tensor):
+            raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
             self.kind = "csr"
             tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
@@ -81,8 +83,8 @@ class Matrix(Operator):
         super().__init__([], [], tensors)
 
 
-def as_tensor(number):
+def real_tensor(who, name, value):
     """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
-    if isinstance(number, torch.Tensor):
-        return number
-    return torch.tensor(float(number), dtype=torch.float64)
+    if isinstance(value, torch.Tensor):
+        return value
+    return torch.tensor(_check.real(who, name, value), dtype=torch.float64)

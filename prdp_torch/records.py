@@ -1,6 +1,7 @@
 """Records: what a training was, what it cost and what it reached, as JSON."""
 
 import json
+import math
 import os
 import platform
 import subprocess
@@ -51,15 +52,14 @@ def settings(scene):
         "scene": scene.name,
         "text": scene.text,
         "backward": scene.backward,
-        "epochs": scene.training.epochs,
-        "updates": scene.training.updates,
+        "intervals": scene.training.intervals,
     }
 
 
 def write(path, content):
-    """Write JSON (or text) whole or not at all: beside its place, then moved there."""
+    """Write JSON (or text) whole or not at all: beside its place, then moved there. NaN is null."""
     path = Path(path)
-    text = content if isinstance(content, str) else json.dumps(content, indent=1)
+    text = content if isinstance(content, str) else json.dumps(_null_for_nan(content), indent=1, allow_nan=False)
     unfinished = path.with_name(path.name + ".part")
     unfinished.write_text(text + "\n")
     unfinished.replace(path)
@@ -67,6 +67,14 @@ def write(path, content):
 
 def read(path):
     return json.loads(Path(path).read_text())
+
+
+def _null_for_nan(content):
+    if isinstance(content, dict):
+        return {name: _null_for_nan(value) for name, value in content.items()}
+    if isinstance(content, list):
+        return [_null_for_nan(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def prepare_folder(path):

@@ -3,30 +3,47 @@
 import base64
 import io
 from pathlib import Path
+from typing import NamedTuple
 
 import jinja2
 
 from prdp_torch import charts, records
 
 
+class Column(NamedTuple):
+    short: str
+    """Heading in the terminal."""
+    long: str
+    """Heading on the page."""
+    note: str = ""
+
+
 def columns(scene):
-    """Headings of the table: (short, for the terminal; long, for the page)."""
-    error = "validation error" if scene.task == "emulator" else "parameter error"
-    until = "" if scene.compare.target is None else f" to an error of {scene.compare.target:g}"
-    names = [
-        ("", ""),
-        ("error", f"final {error}"),
-        ("last K", "last K"),
-        ("allowed", f"iterations allowed{until}"),
-        ("saved", "saved"),
-        ("taken", "iterations taken"),
-        ("A·v", "products with A"),
-        ("s", "seconds of training"),
+    """The table's columns, in order."""
+    emulator, target = scene.task == "emulator", scene.compare.target
+    error = "validation error" if emulator else "parameter error"
+    until = "" if target is None else f" to an error of {target:g}"
+    unit = f"{scene.unit}s"
+    reached = []
+    if target is not None:
+        reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
+    return [
+        Column("", "", "Converged: K_ε, the K that the scene takes for converged."),
+        Column("error", f"final {error}", "± one standard deviation over the seeds." if emulator else ""),
+        Column("last K", "last K"),
+        *reached,
+        Column(
+            "allowed", f"iterations allowed{until}", f"allowed: K summed over the updates{until}, the paper's count."
+        ),
+        Column("saved", "saved", "saved: of the converged run's."),
+        Column("taken", "iterations taken", "taken: fewer where a solve meets its tolerance before K."),
+        Column(
+            "A·v",
+            "products with A",
+            "A·v: products with A, those of the adjoint solves included; like the iterations, per sample of a batch.",
+        ),
+        Column("s", "seconds of training"),
     ]
-    if scene.compare.target is not None:
-        interval = "epochs" if scene.task == "emulator" else "updates"
-        names.insert(3, (interval, f"{interval}{until}"))
-    return names
 
 
 def cells(scene, entry):
@@ -34,12 +51,13 @@ def cells(scene, entry):
     spread = f" ±{entry['metric_std']:.0e}" if entry["metric_std"] else ""
     exact = entry["kind"] == "direct"
     missed = entry["reaches_target"] is False
+    unsaved = exact or missed or entry["diverged"] or entry["kind"] == "converged"
     row = [
         entry["title"],
-        f"{entry['metric']:.2e}{spread}",
+        f"{entry['diverged']} diverged" if entry["diverged"] else f"{entry['metric']:.2e}{spread}",
         "–" if exact else f"{entry['last_k']:.1f}".removesuffix(".0"),
         "–" if exact else f"{entry['budget']:,.0f}",
-        "–" if exact or missed or entry["kind"] == "converged" else f"{100 * entry['saved']:.1f} %",
+        "–" if unsaved else f"{100 * entry['saved']:.1f} %",
         "–" if exact else f"{entry['iterations']:,.0f}",
         f"{entry['operator_applications']:,.0f}",
         f"{entry['seconds']:.2f}",
@@ -49,32 +67,49 @@ def cells(scene, entry):
     return row
 
 
-def notes(scene):
-    text = (
-        "Iterations allowed: K summed over all updates, the paper's count; saved: against the converged run. "
-        "Taken: fewer where a solve meets its tolerance before K. A·v: products with A, those of the adjoint "
-        "solves included; like the iterations, per sample of a batch."
-    )
-    if scene.task == "emulator":
-        text += " ± is one standard deviation over the seeds."
-    if scene.compare.target is not None:
-        text += " A run that does not reach the error is counted to its end."
-    return text
+def notes(scene, kept=None):
+    """What the columns mean; of those `kept` by index, or all."""
+    return " ".join(c.note for i, c in enumerate(columns(scene)) if c.note and (kept is None or i in kept))
 
 
 def headline(scene, table):
-    """The comparison in two sentences."""
+    """What the comparison shows of PRDP, in a sentence or two, whichever way it went."""
     by_kind = {entry["kind"]: entry for entry in table}
     base, prdp = by_kind["converged"], by_kind["prdp"]
-    saved = f"PRDP was allowed {100 * prdp['saved']:.1f} % fewer iterations than K = {scene.max_iter} throughout"
-    if scene.task == "emulator" and base["metric_std"]:
-        within = abs(prdp["metric"] - base["metric"]) <= base["metric_std"]
-        verdict = "within" if within else "beyond"
+    name = f"K = {scene.max_iter}"
+    if prdp["diverged"] or base["diverged"]:
+        return f"Trainings that diverged: {prdp['diverged']} with PRDP, {base['diverged']} with {name}."
+    if scene.compare.target is not None:
+        return _to_target(scene, base, prdp, name)
+    change = f"{abs(100 * prdp['saved']):.1f} % {'fewer' if prdp['saved'] >= 0 else 'more'} iterations"
+    allowed = f"PRDP was allowed {change} than {name} throughout"
+    if not base["metric_std"]:
+        return f"{allowed}; its error ends at {prdp['metric']:.2e}, that of {name} at {base['metric']:.2e}."
+    distance = prdp["metric"] - base["metric"]
+    verdict = "within one standard deviation of"
+    if abs(distance) > base["metric_std"]:
+        verdict = f"{'worse' if distance > 0 else 'better'} by more than one standard deviation than"
+    return (
+        f"{allowed}; its final error, {prdp['metric']:.2e}, is {verdict} "
+        f"{base['metric']:.2e} ± {base['metric_std']:.1e} of {name}."
+    )
+
+
+def _to_target(scene, base, prdp, name):
+    """PRDP against the converged run where an error is to be reached."""
+
+    def course(entry):
+        if not entry["reaches_target"]:
+            return f"did not reach an error of {scene.compare.target:g} in {entry['intervals']:.0f} {scene.unit}s"
         return (
-            f"{saved}; its validation error, {prdp['metric']:.2e}, is {verdict} one standard deviation of the "
-            f"converged runs' {base['metric']:.2e} ± {base['metric_std']:.1e}."
+            f"reached an error of {scene.compare.target:g} after {entry['intervals']:.0f} {scene.unit}s and "
+            f"{entry['budget']:,.0f} iterations"
         )
-    return f"{saved}; its error ends at {prdp['metric']:.2e}, the converged run's at {base['metric']:.2e}."
+
+    text = f"PRDP {course(prdp)}, {name} {course(base)}"
+    if prdp["reaches_target"] and base["reaches_target"]:
+        text += f": {abs(100 * prdp['saved']):.1f} % {'fewer' if prdp['saved'] >= 0 else 'more'} iterations"
+    return text + "."
 
 
 def _svg(figure):
@@ -85,7 +120,7 @@ def _svg(figure):
 
 def write(scene, rows, table, folder):
     """`report.html`, one self-contained file with table, charts and the scene, and each chart as PNG."""
-    drawn = list(charts.all_charts(scene, rows, table))
+    drawn = charts.all_charts(scene, rows, table)
     for name, figure, _ in drawn:
         figure.savefig(folder / f"{name}.png", dpi=120)
     template = jinja2.Environment(autoescape=True).from_string(
@@ -96,7 +131,7 @@ def write(scene, rows, table, folder):
         seeds=len(rows[0].curves),
         environment=records.environment(),
         headline=headline(scene, table),
-        columns=[heading for _, heading in columns(scene)],
+        columns=[column.long for column in columns(scene)],
         cells=[{"kind": entry["kind"], "cells": cells(scene, entry)} for entry in table],
         notes=notes(scene),
         charts=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in drawn],

@@ -1,13 +1,14 @@
 """`linear_solve`, and what a solve says of itself."""
 
 import weakref
+from collections import Counter
 from enum import IntEnum
 from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, operators
-from prdp_torch.solvers import Solver
+from prdp_torch import _C, _check, operators
+from prdp_torch.solvers import check_options
 
 SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
 SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
@@ -44,6 +45,16 @@ class SolveInfo(NamedTuple):
     """Products with A, all told (int64)."""
     log: AdjointLog | None = None
 
+    def __repr__(self):
+        found = Counter(SolveStatus(s).name for s in self.status.tolist())
+        statuses = ", ".join(f"{count} {name}" for name, count in found.items())
+        ranges = ", ".join(
+            f"{name} {min(values):g} to {max(values):g}"
+            for name in ("iterations", "residual", "operator_applications")
+            if (values := getattr(self, name).tolist())
+        )
+        return f"SolveInfo({statuses}; {ranges})"
+
     @property
     def adjoint(self):
         """The same of the adjoint solve, after `backward()` in implicit mode; None before."""
@@ -77,16 +88,19 @@ def linear_solve(
         ValueError, TypeError: bad arguments, before any work.
         torch.linalg.LinAlgError: a failed sample, with on_failure="raise"; in backward too.
 
-    The derivative is that of Paper, section 2.1 (Bhatia, Koehler, Thuerey: PRDP, ICLR 2025).
+    Source of the derivatives: Bhatia, Koehler, Thuerey, "Progressively Refined Differentiable
+    Physics", ICLR 2025, section 2.1.
     """
     if isinstance(A, torch.Tensor):
         A = operators.Matrix(A)
     if not isinstance(A, operators.Operator):
         raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}")
-    if not isinstance(solver, Solver):
-        raise TypeError(f"linear_solve: solver must be a Solver such as Jacobi(10), got {solver!r}")
-    log = None if torch.compiler.is_compiling() else AdjointLog()
-    lone_vector = b.dim() == 1
+    log = None
+    if not torch.compiler.is_compiling():
+        _check.dense("linear_solve", "b", b)
+        check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure)
+        log = AdjointLog()
+    lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     u, *report = torch.ops.prdp.linear_solve(
         b.unsqueeze(0) if lone_vector else b,
         A.tensors,

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, _check
 
 
 @dataclass
@@ -24,7 +24,10 @@ class Solver:
 
     def __post_init__(self):
         if not torch.compiler.is_compiling():
-            _C.check_solver(type(self).__name__, self.method, self.max_iter, self.rtol)
+            who = type(self).__name__
+            self.max_iter = _check.whole(who, "max_iter", self.max_iter)
+            self.rtol = _check.real(who, "rtol", self.rtol)
+            _C.check_solver(who, self.method, self.max_iter, self.rtol)
 
 
 @dataclass
@@ -56,3 +59,19 @@ class Direct(Solver):
     max_iter: int = 1
 
     method: ClassVar[str] = "direct"
+
+
+def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure):
+    """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
+    if not isinstance(solver, Solver):
+        raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
+    _C.check_options(
+        who,
+        solver.method,
+        _check.whole(who, "max_iter", solver.max_iter),
+        _check.real(who, "rtol", solver.rtol),
+        _check.string(who, "backward", backward),
+        _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
+        _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
+        _check.string(who, "on_failure", on_failure),
+    )

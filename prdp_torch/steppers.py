@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import torch
 
-from prdp_torch import _C, operators
+from prdp_torch import _C, _check, operators
 from prdp_torch.solve import AdjointLog, SolveInfo
-from prdp_torch.solvers import Solver
+from prdp_torch.solvers import check_options
 
 
 @dataclass
@@ -46,12 +46,7 @@ class Stepper(torch.nn.Module):
         self, equation, solver, backward="implicit", adjoint_max_iter=None, adjoint_rtol=None, on_failure="raise"
     ):
         super().__init__()
-        name = type(self).__name__
-        if not isinstance(solver, Solver):
-            raise TypeError(f"{name}: solver must be a Solver such as Jacobi(10), got {solver!r}")
-        _C.check_options(
-            name, solver.method, solver.max_iter, solver.rtol, backward, adjoint_max_iter, adjoint_rtol, on_failure
-        )
+        check_options(type(self).__name__, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure)
         self.equation = equation
         self.method = solver.method
         self.rtol = float(solver.rtol)
@@ -65,6 +60,8 @@ class Stepper(torch.nn.Module):
         self.info = None
 
     def forward(self, u):
+        if not torch.compiler.is_compiling():
+            _check.dense(type(self).__name__, "u", u)
         u_next, *report = torch.ops.prdp.step(
             u,
             self.equation.tensors,
@@ -89,7 +86,8 @@ class Stepper(torch.nn.Module):
 
     @max_iter.setter
     def max_iter(self, k):
-        _C.check_solver(type(self).__name__, self.method, k, self.rtol)
+        who = type(self).__name__
+        _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol)
         self._max_iter.fill_(k)
 
     @property

@@ -1,6 +1,7 @@
-"""The Python trainer. One loop a kind of task; data, losses and metrics come from the library, the
-network may be any `nn.Module`. `csrc/train` holds the same loops in C++."""
+"""The Python trainer. Data, losses and metrics come from the library, the network may be any
+`nn.Module`; `csrc/train` holds the same loops in C++."""
 
+import math
 import time
 
 import torch
@@ -9,6 +10,7 @@ from prdp_torch import _C
 from prdp_torch.controller import LinearSchedule, PRDPController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
+from prdp_torch.solve import SolveStatus
 
 
 class Refinement:
@@ -43,40 +45,12 @@ class Refinement:
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
 
 
-class Tally:
-    """Adds up what the solves of an interval cost."""
-
-    def __init__(self):
-        self.intervals = {name: [] for name in ("max_iter", "budget", "iterations", "operator_applications", "seconds")}
-
-    def begin(self, k):
-        self._k, self._updates, self._iterations, self._applications = k, 0, 0.0, 0.0
-        self._started = time.perf_counter()
-
-    def add(self, stepper):
-        """Count the update that just went through this stepper, per sample of the batch."""
-        self._updates += 1
-        self._iterations += float(stepper.info.iterations.double().mean())
-        self._applications += float(stepper.info.operator_applications.double().mean())
-        adjoint = stepper.adjoint_info
-        if adjoint is not None:
-            self._applications += float(adjoint.operator_applications.double().mean())
-
-    def end(self):
-        row = (
-            self._k,
-            self._k * self._updates,
-            self._iterations,
-            self._applications,
-            time.perf_counter() - self._started,
-        )
-        for name, value in zip(self.intervals, row, strict=True):
-            self.intervals[name].append(value)
-
-
 def train(scene, refinement, seed=0, network=None, on_interval=None):
-    """Train the scene once. Returns the curves as a dict of lists, one entry an interval (an epoch,
-    or an update of the task "parameters"); "metric" starts before the first interval.
+    """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
+    an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
+    the updates; iterations and operator applications are per sample of a batch, summed over updates.
+    A training whose loss or metric is no longer finite stops there: "diverged" says where and why, the
+    metric is NaN from then on, and nothing more is counted.
 
     Args:
         scene: from `prdp_torch.scenes.load`.
@@ -85,62 +59,118 @@ def train(scene, refinement, seed=0, network=None, on_interval=None):
         network: any module from (batch, 1, *shape) to the same shape; the scene's own where None.
         on_interval: called after each interval with (how many are done, the metric, K).
     """
-    loop = _train_emulator if scene.task == "emulator" else _train_parameters
-    return loop(scene, refinement, seed, network, on_interval or (lambda *report: None))
+    stepper = make_stepper(scene, refinement.direct)
+    run = _Run(scene.training.intervals, stepper, refinement.attach([stepper]))
+    task = _emulator if scene.task == "emulator" else _parameters
+    updates, metric = task(scene, stepper, seed, network)
+    try:
+        run.go(updates, metric, on_interval or (lambda *report: None))
+    except _Diverged as divergence:
+        run.give_up(str(divergence))
+    return run.curves
 
 
-def _train_emulator(scene, refinement, seed, network, on_interval):
+class _Diverged(Exception):
+    pass
+
+
+class _Run:
+    """What the tasks share: the intervals, their costs, and when a training is lost."""
+
+    def __init__(self, intervals, stepper, controller):
+        self.intervals = intervals
+        self.stepper = stepper
+        self.controller = controller
+        names = ("update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds")
+        self.curves = {name: [] for name in names}
+
+    def go(self, updates, metric, on_interval):
+        self._observe(metric(), 0)
+        for done in range(1, self.intervals + 1):
+            k, started, count = self.stepper.max_iter, time.perf_counter(), 0
+            iterations = applications = 0.0
+            for loss in updates():
+                count += 1
+                self._check(loss, done)
+                self.curves["update_loss"].append(loss)
+                iterations += float(self.stepper.info.iterations.double().mean())
+                for report in (self.stepper.info, self.stepper.adjoint_info):
+                    if report is not None:
+                        applications += float(report.operator_applications.double().mean())
+            self._append(k, k * count, iterations, applications, time.perf_counter() - started)
+            self._observe(metric(), done)
+            on_interval(done, self.curves["metric"][-1], self.stepper.max_iter)
+
+    def give_up(self, why):
+        self.curves["diverged"] = why
+        self.curves["metric"] += [math.nan] * (self.intervals + 1 - len(self.curves["metric"]))
+        while len(self.curves["seconds"]) < self.intervals:
+            self._append(self.stepper.max_iter, 0, 0.0, 0.0, 0.0)
+
+    def _append(self, *costs):
+        for name, value in zip(
+            ("max_iter", "budget", "iterations", "operator_applications", "seconds"), costs, strict=True
+        ):
+            self.curves[name].append(value)
+
+    def _observe(self, metric, done):
+        if not math.isfinite(metric):
+            raise _Diverged(f"interval {done}: the metric is {metric}")
+        self.curves["metric"].append(metric)
+        self.controller.step(metric)
+
+    def _check(self, loss, done):
+        if not math.isfinite(loss):
+            raise _Diverged(f"interval {done}: the loss is {loss}")
+        if bool((self.stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()):
+            raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
+
+
+def _emulator(scene, stepper, seed, network):
+    """The updates of one epoch, as an iterator over their losses, and the validation metric."""
     data = _C.make_dataset(scene)
     network = make_network(scene, seed) if network is None else network
-    stepper = make_stepper(scene, refinement.direct)
-    controller = refinement.attach([stepper])
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
+    done = 0
 
-    def validate():
-        with torch.no_grad():
-            return float(_C.normalised_mse(network(network(data.valid_start)), data.valid_end))
-
-    update_loss, metrics, tally = [], [validate()], Tally()
-    controller.step(metrics[-1])
-    for epoch in range(scene.training.epochs):
-        tally.begin(stepper.max_iter)
+    def updates():
+        nonlocal done
         for batch in torch.randperm(len(data.train_start), generator=generator).split(scene.training.batch):
             for group in optimiser.param_groups:
-                group["lr"] = scene.learning_rate(len(update_loss))
+                group["lr"] = scene.learning_rate(done)
             optimiser.zero_grad()
             u2 = stepper(network(data.train_start[batch]))
             loss = _C.loss(scene.training.loss, u2, data.train_end[batch])
             loss.backward()
             optimiser.step()
-            update_loss.append(float(loss.detach()))
-            tally.add(stepper)
-        tally.end()
-        metrics.append(validate())
-        controller.step(metrics[-1])
-        on_interval(epoch + 1, metrics[-1], stepper.max_iter)
-    return {"update_loss": update_loss, "metric": metrics, **tally.intervals}
+            done += 1
+            yield float(loss.detach())
+
+    def metric():
+        with torch.no_grad():
+            return float(_C.normalised_mse(network(network(data.valid_start)), data.valid_end))
+
+    return updates, metric
 
 
-def _train_parameters(scene, refinement, seed, network, on_interval):
+def _parameters(scene, stepper, seed, network):
+    """The single update of an interval, as an iterator over its loss, and the error of θ."""
     problem = _C.make_parameter_problem(scene)
-    stepper = make_stepper(scene, refinement.direct)
-    controller = refinement.attach([stepper])
     theta = problem.start.clone().requires_grad_()
-    update_loss, tally = [], Tally()
-    metrics = [float(_C.relative_error(theta.detach(), problem.reference))]
-    controller.step(metrics[-1])
-    for update in range(scene.training.updates):
-        tally.begin(stepper.max_iter)
+    done = 0
+
+    def updates():
+        nonlocal done
         u = stepper((theta @ problem.modes)[None, None])
         loss = _C.half_mse(u, problem.solution)
         (gradient,) = torch.autograd.grad(loss, theta)
         with torch.no_grad():
-            theta -= scene.learning_rate(update) * gradient
-        update_loss.append(float(loss.detach()))
-        tally.add(stepper)
-        tally.end()
-        metrics.append(float(_C.relative_error(theta.detach(), problem.reference)))
-        controller.step(metrics[-1])
-        on_interval(update + 1, metrics[-1], stepper.max_iter)
-    return {"update_loss": update_loss, "metric": metrics, **tally.intervals}
+            theta.sub_(gradient, alpha=scene.learning_rate(done))
+        done += 1
+        yield float(loss.detach())
+
+    def metric():
+        return float(_C.relative_error(theta.detach(), problem.reference))
+
+    return updates, metric

@@ -13,17 +13,15 @@ py::dict as_dict(const PRDPSettings& s) {
 }
 
 void bind_controllers(py::module_& m) {
-  const PRDPSettings defaults;
+  m.attr("PRDP_DEFAULTS") = as_dict(PRDPSettings{});
   py::class_<PRDPController>(m, "PRDPController")
       .def(py::init([](double tau_step, double tau_stop, int64_t delta, int64_t window, int64_t initial,
                        int64_t increment, std::optional<int64_t> maximum, double growth) {
              return PRDPController(
                  {tau_step, tau_stop, delta, window, initial, increment, maximum, growth});
            }),
-           py::kw_only(), py::arg("tau_step") = defaults.tau_step, py::arg("tau_stop") = defaults.tau_stop,
-           py::arg("delta") = defaults.delta, py::arg("window") = defaults.window,
-           py::arg("initial") = defaults.initial, py::arg("increment") = defaults.increment,
-           py::arg("maximum") = defaults.maximum, py::arg("growth") = defaults.growth)
+           py::kw_only(), py::arg("tau_step"), py::arg("tau_stop"), py::arg("delta"), py::arg("window"),
+           py::arg("initial"), py::arg("increment"), py::arg("maximum"), py::arg("growth"))
       .def("_step", &PRDPController::step, py::arg("metric"), py::arg("converged"))
       .def_property_readonly("max_iter", &PRDPController::max_iter)
       .def_property_readonly("settings",

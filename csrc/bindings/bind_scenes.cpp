@@ -23,8 +23,7 @@ void bind_scenes(py::module_& m) {
   py::class_<Scene::Training>(m, "Training")
       .def_readonly("loss", &Scene::Training::loss)
       .def_readonly("batch", &Scene::Training::batch)
-      .def_readwrite("epochs", &Scene::Training::epochs)
-      .def_readwrite("updates", &Scene::Training::updates);
+      .def_readwrite("intervals", &Scene::Training::intervals);
   py::class_<Scene::Compare>(m, "Compare")
       .def_readonly("seeds", &Scene::Compare::seeds)
       .def_readonly("constant", &Scene::Compare::constant)
@@ -41,6 +40,10 @@ void bind_scenes(py::module_& m) {
                              [](const Scene& s) {
                                return s.task == Scene::Task::kEmulator ? "emulator" : "parameters";
                              })
+      .def_property_readonly("unit",
+                             [](const Scene& s) {
+                               return s.task == Scene::Task::kEmulator ? "epoch" : "update";
+                             })
       .def_readonly("dtype", &Scene::dtype)
       .def_readonly("physics", &Scene::physics)
       .def_readonly("data", &Scene::data)
@@ -51,8 +54,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("max_iter", [](const Scene& s) { return s.solver.max_iter.expect_int(); })
       .def_property_readonly("rtol", [](const Scene& s) { return s.solver.rtol; })
       .def_property(
-          "backward", [](const Scene& s) { return name(s.backward); },
-          [](Scene& s, std::string_view mode) { s.backward = backward_from_name(mode); })
+          "backward", [](const Scene& s) { return name(s.backward); }, &Scene::set_backward)
       .def_property_readonly("prdp",
                              [](const Scene& s) { return as_dict(s.prdp); })
       .def("learning_rate", &Scene::learning_rate, py::arg("update"));

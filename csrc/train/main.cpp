@@ -8,99 +8,141 @@
 #include <filesystem>
 #include <fstream>
 #include <nlohmann/json.hpp>
+#include <thread>
 
 #include "training.h"
 
 namespace {
 
+using Json = nlohmann::ordered_json;
+namespace fs = std::filesystem;
+
 volatile std::sig_atomic_t interrupted = 0;
 struct Interrupted {};
 
-nlohmann::ordered_json record(const prdp::Scene& scene, const std::string& label, int64_t seed,
-                              const std::string& command, const prdp::train::Curves& c) {
+struct Options {
+  std::string scene, out, schedule, backward;
+  int64_t seeds = 1, constant = -1, intervals = 0;
+  bool direct = false, resume = false;
+};
+
+/// What a record must agree on to be of the same training.
+Json settings(const prdp::Scene& scene) {
   return {{"scene", scene.name},
-          {"label", label},
+          {"text", scene.text},
+          {"backward", prdp::name(scene.backward)},
+          {"intervals", scene.training.intervals}};
+}
+
+Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, const std::string& command,
+            const prdp::train::Curves& c) {
+  Json curves{{"update_loss", c.update_loss},
+              {"metric", c.metric},
+              {"max_iter", c.max_iter},
+              {"budget", c.budget},
+              {"iterations", c.iterations},
+              {"operator_applications", c.operator_applications},
+              {"seconds", c.seconds}};
+  if (!c.diverged.empty()) curves["diverged"] = c.diverged;
+  return {{"label", label},
           {"seed", seed},
-          {"settings", scene.text},
+          {"settings", settings(scene)},
+          {"versions", {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}},
+          {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
           {"command", command},
-          {"versions", {{"prdp", PRDP_VERSION}, {"torch", TORCH_VERSION}}},
-          {"threads", at::get_num_threads()},
-          {"curves",
-           {{"update_loss", c.update_loss},
-            {"metric", c.metric},
-            {"max_iter", c.max_iter},
-            {"budget", c.budget},
-            {"iterations", c.iterations},
-            {"operator_applications", c.operator_applications},
-            {"seconds", c.seconds}}}};
+          {"curves", curves}};
 }
 
 /// Writes beside the place and moves it there: a file is whole or not there.
-void write_whole(const std::filesystem::path& path, const std::string& text) {
+void write_whole(const fs::path& path, const std::string& text) {
   auto unfinished = path;
   unfinished += ".part";
   std::ofstream file(unfinished);
   file << text << '\n';
   file.close();
-  if (!file) throw std::runtime_error("cannot write '" + path.string() + "'");
-  std::filesystem::rename(unfinished, path);
+  if (!file) throw std::runtime_error("--out: cannot write '" + path.string() + "'");
+  fs::rename(unfinished, path);
+}
+
+bool is_done(const fs::path& path, const prdp::Scene& scene) {
+  std::ifstream file(path);
+  return file && Json::parse(file).value("settings", Json()) == settings(scene);
+}
+
+prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
+  if (options.constant >= 0) return prdp::train::constant(options.constant);
+  if (options.direct) return prdp::train::direct();
+  if (options.schedule.empty()) return prdp::train::prdp(scene);
+  long long start = 0, step = 0;
+  char rest = 0;
+  if (std::sscanf(options.schedule.c_str(), "%lld:%lld%c", &start, &step, &rest) != 2)
+    throw std::runtime_error("--schedule: expected START:STEP, two whole numbers, got '" + options.schedule + "'");
+  return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
+}
+
+/// Returns the exit status: 1 where a training diverged.
+int run(const Options& options, const std::string& command) {
+  auto scene = prdp::read_scene(options.scene);
+  if (!options.backward.empty()) scene.set_backward(options.backward);
+  if (options.intervals > 0) scene.training.intervals = options.intervals;
+  const auto refinement = refinement_of(options, scene);
+  const auto folder = fs::path(options.out.empty() ? "runs/" + scene.name + "-cpp" : options.out) / refinement.label;
+  std::error_code error;
+  fs::create_directories(folder, error);
+  if (error) throw std::runtime_error("--out: cannot write to '" + folder.string() + "': " + error.message());
+
+  std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
+  int diverged = 0;
+  for (int64_t seed = 0; seed < options.seeds; ++seed) {
+    const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
+    if (options.resume && is_done(file, scene)) continue;
+    const auto curves = prdp::train::train(scene, refinement, seed, [&](int64_t done, double metric, int64_t k) {
+      if (interrupted) throw Interrupted{};
+      if (done % 10 == 0 || done == 1)
+        std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
+    });
+    write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1));
+    if (curves.diverged.empty()) {
+      std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
+    } else {
+      ++diverged;
+      std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, curves.diverged.c_str());
+    }
+  }
+  return diverged > 0 ? 1 : 0;
 }
 
 }  // namespace
 
 int main(int argc, char** argv) {
   CLI::App app("Train a scene through differentiable physics that stops early, in C++.");
-  std::string path, out, schedule;
-  int64_t seeds = 1, constant = -1;
-  bool direct = false;
-  app.add_option("scene", path, "scene file (.toml)")->required();
-  app.add_option("--seeds", seeds, "how many seeds, from 0")->check(CLI::PositiveNumber);
-  auto* k = app.add_option("--constant", constant, "constant K in place of PRDP")->check(CLI::NonNegativeNumber);
-  auto* s = app.add_option("--schedule", schedule, "START:STEP, K grows with every interval");
-  auto* d = app.add_flag("--direct", direct, "the exact solver in place of the scene's");
-  app.add_option("--out", out, "folder for the records; default runs/SCENE-cpp");
+  Options options;
+  const auto positive = CLI::Range(int64_t{1}, int64_t{1000000});
+  app.add_option("scene", options.scene, "scene file (.toml)")->required();
+  app.add_option("--seeds", options.seeds, "how many seeds, from 0")->check(positive);
+  auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
+  auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
+  auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
+  app.add_option("--backward", options.backward, "implicit or unrolled, in place of the scene's");
+  app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
+  app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
+  app.add_flag("--resume", options.resume, "keep trainings that are already recorded there");
   k->excludes(s)->excludes(d);
   s->excludes(d);
   CLI11_PARSE(app, argc, argv);
   std::signal(SIGINT, [](int) { interrupted = 1; });
+  std::string command;
+  for (int i = 0; i < argc; ++i) command += (i ? " " : "") + std::string(argv[i]);
 
   try {
-    const auto scene = prdp::read_scene(path);
-    auto refinement = prdp::train::prdp(scene);
-    if (*k) refinement = prdp::train::constant(constant);
-    if (*d) refinement = prdp::train::direct();
-    if (*s) {
-      long long start = 0, step = 0;
-      if (std::sscanf(schedule.c_str(), "%lld:%lld", &start, &step) != 2)
-        throw std::runtime_error("--schedule: expected START:STEP, got '" + schedule + "'");
-      refinement = prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
-    }
-    const std::filesystem::path folder =
-        std::filesystem::path(out.empty() ? "runs/" + scene.name + "-cpp" : out) / refinement.label;
-    std::filesystem::create_directories(folder);
-    std::string command;
-    for (int i = 0; i < argc; ++i) command += (i ? " " : "") + std::string(argv[i]);
-
-    std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
-    for (int64_t seed = 0; seed < seeds; ++seed) {
-      const auto curves = prdp::train::train(scene, refinement, seed, [&](int64_t done, double metric, int64_t max_iter) {
-        if (interrupted) throw Interrupted{};
-        if (done % 10 == 0 || done == 1)
-          std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, max_iter);
-      });
-      const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
-      write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1));
-      std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
-    }
+    return run(options, command);
   } catch (const Interrupted&) {
-    std::fprintf(stderr, "interrupted; finished seeds are kept\n");
+    std::fprintf(stderr, "prdp_train: interrupted; finished seeds are kept, --resume goes on from them\n");
     return 130;
   } catch (const c10::Error& error) {
     std::fprintf(stderr, "prdp_train: %s\n", error.what_without_backtrace());
-    return 2;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "prdp_train: %s\n", error.what());
-    return 2;
   }
-  return 0;
+  return 2;
 }

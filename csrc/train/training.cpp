@@ -4,11 +4,14 @@
 #include <torch/optim/adam.h>
 
 #include <chrono>
+#include <cmath>
+#include <limits>
 
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
+#include "prdp/solvers/status.h"
 
 namespace prdp::train {
 
@@ -36,130 +39,151 @@ Refinement direct() {
 
 namespace {
 
-double per_sample(const at::Tensor& t) { return t.to(at::kDouble).mean().item<double>(); }
+double per_sample(const at::Tensor& counts) { return counts.to(at::kDouble).mean().item<double>(); }
 
-/// Adds up what the solves of an interval cost.
-class Tally {
+struct Diverged {
+  std::string why;
+};
+
+/// What a task supplies: the updates of one interval, each reporting its loss, and the metric.
+struct Task {
+  std::function<void(const std::function<void(double)>& on_update)> updates;
+  std::function<double()> metric;
+};
+
+/// What the tasks share: the intervals, their costs, and when a training is lost.
+class Run {
  public:
-  explicit Tally(Curves& curves) : curves_(curves) {}
+  Run(const Scene& scene, const Refinement& refinement)
+      : stepper(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver)),
+        intervals_(scene.training.intervals),
+        controller_(refinement.controller()) {
+    stepper.set_max_iter(controller_->max_iter());
+  }
 
-  void begin(int64_t k) {
-    k_ = k;
-    updates_ = 0;
-    iterations_ = applications_ = 0.0;
-    started_ = std::chrono::steady_clock::now();
+  Curves go(const Task& task, const OnInterval& on_interval) {
+    try {
+      observe(task.metric(), 0);
+      for (int64_t done = 1; done <= intervals_; ++done) {
+        run_interval(task, done);
+        observe(task.metric(), done);
+        on_interval(done, curves_.metric.back(), stepper.max_iter());
+      }
+    } catch (const Diverged& divergence) {
+      give_up(divergence.why);
+    }
+    return curves_;
   }
-  void add(const Stepper& stepper) {
-    ++updates_;
-    iterations_ += per_sample(stepper.info()->iterations);
-    applications_ += per_sample(stepper.info()->operator_applications);
-    if (const auto adjoint = stepper.adjoint_info()) applications_ += per_sample(adjoint->operator_applications);
-  }
-  void end() {
-    const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started_;
-    curves_.max_iter.push_back(k_);
-    curves_.budget.push_back(k_ * updates_);
-    curves_.iterations.push_back(iterations_);
-    curves_.operator_applications.push_back(applications_);
-    curves_.seconds.push_back(elapsed.count());
-  }
+
+  Stepper stepper;
 
  private:
-  Curves& curves_;
-  int64_t k_ = 0, updates_ = 0;
-  double iterations_ = 0.0, applications_ = 0.0;
-  std::chrono::steady_clock::time_point started_;
+  void run_interval(const Task& task, int64_t done) {
+    const int64_t k = stepper.max_iter();
+    const auto started = std::chrono::steady_clock::now();
+    int64_t updates = 0;
+    double iterations = 0.0, applications = 0.0;
+    task.updates([&](double loss) {
+      ++updates;
+      check(loss, done);
+      curves_.update_loss.push_back(loss);
+      iterations += per_sample(stepper.info()->iterations);
+      applications += per_sample(stepper.info()->operator_applications);
+      if (const auto adjoint = stepper.adjoint_info()) applications += per_sample(adjoint->operator_applications);
+    });
+    const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
+    append(k, k * updates, iterations, applications, elapsed.count());
+  }
+
+  void append(int64_t k, int64_t budget, double iterations, double applications, double seconds) {
+    curves_.max_iter.push_back(k);
+    curves_.budget.push_back(budget);
+    curves_.iterations.push_back(iterations);
+    curves_.operator_applications.push_back(applications);
+    curves_.seconds.push_back(seconds);
+  }
+
+  void observe(double metric, int64_t done) {
+    const auto interval = "interval " + std::to_string(done);
+    if (!std::isfinite(metric)) throw Diverged{interval + ": the metric is " + std::to_string(metric)};
+    curves_.metric.push_back(metric);
+    controller_->step(metric, stepper.converged());
+    stepper.set_max_iter(controller_->max_iter());
+  }
+
+  void check(double loss, int64_t done) const {
+    const auto interval = "interval " + std::to_string(done);
+    if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
+    const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
+    if (stepper.info()->status.le(nonfinite).any().item<bool>())
+      throw Diverged{interval + ": the solver was given NaN or Inf"};
+  }
+
+  void give_up(const std::string& why) {
+    curves_.diverged = why;
+    curves_.metric.resize(intervals_ + 1, std::numeric_limits<double>::quiet_NaN());
+    while (static_cast<int64_t>(curves_.seconds.size()) < intervals_) append(stepper.max_iter(), 0, 0.0, 0.0, 0.0);
+  }
+
+  int64_t intervals_;
+  std::unique_ptr<Controller> controller_;
+  Curves curves_;
 };
 
-/// The scene's step and the controller that gives it K.
-struct Physics {
-  Stepper stepper;
-  std::unique_ptr<Controller> controller;
-
-  Physics(const Scene& scene, const Refinement& refinement)
-      : stepper(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver)),
-        controller(refinement.controller()) {
-    stepper.set_max_iter(controller->max_iter());
-  }
-  void refine(double metric) {
-    controller->step(metric, stepper.converged());
-    stepper.set_max_iter(controller->max_iter());
-  }
-};
-
-Curves train_emulator(const Scene& scene, const Refinement& refinement, int64_t seed,
-                      const OnInterval& on_interval) {
+Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterval& on_interval) {
   const auto data = make_dataset(scene);
   torch::manual_seed(static_cast<uint64_t>(seed));
   MLP network(data.train_start[0].numel(), scene.network.hidden);
   network->to(scene.dtype);
-  Physics physics(scene, refinement);
   torch::optim::Adam optimiser(network->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
+  int64_t done = 0;
 
-  const auto validate = [&] {
-    const torch::NoGradGuard no_grad;
-    return normalised_mse(network(network(data.valid_start)), data.valid_end).item<double>();
-  };
-  Curves curves;
-  Tally tally(curves);
-  curves.metric.push_back(validate());
-  physics.refine(curves.metric.back());
-  for (int64_t epoch = 0; epoch < scene.training.epochs; ++epoch) {
-    tally.begin(physics.stepper.max_iter());
+  const auto updates = [&](const std::function<void(double)>& on_update) {
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
-      const auto update = static_cast<int64_t>(curves.update_loss.size());
-      for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
+      for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(done));
       optimiser.zero_grad();
-      const auto u2 = physics.stepper(network(data.train_start.index_select(0, batch)));
+      const auto u2 = run.stepper(network(data.train_start.index_select(0, batch)));
       const auto error = loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
       error.backward();
       optimiser.step();
-      curves.update_loss.push_back(error.item<double>());
-      tally.add(physics.stepper);
+      ++done;
+      on_update(error.item<double>());
     }
-    tally.end();
-    curves.metric.push_back(validate());
-    physics.refine(curves.metric.back());
-    on_interval(epoch + 1, curves.metric.back(), physics.stepper.max_iter());
-  }
-  return curves;
+  };
+  const auto metric = [&] {
+    const torch::NoGradGuard no_grad;
+    return normalised_mse(network(network(data.valid_start)), data.valid_end).item<double>();
+  };
+  return run.go({updates, metric}, on_interval);
 }
 
-Curves train_parameters(const Scene& scene, const Refinement& refinement, const OnInterval& on_interval) {
+Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
-  Physics physics(scene, refinement);
   auto theta = problem.start.clone().requires_grad_();
-  const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
-  Curves curves;
-  Tally tally(curves);
-  curves.metric.push_back(metric());
-  physics.refine(curves.metric.back());
-  for (int64_t update = 0; update < scene.training.updates; ++update) {
-    tally.begin(physics.stepper.max_iter());
-    const auto u = physics.stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
+  int64_t done = 0;
+
+  const auto updates = [&](const std::function<void(double)>& on_update) {
+    const auto u = run.stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
     const auto error = half_mse(u, problem.solution);
     const auto gradient = torch::autograd::grad({error}, {theta})[0];
     {
       const torch::NoGradGuard no_grad;
-      theta -= scene.learning_rate(update) * gradient;
+      theta.sub_(gradient, scene.learning_rate(done));
     }
-    curves.update_loss.push_back(error.item<double>());
-    tally.add(physics.stepper);
-    tally.end();
-    curves.metric.push_back(metric());
-    physics.refine(curves.metric.back());
-    on_interval(update + 1, curves.metric.back(), physics.stepper.max_iter());
-  }
-  return curves;
+    ++done;
+    on_update(error.item<double>());
+  };
+  const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
+  return run.go({updates, metric}, on_interval);
 }
 
 }  // namespace
 
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval) {
-  return scene.task == Scene::Task::kEmulator
-             ? train_emulator(scene, refinement, seed, on_interval)
-             : train_parameters(scene, refinement, on_interval);
+  Run run(scene, refinement);
+  return scene.task == Scene::Task::kEmulator ? train_emulator(scene, run, seed, on_interval)
+                                              : train_parameters(scene, run, on_interval);
 }
 
 }  // namespace prdp::train

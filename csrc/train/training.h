@@ -29,6 +29,7 @@ struct Curves {
   std::vector<int64_t> budget;      // K times the updates, the paper's count
   std::vector<double> iterations, operator_applications;  // per sample of a batch, summed over updates
   std::vector<double> seconds;
+  std::string diverged;  // where and why a training was lost; the metric is NaN from there on
 };
 
 /// Called after each interval with (how many are done, the metric, K).

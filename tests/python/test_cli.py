@@ -59,7 +59,7 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
     missing.unlink()
     done = prdp("compare", "heat_1d", "--seeds", 2, "--intervals", 4, "--resume", cwd=folder)
     assert done.returncode == 0 and missing.exists() and kept.stat().st_mtime_ns == before
-    other = prdp("train", "heat_1d", "--prdp", "--intervals", 5, "--resume", cwd=folder)
+    other = prdp("train", "heat_1d", "--prdp", "--intervals", 5, "--resume", "--out", records, cwd=folder)
     assert other.returncode == 0 and kept.stat().st_mtime_ns > before  # other settings: not the same training
 
 
@@ -87,10 +87,10 @@ def test_scenes_are_listed(tmp_path):
         (["train", "heat_1d", "--prdp", "--direct"], "give one of --prdp, --constant, --schedule and --direct"),
         (
             ["train", "heat_1d", "--backward", "both"],
-            "backward: unknown name 'both'; allowed: implicit, unrolled, none",
+            "backward: unknown name 'both' for a scene; allowed: implicit, unrolled",
         ),
         (["train", "heat_1d", "--out", "/proc/nothing"], "prdp: --out: cannot write to '/proc/nothing'"),
-        (["train", "heat_1d", "--constant", "-1"], "--constant"),
+        (["train", "heat_1d", "--constant", "0"], "--constant"),
         (["train", "heat_1d", "--frobnicate"], "No such option"),
     ],
 )
@@ -127,7 +127,7 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     "arguments, message",
     [
         (["nosuch.toml"], "prdp_train: scene: cannot read 'nosuch.toml'"),
-        ([ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"], "expected START:STEP, got '3'"),
+        ([ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"], "expected START:STEP, two whole numbers, got '3'"),
         ([ROOT / "examples/scenes/heat_1d.toml", "--out", "/proc/nothing"], "prdp_train: "),
     ],
 )

@@ -102,6 +102,40 @@ def test_wrong_kinds_of_arguments():
         prdp.linear_solve([[1.0]], torch.ones(1), prdp.Jacobi(1))
 
 
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: prdp.Jacobi(2.5), "Jacobi: max_iter must be a whole number, got 2.5"),
+        (lambda: prdp.Jacobi(True), "Jacobi: max_iter must be a whole number, got True"),
+        (lambda: prdp.CG(3, rtol="tight"), "CG: rtol must be a real number, got 'tight'"),
+        (lambda: prdp.Heat(30, 1e-3, 1.0, prdp.Jacobi(1)), r"Heat: shape must be a tuple .* such as \(30,\), got 30"),
+        (lambda: prdp.Poisson((30.5,), prdp.Jacobi(1)), "Poisson: every extent of shape must be a whole number"),
+        (lambda: prdp.Heat((30,), "a", 1.0, prdp.Jacobi(1)), "Heat: nu must be a real number, got 'a'"),
+        (lambda: prdp.Heat((30,), 1e-3, None, prdp.Jacobi(1)), "Heat: dt must be a real number, got None"),
+        (lambda: heat(backward=None), "Heat: backward must be a string, got None"),
+        (lambda: heat(adjoint_max_iter="3"), "Heat: adjoint_max_iter must be a whole number, got '3'"),
+        (lambda: heat()([0.0] * 30), "Heat: u must be a torch tensor, got list"),
+        (lambda: heat()(torch.zeros(2, 1, 30).to_sparse()), "Heat: u must be a dense tensor, got one of layout"),
+        (lambda: setattr(heat(), "max_iter", 1.5), "Heat: max_iter must be a whole number, got 1.5"),
+        (lambda: prdp.linear_solve(torch.eye(2), [1.0, 2.0], prdp.Jacobi(1)), "linear_solve: b must be a torch tensor"),
+        (lambda: prdp.PRDPController(heat()), r"PRDPController: steppers must be a list such as \[heat\], got Heat"),
+        (lambda: prdp.PRDPController([3]), "PRDPController: a stepper must have max_iter, got 3"),
+        (lambda: prdp.PRDPController(tau=0.9), "PRDPController: unknown setting 'tau'; allowed: tau_step, tau_stop"),
+        (lambda: prdp.PRDPController(delta=2.5), "PRDPController: delta must be a whole number, got 2.5"),
+        (lambda: prdp.PRDPController().step("low"), "PRDPController: metric must be a real number, got 'low'"),
+    ],
+)  # fmt: skip
+def test_wrong_types(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+def test_a_report_reads_well():
+    step = heat()
+    step(torch.ones(4, 1, 30))
+    assert repr(step.info).startswith("SolveInfo(4 MAX_ITER; iterations 3 to 3, residual ")
+
+
 def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
     from prdp_torch import _load
 
@@ -110,6 +144,7 @@ def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
         _load.check_torch()
     (tmp_path / "built_for_torch.txt").write_text("2.0.1+cpu\n")
     with pytest.raises(
-        ImportError, match=r"was built for torch 2.0.1\+cpu, but torch .* is installed; install torch==2.0.1"
+        ImportError,
+        match=r"was built for torch 2.0.1\+cpu, but torch .* is installed; install torch 2.0.1\+cpu, or rebuild",
     ):
         _load.check_torch()

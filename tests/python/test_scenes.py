@@ -27,14 +27,14 @@ def test_the_projects_scenes_hold_the_papers_settings():
     heat = scenes.load("heat_1d")
     assert (heat.method, heat.max_iter, heat.rtol, heat.backward) == ("jacobi", 25, 1e-5, "implicit")
     assert (heat.physics.shape, heat.physics.nu, heat.physics.dt) == ([30], 1e-3, 1.0)
-    assert (heat.data.train, heat.data.valid, heat.training.batch, heat.training.epochs) == (200, 5, 25, 100)
+    assert (heat.data.train, heat.data.valid, heat.training.batch, heat.training.intervals) == (200, 5, 25, 100)
     assert heat.prdp == {
         "tau_step": 0.98, "tau_stop": 0.9, "delta": 3, "window": 8, "initial": 1, "increment": 1,
         "maximum": None, "growth": 1.0,
     }  # fmt: skip
     one, three = scenes.load("poisson_1p"), scenes.load("poisson_3p")
-    assert (one.max_iter, one.training.updates, one.learning_rate(100)) == (600, 170, 275.0)
-    assert (three.max_iter, three.training.updates, three.learning_rate(0)) == (450, 750, 3500.0)
+    assert (one.max_iter, one.training.intervals, one.learning_rate(100)) == (600, 170, 275.0)
+    assert (three.max_iter, three.training.intervals, three.learning_rate(0)) == (450, 750, 3500.0)
     assert (one.prdp["tau_step"], one.prdp["tau_stop"], one.prdp["initial"], one.prdp["increment"]) == (
         0.92,
         0.98,
@@ -42,7 +42,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         10,
     )
     steepest = scenes.load("poisson_3p_sd")
-    assert (steepest.method, steepest.max_iter, steepest.training.updates) == ("steepest_descent", 240, 800)
+    assert (steepest.method, steepest.max_iter, steepest.training.intervals) == ("steepest_descent", 240, 800)
 
 
 @pytest.mark.parametrize(
@@ -61,6 +61,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ('loss = "nmse"', 'loss = "l1"', "loss =", "training.loss: unknown name 'l1'; allowed: nmse, mse"),
         ("delta = 3", "delta = 1", "delta", "prdp.delta: must be >= 2, got 1"),
         ('dtype = "float32"', 'dtype = "half"', "dtype", "dtype: unknown name 'half'; allowed: float32, float64"),
+        ('"implicit"', '"none"', "backward", "solver.backward: unknown name 'none'; allowed: implicit, unrolled"),
         ("[network]", "[networks]", "title", "network: missing; the table holds:"),
         ("[physics]", "[physics", "[physics", "Error while parsing"),
     ],

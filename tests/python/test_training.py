@@ -1,7 +1,9 @@
 """Trainings: the two languages agree, and the scenes show what the paper shows."""
 
 import json
+import math
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from prdp_torch import _C, scenes
 from prdp_torch.training import Refinement, train
 
 ROOT = Path(__file__).parents[2]
+PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
 TRAINER = ROOT / "build" / "prdp_train"
 
 
@@ -25,7 +28,7 @@ def in_cpp(tmp_path, scene, *arguments):
 
 def short(name, intervals=3, backward=None):
     scene = scenes.load(name)
-    scene.training.epochs = scene.training.updates = intervals
+    scene.training.intervals = intervals
     if backward:
         scene.backward = backward
     return scene
@@ -128,8 +131,40 @@ def test_costs_are_counted_per_sample():
 
 
 def test_without_a_gradient_the_network_cannot_learn():
-    with pytest.raises(RuntimeError, match="does not require grad"):
-        train(short("heat_1d", backward="none"), Refinement.constant(5))
+    with pytest.raises(ValueError, match="unknown name 'none' for a scene; allowed: implicit, unrolled"):
+        short("heat_1d", backward="none")
+
+
+def diverging(tmp_path):
+    """heat_1d with a learning rate that throws the network out of the dtype's range."""
+    path = tmp_path / "wild.toml"
+    path.write_text(scenes.available()["heat_1d"].read_text().replace("rate = 1e-3", "rate = 1e12"))
+    return path
+
+
+def test_a_training_that_diverges_stops_and_says_so(tmp_path):
+    scene = scenes.load(diverging(tmp_path))
+    curves = train(scene, Refinement.constant(25))
+    assert "interval 1: the" in curves["diverged"]
+    assert len(curves["metric"]) == 101 and math.isfinite(curves["metric"][0]) and math.isnan(curves["metric"][-1])
+    assert all(len(curves[cost]) == 100 and sum(curves[cost][1:]) == 0 for cost in ("budget", "iterations", "seconds"))
+
+
+def test_both_languages_and_the_comparison_report_divergence(tmp_path):
+    path = diverging(tmp_path)
+    for command in ([*PRDP, "train", path, "--out", tmp_path / "py"], [TRAINER, path, "--out", tmp_path / "cpp"]):
+        done = subprocess.run([*command, "--constant", "25"], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 1 and "seed 0 diverged, interval 1" in done.stderr
+    python, cpp = (
+        json.loads((tmp_path / language / "constant_25/seed_0.json").read_text())["curves"]
+        for language in ("py", "cpp")
+    )
+    assert python["diverged"] == cpp["diverged"] and python["metric"][-1] is cpp["metric"][-1] is None
+    done = subprocess.run(
+        [*PRDP, "compare", path, "--seeds", "2", "--intervals", "3"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "Trainings that diverged: 2 with PRDP" in done.stdout, done.stderr
+    assert "2 diverged" in (tmp_path / "runs/wild/report.html").read_text()
 
 
 @pytest.mark.parametrize("kind", ["nmse", "mse"])

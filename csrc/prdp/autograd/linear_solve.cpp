@@ -225,7 +225,7 @@ struct Kernels<Outputs(const at::Tensor&, Args...)> {
 }  // namespace
 
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options) {
-  const bool lone_vector = b.dim() == 1;  // (n,), for matrices
+  const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
   auto [u, iterations, residual, status, applications] =
       call_op(lone_vector ? b.unsqueeze(0) : b, a, options);
   return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications}};

@@ -1,5 +1,6 @@
 #include "prdp/scenes/scene.h"
 
+#include <algorithm>
 #include <cmath>
 #include <filesystem>
 #include <fstream>
@@ -10,6 +11,9 @@
 namespace prdp {
 
 namespace {
+
+/// The derivatives that every task of a scene can be trained with: its only gradient is the solver's.
+const std::vector<std::string> kBackwards{"implicit", "unrolled"};
 
 Scene::Physics read_physics(TomlSection s) {
   Scene::Physics p;
@@ -29,7 +33,7 @@ void read_solver(TomlSection s, Scene& scene) {
       s.choice("method", {"jacobi", "steepest_descent", "cg", "direct"}));
   scene.solver.max_iter = s.whole("max_iter", 0);
   scene.solver.rtol = s.at_least("rtol", 0.0);
-  scene.backward = backward_from_name(s.choice("backward", {"implicit", "unrolled", "none"}));
+  scene.backward = backward_from_name(s.choice("backward", kBackwards));
   s.finish();
 }
 
@@ -53,9 +57,9 @@ Scene::Training read_training(TomlSection s, Scene::Task task) {
     t.decay = s.above("decay", 0.0);
     t.decay_steps = s.whole("decay_steps", 1);
     t.batch = s.whole("batch", 1);
-    t.epochs = s.whole("epochs", 1);
+    t.intervals = s.whole("epochs", 1);
   } else {
-    t.updates = s.whole("updates", 1);
+    t.intervals = s.whole("updates", 1);
   }
   s.finish();
   return t;
@@ -107,6 +111,12 @@ Stepper Scene::stepper(Solver with) const {
   return {equation, {std::move(with), backward, {}, {}, OnFailure::kReturn}};
 }
 
+void Scene::set_backward(const std::string& name) {
+  const bool known = std::find(kBackwards.begin(), kBackwards.end(), name) != kBackwards.end();
+  TORCH_CHECK_VALUE(known, "backward: unknown name '", name, "' for a scene; allowed: implicit, unrolled");
+  backward = backward_from_name(name);
+}
+
 double Scene::learning_rate(int64_t update) const {
   const double periods = static_cast<double>(update) / static_cast<double>(training.decay_steps);
   return training.learning_rate * std::pow(training.decay, periods);
@@ -114,7 +124,8 @@ double Scene::learning_rate(int64_t update) const {
 
 Scene read_scene(const std::string& path) {
   std::ifstream file(path);
-  TORCH_CHECK_VALUE(file && !std::filesystem::is_directory(path), "scene: cannot read '", path, "'");
+  TORCH_CHECK_VALUE(file && !std::filesystem::is_directory(path), "scene: cannot read '", path,
+                    "'; expected the path of a .toml file");
   std::ostringstream text;
   text << file.rdbuf();
 

@@ -32,8 +32,8 @@ struct Scene {
     double learning_rate = 0.0;
     double decay = 1.0;  // of the learning rate, over decay_steps updates, exponentially
     int64_t decay_steps = 1;
-    int64_t batch = 0, epochs = 0;  // emulator
-    int64_t updates = 0;            // parameters
+    int64_t batch = 0;      // emulator
+    int64_t intervals = 0;  // epochs of an emulator, updates of parameters: what the controller counts in
   };
   struct Parameters {
     std::vector<double> start, reference;
@@ -62,6 +62,9 @@ struct Scene {
 
   /// The scene's step with this solver; a failed sample does not stop a training.
   Stepper stepper(Solver solver) const;
+  /// Replaces the scene's derivative. Raises ValueError for an unknown name, or one that would leave
+  /// the task without a gradient.
+  void set_backward(const std::string& name);
   /// The learning rate of an update, counted from 0.
   double learning_rate(int64_t update) const;
 };

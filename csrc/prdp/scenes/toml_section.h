@@ -89,7 +89,7 @@ class TomlSection {
     if (has(key)) return;
     std::ostringstream present;
     for (const auto& [other, node] : table_) present << (present.tellp() > 0 ? ", " : "") << other.str();
-    fail(key, "missing; the table holds: " + present.str());
+    fail(key, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
   }
   static std::string bound(const char* relation, double least, double got) {
     std::ostringstream text;

@@ -73,7 +73,7 @@ void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& in
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
   if (on_failure == OnFailure::kRaise)
-    text << ". on_failure='return' hands out what there is, with the status of each sample";
+    text << ". With on_failure = return, what there is comes back with the status of each sample";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, text.str());
   warning_sink()(text.str());
 }

@@ -17,7 +17,7 @@ const std::vector<StatusText>& solve_statuses() {
       {S::kOverflow, "OVERFLOW",
        "a number left the range of the dtype; float64 or another method would help"},
       {S::kBreakdown, "BREAKDOWN",
-       "no search direction is left; the operator is singular or this method does not fit it"},
+       "the operator is singular, or this method does not fit it"},
       {S::kZeroDiagonal, "ZERO_DIAGONAL", "Jacobi divides by the diagonal; take another method"},
       {S::kInconsistent, "INCONSISTENT",
        "the right-hand side lies outside the range of a singular operator"},

@@ -1,0 +1,42 @@
+"""Types of arguments in words; the compiled library checks their ranges. Each returns the argument as
+the plain type it stands for, or raises TypeError."""
+
+import numbers
+
+import torch
+
+
+def whole(who, name, value):
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        return int(value)
+    raise TypeError(f"{who}: {name} must be a whole number, got {value!r}")
+
+
+def real(who, name, value):
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        return float(value)
+    raise TypeError(f"{who}: {name} must be a real number, got {value!r}")
+
+
+def optional(check, who, name, value):
+    return None if value is None else check(who, name, value)
+
+
+def string(who, name, value):
+    if isinstance(value, str):
+        return value
+    raise TypeError(f"{who}: {name} must be a string, got {value!r}")
+
+
+def shape(who, value):
+    if isinstance(value, (tuple, list)):
+        return [whole(who, "every extent of shape", n) for n in value]
+    raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {value!r}")
+
+
+def dense(who, name, value):
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{who}: {name} must be a torch tensor, got {type(value).__name__}")
+    if value.layout != torch.strided:
+        raise TypeError(f"{who}: {name} must be a dense tensor, got one of layout {value.layout}")
+    return value
