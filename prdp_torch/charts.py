@@ -85,7 +85,7 @@ def total_iterations(scene, rows, table):
     converged one) and progressive refinement (K starts lower still) save of the converged run's."""
     chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
     figure, (axes,) = _figure(height=1.6 + 0.55 * len(chosen))
-    base = chosen[0]["budget"]
+    base = max(1.0, chosen[0]["budget"])
     spent = np.array([entry["budget"] / base for entry in chosen])
     saved = np.maximum(0.0, 1 - spent)
     ic = np.minimum([entry["saved_by_incomplete_convergence"] for entry in chosen], saved)

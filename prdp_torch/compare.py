@@ -117,7 +117,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
 def summarise(scene, rows):
     """The table of a comparison: one dict a row, means over seeds; savings against the first row."""
     target = scene.compare.target
-    base = rows[0].total("budget", target).mean()
+    base = max(1.0, rows[0].total("budget", target).mean())  # a run that diverged at once has none
     table = []
     for row in rows:
         final = row.final()
