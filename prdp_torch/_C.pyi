@@ -4,16 +4,18 @@ from torch import Tensor, dtype
 
 VERSION: str
 DEFAULT_RTOL: float
+DEFAULT_RESTART: int
 SOLVE_STATUSES: dict[str, int]
 PRDP_DEFAULTS: dict[str, float | int | None]
 
 def check_operator(kind: str, shape: list[int], parameters: list[float], tensors: list[Tensor]) -> None: ...
-def check_solver(who: str, method: str, max_iter: int, rtol: float) -> None: ...
+def check_solver(who: str, method: str, max_iter: int, rtol: float, restart: int) -> None: ...
 def check_options(
     who: str,
     method: str,
     max_iter: int,
     rtol: float,
+    restart: int,
     backward: str,
     adjoint_max_iter: int | None,
     adjoint_rtol: float | None,
@@ -32,6 +34,7 @@ def solve_with_tensors(
     solver: str,
     max_iter: int,
     rtol: float,
+    restart: int = ...,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]: ...
 
 class PRDPController:

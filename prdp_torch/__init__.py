@@ -13,13 +13,14 @@ _load.check_torch()
 from prdp_torch import _C, operators  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
-from prdp_torch.solvers import CG, Direct, Jacobi, SteepestDescent  # noqa: E402
+from prdp_torch.solvers import CG, GMRES, Direct, Jacobi, SteepestDescent  # noqa: E402
 from prdp_torch.steppers import Heat, Poisson, Stepper  # noqa: E402
 
 __version__ = _C.VERSION
 
 __all__ = [
     "CG",
+    "GMRES",
     "Direct",
     "Heat",
     "Jacobi",

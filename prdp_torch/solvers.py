@@ -20,6 +20,7 @@ class Solver:
     max_iter: int
     rtol: float = _C.DEFAULT_RTOL
 
+    restart: ClassVar[int] = _C.DEFAULT_RESTART
     method: ClassVar[str]
 
     def __post_init__(self):
@@ -27,7 +28,7 @@ class Solver:
             who = type(self).__name__
             self.max_iter = _check.whole(who, "max_iter", self.max_iter)
             self.rtol = _check.real(who, "rtol", self.rtol)
-            _C.check_solver(who, self.method, self.max_iter, self.rtol)
+            _C.check_solver(who, self.method, self.max_iter, self.rtol, self.restart)
 
 
 @dataclass
@@ -51,6 +52,22 @@ class CG(Solver):
     method: ClassVar[str] = "cg"
 
 
+@dataclass(kw_only=True)
+class GMRES(Solver):
+    """Restarted GMRES(m) with m = `restart` products a cycle, for any operator (Saad and Schultz 1986);
+    `max_iter` counts cycles. The residual never grows. In float32 unrolled derivatives can be far off:
+    prefer implicit ones."""
+
+    restart: int = _C.DEFAULT_RESTART
+
+    method: ClassVar[str] = "gmres"
+
+    def __post_init__(self):
+        if not torch.compiler.is_compiling():
+            self.restart = _check.whole("GMRES", "restart", self.restart)
+        super().__post_init__()
+
+
 @dataclass
 class Direct(Solver):
     """The cheapest exact method of the operator: Thomas in 1D, sine transform in 2D and 3D, LU for
@@ -70,6 +87,7 @@ def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_fail
         solver.method,
         _check.whole(who, "max_iter", solver.max_iter),
         _check.real(who, "rtol", solver.rtol),
+        _check.whole(who, "restart", solver.restart),
         _check.string(who, "backward", backward),
         _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),

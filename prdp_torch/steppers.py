@@ -30,7 +30,7 @@ class Stepper(torch.nn.Module):
 
     Args of every stepper beside its physics:
         shape: grid of unknowns in the unit domain, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-        solver: `Jacobi`, `SteepestDescent`, `CG` or `Direct`.
+        solver: `Jacobi`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure: as in `linear_solve`.
 
     Attributes:
@@ -50,6 +50,7 @@ class Stepper(torch.nn.Module):
         self.equation = equation
         self.method = solver.method
         self.rtol = float(solver.rtol)
+        self.restart = solver.restart
         self.backward = backward
         self.adjoint_max_iter = adjoint_max_iter
         self.adjoint_rtol = adjoint_rtol
@@ -71,6 +72,7 @@ class Stepper(torch.nn.Module):
             self.method,
             self._max_iter.item(),
             self.rtol,
+            self.restart,
             self.backward,
             self.adjoint_max_iter,
             self.adjoint_rtol,
@@ -87,7 +89,7 @@ class Stepper(torch.nn.Module):
     @max_iter.setter
     def max_iter(self, k):
         who = type(self).__name__
-        _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol)
+        _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol, self.restart)
         self._max_iter.fill_(k)
 
     @property

@@ -27,6 +27,7 @@ void warn_in_python(const std::string& text) {
 void bind_solvers(py::module_& m) {
   set_warning_sink(warn_in_python);
   m.attr("DEFAULT_RTOL") = kDefaultRtol;
+  m.attr("DEFAULT_RESTART") = kDefaultRestart;
   py::dict statuses;
   for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
   m.attr("SOLVE_STATUSES") = statuses;
@@ -38,22 +39,22 @@ void bind_solvers(py::module_& m) {
         },
         py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
   m.def("check_solver",
-        [](std::string who, std::string method, int64_t max_iter, double rtol) {
-          Solver{method_from_name(method), max_iter, rtol}.check(who.c_str());
+        [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart) {
+          Solver{method_from_name(method), max_iter, rtol, restart}.check(who.c_str());
         },
-        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"));
+        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"));
   m.def("check_options",
-        [](std::string who, std::string method, int64_t max_iter, double rtol, std::string backward,
+        [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
            std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
            std::string on_failure) {
-          SolveOptions{{method_from_name(method), max_iter, rtol},
+          SolveOptions{{method_from_name(method), max_iter, rtol, restart},
                        backward_from_name(backward),
                        adjoint_max_iter,
                        adjoint_rtol,
                        on_failure_from_name(on_failure)}
               .check(who.c_str());
         },
-        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("backward"),
+        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"), py::arg("backward"),
         py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"));
 
   m.def("open_adjoint_log", &adjoint_log::open);
@@ -69,14 +70,15 @@ void bind_solvers(py::module_& m) {
   m.def("solve_with_tensors",
         [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,
            std::vector<int64_t> shape, std::vector<double> parameters, bool transposed,
-           std::string solver, int64_t max_iter, double rtol) {
+           std::string solver, int64_t max_iter, double rtol, int64_t restart) {
           auto a = spec(kind, shape, parameters, tensors);
           a.transposed = transposed;
           const auto result =
-              solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, {}});
+              solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, restart});
           return py::make_tuple(result.u, as_tuple(result.info));
         },
         "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.",
         py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"),
-        py::arg("transposed"), py::arg("solver"), py::arg("max_iter"), py::arg("rtol"));
+        py::arg("transposed"), py::arg("solver"), py::arg("max_iter"), py::arg("rtol"),
+        py::arg("restart") = kDefaultRestart);
 }

@@ -59,7 +59,7 @@ TEST(Solve, EachSampleStopsAtItsOwnCap) {
   const auto caps = at::tensor({0, 1, 5, 9}, at::kLong);
   for (const auto& [method, name] : kMethods) {
     SCOPED_TRACE(name);
-    const prdp::SolveRequest request{method, 99, 0.0, caps};
+    const prdp::SolveRequest request{method, 99, 0.0, prdp::kDefaultRestart, caps};
     for (const auto& result : {prdp::solve(*a, b, request), prdp::solve_with_tensors(*a, b, request)}) {
       EXPECT_TRUE(at::equal(result.info.iterations, caps));
       for (int64_t i = 0; i < 4; ++i) {

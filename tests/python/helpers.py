@@ -8,7 +8,7 @@ import torch
 import prdp_torch as prdp
 
 DATA = Path(__file__).parents[1] / "data"
-ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG]
+ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
 SOLVERS = [*ITERATIVE, prdp.Direct]
 
 

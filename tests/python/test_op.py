@@ -16,11 +16,11 @@ from prdp_torch import operators
 def arguments(backward="implicit", solver="jacobi", requires_grad=True):
     b = field((5,)).requires_grad_(requires_grad)
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=requires_grad)
-    return b, nu, (solver, 4, 1e-5, backward, None, None, "raise", 0)
+    return b, nu, (solver, 4, 1e-5, 3, backward, None, None, "raise", 0)
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unrolled", "none"])
-@pytest.mark.parametrize("solver", ["jacobi", "steepest_descent", "cg", "direct"])
+@pytest.mark.parametrize("solver", ["jacobi", "steepest_descent", "cg", "gmres", "direct"])
 def test_linear_solve_passes_opcheck(backward, solver):
     b, nu, options = arguments(backward, solver)
     result = opcheck(torch.ops.prdp.linear_solve.default, (b, [nu], "heat", [5], [1.0], False, *options))
@@ -41,7 +41,7 @@ def test_matrices_and_the_other_ops_pass_opcheck():
         (torch.ops.prdp.rhs, (b, "poisson")),
         (
             torch.ops.prdp.unrolled_vjp,
-            (b.detach(), b.detach(), [nu.detach()], [1, 1], "heat", [5], [1.0], False, "cg", 4, 1e-5,
+            (b.detach(), b.detach(), [nu.detach()], [1, 1], "heat", [5], [1.0], False, "cg", 4, 1e-5, 3,
              torch.tensor([4, 4]), torch.tensor([-1, -1])),
         ),
     ]  # fmt: skip

@@ -52,7 +52,7 @@ def test_converged_solves_equal_lapack(shape, solver, dtype, rtol, close):
         (operators.Heat(shape, 1e-3, 1.0), dense_heat(shape)),
     ):
         u, info = prdp.linear_solve(a, b.to(dtype), solver(20000, rtol=rtol))
-        assert set(statuses(info)) == {"CONVERGED"}
+        assert (info.status > 0).all()
         expected = np.linalg.solve(matrix, b.flatten(1).numpy().T).T
         np.testing.assert_allclose(u.double().flatten(1), expected, rtol=0, atol=close * np.abs(expected).max())
 

@@ -150,7 +150,8 @@ def test_overflow_is_said_and_a_finite_iterate_handed_out(solver):
     a = torch.tensor([[1e30, 1e30], [1e30, 2e30]], dtype=torch.float32)
     u, info = prdp.linear_solve(torch.stack([a, torch.eye(2)]), torch.ones(2, 2), solver(20), on_failure="return")
     assert torch.isfinite(u).all()
-    assert statuses(info)[1] == "CONVERGED" and torch.equal(u[1], torch.ones(2))
+    assert info.status[1] > 0
+    np.testing.assert_allclose(u[1], torch.ones(2), rtol=1e-6)
     assert statuses(info)[0] in ("OVERFLOW", "CONVERGED", "MAX_ITER")
     residual = (1.0 - (a.double() @ u[0].double())).norm() / 2**0.5
     assert info.residual[0].item() == pytest.approx(float(residual), rel=1e-3)
@@ -254,4 +255,4 @@ def test_spd_systems_never_fail():
     b = torch.randn(50, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     for solver in SOLVERS:
         _, info = prdp.linear_solve(m, b, solver(500))
-        assert set(statuses(info)) == {"CONVERGED"}
+        assert (info.status > 0).all()

@@ -18,7 +18,7 @@ using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::T
 
 constexpr const char* kSchema =
     "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, "
-    "bool transposed, str solver, SymInt max_iter, float rtol, str backward, "
+    "bool transposed, str solver, SymInt max_iter, float rtol, int restart, str backward, "
     "SymInt? adjoint_max_iter, float? adjoint_rtol, str on_failure, int adjoint_log) -> "
     "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 
@@ -30,7 +30,7 @@ struct Call : torch::CustomClassHolder {
 
 using Signature = Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
                           at::ArrayRef<double>, bool, c10::string_view, c10::SymInt, double,
-                          c10::string_view, std::optional<c10::SymInt>, std::optional<double>,
+                          int64_t, c10::string_view, std::optional<c10::SymInt>, std::optional<double>,
                           c10::string_view, int64_t);
 
 /// Calls the op through the dispatcher.
@@ -39,7 +39,7 @@ Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& 
                              .findSchemaOrThrow("prdp::linear_solve", "")
                              .typed<Signature>();
   return op.call(b, a.tensors, a.kind, a.shape, a.parameters, a.transposed, name(o.solver.method),
-                 o.solver.max_iter, o.solver.rtol, name(o.backward), o.adjoint_max_iter,
+                 o.solver.max_iter, o.solver.rtol, o.solver.restart, name(o.backward), o.adjoint_max_iter,
                  o.adjoint_rtol, name(o.on_failure), o.adjoint_log);
 }
 
@@ -47,12 +47,12 @@ Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& 
 c10::intrusive_ptr<Call> unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                                 at::ArrayRef<double> parameters, bool transposed,
                                 c10::string_view solver, c10::SymInt max_iter, double rtol,
-                                c10::string_view backward, std::optional<c10::SymInt> adjoint_max_iter,
+                                int64_t restart, c10::string_view backward, std::optional<c10::SymInt> adjoint_max_iter,
                                 std::optional<double> adjoint_rtol, c10::string_view on_failure,
                                 int64_t adjoint_log) {
   auto call = c10::make_intrusive<Call>();
   call->a = {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed};
-  call->options = {{method_from_name(solver), std::move(max_iter), rtol},
+  call->options = {{method_from_name(solver), std::move(max_iter), rtol, restart},
                    backward_from_name(backward),
                    std::move(adjoint_max_iter),
                    adjoint_rtol,
@@ -77,7 +77,8 @@ Outputs solve_kernel(const at::Tensor& b, Args... args) {
   const auto a = checked_operator(b, *call);
   a->check_parameters();
   const auto& o = call->options;
-  const auto result = solve(*a, b, {o.solver.method, o.solver.max_iter.expect_int(), o.solver.rtol, {}});
+  const auto& s = o.solver;
+  const auto result = solve(*a, b, {s.method, s.max_iter.expect_int(), s.rtol, s.restart});
   if (call->a.transposed && o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, result.info);
   report_failures(*a, b, result.info, o.on_failure, role_of(call->a));
   const auto& info = result.info;

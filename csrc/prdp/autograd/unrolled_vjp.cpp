@@ -15,7 +15,7 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor[] tensors, int[] needed, str kind, "
-    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, float rtol, "
+    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, float rtol, int restart, "
     "Tensor iterations, Tensor status) -> Tensor[]";
 
 /// b = 0 is solved in no iterations, yet the map has a derivative there: A⁻ᵀ by the same method and
@@ -43,8 +43,7 @@ std::vector<at::Tensor> differentiate(const at::Tensor& cotangent, const at::Ten
   const c10::impl::ForceDispatchKeyGuard with_autograd(
       keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
   const at::AutoGradMode record(true);
-  const auto u = solve_recorded(*make_operator(solve.a), b, solve.solver.method,
-                                solve.iterations);
+  const auto u = solve_recorded(*make_operator(solve.a), b, solve.solver, solve.iterations);
   std::vector<at::Tensor> inputs;
   if (needed[0]) inputs.push_back(b);
   for (size_t i = 0; i < solve.a.tensors.size(); ++i)
@@ -64,9 +63,9 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
                                    c10::string_view kind, at::IntArrayRef shape,
                                    at::ArrayRef<double> parameters, bool transposed,
                                    c10::string_view solver, c10::SymInt max_iter, double rtol,
-                                   const at::Tensor& iterations, const at::Tensor& status) {
+                                   int64_t restart, const at::Tensor& iterations, const at::Tensor& status) {
   UnrolledSolve unrolled{{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
-                         {method_from_name(solver), max_iter, rtol},
+                         {method_from_name(solver), max_iter, rtol, restart},
                          iterations,
                          status};
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
@@ -74,7 +73,7 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
     // K sweeps from zero are u = Σ_k (I - D⁻¹A)ᵏ D⁻¹ b; transposed, that is K sweeps with Aᵀ.
     auto transpose = unrolled.a;
     transpose.transposed = !transposed;
-    const SolveRequest request{Method::kJacobi, 0, 0.0, iterations};
+    const SolveRequest request{Method::kJacobi, 0, 0.0, restart, iterations};
     std::vector<at::Tensor> gradients{prdp::solve(*make_operator(transpose), cotangent, request).u};
     add_derivative_at_zero(gradients, cotangent, unrolled, needed);
     return gradients;
@@ -89,7 +88,7 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
 std::vector<at::Tensor> fake_kernel(const at::Tensor&, const at::Tensor& b, at::TensorList tensors,
                                     at::IntArrayRef needed, c10::string_view, at::IntArrayRef,
                                     at::ArrayRef<double>, bool, c10::string_view, c10::SymInt, double,
-                                    const at::Tensor&, const at::Tensor&) {
+                                    int64_t, const at::Tensor&, const at::Tensor&) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -106,8 +105,8 @@ std::vector<at::Tensor> unrolled_vjp(const at::Tensor& cotangent, const at::Tens
                              .typed<decltype(vjp_kernel)>();
   const auto& a = solve.a;
   return op.call(cotangent, b, a.tensors, needed, a.kind, a.shape, a.parameters, a.transposed,
-                 name(solve.solver.method), solve.solver.max_iter, solve.solver.rtol, solve.iterations,
-                 solve.status);
+                 name(solve.solver.method), solve.solver.max_iter, solve.solver.rtol,
+                 solve.solver.restart, solve.iterations, solve.status);
 }
 
 std::vector<at::Tensor> unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,

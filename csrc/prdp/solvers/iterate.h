@@ -24,6 +24,8 @@ struct SampleState {
   double residual2 = 0.0;
   int64_t best = 0;  // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
+  int64_t still = 0;   // cycles since the residual last fell, for methods whose residual never grows
+  double fallen2 = std::numeric_limits<double>::infinity();  // the residual then
   double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
 
   void stop(SolveStatus why) {
@@ -36,7 +38,8 @@ struct SampleState {
     active = cap > 0;
     settled = claims = false;
     status = SolveStatus::kMaxIter;
-    iterations = 0;
+    iterations = still = 0;
+    fallen2 = std::numeric_limits<double>::infinity();
     refuted2 = std::numeric_limits<double>::infinity();
   }
 };
@@ -45,15 +48,20 @@ inline constexpr double kDivergenceBound = 1e13;
 
 namespace detail {
 
+/// GMRES and its like: each iteration takes the least residual over a space, which may be exhausted.
+template <class Method>
+inline constexpr bool kLeastResidual = requires(const Method& m) { m.exhausted(); };
+
 /// The iterates have run away: the last one is of no use.
 inline bool lost(const SampleState& s) {
   return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
 }
 
-/// A residual of this size is rounding: ε ‖A‖ ‖u‖.
+/// A residual of this size is rounding: ε ‖A‖ ‖u‖. An exhausted space is judged with some slack.
 template <class Space>
 bool at_rounding_floor(const Space& space, const SampleState& s, double norm_a, double u2) {
-  return std::sqrt(s.residual2) <= space.epsilon() * norm_a * std::sqrt(u2);
+  const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : 1.0;
+  return std::sqrt(s.residual2) <= slack * space.epsilon() * norm_a * std::sqrt(u2);
 }
 
 /// The true residual no longer follows the method's own: a second false claim, after the method has
@@ -69,12 +77,31 @@ inline void judge(SampleState& s, double rtol) {
   if (s.residual2 <= rtol * rtol * s.b2) s.stop(SolveStatus::kConverged);
 }
 
+/// A method of least residuals that no longer moves: a breakdown where its space is exhausted, and
+/// stagnation where several cycles in a row have not taken a thousandth off the residual.
+inline void judge_progress(SampleState& s, bool exhausted) {
+  constexpr double progress2 = 0.998;
+  constexpr int64_t patience = 10;
+  if (s.residual2 < progress2 * s.fallen2) {
+    s.fallen2 = s.residual2;
+    s.still = 0;
+    return;
+  }
+  if (exhausted) {
+    --s.iterations;  // this one changed nothing
+    return s.stop(SolveStatus::kBreakdown);
+  }
+  if (++s.still >= patience) s.stop(SolveStatus::kStagnated);
+}
+
 /// Takes the residuals that the method knows. Freezes what diverged, overflowed or broke down, and
 /// confirms what seems converged by the true residual: a recursive one may have drifted from it.
 template <class Space, class Method>
 void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto residual2 = space.lanes(method.residual2());
   const auto broken = space.broken();
+  [[maybe_unused]] decltype(space.lanes(method.residual2())) exhausted{};
+  if constexpr (kLeastResidual<Method>) exhausted = space.lanes(method.exhausted());
   bool any_claims = false;
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
@@ -91,6 +118,9 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
       continue;
     }
     judge(s, rtol);
+    if constexpr (kLeastResidual<Method>) {
+      if (s.active && rtol > 0.0) judge_progress(s, exhausted[i] != 0.0);
+    }
     if (s.status != SolveStatus::kConverged) continue;
     s.status = SolveStatus::kMaxIter;  // only a claim so far; with rtol = 0 nothing stops early
     s.active = true;
@@ -110,6 +140,9 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     judge(s, rtol);
     if (s.active && (at_rounding_floor(space, s, norm_a[i], u2[i]) || parted_ways(s, rtol)))
       s.stop(SolveStatus::kStagnated);
+    if constexpr (kLeastResidual<Method>) {
+      if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
+    }
     s.refuted2 = s.residual2;
     s.settled = !s.active;
   }
@@ -149,8 +182,9 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
     s.residual2 = residual2[i];
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!lost(s)) judge(s, rtol);
-    if (s.status == SolveStatus::kMaxIter && rtol > 0.0 &&
-        at_rounding_floor(space, s, norm_a[i], u2[i]))
+    const bool may_stagnate = s.status == SolveStatus::kMaxIter ||
+                              (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
+    if (may_stagnate && rtol > 0.0 && at_rounding_floor(space, s, norm_a[i], u2[i]))
       s.status = SolveStatus::kStagnated;
     s.active = false;
     s.settled = true;

@@ -17,6 +17,7 @@ struct SampleBatch {
   Method method;
   int64_t max_iter;
   double rtol;
+  int64_t restart;
   const int64_t* caps;
   const T* b;
   T* u;
@@ -33,7 +34,7 @@ const T* run_method(const Kernel& kernel, const Factors* factors, kernels::Works
   SampleSpace<Kernel, Factors> space(kernel, factors, workspace, states);
   space.begin();
   states[0].b2 = space.b2();
-  return with_method(batch.method, space, [&](auto method) -> const T* {
+  return with_method(batch.method, batch.restart, space, [&](auto method) -> const T* {
     iterate(space, method, states, batch.rtol);
     return method.x;
   });
@@ -89,7 +90,8 @@ template <class Kernel, class T>
 void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
   using Factors = typename kernels::FactorsOf<Kernel>::Type;
   auto& workspace = kernels::Workspace<T>::local();
-  workspace.prepare(SampleSpace<Kernel, Factors>::kVectors, kernel.length(), kernel.halo());
+  const int64_t restart = std::min(batch.restart, kernel.unknowns());
+  workspace.prepare(2 + vectors_of(batch.method, restart), kernel.length(), kernel.halo());
   const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
     const bool finite = a.operator_is_finite();
     std::optional<Factors> factors;

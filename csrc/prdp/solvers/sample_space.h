@@ -3,6 +3,7 @@
 #include <cmath>
 #include <limits>
 #include <utility>
+#include <vector>
 
 #include "prdp/kernels/vector.h"
 #include "prdp/solvers/iterate.h"
@@ -19,8 +20,6 @@ class SampleSpace {
   using Scalar = T;
   using States = std::array<SampleState, 1>;
 
-  static constexpr int64_t kVectors = 6;  // b, a scratch vector and at most four of the method
-
   SampleSpace(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
               States& states)
       : kernel_(kernel), factors_(factors), workspace_(workspace), state_(states[0]) {}
@@ -32,6 +31,7 @@ class SampleSpace {
   Vector scratch() { return workspace_.vector(1); }
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
+  int64_t unknowns() const { return kernel_.unknowns(); }
   double epsilon() const { return std::numeric_limits<T>::epsilon() / 2; }
 
   void fill_zero(Vector v) { std::fill(v, v + length(), T(0)); }
@@ -80,6 +80,39 @@ class SampleSpace {
   }
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
 
+  /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
+  static constexpr bool recording() { return false; }
+  Scalar constant(Scalar value) const { return value; }
+  void scale(const T* v, Scalar factor, Vector out) {
+    for (int64_t i = 0; i < length(); ++i) out[i] = factor * v[i];
+  }
+  void dots(const std::vector<Vector>& v, int64_t count, const T* w, Scalar* h) {
+    for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i], w);
+  }
+  /// w -= Σ h_i v_i; returns ‖w‖².
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector w) {
+    for (int64_t i = 0; i < count; ++i) loops_.axpy(-h[i], v[i], w, length());
+    return dot(w, w);
+  }
+  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x) {
+    for (int64_t i = 0; i < count; ++i) loops_.axpy(y[i], v[i], x, length());
+  }
+  /// A second pass pays where the first left less than it took.
+  bool lost_orthogonality(Scalar left2, Scalar taken2) const { return left2 < taken2; }
+  /// 1/value; 0 where value is rounding beside `scale`.
+  Scalar inverse(Scalar value, Scalar scale) const {
+    return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
+  }
+  Scalar larger(Scalar a, Scalar b) const { return a > b ? a : b; }
+  Scalar is_larger(Scalar a, Scalar b) const { return a > b; }
+  void restore(Scalar where, const T* from, Vector to) {
+    if (where != 0) copy(from, to);
+  }
+  void restore(Scalar where, Scalar from, Scalar& to) const { to = where != 0 ? from : to; }
+  Scalar is_zero(Scalar value) const { return value == 0; }
+  Scalar is_not_zero(Scalar value) const { return value != 0; }
+  bool all_exhausted(Scalar exhausted) const { return exhausted != 0; }
+
   std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {kernel_.norm()}; }
@@ -92,12 +125,14 @@ class SampleSpace {
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void restart() {
     broken_ = false;
-    for (int64_t i = 1; i < kVectors; ++i) workspace_.clear(i);
+    for (int64_t i = 1; i < workspace_.count(); ++i) workspace_.clear(i);
   }
 
  private:
   /// Squared norms below this are zero to the dtype, b being scaled to the order of one.
   static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
+
+  static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
 
   int64_t length() const { return kernel_.length(); }
 

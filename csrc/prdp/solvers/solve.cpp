@@ -32,6 +32,7 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
   const SampleBatch<T> batch{request.method,
                              request.max_iter,
                              request.rtol,
+                             request.restart,
                              caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
                              rhs.const_data_ptr<T>(),
                              result.u.mutable_data_ptr<T>(),

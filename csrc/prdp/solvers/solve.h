@@ -15,7 +15,8 @@ struct SolveRequest {
   Method method;
   int64_t max_iter;
   double rtol;
-  std::optional<at::Tensor> caps;
+  int64_t restart;
+  std::optional<at::Tensor> caps{};
 };
 
 /// A u = b by the CPU loops, or by plain tensor operations where there are none for the operator or
@@ -27,7 +28,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 
 /// u after exactly `caps` iterations of each sample, recorded by autograd where b or the tensors of
 /// `a` require it: the map whose derivative the unrolled mode takes.
-at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method, const at::Tensor& caps);
+at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver, const at::Tensor& caps);
 
 /// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples, naming them with
 /// what happened. `role` is "linear_solve" or "adjoint solve".

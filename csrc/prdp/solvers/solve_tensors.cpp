@@ -99,7 +99,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
 
-  auto u = with_method(request.method, space, [&](auto method) {
+  auto u = with_method(request.method, request.restart, space, [&](auto method) {
     iterate(space, method, states, request.rtol);
     return method.x;
   });
@@ -116,7 +116,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   return {u.contiguous(), info_of(states, b.options())};
 }
 
-at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method,
+at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
                           const at::Tensor& caps) {
   // Samples of no iterations return zero and have no derivative. They are left out: an operator that
   // was refused would send NaN backwards even from behind a mask.
@@ -124,7 +124,7 @@ at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method,
   if (index.numel() < b.size(0)) {
     const auto zeros = at::zeros_like(b);
     if (index.numel() == 0) return zeros;
-    const auto some = solve_recorded(*a.select(index), b.index_select(0, index), method,
+    const auto some = solve_recorded(*a.select(index), b.index_select(0, index), solver,
                                      caps.index_select(0, index.to(caps.device())));
     return zeros.index_copy(0, index, some);
   }
@@ -132,8 +132,8 @@ at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, Method method,
   std::vector<SampleState> states(b.size(0));
   for (size_t i = 0; i < states.size(); ++i) states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
-  TensorSpace space(a, rhs, states);
-  return with_method(method, space, [&](auto m) {
+  TensorSpace space(a, rhs, states, /*recording=*/true);
+  return with_method(solver.method, solver.restart, space, [&](auto m) {
     detail::run(space, m, states, 0.0, /*track=*/false);
     return m.x / scale;
   });

@@ -11,9 +11,10 @@ namespace {
 template <class Enum, size_t N>
 using Names = std::array<std::pair<Enum, std::string_view>, N>;
 
-constexpr Names<Method, 4> kMethods{{{Method::kJacobi, "jacobi"},
+constexpr Names<Method, 5> kMethods{{{Method::kJacobi, "jacobi"},
                                      {Method::kSteepestDescent, "steepest_descent"},
                                      {Method::kConjugateGradient, "cg"},
+                                     {Method::kGmres, "gmres"},
                                      {Method::kDirect, "direct"}}};
 constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
                                          {Backward::kUnrolled, "unrolled"},
@@ -61,7 +62,10 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
 
 }  // namespace
 
-void Solver::check(const char* who) const { check_budget(who, "", max_iter, rtol); }
+void Solver::check(const char* who) const {
+  check_budget(who, "", max_iter, rtol);
+  TORCH_CHECK_VALUE(restart >= 1, who, ": restart must be >= 1, got ", restart);
+}
 
 void SolveOptions::check(const char* who) const {
   solver.check(who);

@@ -7,10 +7,12 @@
 
 namespace prdp {
 
-enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kDirect };
+enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kGmres, kDirect };
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
+/// Products in a cycle of GMRES.
+inline constexpr int64_t kDefaultRestart = 10;
 
 /// A solver and its budget. All start from zero and stop at the first of ‖b - A u‖ <= rtol ‖b‖ or
 /// max_iter iterations; rtol = 0 runs exactly max_iter.
@@ -18,8 +20,9 @@ struct Solver {
   Method method;
   c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
   double rtol = kDefaultRtol;
+  int64_t restart = kDefaultRestart;  // m of GMRES(m)
 
-  /// Raises ValueError unless max_iter >= 0 and rtol >= 0.
+  /// Raises ValueError unless max_iter >= 0, rtol >= 0 and restart >= 1.
   void check(const char* who) const;
 };
 
@@ -37,6 +40,13 @@ struct CG {
   int64_t max_iter;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol}; }
+};
+/// Restarted; max_iter counts cycles.
+struct GMRES {
+  int64_t restart = kDefaultRestart;
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kGmres, max_iter, rtol, restart}; }
 };
 /// The cheapest exact method of the operator; an iteration is one direct solve, those after the
 /// first refine its result.

@@ -24,8 +24,8 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 
 }  // namespace
 
-TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states)
-    : a_(a), b_(std::move(b)), diagonal_(a.diagonal()), states_(states) {
+TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording)
+    : a_(a), b_(std::move(b)), diagonal_(a.diagonal()), states_(states), recording_(recording) {
   diagonal_ = diagonal_.to(b_.options());
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
   b2_ = dot(b_, b_);
@@ -60,6 +60,11 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) const {
   const auto none = den.detach() < negligible_;
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
+}
+
+TensorSpace::Scalar TensorSpace::inverse(const Scalar& value, const Scalar& scale) const {
+  const auto vanishing = value.le(16 * limits_of(b_).epsilon * scale.abs()).logical_or(value.lt(negligible_));
+  return at::where(vanishing, at::zeros_like(value), 1 / value);
 }
 
 std::vector<double> TensorSpace::lanes(const Scalar& value) const {

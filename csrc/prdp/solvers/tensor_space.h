@@ -18,12 +18,13 @@ class TensorSpace {
   using States = std::vector<SampleState>;
 
   /// b must be finite and scaled to the order of one, or zero.
-  TensorSpace(const Operator& a, at::Tensor b, States& states);
+  TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording = false);
 
   Vector vector() const { return at::zeros_like(b_); }
   Vector scratch() const { return vector(); }
   const Vector& b() const { return b_; }
   const Scalar& b2() const { return b2_; }
+  int64_t unknowns() const { return b_.numel() / std::max<int64_t>(b_.size(0), 1); }
   double epsilon() const;
 
   void fill_zero(Vector& v) { v = at::zeros_like(b_); }
@@ -65,6 +66,31 @@ class TensorSpace {
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
   Scalar ratio(const Scalar& num, const Scalar& den) const;
 
+  /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
+  bool recording() const { return recording_; }
+  Scalar constant(const Scalar& value) const { return value.detach(); }
+  void scale(const Vector& v, const Scalar& factor, Vector& out) const { out = factor * v; }
+  void dots(const std::vector<Vector>& v, int64_t count, const Vector& w, Scalar* h) const {
+    for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), w.detach());
+  }
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) const {
+    for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
+    return dot(w.detach(), w.detach());
+  }
+  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x) const {
+    auto sum = x;
+    for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
+    x = keep_frozen(sum, x);
+  }
+  bool lost_orthogonality(const Scalar&, const Scalar&) const { return true; }  // for some sample
+  Scalar inverse(const Scalar& value, const Scalar& scale) const;
+  Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
+  Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
+  void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const { to = at::where(where.ne(0), from, to); }
+  Scalar is_zero(const Scalar& value) const { return value.eq(0).to(b_.scalar_type()); }
+  Scalar is_not_zero(const Scalar& value) const { return value.ne(0).to(b_.scalar_type()); }
+  bool all_exhausted(const Scalar&) const { return false; }  // the basis goes on with zeros
+
   std::vector<double> lanes(const Scalar& value) const;
   std::vector<bool> broken() const;
   std::vector<double> operator_norm() const;
@@ -100,6 +126,7 @@ class TensorSpace {
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
+  bool recording_;
 };
 
 }  // namespace prdp
