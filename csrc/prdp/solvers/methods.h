@@ -14,6 +14,7 @@ auto with_method(Method method, Space& space, const Body& body) {
     case Method::kJacobi: return body(JacobiMethod<Space>(space));
     case Method::kSteepestDescent: return body(SteepestDescentMethod<Space>(space));
     case Method::kConjugateGradient: return body(ConjugateGradientMethod<Space>(space));
+    case Method::kGmres: TORCH_CHECK_NOT_IMPLEMENTED(false, "gmres is not there yet");
     case Method::kDirect: break;
   }
   return body(DirectMethod<Space>(space));

@@ -7,7 +7,7 @@
 
 namespace prdp {
 
-enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kDirect };
+enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kGmres, kDirect };
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -18,6 +18,7 @@ struct Solver {
   Method method;
   c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
   double rtol = kDefaultRtol;
+  int64_t restart = 10;  // Arnoldi steps in a GMRES cycle
 
   /// Raises ValueError unless max_iter >= 0 and rtol >= 0.
   void check(const char* who) const;
