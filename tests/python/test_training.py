@@ -79,7 +79,7 @@ def test_both_languages_train_a_resnet_alike(tmp_path):
     assert len(python["update_loss"]) == 40
     np.testing.assert_allclose(cpp["update_loss"][:20], python["update_loss"][:20], rtol=1e-5)
     np.testing.assert_allclose(cpp["metric"][:3], python["metric"][:3], rtol=1e-5)
-    assert python["metric"][-1] < 0.5 * python["metric"][0]
+    assert python["metric"][-1] < 0.9 * python["metric"][0]
 
 
 def test_the_metric_applies_the_network_as_often_as_the_scene_says(tmp_path):
