@@ -67,16 +67,21 @@ class Physics:
     shape: list[int]
     nu: float
     dt: float
+    channels: int
+    periodic: bool
 
 class Data:
     modes: int
     train: int
     valid: int
     seed: int
+    valid_steps: int
 
 class Network:
     kind: str
     hidden: list[int]
+    blocks: int
+    width: int
 
 class Training:
     loss: str
@@ -106,6 +111,7 @@ class Scene:
     method: str
     max_iter: int
     rtol: float
+    restart: int
     backward: str
     prdp: dict[str, float | int | None]
 

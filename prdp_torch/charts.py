@@ -31,7 +31,8 @@ def _figure(panels=1, height=4.2):
 
 def _metric_name(scene):
     if scene.task == "emulator":
-        return "validation error at t = 2,\nmean of (‖u − u_ref‖ / ‖u_ref‖)²"
+        steps = f"{scene.data.valid_steps} step{'s' if scene.data.valid_steps > 1 else ''}"
+        return f"validation error after {steps},\nmean of (‖u − u_ref‖ / ‖u_ref‖)²"
     return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
 
 

@@ -2,15 +2,13 @@
 
 from pathlib import Path
 
-from prdp_torch import _C
-from prdp_torch.solvers import CG, Direct, Jacobi, SteepestDescent
-from prdp_torch.steppers import Heat, Poisson
+from prdp_torch import _C, solvers, steppers
 
 _PACKAGE = Path(__file__).parent
 # In a checkout the scenes lie among the examples; a wheel carries them along.
 _FOLDERS = [_PACKAGE.parent / "examples" / "scenes", _PACKAGE / "scenes"]
 
-_SOLVERS = {solver.method: solver for solver in (Jacobi, SteepestDescent, CG, Direct)}
+_SOLVERS = {solver.method: solver for solver in solvers.Solver.__subclasses__()}
 
 
 def available():
@@ -34,9 +32,18 @@ def load(scene):
 def make_stepper(scene, direct=False):
     """The scene's step, with its solver or with the exact method. A failed sample is only reported:
     coarse physics may well diverge early in a training."""
-    solver = Direct() if direct else _SOLVERS[scene.method](scene.max_iter, scene.rtol)
     physics = scene.physics
-    options = {"solver": solver, "backward": scene.backward, "on_failure": "return"}
-    if physics.equation == "heat":
-        return Heat(physics.shape, physics.nu, physics.dt, **options)
-    return Poisson(physics.shape, **options)
+    options = {
+        "solver": solvers.Direct() if direct else _solver(scene),
+        "backward": scene.backward,
+        "on_failure": "return",
+    }
+    if physics.equation == "poisson":
+        return steppers.Poisson(physics.shape, **options)
+    kind = steppers.Heat if physics.equation == "heat" else steppers.Burgers
+    return kind(physics.shape, physics.nu, physics.dt, **options)
+
+
+def _solver(scene):
+    extra = {"restart": scene.restart} if scene.method == "gmres" else {}
+    return _SOLVERS[scene.method](max_iter=scene.max_iter, rtol=scene.rtol, **extra)

@@ -56,7 +56,7 @@ def train(scene, refinement, seed=0, network=None, on_interval=None):
         scene: from `prdp_torch.scenes.load`.
         refinement: a `Refinement`.
         seed: of the network's weights and of the shuffling; the data stay the same.
-        network: any module from (batch, 1, *shape) to the same shape; the scene's own where None.
+        network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
         on_interval: called after each interval with (how many are done, the metric, K).
     """
     stepper = make_stepper(scene, refinement.direct)
@@ -149,7 +149,10 @@ def _emulator(scene, stepper, seed, network):
 
     def metric():
         with torch.no_grad():
-            return float(_C.normalised_mse(network(network(data.valid_start)), data.valid_end))
+            u = data.valid_start
+            for _ in range(scene.data.valid_steps):
+                u = network(u)
+            return float(_C.normalised_mse(u, data.valid_end))
 
     return updates, metric
 

@@ -11,15 +11,20 @@ void bind_scenes(py::module_& m) {
       .def_readonly("equation", &Scene::Physics::equation)
       .def_readonly("shape", &Scene::Physics::shape)
       .def_readonly("nu", &Scene::Physics::nu)
-      .def_readonly("dt", &Scene::Physics::dt);
+      .def_readonly("dt", &Scene::Physics::dt)
+      .def_property_readonly("channels", &Scene::Physics::channels)
+      .def_property_readonly("periodic", &Scene::Physics::periodic);
   py::class_<Scene::Data>(m, "Data")
       .def_readonly("modes", &Scene::Data::modes)
       .def_readonly("train", &Scene::Data::train)
       .def_readonly("valid", &Scene::Data::valid)
-      .def_readonly("seed", &Scene::Data::seed);
+      .def_readonly("seed", &Scene::Data::seed)
+      .def_readonly("valid_steps", &Scene::Data::valid_steps);
   py::class_<Scene::Network>(m, "Network")
       .def_readonly("kind", &Scene::Network::kind)
-      .def_readonly("hidden", &Scene::Network::hidden);
+      .def_readonly("hidden", &Scene::Network::hidden)
+      .def_readonly("blocks", &Scene::Network::blocks)
+      .def_readonly("width", &Scene::Network::width);
   py::class_<Scene::Training>(m, "Training")
       .def_readonly("loss", &Scene::Training::loss)
       .def_readonly("batch", &Scene::Training::batch)
@@ -53,6 +58,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("method", [](const Scene& s) { return name(s.solver.method); })
       .def_property_readonly("max_iter", [](const Scene& s) { return s.solver.max_iter.expect_int(); })
       .def_property_readonly("rtol", [](const Scene& s) { return s.solver.rtol; })
+      .def_property_readonly("restart", [](const Scene& s) { return s.solver.restart; })
       .def_property(
           "backward", [](const Scene& s) { return name(s.backward); }, &Scene::set_backward)
       .def_property_readonly("prdp",

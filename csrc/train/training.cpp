@@ -1,6 +1,8 @@
 #include "training.h"
 
+#include <c10/util/accumulate.h>
 #include <torch/csrc/autograd/autograd.h>
+#include <torch/nn/modules/container/any.h>
 #include <torch/optim/adam.h>
 
 #include <chrono>
@@ -9,6 +11,7 @@
 
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/networks/mlp.h"
+#include "prdp/networks/resnet.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/solvers/status.h"
@@ -130,12 +133,23 @@ class Run {
   Curves curves_;
 };
 
+/// The scene's network with the weights that belong to the seed, in every language.
+torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
+  using torch::nn::AnyModule;
+  const auto& p = scene.physics;
+  const auto& n = scene.network;
+  const auto dim = static_cast<int64_t>(p.shape.size());
+  torch::manual_seed(static_cast<uint64_t>(seed));
+  auto network = n.kind == "mlp" ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
+                                 : AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()));
+  network.ptr()->to(scene.dtype);
+  return network;
+}
+
 Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterval& on_interval) {
   const auto data = make_dataset(scene);
-  torch::manual_seed(static_cast<uint64_t>(seed));
-  MLP network(data.train_start[0].numel(), scene.network.hidden);
-  network->to(scene.dtype);
-  torch::optim::Adam optimiser(network->parameters(), scene.learning_rate(0));
+  auto network = make_network(scene, seed);
+  torch::optim::Adam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
   int64_t done = 0;
 
@@ -143,7 +157,7 @@ Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterv
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(done));
       optimiser.zero_grad();
-      const auto u2 = run.stepper(network(data.train_start.index_select(0, batch)));
+      const auto u2 = run.stepper(network.forward(data.train_start.index_select(0, batch)));
       const auto error = loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
       error.backward();
       optimiser.step();
@@ -153,7 +167,9 @@ Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterv
   };
   const auto metric = [&] {
     const torch::NoGradGuard no_grad;
-    return normalised_mse(network(network(data.valid_start)), data.valid_end).item<double>();
+    auto u = data.valid_start;
+    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = network.forward(u);
+    return normalised_mse(u, data.valid_end).item<double>();
   };
   return run.go({updates, metric}, on_interval);
 }

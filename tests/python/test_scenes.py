@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from prdp_torch import _C, scenes
-from prdp_torch.networks import MLP, make_network
+from prdp_torch import _C, charts, scenes
 
 
 def written(tmp_path, *changes, scene="heat_1d"):
@@ -28,6 +27,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
     assert (heat.method, heat.max_iter, heat.rtol, heat.backward) == ("jacobi", 25, 1e-5, "implicit")
     assert (heat.physics.shape, heat.physics.nu, heat.physics.dt) == ([30], 1e-3, 1.0)
     assert (heat.data.train, heat.data.valid, heat.training.batch, heat.training.intervals) == (200, 5, 25, 100)
+    assert (heat.data.valid_steps, heat.physics.channels, heat.physics.periodic) == (2, 1, False)
     assert heat.prdp == {
         "tau_step": 0.98, "tau_stop": 0.9, "delta": 3, "window": 8, "initial": 1, "increment": 1,
         "maximum": None, "growth": 1.0,
@@ -43,6 +43,13 @@ def test_the_projects_scenes_hold_the_papers_settings():
     )
     steepest = scenes.load("poisson_3p_sd")
     assert (steepest.method, steepest.max_iter, steepest.training.intervals) == ("steepest_descent", 240, 800)
+    burgers = scenes.load("burgers_1d")
+    assert (burgers.method, burgers.restart, burgers.max_iter, burgers.backward) == ("gmres", 2, 23, "implicit")
+    assert (burgers.physics.shape, burgers.physics.nu, burgers.physics.dt) == ([256], 1e-3, 0.01)
+    assert (burgers.physics.channels, burgers.physics.periodic) == (1, True)
+    assert (burgers.network.kind, burgers.network.blocks, burgers.network.width) == ("resnet", 6, 32)
+    assert (burgers.data.modes, burgers.data.valid_steps, burgers.learning_rate(100)) == (20, 5, pytest.approx(7e-4))
+    assert (burgers.prdp["tau_step"], burgers.prdp["window"], burgers.prdp["initial"]) == (0.9, 15, 4)
 
 
 @pytest.mark.parametrize(
@@ -62,12 +69,38 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ("delta = 3", "delta = 1", "delta", "prdp.delta: must be >= 2, got 1"),
         ('dtype = "float32"', 'dtype = "half"', "dtype", "dtype: unknown name 'half'; allowed: float32, float64"),
         ('"implicit"', '"none"', "backward", "solver.backward: unknown name 'none'; allowed: implicit, unrolled"),
+        ("valid_steps = 2", "valid_steps = 0", "valid_steps", "data.valid_steps: must be >= 1, got 0"),
+        ("valid_steps = 2", "", "[data]", "data.valid_steps: missing; the table holds: modes, seed, train, valid"),
+        ('"heat"', '"wave"', "equation =", "physics.equation: unknown name 'wave'; allowed: poisson, heat, burgers"),
+        ('kind = "mlp"', 'kind = "cnn"', "kind", "network.kind: unknown name 'cnn'; allowed: mlp, resnet"),
+        ("hidden", "blocks = 6\nhidden", "blocks", "unknown name 'network.blocks'; allowed: hidden, kind"),
+        ("rtol = 1e-5", "rtol = 1e-5\nrestart = 2", "restart", "unknown name 'solver.restart'; allowed: backward"),
         ("[network]", "[networks]", "title", "network: missing; the table holds:"),
         ("[physics]", "[physics", "[physics", "Error while parsing"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):
-    path = written(tmp_path, (before, after))
+    assert_refused(written(tmp_path, (before, after)), where, message)
+
+
+@pytest.mark.parametrize(
+    "before, after, where, message",
+    [
+        ("restart = 2", "", "[solver]", "solver.restart: missing; the table holds: backward, max_iter, method, rtol"),
+        ("restart = 2", "restart = 0", "restart =", "solver.restart: must be >= 1, got 0"),
+        ("restart = 2", "restart = 1.5", "restart =", "solver.restart: expected a whole number"),
+        ("blocks = 6", "blocks = 0", "blocks", "network.blocks: must be >= 1, got 0"),
+        ("width = 32", "width = 0", "width", "network.width: must be >= 1, got 0"),
+        ("width = 32", "", "[network]", "network.width: missing; the table holds: blocks, kind"),
+        ("width = 32", "width = 32\nhidden = [3]", "hidden", "unknown name 'network.hidden'; allowed: blocks, kind"),
+        ("nu = 1e-3", "", "[physics]", "physics.nu: missing; the table holds: dt, equation, shape"),
+    ],
+)  # fmt: skip
+def test_mistakes_of_gmres_and_the_resnet_are_named_too(tmp_path, before, after, where, message):
+    assert_refused(written(tmp_path, (before, after), scene="burgers_1d"), where, message)
+
+
+def assert_refused(path, where, message):
     with pytest.raises(ValueError) as error:
         _C.read_scene(path)
     text = str(error.value)
@@ -80,7 +113,7 @@ def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, m
 def test_missing_files_and_unknown_scenes():
     with pytest.raises(ValueError, match=r"scene: cannot read 'nowhere.toml'"):
         scenes.load("nowhere.toml")
-    with pytest.raises(ValueError, match="no scene 'heat1d'; available: heat_1d, poisson_1p"):
+    with pytest.raises(ValueError, match="no scene 'heat1d'; available: burgers_1d, heat_1d, poisson_1p"):
         scenes.load("heat1d")
 
 
@@ -94,14 +127,16 @@ def test_data_is_the_same_at_every_call_and_in_every_precision(tmp_path):
     assert not torch.equal(other.train_start, once.train_start)
 
 
-def test_the_network_has_the_papers_size_and_depends_on_its_seed_alone():
-    scene = scenes.load("heat_1d")
-    torch.manual_seed(123)
-    before = torch.get_rng_state()
-    first, again, other = make_network(scene, 0), make_network(scene, 0), make_network(scene, 1)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert sum(p.numel() for p in first.parameters()) == 12254
-    assert [n for n, _ in first.named_parameters()][:2] == ["layers.0.weight", "layers.0.bias"]
-    for p, q, r in zip(first.parameters(), again.parameters(), other.parameters(), strict=True):
-        assert torch.equal(p, q) and not torch.equal(p, r)
-    assert MLP(12, [5])(torch.zeros(2, 1, 3, 4)).shape == (2, 1, 3, 4)
+def test_validation_follows_as_many_steps_as_the_scene_says(tmp_path):
+    two, five = (
+        _C.read_scene(written(tmp_path, ("valid_steps = 2", f"valid_steps = {n}"), ('"float32"', '"float64"')))
+        for n in (2, 5)
+    )
+    data, longer = _C.make_dataset(two), _C.make_dataset(five)
+    exact = scenes.make_stepper(two, direct=True)
+    expected = data.valid_end
+    for _ in range(3):
+        expected = exact(expected)
+    torch.testing.assert_close(longer.valid_end, expected, rtol=1e-12, atol=1e-12)
+    assert torch.equal(data.train_end, longer.train_end) and torch.equal(data.valid_start, longer.valid_start)
+    assert "after 2 steps" in charts._metric_name(two) and "after 5 steps" in charts._metric_name(five)

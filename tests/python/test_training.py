@@ -20,8 +20,7 @@ TRAINER = ROOT / "build" / "prdp_train"
 
 def in_cpp(tmp_path, scene, *arguments):
     """The curves of the C++ trainer."""
-    path = scenes.available()[scene]
-    subprocess.run([TRAINER, path, "--out", tmp_path, *arguments], check=True, capture_output=True)
+    subprocess.run([TRAINER, scenes.load(scene).path, "--out", tmp_path, *arguments], check=True, capture_output=True)
     (record,) = tmp_path.glob("*/seed_0.json")
     return json.loads(record.read_text())["curves"]
 
@@ -53,6 +52,47 @@ def test_both_languages_train_alike(tmp_path, name, arguments, refinement):
     assert cpp["budget"][:20] == python["budget"][:20]
     np.testing.assert_allclose(cpp["operator_applications"][:2], python["operator_applications"][:2], rtol=1e-3)
     assert set(cpp) == set(python) and all(len(cpp[key]) == len(python[key]) for key in cpp)
+
+
+class Linear(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(30, 30, bias=False)
+
+    def forward(self, u):
+        return self.layer(u)
+
+
+def heat_with_a_resnet(tmp_path):
+    text = scenes.available()["heat_1d"].read_text()
+    mlp = 'kind = "mlp"\nhidden = [64, 64, 64]'
+    assert mlp in text
+    path = tmp_path / "heat_resnet.toml"
+    path.write_text(text.replace(mlp, 'kind = "resnet"\nblocks = 2\nwidth = 8'))
+    return str(path)
+
+
+def test_both_languages_train_a_resnet_alike(tmp_path):
+    path = heat_with_a_resnet(tmp_path)
+    cpp = in_cpp(tmp_path, path, "--constant", "25", "--intervals", "5")
+    python = train(short(path, intervals=5), Refinement.constant(25))
+    assert len(python["update_loss"]) == 40
+    np.testing.assert_allclose(cpp["update_loss"][:20], python["update_loss"][:20], rtol=1e-5)
+    np.testing.assert_allclose(cpp["metric"][:3], python["metric"][:3], rtol=1e-5)
+    assert python["metric"][-1] < 0.9 * python["metric"][0]
+
+
+def test_the_metric_applies_the_network_as_often_as_the_scene_says(tmp_path):
+    path = tmp_path / "longer.toml"
+    path.write_text(scenes.available()["heat_1d"].read_text().replace("valid_steps = 2", "valid_steps = 4"))
+    scene = short(path, intervals=1)
+    network = Linear()
+    torch.nn.init.eye_(network.layer.weight).data.mul_(0.5)
+    data = _C.make_dataset(scene)
+    expected = float(_C.normalised_mse(data.valid_start / 16, data.valid_end))
+    assert train(scene, Refinement.constant(25), network=network)["metric"][0] == pytest.approx(expected, rel=1e-5)
+    cpp, python = in_cpp(tmp_path, str(path), "--intervals", "1"), train(scene, Refinement.prdp(scene))
+    np.testing.assert_allclose(cpp["metric"], python["metric"], rtol=1e-5)
 
 
 def test_heat_1d_shows_what_the_paper_shows():
@@ -99,14 +139,6 @@ def test_poisson_3p_saves_what_the_paper_saves_at_the_same_error(name, least):
 
 
 def test_the_trainer_takes_any_network():
-    class Linear(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.layer = torch.nn.Linear(30, 30, bias=False)
-
-        def forward(self, u):
-            return self.layer(u)
-
     network = Linear()
     before = network.layer.weight.detach().clone()
     curves = train(short("heat_1d"), Refinement.constant(25), network=network)

@@ -15,12 +15,25 @@ at::Tensor shuffled(int64_t samples, at::Generator& generator) {
   return at::randperm(samples, generator, at::TensorOptions().dtype(at::kLong));
 }
 
-at::Tensor fourier_series(const Grid& grid, int64_t samples, int64_t modes, int64_t seed,
+namespace {
+
+/// The unknowns' places on an axis of the unit domain, i/N where it is periodic, else between the
+/// boundary points, (i + 1)/(N + 1).
+at::Tensor unknowns_on_axis(const Scene::Physics& physics, int64_t axis) {
+  const int64_t n = physics.shape[axis], first = physics.periodic() ? 0 : 1;
+  const double dx = 1.0 / static_cast<double>(n + first);
+  return at::arange(first, n + first, at::TensorOptions().dtype(at::kDouble)) * dx;
+}
+
+}  // namespace
+
+at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype) {
   auto generator = make_generator(seed);
-  const int64_t dim = grid.dim(), products = int64_t{1} << dim;
+  const auto dim = static_cast<int64_t>(physics.shape.size());
+  const int64_t channels = physics.channels(), products = int64_t{1} << dim;
   const auto real = at::TensorOptions().dtype(at::kDouble);
-  const auto amplitude = at::rand({samples, modes, products}, generator, real) * 2.0 - 1.0;
+  const auto amplitude = at::rand({samples, channels, modes, products}, generator, real) * 2.0 - 1.0;
 
   // wave[n·products + p]: the product whose axis d is a sine where bit d of p is 0, else a cosine.
   std::vector<at::Tensor> waves;
@@ -28,38 +41,35 @@ at::Tensor fourier_series(const Grid& grid, int64_t samples, int64_t modes, int6
     for (int64_t p = 0; p < products; ++p) {
       auto wave = at::ones({}, real);
       for (int64_t d = 0; d < dim; ++d) {
-        const auto x = at::arange(1, grid.shape()[d] + 1, real) * grid.dx(d);
-        const auto angle = x * (2.0 * std::numbers::pi * static_cast<double>(n));
+        const auto angle = unknowns_on_axis(physics, d) * (2.0 * std::numbers::pi * static_cast<double>(n));
         wave = wave.unsqueeze(-1) * ((p >> d) & 1 ? angle.cos() : angle.sin());
       }
       waves.push_back(wave.flatten());
     }
-  const auto values = at::matmul(amplitude.reshape({samples, modes * products}), at::stack(waves));
-  std::vector<int64_t> shape{samples, 1};
-  shape.insert(shape.end(), grid.shape().begin(), grid.shape().end());
+  const auto values = at::matmul(amplitude.reshape({samples * channels, modes * products}), at::stack(waves));
+  std::vector<int64_t> shape{samples, channels};
+  shape.insert(shape.end(), physics.shape.begin(), physics.shape.end());
   return values.reshape(shape).to(dtype);
 }
 
 Dataset make_dataset(const Scene& scene) {
   const at::NoGradGuard no_grad;
-  const Grid grid("data", scene.physics.shape);
   const auto& d = scene.data;
-  const auto start = fourier_series(grid, d.train + d.valid, d.modes, d.seed, at::kDouble);
+  const auto start = fourier_series(scene.physics, d.train + d.valid, d.modes, d.seed, at::kDouble);
+  const auto train = start.narrow(0, 0, d.train), valid = start.narrow(0, d.train, d.valid);
   auto converged = scene.stepper(Direct{});
-  const auto end = converged(converged(start));
-  const auto part = [&](const at::Tensor& t, int64_t from, int64_t count) {
-    return t.narrow(0, from, count).to(scene.dtype).contiguous();
+  const auto after = [&](int64_t steps, at::Tensor u) {
+    for (int64_t i = 0; i < steps; ++i) u = converged(u);
+    return u.to(scene.dtype).contiguous();
   };
-  return {part(start, 0, d.train), part(end, 0, d.train), part(start, d.train, d.valid),
-          part(end, d.train, d.valid)};
+  return {after(0, train), after(2, train), after(0, valid), after(d.valid_steps, valid)};
 }
 
 ParameterProblem make_parameter_problem(const Scene& scene) {
   const at::NoGradGuard no_grad;
   const auto real = at::TensorOptions().dtype(at::kDouble);
   const int64_t n = scene.physics.shape[0];
-  const Grid grid("data", scene.physics.shape);
-  const auto x = at::arange(1, n + 1, real) * grid.dx(0);
+  const auto x = unknowns_on_axis(scene.physics, 0);
   std::vector<at::Tensor> sines;
   for (size_t i = 1; i <= scene.parameters.start.size(); ++i)
     sines.push_back((x * (2.0 * std::numbers::pi * static_cast<double>(i))).sin());

@@ -1,19 +1,18 @@
 #pragma once
 #include <ATen/ATen.h>
 
-#include "prdp/grid/grid.h"
 #include "prdp/scenes/scene.h"
 
 namespace prdp {
 
 /// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of
-/// sin(2πn·) and cos(2πn·) over the axes, amplitudes U(-1, 1). Shape (samples, 1, *shape), values at
-/// the grid's unknowns; the same seed gives the same series in every language.
-at::Tensor fourier_series(const Grid& grid, int64_t samples, int64_t modes, int64_t seed,
+/// sin(2πn·) and cos(2πn·) over the axes, amplitudes U(-1, 1). Shape (samples, channels, *shape), values
+/// at the grid's unknowns; the same seed gives the same series in every language.
+at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
-/// Initial states and where two steps of the converged equation take them, at t = 2; each
-/// (samples, 1, *shape).
+/// Initial states and where steps of the converged equation take them, two of them in training and
+/// data.valid_steps in validation; each (samples, channels, *shape).
 struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
 };

@@ -17,10 +17,10 @@ const std::vector<std::string> kBackwards{"implicit", "unrolled"};
 
 Scene::Physics read_physics(TomlSection s) {
   Scene::Physics p;
-  p.equation = s.choice("equation", {"poisson", "heat"});
+  p.equation = s.choice("equation", {"poisson", "heat", "burgers"});
   p.shape = s.wholes("shape", 1);
   if (p.shape.empty() || p.shape.size() > 3) s.fail("shape", "expected 1 to 3 extents");
-  if (p.equation == "heat") {
+  if (p.equation != "poisson") {
     p.nu = s.at_least("nu", 0.0);
     p.dt = s.above("dt", 0.0);
   }
@@ -30,21 +30,30 @@ Scene::Physics read_physics(TomlSection s) {
 
 void read_solver(TomlSection s, Scene& scene) {
   scene.solver.method = method_from_name(
-      s.choice("method", {"jacobi", "steepest_descent", "cg", "direct"}));
+      s.choice("method", {"jacobi", "steepest_descent", "cg", "gmres", "direct"}));
   scene.solver.max_iter = s.whole("max_iter", 0);
   scene.solver.rtol = s.at_least("rtol", 0.0);
+  if (scene.solver.method == Method::kGmres) scene.solver.restart = s.whole("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", kBackwards));
   s.finish();
 }
 
 Scene::Data read_data(TomlSection s) {
-  Scene::Data d{s.whole("modes", 1), s.whole("train", 1), s.whole("valid", 1), s.whole("seed", 0)};
+  Scene::Data d{s.whole("modes", 1), s.whole("train", 1), s.whole("valid", 1), s.whole("seed", 0),
+                s.whole("valid_steps", 1)};
   s.finish();
   return d;
 }
 
 Scene::Network read_network(TomlSection s) {
-  Scene::Network n{s.choice("kind", {"mlp"}), s.wholes("hidden", 1)};
+  Scene::Network n;
+  n.kind = s.choice("kind", {"mlp", "resnet"});
+  if (n.kind == "mlp") {
+    n.hidden = s.wholes("hidden", 1);
+  } else {
+    n.blocks = s.whole("blocks", 1);
+    n.width = s.whole("width", 1);
+  }
   s.finish();
   return n;
 }
@@ -104,11 +113,12 @@ Scene::Compare read_compare(TomlSection s) {
 }  // namespace
 
 Stepper Scene::stepper(Solver with) const {
-  const auto equation =
-      physics.equation == "heat"
-          ? Equation{"heat", physics.shape, {physics.dt}, {at::scalar_tensor(physics.nu, at::kDouble)}}
-          : Equation{physics.equation, physics.shape, {}, {}};
-  return {equation, {std::move(with), backward, {}, {}, OnFailure::kReturn}};
+  Equation equation{physics.equation, physics.shape, {}, {}};
+  if (physics.equation != "poisson") {
+    equation.parameters = {physics.dt};
+    equation.tensors = {at::scalar_tensor(physics.nu, at::kDouble)};
+  }
+  return {std::move(equation), {std::move(with), backward, {}, {}, OnFailure::kReturn}};
 }
 
 void Scene::set_backward(const std::string& name) {

@@ -18,14 +18,20 @@ struct Scene {
   struct Physics {
     std::string equation;
     std::vector<int64_t> shape;
-    double nu = 0.0, dt = 0.0;  // heat only
+    double nu = 0.0, dt = 0.0;  // not of poisson
+
+    bool periodic() const { return equation == "burgers"; }
+    /// Of a state (batch, channels, *shape): a velocity has a component for each axis.
+    int64_t channels() const { return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1; }
   };
   struct Data {
     int64_t modes = 0, train = 0, valid = 0, seed = 0;
+    int64_t valid_steps = 0;  // how far the metric follows the validation samples
   };
   struct Network {
-    std::string kind;
-    std::vector<int64_t> hidden;
+    std::string kind;             // "mlp" or "resnet"
+    std::vector<int64_t> hidden;  // mlp
+    int64_t blocks = 0, width = 0;  // resnet
   };
   struct Training {
     std::string loss;  // "nmse" or "mse"

@@ -1,0 +1,107 @@
+"""The scenes' networks: shapes, boundaries, sizes, and that a seed determines them."""
+
+import numpy as np
+import pytest
+import torch
+
+from prdp_torch import scenes
+from prdp_torch.networks import MLP, ResNet, make_network
+
+SHAPES = [(13,), (7, 9), (5, 6, 7)]
+
+
+def resnet(shape, periodic, channels=1, blocks=2, width=4):
+    torch.manual_seed(0)
+    return ResNet(len(shape), channels, blocks, width, periodic).double()
+
+
+def test_the_perceptron_keeps_the_shape_and_has_the_papers_size():
+    network = make_network(scenes.load("heat_1d"), 0)
+    assert sum(p.numel() for p in network.parameters()) == 12254
+    assert [n for n, _ in network.named_parameters()][:2] == ["layers.0.weight", "layers.0.bias"]
+    assert MLP(12, [5])(torch.zeros(2, 1, 3, 4)).shape == (2, 1, 3, 4)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("periodic", [True, False])
+@pytest.mark.parametrize("batch, channels", [(1, 1), (3, 2)])
+def test_a_resnet_keeps_the_shape_and_every_value_matters(shape, periodic, batch, channels):
+    network = resnet(shape, periodic, channels)
+    u = torch.randn(batch, channels, *shape, dtype=torch.float64, requires_grad=True)
+    out = network(u)
+    assert out.shape == u.shape
+    out.square().sum().backward()
+    assert (u.grad != 0).all() and all((p.grad != 0).any() for p in network.parameters())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_shift_commutes_with_a_periodic_resnet_alone(shape):
+    u = torch.randn(2, 1, *shape, dtype=torch.float64)
+    periodic, zeros = resnet(shape, True), resnet(shape, False)
+    for axis in range(2, u.dim()):
+        for by in (1, 3, -2):
+            torch.testing.assert_close(periodic(u.roll(by, axis)), periodic(u).roll(by, axis), rtol=1e-10, atol=1e-12)
+        assert not torch.allclose(zeros(u.roll(1, axis)), zeros(u).roll(1, axis), atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(40,), (24, 26)])
+@pytest.mark.parametrize("periodic", [True, False])
+def test_what_happens_at_one_end_is_seen_at_the_other_where_it_is_periodic(shape, periodic):
+    """Two blocks look four points far."""
+    network = resnet(shape, periodic)
+    u = torch.randn(1, 1, *shape, dtype=torch.float64)
+    changed = u.clone()
+    changed.select(-1, 0).add_(1.0)
+    seen = (network(changed) != network(u)).any(dim=-2) if len(shape) == 2 else network(changed) != network(u)
+    seen = seen.flatten()
+    assert seen[0] and not seen[5:-4].any()
+    assert seen[-4:].any() == periodic
+
+
+def test_a_resnet_is_what_its_description_says():
+    """Against numpy, with the weights read by name."""
+    network = resnet((11,), False, channels=2, blocks=2, width=3)
+    weights = {name: p.detach().numpy() for name, p in network.named_parameters()}
+    assert list(weights)[:6] == [
+        "lift.weight", "lift.bias", "blocks.0.0.weight", "blocks.0.0.bias", "blocks.0.2.weight", "blocks.0.2.bias",
+    ]  # fmt: skip
+
+    def conv(x, name):
+        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        reach = weight.shape[2] // 2
+        padded = np.pad(x, ((0, 0), (reach, reach)))
+        taps = [weight[:, :, k] @ padded[:, k : k + x.shape[1]] for k in range(weight.shape[2])]
+        return sum(taps) + bias[:, None]
+
+    u = np.random.default_rng(0).standard_normal((2, 11))
+    x = conv(u, "lift")
+    for i in range(2):
+        x = np.maximum(x + conv(np.maximum(conv(x, f"blocks.{i}.0"), 0), f"blocks.{i}.2"), 0)
+    np.testing.assert_allclose(network(torch.from_numpy(u)[None])[0].detach(), conv(x, "project"), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "dim, channels, blocks, width", [(1, 1, 6, 32), (2, 3, 3, 64), (3, 1, 6, 32)], ids=["burgers", "ns", "heat3d"]
+)
+def test_a_resnet_has_as_many_parameters_as_its_kernels_say(dim, channels, blocks, width):
+    convolution = width * width * 3**dim + width
+    expected = (channels * width + width) + 2 * blocks * convolution + (width * channels + channels)
+    assert sum(p.numel() for p in ResNet(dim, channels, blocks, width, True).parameters()) == expected
+
+
+def test_a_resnet_has_at_most_three_axes():
+    with pytest.raises(ValueError, match="ResNet: dim must be 1, 2 or 3, got 4"):
+        ResNet(4, 1, 1, 8, True)
+
+
+@pytest.mark.parametrize("name", ["heat_1d", "burgers_1d"])
+def test_weights_depend_on_the_seed_alone(name):
+    scene = scenes.load(name)
+    torch.manual_seed(123)
+    before = torch.get_rng_state()
+    first, again, other = make_network(scene, 0), make_network(scene, 0), make_network(scene, 1)
+    assert torch.equal(torch.get_rng_state(), before)
+    for p, q, r in zip(first.parameters(), again.parameters(), other.parameters(), strict=True):
+        assert torch.equal(p, q) and not torch.equal(p, r)
+    u = torch.zeros(2, scene.physics.channels, *scene.physics.shape)
+    assert first(u).shape == u.shape
