@@ -7,6 +7,11 @@ namespace prdp::kernels {
 
 namespace {
 
+template <int Value>
+struct Constant {
+  static constexpr int value = Value;
+};
+
 /// Sum of partial sums, pairwise: the order depends on nothing but their number.
 template <class T, int64_t Width>
 T pairwise_sum(T (&part)[Width]) {
@@ -49,6 +54,83 @@ T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
     }
   }
   return pairwise_sum(part);
+}
+
+/// One register of the instruction set. Sums over several vectors at once are written with it: their
+/// plain loops, being nested, are not compiled into vector code.
+#if defined(__AVX512F__)
+constexpr int64_t kRegister = 64;
+#elif defined(__AVX__)
+constexpr int64_t kRegister = 32;
+#else
+constexpr int64_t kRegister = 16;
+#endif
+template <class T>
+struct Register {
+  typedef T Type __attribute__((vector_size(kRegister)));
+};
+
+/// v_j·w for the first `Count` vectors of v at once, in as many partial sums as hide the latency of an
+/// addition.
+template <int Count, class T>
+void dot_block(const T* const* v, const T* w, T* h, int64_t n) {
+  using Vector = typename Register<T>::Type;
+  constexpr int64_t width = (Count > 4 ? 1 : Count > 2 ? 2 : 4) * kLanes<T>;
+  constexpr int64_t lanes = kRegister / sizeof(T), registers = width / lanes;
+  Vector sums[Count][registers] = {};
+  int64_t i = 0;
+  for (; i + width <= n; i += width) {
+#pragma GCC unroll 16
+    for (int64_t k = 0; k < registers; ++k) {
+      Vector wk;
+      __builtin_memcpy(&wk, w + i + k * lanes, sizeof wk);
+#pragma GCC unroll 8
+      for (int j = 0; j < Count; ++j) {
+        Vector vk;
+        __builtin_memcpy(&vk, v[j] + i + k * lanes, sizeof vk);
+        sums[j][k] += vk * wk;
+      }
+    }
+  }
+  for (int j = 0; j < Count; ++j) {
+    T part[width];
+    __builtin_memcpy(part, sums[j], sizeof part);
+    for (int64_t l = 0; i + l < n; ++l) part[l] += v[j][i + l] * w[i + l];
+    h[j] = pairwise_sum(part);
+  }
+}
+
+template <int Count, class T>
+void axpy_block(const T* alpha, const T* const* v, T* w, int64_t n) {
+  T a[Count];  // of their own, as w might overwrite those of the caller for all the compiler knows
+  const T* from[Count];
+  for (int j = 0; j < Count; ++j) a[j] = alpha[j], from[j] = v[j];
+#pragma GCC ivdep
+  for (int64_t i = 0; i < n; ++i) {
+    T sum = w[i];
+    for (int j = 0; j < Count; ++j) sum -= a[j] * from[j][i];
+    w[i] = sum;
+  }
+}
+
+/// Vectors that one pass over w takes.
+constexpr int kBlock = 8;
+
+/// Calls body for the blocks of `count` vectors: their first one, and their number as a constant.
+template <int Count = kBlock, class Body>
+void for_each_block(int64_t first, int64_t count, const Body& body) {
+  for (; count - first >= Count; first += Count) body(first, Constant<Count>());
+  if constexpr (Count > 1) for_each_block<Count - 1>(first, count, body);
+}
+
+template <class T>
+void multi_dot(const T* const* v, int64_t count, const T* w, T* h, int64_t n) {
+  for_each_block(0, count, [&](int64_t j, auto block) { dot_block<block.value>(v + j, w, h + j, n); });
+}
+
+template <class T>
+void multi_axpy(const T* alpha, const T* const* v, int64_t count, T* w, int64_t n) {
+  for_each_block(0, count, [&](int64_t j, auto block) { axpy_block<block.value>(alpha + j, v + j, w, n); });
 }
 
 /// Weighted sum of the 2·Dim neighbours of v[l]; w points at the x weights of the same lane.
@@ -115,15 +197,99 @@ T sweep_and_measure(const PaddedStencil<T>& a, const T* c, const T* x, T* y) {
 }
 
 template <class T>
+void upwind_row(T advection, T diffusion, const T* before, const T* here, const T* after,
+                T* __restrict lower, T* __restrict upper, T* __restrict centre, int64_t n) {
+  const T half = advection / 2;
+  for (int64_t i = 0; i < n; ++i) {
+    const T sum_before = before[i] + here[i], sum_after = here[i] + after[i];
+    const T backward = half * (sum_before > T(0) ? sum_before : T(0));
+    const T forward = half * (sum_after < T(0) ? sum_after : T(0));
+    lower[i] = -backward - diffusion;
+    upper[i] = forward - diffusion;
+    centre[i] += backward - forward + 2 * diffusion;
+  }
+}
+
+/// The neighbours of row j along y, round the ends.
+template <class T>
+int64_t row_below(const PeriodicStencil<T>& a, int64_t j) {
+  return (j > 0 ? j - 1 : a.ny - 1) * a.row;
+}
+template <class T>
+int64_t row_above(const PeriodicStencil<T>& a, int64_t j) {
+  return (j + 1 < a.ny ? j + 1 : 0) * a.row;
+}
+
+template <int Dim, class T>
+void periodic_row(const PeriodicStencil<T>& a, int64_t j, const T* field, T* result) {
+  const int64_t row = a.row;
+  const T *w = a.coefficients + j * (2 * Dim + 1) * row, *wraps = a.wraps + 2 * j;
+  const T *v = field + j * row, *below = field + row_below(a, j), *above = field + row_above(a, j);
+  T* __restrict out = result + j * row;
+  for (int64_t i = 0; i < row; i += kLanes<T>) {
+#pragma GCC ivdep
+    for (int64_t l = i; l < i + kLanes<T>; ++l) {
+      T sum = w[l] * v[l] + w[row + l] * v[l - 1] + w[2 * row + l] * v[l + 1];
+      if constexpr (Dim > 1) sum += w[3 * row + l] * below[l] + w[4 * row + l] * above[l];
+      out[l] = sum;
+    }
+  }
+  out[0] += wraps[0] * v[a.nx - 1];
+  out[a.nx - 1] += wraps[1] * v[0];
+}
+
+template <int Dim, class T>
+void apply_periodic(const PeriodicStencil<T>& a, const T* v, T* out) {
+  for (int64_t j = 0; j < a.ny; ++j) periodic_row<Dim>(a, j, v, out);
+}
+
+/// Adds the pressure gradient to row j of both velocities, and sets the divergence in it.
+template <class T>
+void couple_row(const StaggeredStencil<T>& a, int64_t j, const T* v, T* result) {
+  const auto& grid = a.velocity[0];
+  const int64_t row = grid.row, nx = grid.nx, field = grid.ny * row, at = j * row;
+  const T *u1 = v + at, *u2 = u1 + field, *u2_above = v + field + row_above(grid, j);
+  const T *p = u2 + field, *p_below = v + 2 * field + row_below(grid, j);
+  const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
+  T *__restrict g1 = result + at, *__restrict g2 = g1 + field, *__restrict d = g2 + field;
+  for (int64_t i = 0; i < row; i += kLanes<T>) {
+#pragma GCC ivdep
+    for (int64_t l = i; l < i + kLanes<T>; ++l) {
+      g1[l] += x[l] * p[l] - x_lower[l] * p[l - 1];
+      g2[l] += y[l] * (p[l] - p_below[l]);
+      d[l] = x_upper[l] * u1[l + 1] - x[l] * u1[l] + y[l] * (u2_above[l] - u2[l]);
+    }
+  }
+  g1[0] -= x[0] * p[nx - 1];
+  d[nx - 1] += x[0] * u1[0];
+}
+
+template <class T>
+void apply_staggered(const StaggeredStencil<T>& a, const T* v, T* out) {
+  const auto& grid = a.velocity[0];
+  const int64_t field = grid.ny * grid.row;
+  for (int64_t j = 0; j < grid.ny; ++j) {
+    periodic_row<2>(a.velocity[0], j, v, out);
+    periodic_row<2>(a.velocity[1], j, v + field, out + field);
+    couple_row(a, j, v, out);
+  }
+}
+
+template <class T>
 constexpr Loops<T> table(const char* level) {
   return {level,
           dot<T>,
           axpy<T>,
           xpby<T>,
           descend<T>,
+          multi_dot<T>,
+          multi_axpy<T>,
           {apply<1, T>, apply<2, T>, apply<3, T>},
           {sweep<1, T>, sweep<2, T>, sweep<3, T>},
-          {sweep_and_measure<1, T>, sweep_and_measure<2, T>, sweep_and_measure<3, T>}};
+          {sweep_and_measure<1, T>, sweep_and_measure<2, T>, sweep_and_measure<3, T>},
+          upwind_row<T>,
+          {apply_periodic<1, T>, apply_periodic<2, T>},
+          apply_staggered<T>};
 }
 
 }  // namespace

@@ -19,6 +19,26 @@ struct PaddedStencil {
   const T* weights;
 };
 
+/// One field on a periodic grid in padded rows, with coefficients of their own at every point. Each row
+/// of the grid has a row of each of them in turn: centre, x lower, x upper (, y lower, y upper), with
+/// zeros in the padding. Those that couple the two ends of a row are kept apart as its two wraps, lower
+/// and upper, with zeros in their places: what lies next to a row in memory is never used.
+template <class T>
+struct PeriodicStencil {
+  int64_t ny, nx, row;
+  const T* coefficients;
+  const T* wraps;
+};
+
+/// [[C1, 0, G1], [0, C2, G2], [D1, D2, 0]] on three such fields, two velocities and the pressure, with
+/// backward differences G and forward differences D. The weights are rows of 1/dx, of 1/dx but for the
+/// first point, of 1/dx but for the last point, and of 1/dy; all negative in the transpose.
+template <class T>
+struct StaggeredStencil {
+  PeriodicStencil<T> velocity[2];
+  const T* weights;
+};
+
 template <class T>
 struct Loops {
   const char* level;  // "baseline", "x86-64-v3", "x86-64-v4"
@@ -31,12 +51,24 @@ struct Loops {
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
   /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself. n: padded.
   T (*descend)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
+  /// h_j = v_j·w for `count` vectors; and w -= Σ alpha_j v_j. Any count, any n.
+  void (*multi_dot)(const T* const* v, int64_t count, const T* w, T* h, int64_t n);
+  void (*multi_axpy)(const T* alpha, const T* const* v, int64_t count, T* w, int64_t n);
 
   /// By the number of dimensions less one. out = A v.
   void (*apply[3])(const PaddedStencil<T>& a, const T* v, T* out);
   /// y = c + (neighbours of x, weighted); the other one returns ‖y - x‖² as well.
   void (*sweep[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y);
   T (*sweep_and_measure[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y);
+
+  /// Upwind differences and diffusion along one axis: advection (max(w⁻, 0) B + min(w⁺, 0) F) plus
+  /// diffusion times minus the second difference, with w⁻ and w⁺ the means of the winds here and on
+  /// either side. Sets lower and upper, adds to centre; any n.
+  void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower,
+                     T* upper, T* centre, int64_t n);
+  /// out = A v; by the number of dimensions less one.
+  void (*apply_periodic[2])(const PeriodicStencil<T>& a, const T* v, T* out);
+  void (*apply_staggered)(const StaggeredStencil<T>& a, const T* v, T* out);
 };
 
 /// The loops for this processor; the environment variable PRDP_CPU_LEVEL asks for a lower level by its

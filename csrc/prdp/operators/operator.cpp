@@ -53,6 +53,8 @@ class Transposed final : public Operator {
     auto k = a_->kernel();
     if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;
     if (auto* csr = std::get_if<CsrParameters>(&k)) csr->transposed = true;
+    if (auto* burgers = std::get_if<BurgersParameters>(&k)) burgers->transposed = true;
+    if (auto* flow = std::get_if<NavierStokesParameters>(&k)) flow->transposed = true;
     return k;
   }
 

@@ -32,9 +32,25 @@ struct CsrParameters {
   bool transposed = false;
 };
 
+/// The winds (batch or 1, Dim, *shape), contiguous, of I + dt Γ - ν dt L on a periodic grid in one or
+/// two dimensions; channel 0 is the velocity along x, the last axis.
+struct BurgersParameters {
+  at::Tensor winds;
+  double nu, dt;
+  bool transposed = false;
+};
+
+/// The velocity (batch or 1, 2 or more, Ny, Nx), contiguous, about which the Navier–Stokes equations
+/// are linearised on a periodic staggered grid; the first two channels are u1 (along x) and u2.
+struct NavierStokesParameters {
+  at::Tensor velocity;
+  double nu, dt;
+  bool transposed = false;
+};
+
 /// What the CPU loops need to know of an operator; monostate: it has plain tensor operations only.
 using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters,
-                                      CsrParameters>;
+                                      CsrParameters, BurgersParameters, NavierStokesParameters>;
 
 /// A linear operator A(g) on batches of fields. Immutable; knows nothing of solvers.
 /// Vectors are batched: (batch, channel, *shape) for stencils, (batch, n) for matrices.

@@ -13,5 +13,9 @@ template <class T>
 void solve_range(const DenseParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>
 void solve_range(const CsrParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
+template <class T>
+void solve_range(const BurgersParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
+template <class T>
+void solve_range(const NavierStokesParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 
 }  // namespace prdp

@@ -1,0 +1,126 @@
+#pragma once
+#include <limits>
+#include <optional>
+
+#include "prdp/kernels/upwind_stencil.h"
+
+namespace prdp::kernels {
+
+/// [[C1, 0, G1], [0, C2, G2], [D1, D2, 0]] with C_i = I/dt + Γ_i - ν L on one sample of a staggered
+/// grid: u1 on the left faces, u2 on the bottom faces, p in the centres of the cells. A constant
+/// pressure is in the null space of A and Aᵀ. It knows its coefficients where all samples share the
+/// velocity, else those of sample(s) do.
+template <class T>
+class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
+  using Base = PeriodicBase<T, 3, NavierStokes<T>>;
+  using Base::field, Base::nx, Base::ny, Base::row_, Base::loops_;
+
+ public:
+  explicit NavierStokes(const UpwindParameters<T>& p)
+      : Base(p), inverse_dx_(inverse_spacing(p.nx, p.transposed)),
+        inverse_dy_(inverse_spacing(p.ny, p.transposed)) {
+    if (!this->is_shared()) return;
+    const typename Stencil::Terms terms{1.0 / p.dt, 1.0, p.nu, p.transposed};
+    const auto u1 = [&p](int64_t j) { return p.winds + (j + p.ny) % p.ny * p.nx; };
+    const auto u2 = [&](int64_t j) { return u1(j) + p.ny * p.nx; };
+    const auto at_point = [](const T* wind) { return WindRow<T>{wind, wind, wind}; };
+    velocity_[0].emplace(p.ny, p.nx, terms, [&](int axis, int64_t j, T* mean) {
+      if (axis == 0) return at_point(u1(j));
+      for (int64_t i = 0; i < p.nx; ++i) mean[i + 1] = u2(j)[i] + u2(j + 1)[i];
+      mean[0] = mean[p.nx];
+      return at_point(finish_mean(mean));
+    });
+    velocity_[1].emplace(p.ny, p.nx, terms, [&](int axis, int64_t j, T* mean) {
+      if (axis == 1) return at_point(u2(j));
+      for (int64_t i = 0; i < p.nx; ++i) mean[i] = u1(j - 1)[i] + u1(j)[i];
+      mean[p.nx] = mean[0];
+      return at_point(finish_mean(mean));
+    });
+    make_weights();
+  }
+
+  NavierStokes sample(int64_t s) const { return NavierStokes(this->parameters_.sample(s)); }
+  double norm() const {
+    if (!this->finite_) return std::numeric_limits<double>::quiet_NaN();
+    const double x = std::abs(inverse_dx_), y = std::abs(inverse_dy_);
+    return std::max({velocity_[0]->norm() + 2 * x, velocity_[1]->norm() + 2 * y, 2 * (x + y)});
+  }
+  bool has_zero_diagonal() const { return true; }  // the pressure's
+  const T* diagonal(int64_t r) const {
+    return r < 2 * ny() ? velocity_[r / ny()]->diagonal(r % ny()) : weight(kZero);
+  }
+
+  /// out = A v
+  void apply(const T* v, T* out) const {
+    loops_.apply_staggered({{velocity_[0]->stencil(), velocity_[1]->stencil()}, weights_.data()}, v, out);
+  }
+  /// Takes the mean off the pressure.
+  void project(T* v) const {
+    const T mean = pressure_mean(v);
+    for (int64_t j = 0; j < ny(); ++j) loops_.axpy(-mean, weight(kOne), pressure(v, j), row_);
+  }
+  /// |mean of the pressure|: how far a right-hand side v is from having a solution.
+  T inconsistency(const T* v) const { return std::abs(pressure_mean(v)); }
+
+  /// Calls body(row, column, value) for the entries of A as applied; those that coincide one by one.
+  template <class Body>
+  void for_each_entry(const Body& body) const {
+    const int64_t n = ny() * nx();
+    for (int64_t c = 0; c < 2; ++c)
+      velocity_[c]->for_each_entry([&](int64_t i, int64_t j, T a) { body(c * n + i, c * n + j, a); });
+    // Backward differences of the pressure; D = -Gᵀ.
+    const auto gradient = [&](int64_t u, int64_t p, T value) {
+      body(u, 2 * n + p, value);
+      body(2 * n + p, u, -value);
+    };
+    for (int64_t j = 0; j < ny(); ++j)
+      for (int64_t i = 0; i < nx(); ++i) {
+        const int64_t at = j * nx() + i;
+        gradient(at, at, inverse_dx_);
+        gradient(at, i > 0 ? at - 1 : at + nx() - 1, -inverse_dx_);
+        gradient(n + at, at, inverse_dy_);
+        gradient(n + at, j > 0 ? at - nx() : at + n - nx(), -inverse_dy_);
+      }
+  }
+
+ private:
+  using Stencil = UpwindStencil<T, 2>;
+  enum Weight { kX, kXLower, kXUpper, kY, kOne, kZero, kWeights };  // the first four: StaggeredStencil
+
+  /// Along an axis of one point all differences vanish.
+  static T inverse_spacing(int64_t n, bool transposed) {
+    return n == 1 ? T(0) : static_cast<T>(transposed ? -n : n);
+  }
+  /// From sums over two rows to means over four points.
+  const T* finish_mean(T* sum) const {
+    for (int64_t i = 0; i < nx(); ++i) sum[i] = T(0.25) * (sum[i] + sum[i + 1]);
+    return sum;
+  }
+  void make_weights() {
+    weights_.assign(kWeights * row_, T(0));
+    for (int64_t i = 0; i < nx(); ++i) {
+      weights_[kX * row_ + i] = inverse_dx_;
+      weights_[kXLower * row_ + i] = i > 0 ? inverse_dx_ : T(0);
+      weights_[kXUpper * row_ + i] = i + 1 < nx() ? inverse_dx_ : T(0);
+      weights_[kY * row_ + i] = inverse_dy_;
+      weights_[kOne * row_ + i] = T(1);
+    }
+  }
+  const T* weight(Weight which) const { return weights_.data() + which * row_; }
+  template <class Pointer>
+  Pointer pressure(Pointer v, int64_t j) const {
+    return v + 2 * field() + j * row_;
+  }
+  T pressure_mean(const T* v) const {
+    double sum = 0;
+    for (int64_t j = 0; j < ny(); ++j)
+      sum += static_cast<double>(loops_.dot(pressure(v, j), weight(kOne), row_));
+    return static_cast<T>(sum / static_cast<double>(ny() * nx()));
+  }
+
+  T inverse_dx_, inverse_dy_;  // negative in the transpose
+  std::optional<Stencil> velocity_[2];
+  std::vector<T> weights_;  // rows of the padded length
+};
+
+}  // namespace prdp::kernels
