@@ -1,36 +1,39 @@
 """Progressively Refined Differentiable Physics for PyTorch.
 
 Differentiable PDE steps whose linear solves may stop early, and a controller that decides how early:
-`Heat`, `Poisson` and `linear_solve` solve, `PRDPController` refines. Tensors are (batch, channel,
-*shape); see the README for a first program and docs/ for the discretisation, the derivatives and what
-a solve says when it fails.
+`Heat`, `Poisson`, `Burgers`, `NavierStokes` and `linear_solve` solve, `PRDPController` refines. Tensors
+are (batch, channel, *shape); see the README for a first program and docs/ for the discretisation, the
+derivatives and what a solve says when it fails.
 """
 
 from prdp_torch import _load
 
 _load.check_torch()
 
-from prdp_torch import _C, operators  # noqa: E402
+from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
 from prdp_torch.solvers import CG, GMRES, Direct, Jacobi, SteepestDescent  # noqa: E402
-from prdp_torch.steppers import Heat, Poisson, Stepper  # noqa: E402
+from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson, Stepper  # noqa: E402
 
 __version__ = _C.VERSION
 
 __all__ = [
     "CG",
     "GMRES",
+    "Burgers",
     "Direct",
     "Heat",
     "Jacobi",
     "LinearSchedule",
+    "NavierStokes",
     "PRDPController",
     "Poisson",
     "SolveInfo",
     "SolveStatus",
     "SteepestDescent",
     "Stepper",
+    "fields",
     "linear_solve",
     "operators",
 ]

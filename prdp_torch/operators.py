@@ -1,7 +1,8 @@
 """Linear operators A on batches of vectors, matrix-free; also a torch tensor as one.
 
-A vector is (batch, 1, *shape) for the stencils and (batch, n) for matrices. The tensors that an
-operator is made of (nu, a matrix) get gradients through `apply` and through `linear_solve`.
+A vector is (batch, channel, *shape) for the stencils, with one channel unless an operator says
+otherwise, and (batch, n) for matrices. The tensors that an operator is made of (nu, winds, a matrix) get
+gradients through `apply` and through `linear_solve`.
 """
 
 import torch
@@ -63,6 +64,44 @@ class Heat(Operator):
         super().__init__(_check.shape("Heat", shape), [_check.real("Heat", "dt", dt)], [real_tensor("Heat", "nu", nu)])
 
 
+class Burgers(Operator):
+    """One implicit Euler step of Burgers' equation on a periodic grid of the unit domain, dx = 1/N,
+    linearised about `winds`: I + dt Γ - nu dt L on each velocity channel, with first-order upwind
+    advection Γ = Σ_d max(w⁻, 0) B_d + min(w⁺, 0) F_d by the winds w∓ averaged to the faces of a cell
+    (paper, appendix C.5). Row sums are 1 and off-diagonal entries <= 0.
+
+    winds: (batch, 1, N) or (batch, 2, Ny, Nx), with batch 1 for all samples alike; channel 0 is the
+        velocity along x, the last axis, channel 1 along y. float32 or float64, as the vectors.
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0.
+    """
+
+    kind = "burgers"
+
+    def __init__(self, winds, nu, dt):
+        super().__init__(*flow("Burgers", "winds", winds, nu, dt))
+
+
+class NavierStokes(Operator):
+    """One implicit Euler step of the incompressible Navier-Stokes equations on a periodic staggered grid
+    (Ny, Nx) of the unit square, dx = 1/N, linearised about `velocity`. Vectors are (batch, 3, Ny, Nx),
+    the channels u₁ along x on the left face of a cell, u₂ along y on its lower face, p in its centre:
+
+        A = [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]],    C_k = I/dt + Γ_k - nu L
+
+    with divergence D by forward and gradient G = -Dᵀ by backward differences, and first-order upwind
+    advection Γ_k by the velocity at the points of u_k (paper, appendix C.6). A and Aᵀ have one null
+    vector, constant pressure.
+
+    velocity: (batch or 1, 2 or 3, Ny, Nx); a third channel, the pressure, has no influence.
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0.
+    """
+
+    kind = "navier_stokes"
+
+    def __init__(self, velocity, nu, dt):
+        super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt))
+
+
 class Matrix(Operator):
     """A tensor (n, n) or (batch, n, n), dense or sparse CSR. Gradients of a sparse one live on its
     pattern."""
@@ -88,3 +127,10 @@ def real_tensor(who, name, value):
     if isinstance(value, torch.Tensor):
         return value
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+
+
+def flow(who, name, winds, nu, dt):
+    """Shape, parameters and tensors of a flow linearised about winds (batch, channel, *shape)."""
+    if _check.dense(who, name, winds).dim() < 3:
+        raise ValueError(f"{who}: {name} must have shape (batch, channel, *shape), got {tuple(winds.shape)}")
+    return list(winds.shape[2:]), [_check.real(who, "dt", dt)], [winds, real_tensor(who, "nu", nu)]

@@ -17,11 +17,21 @@ class Equation:
     shape: list
     parameters: list
     tensors: list
+    picard_steps: int = 1
+
+    def __post_init__(self):
+        torch.ops.prdp.check_equation(self.tensors, self.kind, self.shape, self.parameters, self.picard_steps)
 
     @classmethod
-    def of(cls, operator):
-        """An equation whose operator does not depend on the state."""
-        return cls(operator.kind, operator.shape, operator.parameters, operator.tensors)
+    def implicit_step(cls, who, kind, shape, nu, dt, picard_steps=1):
+        """One implicit Euler step with diffusion; types in words."""
+        return cls(
+            kind,
+            _check.shape(who, shape),
+            [_check.real(who, "dt", dt)],
+            [operators.real_tensor(who, "nu", nu)],
+            _check.whole(who, "picard_steps", picard_steps),
+        )
 
 
 class Stepper(torch.nn.Module):
@@ -69,6 +79,7 @@ class Stepper(torch.nn.Module):
             self.equation.kind,
             self.equation.shape,
             self.equation.parameters,
+            self.equation.picard_steps,
             self.method,
             self._max_iter.item(),
             self.rtol,
@@ -104,7 +115,7 @@ class Stepper(torch.nn.Module):
 
     def rhs(self, u):
         """b(u), the right-hand side of the step from u."""
-        return torch.ops.prdp.rhs(u, self.equation.kind)
+        return torch.ops.prdp.rhs(u, self.equation.kind, self.equation.shape, self.equation.parameters)
 
     def extra_repr(self):
         e = self.equation
@@ -119,7 +130,7 @@ class Poisson(Stepper):
     dx = 1/(N + 1), second-order differences (paper, appendix C.1)."""
 
     def __init__(self, shape, solver, backward="implicit", **options):
-        super().__init__(Equation.of(operators.Poisson(shape)), solver, backward, **options)
+        super().__init__(Equation("poisson", _check.shape("Poisson", shape), [], []), solver, backward, **options)
 
     def operator(self, u=None):
         """A(u) as an operator; here the same for every u."""
@@ -135,9 +146,47 @@ class Heat(Stepper):
     """
 
     def __init__(self, shape, nu, dt, solver, backward="implicit", **options):
-        super().__init__(Equation.of(operators.Heat(shape, nu, dt)), solver, backward, **options)
+        super().__init__(Equation.implicit_step("Heat", "heat", shape, nu, dt), solver, backward, **options)
 
     def operator(self, u=None):
         """A(u) as an operator; here the same for every u."""
         e = self.equation
         return operators.Heat(e.shape, e.tensors[0], e.parameters[0])
+
+
+class Burgers(Stepper):
+    """One implicit Euler step of u_t + (u·∇)u = nu Δu on a periodic grid of the unit domain, dx = 1/N:
+    (I + dt Γ(u) - nu dt L) u_next = u, first-order upwind, linearised about the state u (paper, appendix
+    C.5). shape (N,) with u of (batch, 1, N), or (Ny, Nx) with u of (batch, 2, Ny, Nx): channel 0 is the
+    velocity along x, the last axis, channel 1 along y.
+
+    nu >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient; dt > 0.
+    picard_steps: solves a step, each linearised about the solution of the one before; `info` then counts
+    all their iterations and holds the worst status and the last residual.
+    """
+
+    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, **options):
+        equation = Equation.implicit_step("Burgers", "burgers", shape, nu, dt, picard_steps)
+        super().__init__(equation, solver, backward, **options)
+
+    def operator(self, u):
+        """A(u) as an operator: the winds are u."""
+        return operators.Burgers(u, self.equation.tensors[0], self.equation.parameters[0])
+
+
+class NavierStokes(Stepper):
+    """One implicit Euler step of u_t + (u·∇)u + ∇p = nu Δu with ∇·u = 0 on a periodic staggered grid
+    (Ny, Nx) of the unit square, dx = 1/N, linearised about the state (paper, appendix C.6). The state is
+    (batch, 3, Ny, Nx): u₁ along x on the left face of a cell, u₂ along y on its lower face, p of mean
+    zero in its centre; the step does not depend on its pressure. `operators.NavierStokes` is A(u).
+
+    nu, dt, picard_steps: as in `Burgers`.
+    """
+
+    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, **options):
+        equation = Equation.implicit_step("NavierStokes", "navier_stokes", shape, nu, dt, picard_steps)
+        super().__init__(equation, solver, backward, **options)
+
+    def operator(self, u):
+        """A(u) as an operator: the winds are the velocity of u."""
+        return operators.NavierStokes(u, self.equation.tensors[0], self.equation.parameters[0])

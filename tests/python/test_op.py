@@ -35,10 +35,10 @@ def test_matrices_and_the_other_ops_pass_opcheck():
     rhs = torch.ones(2, 5, dtype=torch.float64, requires_grad=True)
     calls = [
         (torch.ops.prdp.linear_solve, (rhs, [m], "dense", [], [], False, *options)),
-        (torch.ops.prdp.step, (b, [nu], "heat", [5], [1.0], *options)),
-        (torch.ops.prdp.step, (b, [], "poisson", [5], [], *options)),
+        (torch.ops.prdp.step, (b, [nu], "heat", [5], [1.0], 1, *options)),
+        (torch.ops.prdp.step, (b, [], "poisson", [5], [], 1, *options)),
         (torch.ops.prdp.apply, (b, [nu], "heat", [5], [1.0], False)),
-        (torch.ops.prdp.rhs, (b, "poisson")),
+        (torch.ops.prdp.rhs, (b, "poisson", [5], [])),
         (
             torch.ops.prdp.unrolled_vjp,
             (b.detach(), b.detach(), [nu.detach()], [1, 1], "heat", [5], [1.0], False, "cg", 4, 1e-5, 3,

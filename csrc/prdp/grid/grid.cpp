@@ -4,12 +4,14 @@
 
 namespace prdp {
 
-Grid::Grid(const char* owner, std::vector<int64_t> shape)
-    : owner_(owner), shape_(std::move(shape)) {
+Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary)
+    : owner_(owner), shape_(std::move(shape)), boundary_(boundary) {
   TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3, owner_, ": shape must have 1, 2 or 3 extents, got ",
                     at::IntArrayRef(shape_));
+  // A point of a periodic axis must not be its own neighbour.
+  const int64_t least = boundary_ == Boundary::kPeriodic ? 2 : 1;
   for (const int64_t n : shape_)
-    TORCH_CHECK_VALUE(n >= 1, owner_, ": every extent of shape must be >= 1, got ",
+    TORCH_CHECK_VALUE(n >= least, owner_, ": every extent of shape must be >= ", least, ", got ",
                       at::IntArrayRef(shape_));
 }
 
@@ -38,26 +40,53 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
 
 namespace {
 
-/// v_{i-1} + v_{i+1} along `axis` of extent n, zero outside.
-at::Tensor neighbour_sum(const at::Tensor& v, int64_t axis, int64_t n) {
-  std::vector<int64_t> pad(2 * (v.dim() - axis), 0);
+/// Where the grid's axis lies in v.
+int64_t tensor_axis(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  return v.dim() - grid.dim() + axis;
+}
+
+/// v_{i + offset} on a periodic grid.
+at::Tensor neighbour(const at::Tensor& v, const Grid& grid, int64_t axis, int64_t offset) {
+  return at::roll(v, -offset, tensor_axis(v, grid, axis));
+}
+
+/// v_{i-1} + v_{i+1}.
+at::Tensor neighbour_sum(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  if (grid.boundary() == Boundary::kPeriodic)
+    return neighbour(v, grid, axis, -1) + neighbour(v, grid, axis, 1);
+  const int64_t d = tensor_axis(v, grid, axis), n = grid.shape()[axis];
+  std::vector<int64_t> pad(2 * (v.dim() - d), 0);
   pad[pad.size() - 2] = pad[pad.size() - 1] = 1;
   const auto padded = at::constant_pad_nd(v, pad);
-  return padded.narrow(axis, 0, n) + padded.narrow(axis, 2, n);
+  return padded.narrow(d, 0, n) + padded.narrow(d, 2, n);
 }
 
 }  // namespace
 
 at::Tensor laplacian(const at::Tensor& v, const Grid& grid) {
-  at::Tensor sum;
-  double centre = 0.0;
-  for (int64_t d = 0; d < grid.dim(); ++d) {
-    const double weight = 1.0 / (grid.dx(d) * grid.dx(d));
-    const auto term = neighbour_sum(v, v.dim() - grid.dim() + d, grid.shape()[d]) * weight;
-    sum = sum.defined() ? sum + term : term;
-    centre -= 2.0 * weight;
-  }
-  return sum + centre * v;
+  auto sum = laplacian_diagonal(grid) * v;
+  for (int64_t d = 0; d < grid.dim(); ++d)
+    sum = sum + neighbour_sum(v, grid, d) * (1.0 / (grid.dx(d) * grid.dx(d)));
+  return sum;
+}
+
+double laplacian_diagonal(const Grid& grid) {
+  double diagonal = 0.0;
+  for (int64_t d = 0; d < grid.dim(); ++d) diagonal -= 2.0 / (grid.dx(d) * grid.dx(d));
+  return diagonal;
+}
+
+at::Tensor backward_difference(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  return (v - neighbour(v, grid, axis, -1)) * (1.0 / grid.dx(axis));
+}
+at::Tensor forward_difference(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  return (neighbour(v, grid, axis, 1) - v) * (1.0 / grid.dx(axis));
+}
+at::Tensor backward_mean(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  return (neighbour(v, grid, axis, -1) + v) * 0.5;
+}
+at::Tensor forward_mean(const at::Tensor& v, const Grid& grid, int64_t axis) {
+  return (v + neighbour(v, grid, axis, 1)) * 0.5;
 }
 
 at::Tensor sine_basis(int64_t n, const at::TensorOptions& options) {
@@ -83,7 +112,7 @@ at::Tensor laplacian_eigenvalues(const Grid& grid, const at::TensorOptions& opti
 at::Tensor sine_transform(const at::Tensor& v, const Grid& grid) {
   auto w = v;
   for (int64_t d = 0; d < grid.dim(); ++d) {
-    const int64_t axis = v.dim() - grid.dim() + d;
+    const int64_t axis = tensor_axis(v, grid, d);
     w = at::matmul(w.movedim(axis, -1), sine_basis(grid.shape()[d], v.options())).movedim(-1, axis);
   }
   return w;

@@ -6,18 +6,28 @@
 
 namespace prdp {
 
-/// A uniform grid on the unit interval, square or cube with homogeneous Dirichlet boundaries.
-/// `shape` counts the unknowns in tensor order, (N,), (Ny, Nx) or (Nz, Ny, Nx): the x direction is
-/// the last axis, boundary points are not unknowns, and neighbours are dx = 1/(N + 1) apart.
+/// What lies beyond the ends of every axis.
+enum class Boundary {
+  kDirichlet,  // zero; boundary points are not unknowns, dx = 1/(N + 1)
+  kPeriodic,   // the other end; dx = 1/N
+};
+
+/// A uniform grid on the unit interval, square or cube. `shape` counts the unknowns in tensor order,
+/// (N,), (Ny, Nx) or (Nz, Ny, Nx): the x direction is the last axis. Functions of a field and a grid
+/// take the last dim() axes of the tensor for it, and name an axis by its place in `shape`.
 class Grid {
  public:
-  /// Raises ValueError unless `shape` has 1 to 3 positive extents; `owner` names the caller.
-  Grid(const char* owner, std::vector<int64_t> shape);
+  /// Raises ValueError unless `shape` has 1 to 3 positive extents, >= 2 where the grid is periodic;
+  /// `owner` names the caller.
+  Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary = Boundary::kDirichlet);
 
   const std::vector<int64_t>& shape() const { return shape_; }
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   int64_t unknowns() const;
-  double dx(int64_t axis) const { return 1.0 / static_cast<double>(shape_[axis] + 1); }
+  Boundary boundary() const { return boundary_; }
+  double dx(int64_t axis) const {
+    return 1.0 / static_cast<double>(shape_[axis] + (boundary_ == Boundary::kDirichlet));
+  }
 
   /// Raises ValueError unless v has shape (batch, channels, *shape); TypeError unless it is real.
   void check_field(const at::Tensor& v, int64_t channels) const;
@@ -25,11 +35,22 @@ class Grid {
  private:
   const char* owner_;
   std::vector<int64_t> shape_;
+  Boundary boundary_;
 };
 
-/// Discrete Laplacian L v of a field (batch, channel, *shape) that is zero on the boundary:
-/// Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Differentiable.
+/// Discrete Laplacian L v, Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Differentiable.
 at::Tensor laplacian(const at::Tensor& v, const Grid& grid);
+/// The diagonal of L: -Σ_d 2 / dx_d².
+double laplacian_diagonal(const Grid& grid);
+
+/// One-sided differences on a periodic grid, (v_i - v_{i-1})/dx and (v_{i+1} - v_i)/dx: each is minus
+/// the transpose of the other.
+at::Tensor backward_difference(const at::Tensor& v, const Grid& grid, int64_t axis);
+at::Tensor forward_difference(const at::Tensor& v, const Grid& grid, int64_t axis);
+/// Means of neighbours on a periodic grid, (v_{i-1} + v_i)/2 and (v_i + v_{i+1})/2: each is the
+/// transpose of the other.
+at::Tensor backward_mean(const at::Tensor& v, const Grid& grid, int64_t axis);
+at::Tensor forward_mean(const at::Tensor& v, const Grid& grid, int64_t axis);
 
 /// Orthonormal sine basis of one axis: S_jk = √(2/(N+1)) sin(π j k/(N+1)), symmetric, S S = I.
 at::Tensor sine_basis(int64_t n, const at::TensorOptions& options);

@@ -1,6 +1,7 @@
 #pragma once
 #include "prdp/grid/grid.h"
 #include "prdp/operators/operator.h"
+#include "prdp/operators/step_parameters.h"
 
 namespace prdp {
 
@@ -51,7 +52,7 @@ class PoissonOperator final : public LaplacianOperator {
 class HeatOperator final : public LaplacianOperator {
  public:
   explicit HeatOperator(const OperatorSpec& spec);
-  void check_parameters() const override;
+  void check_parameters() const override { step_.check_values(); }
   at::Tensor apply(const at::Tensor& v) const override;
   std::unique_ptr<Operator> select(const at::Tensor&) const override {
     return std::make_unique<HeatOperator>(*this);
@@ -59,11 +60,10 @@ class HeatOperator final : public LaplacianOperator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
 
  private:
-  Coefficients coefficients() const override { return {1.0, -nu_.item<double>() * dt_}; }
-  at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (nu_ * dt_) * x; }
+  Coefficients coefficients() const override { return {1.0, -step_.nu.item<double>() * step_.dt}; }
+  at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (step_.nu * step_.dt) * x; }
 
-  double dt_;
-  at::Tensor nu_;
+  StepParameters step_;
 };
 
 }  // namespace prdp

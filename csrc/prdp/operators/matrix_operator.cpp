@@ -22,10 +22,6 @@ at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
   return at::matmul(matrix, v.unsqueeze(-1)).squeeze(-1);
 }
 
-int64_t first_nonfinite_entry(const at::Tensor& t) {
-  return t.isfinite().logical_not().reshape(-1).to(at::kByte).argmax().item<int64_t>();
-}
-
 at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b) {
   // A singular matrix gives a non-finite solution here, and a status there.
   return std::get<0>(at::linalg_solve_ex(matrix, b.unsqueeze(-1))).squeeze(-1);
@@ -67,8 +63,8 @@ std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda,
   return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
 }
 
-int64_t DenseOperator::first_nonfinite(int64_t sample) const {
-  return first_nonfinite_entry(matrix_.dim() == 3 ? matrix_.select(0, sample) : matrix_);
+std::vector<int64_t> DenseOperator::first_nonfinite(int64_t sample) const {
+  return first_true(nonfinite(matrix_.dim() == 3 ? matrix_.select(0, sample) : matrix_));
 }
 
 std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
@@ -151,12 +147,12 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda,
   return {at::Tensor(), at::Tensor(), values_.dim() == 1 ? outer.sum(0) : outer};
 }
 
-int64_t CsrOperator::first_nonfinite(int64_t sample) const {
+std::vector<int64_t> CsrOperator::first_nonfinite(int64_t sample) const {
   const bool batched = values_.dim() == 2;
-  const auto k = first_nonfinite_entry(batched ? values_.select(0, sample) : values_);
+  const auto k = first_true(nonfinite(batched ? values_.select(0, sample) : values_))[0];
   const auto row = batched ? rows().select(0, sample) : rows();
   const auto col = batched ? col_.select(0, sample) : col_;
-  return row[k].item<int64_t>() * n() + col[k].item<int64_t>();
+  return {row[k].item<int64_t>(), col[k].item<int64_t>()};
 }
 
 std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {

@@ -15,7 +15,7 @@ class DenseOperator final : public Operator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
-  int64_t first_nonfinite(int64_t sample) const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
   KernelParameters kernel() const override;
@@ -37,7 +37,7 @@ class CsrOperator final : public Operator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
-  int64_t first_nonfinite(int64_t sample) const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {n()}; }
   KernelParameters kernel() const override;

@@ -2,10 +2,24 @@
 
 #include <numeric>
 
+#include "prdp/operators/burgers_operator.h"
 #include "prdp/operators/laplacian_operator.h"
 #include "prdp/operators/matrix_operator.h"
+#include "prdp/operators/navier_stokes_operator.h"
 
 namespace prdp {
+
+std::vector<int64_t> first_true(const at::Tensor& mask) {
+  auto flat = mask.reshape(-1).to(at::kByte).argmax().item<int64_t>();
+  std::vector<int64_t> index(mask.dim());
+  for (int64_t d = mask.dim() - 1; d >= 0; --d) {
+    index[d] = flat % mask.size(d);
+    flat /= mask.size(d);
+  }
+  return index;
+}
+
+at::Tensor nonfinite(const at::Tensor& t) { return t.isfinite().logical_not(); }
 
 at::Tensor Operator::dense(const at::TensorOptions& options) const {
   auto shape = vector_shape();
@@ -37,6 +51,7 @@ class Transposed final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override {
     return a_->product_rule(u, lambda);  // ⟨λ, Aᵀ u⟩ = ⟨u, A λ⟩
   }
+  at::Tensor project(const at::Tensor& v) const override { return a_->project(v); }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   at::Tensor solve_directly(const at::Tensor& b) const override {
@@ -48,7 +63,9 @@ class Transposed final : public Operator {
   std::unique_ptr<Operator> select(const at::Tensor& index) const override {
     return std::make_unique<Transposed>(a_->select(index));
   }
-  int64_t first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override {
+    return a_->first_nonfinite(sample);
+  }
   KernelParameters kernel() const override {
     auto k = a_->kernel();
     if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;
@@ -65,10 +82,12 @@ class Transposed final : public Operator {
 std::unique_ptr<Operator> make_untransposed(const OperatorSpec& spec) {
   if (spec.kind == "heat") return std::make_unique<HeatOperator>(spec);
   if (spec.kind == "poisson") return std::make_unique<PoissonOperator>(spec);
+  if (spec.kind == "burgers") return std::make_unique<BurgersOperator>(spec);
+  if (spec.kind == "navier_stokes") return std::make_unique<NavierStokesOperator>(spec);
   if (spec.kind == "dense") return std::make_unique<DenseOperator>(spec);
   if (spec.kind == "csr") return std::make_unique<CsrOperator>(spec);
   TORCH_CHECK_VALUE(false, "operator: unknown kind '", spec.kind,
-                    "'; allowed: heat, poisson, dense, csr");
+                    "'; allowed: heat, poisson, burgers, navier_stokes, dense, csr");
 }
 
 }  // namespace

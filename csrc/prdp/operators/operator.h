@@ -12,7 +12,7 @@ namespace prdp {
 
 /// The flat description of an operator, as it crosses torch's dispatcher: numbers and tensors only.
 struct OperatorSpec {
-  std::string kind;                  // "heat", "poisson", "dense", "csr"
+  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "dense", "csr"
   std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
   std::vector<double> parameters;    // plain numbers that carry no gradient, such as dt
   std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
@@ -75,8 +75,10 @@ class Operator {
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
   /// ‖A‖∞, one value or one per sample.
   virtual at::Tensor norm() const = 0;
-  /// Flat index i·n + j of the first entry A_ij that is NaN or Inf, for a matrix that has one.
-  virtual int64_t first_nonfinite(int64_t /*sample*/) const { return 0; }
+  /// v without its part in the null space of A and Aᵀ; v itself where A is regular. Differentiable.
+  virtual at::Tensor project(const at::Tensor& v) const { return v; }
+  /// Where the first NaN or Inf that A is made of sits: (i, j) in a matrix, (channel, *grid) in winds.
+  virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator of the samples `index` (int64) alone, differentiable in the same tensors.
   virtual std::unique_ptr<Operator> select(const at::Tensor& index) const = 0;
   /// Shape of one vector without its batch axis.
@@ -87,6 +89,10 @@ class Operator {
   /// A as a matrix (n, n), or (batch, n, n) where A differs between the samples.
   at::Tensor dense(const at::TensorOptions& options) const;
 };
+
+/// Index of the first true entry; which entries are NaN or Inf.
+std::vector<int64_t> first_true(const at::Tensor& mask);
+at::Tensor nonfinite(const at::Tensor& t);
 
 /// Builds the operator that `spec` describes. Raises ValueError for an unknown kind or bad shapes.
 std::unique_ptr<Operator> make_operator(const OperatorSpec& spec);

@@ -11,38 +11,23 @@ WarningSink& warning_sink() {
   return sink;
 }
 
-/// "(0, 17)" for a flat index into an array of this shape.
-std::string position(int64_t flat, at::IntArrayRef shape) {
-  std::vector<int64_t> index(shape.size());
-  for (size_t d = shape.size(); d-- > 0;) {
-    index[d] = flat % shape[d];
-    flat /= shape[d];
-  }
+/// "(0, 17)"
+std::string position(const std::vector<int64_t>& index) {
   std::ostringstream text;
   for (size_t d = 0; d < index.size(); ++d) text << (d ? ", " : "(") << index[d];
   text << ")";
   return text.str();
 }
 
-/// Flat index of the first true entry.
-int64_t first_true(const at::Tensor& rows) {
-  return rows.reshape(-1).to(at::kByte).argmax().item<int64_t>();
-}
-
 /// Where in b or in A the trouble of this sample sits.
 std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus status, int64_t sample) {
   std::ostringstream text;
-  if (status == SolveStatus::kNonfiniteInput) {
-    const auto row = b.select(0, sample);
-    text << " at index " << position(first_true(row.isfinite().logical_not()), row.sizes());
-  } else if (status == SolveStatus::kZeroDiagonal) {
-    const auto every = a.diagonal();
-    const auto diagonal = every.dim() > 1 ? every.select(0, sample) : every;
-    text << " in row " << position(first_true(diagonal.eq(0)), diagonal.sizes());
-  } else if (status == SolveStatus::kNonfiniteOperator) {
-    const int64_t n = a.vector_shape()[0];
-    text << " at index " << position(a.first_nonfinite(sample), {n, n});
-  }
+  if (status == SolveStatus::kNonfiniteInput)
+    text << " at index " << position(first_true(nonfinite(b.select(0, sample))));
+  else if (status == SolveStatus::kZeroDiagonal)
+    text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
+  else if (status == SolveStatus::kNonfiniteOperator)
+    text << " at index " << position(a.first_nonfinite(sample));
   return text.str();
 }
 

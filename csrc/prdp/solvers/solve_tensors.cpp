@@ -35,7 +35,7 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
   // The last mark holds: the order is that of the CPU loops, from the end.
   if (method == Method::kJacobi) {
     const auto zero = a.diagonal().eq(0);
-    mark(zero.dim() == 0 ? zero : zero.any(-1), SolveStatus::kZeroDiagonal);
+    mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
   mark(magnitude.eq(0), SolveStatus::kConverged);
   mark(a.norm().isfinite().logical_not(), SolveStatus::kNonfiniteOperator);

@@ -2,19 +2,62 @@
 
 #include <torch/library.h>
 
+#include <algorithm>
+
+#include "prdp/grid/grid.h"
+
 namespace prdp {
 
-OperatorSpec equation_operator(const Equation& equation, const at::Tensor&) {
-  return {equation.kind, equation.shape, equation.parameters, equation.tensors};
+namespace {
+
+bool is_flow(const Equation& equation) {
+  return equation.kind == "burgers" || equation.kind == "navier_stokes";
+}
+
+/// A state of the equation in which nothing moves.
+at::Tensor rest(const Equation& equation) {
+  std::vector<int64_t> sizes{1, equation.kind == "navier_stokes"
+                                    ? 3 : static_cast<int64_t>(equation.shape.size())};
+  // A negative extent is left for the operator to refuse.
+  for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
+  return at::zeros(sizes);
+}
+
+}  // namespace
+
+void Equation::check() const {
+  TORCH_CHECK_VALUE(picard_steps >= 1, kind, ": picard_steps must be >= 1, got ", picard_steps);
+  make_operator(equation_operator(*this, rest(*this)))->check_parameters();
+}
+
+OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u) {
+  auto tensors = equation.tensors;
+  if (is_flow(equation)) tensors.insert(tensors.begin(), u);  // the winds
+  return {equation.kind, equation.shape, equation.parameters, tensors};
 }
 
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u) {
   if (equation.kind == "poisson") return -u;  // Δu = -p
+  if (equation.kind == "navier_stokes") {
+    Grid("NavierStokes", equation.shape, Boundary::kPeriodic).check_field(u, 3);
+    const auto velocity = u.narrow(1, 0, 2);
+    return at::cat({velocity / equation.parameters[0], at::zeros_like(u.narrow(1, 2, 1))}, 1);
+  }
   return u;
 }
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
-  return linear_solve(equation_operator(equation, u), equation_rhs(equation, u), options);
+  const auto b = equation_rhs(equation, u);
+  auto result = linear_solve(equation_operator(equation, u), b, options);
+  for (int64_t k = 1; k < equation.picard_steps; ++k) {
+    const auto last = std::move(result.info);
+    result = linear_solve(equation_operator(equation, result.u), b, options);
+    auto& info = result.info;
+    info.iterations = info.iterations + last.iterations;
+    info.operator_applications = info.operator_applications + last.operator_applications;
+    info.status = at::minimum(info.status, last.status);  // the least is the worst
+  }
+  return result;
 }
 
 namespace {
@@ -22,11 +65,12 @@ namespace {
 using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
 Outputs step_op(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
-                at::IntArrayRef shape, at::ArrayRef<double> parameters, c10::string_view solver,
-                c10::SymInt max_iter, double rtol, int64_t restart, c10::string_view backward,
+                at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                c10::string_view solver, c10::SymInt max_iter, double rtol, int64_t restart,
+                c10::string_view backward,
                 std::optional<c10::SymInt> adjoint_max_iter, std::optional<double> adjoint_rtol,
                 c10::string_view on_failure, int64_t adjoint_log) {
-  const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec()};
+  const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
   const auto [next, info] = step(equation, u,
                                  {{method_from_name(solver), std::move(max_iter), rtol, restart},
                                   backward_from_name(backward),
@@ -37,19 +81,29 @@ Outputs step_op(const at::Tensor& u, at::TensorList tensors, c10::string_view ki
   return {next, info.iterations, info.residual, info.status, info.operator_applications};
 }
 
-at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind) {
-  return equation_rhs({std::string(kind), {}, {}, {}}, u);
+at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape,
+                  at::ArrayRef<double> parameters) {
+  return equation_rhs({std::string(kind), shape.vec(), parameters.vec(), {}}, u);
+}
+
+void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                       at::ArrayRef<double> parameters, int64_t picard_steps) {
+  Equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps}.check();
 }
 
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
-  m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, str solver, "
-        "SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, float? adjoint_rtol, "
+  m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
+        "str solver, SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, "
+        "float? adjoint_rtol, "
         "str on_failure, int adjoint_log) -> (Tensor u_next, Tensor iterations, Tensor residual, "
         "Tensor status, Tensor operator_applications)",
         step_op);
-  m.def("rhs(Tensor u, str kind) -> Tensor", rhs_op);
+  m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
+  m.def("check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "
+        "int picard_steps) -> ()",
+        check_equation_op);
 }
 
 }  // namespace prdp

@@ -4,19 +4,25 @@
 namespace prdp {
 
 /// A discretised equation, flat like an OperatorSpec: its state u gives the linear system
-/// A(u) u_next = b(u). `kind` is "poisson" or "heat".
+/// A(u) u_next = b(u). `kind` is "poisson", "heat", "burgers" or "navier_stokes"; `tensors` are those
+/// of the operator that are not the state.
 struct Equation {
   std::string kind;
   std::vector<int64_t> shape;
   std::vector<double> parameters;
   std::vector<at::Tensor> tensors;
+  int64_t picard_steps = 1;  // solves a step, each linearised about the last one's solution
+
+  /// Raises ValueError or TypeError for a bad shape or parameter.
+  void check() const;
 };
 
-/// The system's operator A(u) and right-hand side b(u) at the state u.
+/// The system's operator A(u) and right-hand side b(u) at the state u, both differentiable in u.
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u);
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
 
-/// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step.
+/// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step. Over several
+/// Picard steps the info counts all iterations and holds the worst status; its residual is the last.
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options);
 
 }  // namespace prdp

@@ -13,7 +13,7 @@ Stepper::Stepper(Equation equation, SolveOptions options)
       }) {
   options_.adjoint_log = *adjoint_log_;
   options_.check(equation_.kind.c_str());
-  make_operator(equation_operator(equation_, {}))->check_parameters();
+  equation_.check();
 }
 
 at::Tensor Stepper::operator()(const at::Tensor& u) {
@@ -38,10 +38,17 @@ bool Stepper::converged() const {
 Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward)
     : Stepper({"poisson", std::move(shape), {}, {}}, {std::move(solver), backward}) {}
 
-Heat::Heat(std::vector<int64_t> shape, double nu, double dt, Solver solver, Backward backward)
-    : Heat(std::move(shape), at::scalar_tensor(nu, at::kDouble), dt, std::move(solver), backward) {}
+Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward)
+    : Stepper({"heat", std::move(shape), {dt}, {std::move(nu.tensor)}}, {std::move(solver), backward}) {}
 
-Heat::Heat(std::vector<int64_t> shape, at::Tensor nu, double dt, Solver solver, Backward backward)
-    : Stepper({"heat", std::move(shape), {dt}, {std::move(nu)}}, {std::move(solver), backward}) {}
+Burgers::Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
+                 int64_t picard_steps)
+    : Stepper({"burgers", std::move(shape), {dt}, {std::move(nu.tensor)}, picard_steps},
+              {std::move(solver), backward}) {}
+
+NavierStokes::NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
+                           Backward backward, int64_t picard_steps)
+    : Stepper({"navier_stokes", std::move(shape), {dt}, {std::move(nu.tensor)}, picard_steps},
+              {std::move(solver), backward}) {}
 
 }  // namespace prdp

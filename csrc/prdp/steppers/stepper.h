@@ -44,14 +44,36 @@ class Poisson : public Stepper {
   Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit);
 };
 
-/// One implicit Euler step of u_t = ν Δu, u = 0 on the boundary. nu >= 0, a number or a
-/// 0-dimensional tensor, which then gets a gradient; dt > 0.
+/// nu >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient.
+struct Viscosity {
+  Viscosity(double nu) : tensor(at::scalar_tensor(nu, at::kDouble)) {}
+  Viscosity(at::Tensor nu) : tensor(std::move(nu)) {}
+  at::Tensor tensor;
+};
+
+/// One implicit Euler step of u_t = ν Δu, u = 0 on the boundary; dt > 0.
 class Heat : public Stepper {
  public:
-  Heat(std::vector<int64_t> shape, double nu, double dt, Solver solver,
+  Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
        Backward backward = Backward::kImplicit);
-  Heat(std::vector<int64_t> shape, at::Tensor nu, double dt, Solver solver,
-       Backward backward = Backward::kImplicit);
+};
+
+/// One implicit Euler step of u_t + (u·∇)u = ν Δu on a periodic grid, shape (N) or (Ny, Nx); u has one
+/// channel an axis, channel 0 along x, the last axis. First-order upwind, linearised about the state,
+/// or with picard_steps > 1 about the solution of the solve before.
+class Burgers : public Stepper {
+ public:
+  Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
+          Backward backward = Backward::kImplicit, int64_t picard_steps = 1);
+};
+
+/// One implicit Euler step of u_t + (u·∇)u + ∇p = ν Δu, ∇·u = 0 on a periodic grid (Ny, Nx). The state
+/// is (batch, 3, Ny, Nx) = (u₁, u₂, p), staggered: u₁ on the left face of a cell, u₂ on its lower face,
+/// p of mean zero in its centre. Linearised as Burgers.
+class NavierStokes : public Stepper {
+ public:
+  NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
+               Backward backward = Backward::kImplicit, int64_t picard_steps = 1);
 };
 
 }  // namespace prdp

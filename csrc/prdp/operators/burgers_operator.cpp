@@ -1,0 +1,50 @@
+#include "prdp/operators/burgers_operator.h"
+
+namespace prdp {
+
+BurgersOperator::BurgersOperator(const OperatorSpec& spec)
+    : FlowOperator("Burgers", spec, static_cast<int64_t>(spec.shape.size())) {
+  TORCH_CHECK_VALUE(grid_.dim() <= 2, "Burgers: shape must have 1 or 2 extents, got ",
+                    at::IntArrayRef(grid_.shape()));
+  grid_.check_field(winds_, channels_);
+}
+
+const AdvectionDiffusion& BurgersOperator::step() const {
+  if (!made_) {
+    std::vector<AxisWinds> faces;
+    for (int64_t d = 0; d < grid_.dim(); ++d)
+      faces.push_back({backward_mean(wind_along(d), grid_, d), forward_mean(wind_along(d), grid_, d)});
+    made_.emplace(grid_, std::move(faces), step_.nu, 1.0, step_.dt);
+  }
+  return *made_;
+}
+
+std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda,
+                                                      const at::Tensor& u) const {
+  const auto [faces, nu] = step().product_rule(lambda, u);
+  std::vector<at::Tensor> channels;
+  for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed
+    channels.push_back(forward_mean(faces[d].lower, grid_, d) + backward_mean(faces[d].upper, grid_, d));
+  return {as_winds(std::move(channels)), nu.to(step_.nu.options())};
+}
+
+at::Tensor BurgersOperator::matrix() const {
+  // Unit vectors as the channels of one field: row j of the product is column j of the matrix.
+  auto shape = vector_shape();
+  shape[0] = grid_.unknowns();
+  const auto units = at::eye(shape[0], winds_.options()).view(shape).unsqueeze(0);
+  return apply(units).flatten(2).mT();
+}
+
+at::Tensor BurgersOperator::solve_rows(const at::Tensor& matrix, const at::Tensor& b) const {
+  return std::get<0>(at::linalg_solve_ex(matrix, b.flatten(2).mT())).mT().reshape_as(b);
+}
+
+std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<BurgersOperator>(*this);
+  chosen->winds_ = winds_of(index);
+  chosen->made_.reset();
+  return chosen;
+}
+
+}  // namespace prdp

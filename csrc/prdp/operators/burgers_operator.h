@@ -1,0 +1,39 @@
+#pragma once
+#include <optional>
+
+#include "prdp/operators/advection_diffusion.h"
+#include "prdp/operators/flow_operator.h"
+
+namespace prdp {
+
+/// One implicit Euler step of Burgers' equation in one or two dimensions, periodic, linearised about
+/// the winds: A = I + Δt (Γ - ν L) on each of the dim() velocity channels. Γ is first-order upwind with
+/// the winds averaged to the faces of a cell, (w_{i-1} + w_i)/2 and (w_i + w_{i+1})/2. Row sums are 1
+/// and off-diagonal entries <= 0.
+class BurgersOperator final : public FlowOperator {
+ public:
+  /// Raises ValueError unless the winds have shape (batch or 1, dim, *shape) with dim <= 2.
+  explicit BurgersOperator(const OperatorSpec& spec);
+
+  at::Tensor apply(const at::Tensor& v) const override { return step().apply(v); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return step().apply_transpose(v); }
+  at::Tensor diagonal() const override { return step().diagonal(); }
+  at::Tensor norm() const override { return largest(step().row_norms()); }
+  at::Tensor solve_directly(const at::Tensor& b) const override { return solve_rows(matrix(), b); }
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
+    return solve_rows(matrix().mT(), b);
+  }
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+
+ private:
+  /// Made when first wanted: the CPU loops never ask for it.
+  const AdvectionDiffusion& step() const;
+  /// (batch or 1, n, n), the block of one channel.
+  at::Tensor matrix() const;
+  at::Tensor solve_rows(const at::Tensor& matrix, const at::Tensor& b) const;
+
+  mutable std::optional<AdvectionDiffusion> made_;
+};
+
+}  // namespace prdp

@@ -1,0 +1,39 @@
+#pragma once
+#include "prdp/grid/grid.h"
+#include "prdp/operators/operator.h"
+#include "prdp/operators/step_parameters.h"
+
+namespace prdp {
+
+/// What Burgers and Navier-Stokes share: one step of a flow on a periodic grid, linearised about given
+/// winds. Parameters (dt), tensors (winds, nu); the winds are (batch, channels, *shape), or
+/// (1, channels, *shape) for all samples alike. Channel 0 is the velocity along x, the last axis,
+/// channel 1 along y.
+class FlowOperator : public Operator {
+ public:
+  void check_vector(const at::Tensor& b) const override;
+  void check_parameters() const override { step_.check_values(); }
+  std::vector<int64_t> vector_shape() const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override;
+
+ protected:
+  /// Vectors have `channels` channels.
+  FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels);
+
+  /// Of the channel that blows along a grid axis: (batch or 1, 1, *shape).
+  at::Tensor wind_along(int64_t axis) const { return winds_.narrow(1, grid_.dim() - 1 - axis, 1); }
+  /// Gradient of the winds out of its channels, summed over the samples that share them.
+  at::Tensor as_winds(std::vector<at::Tensor> channels) const;
+  /// Largest of the row norms, one per sample, or one value where the winds are shared.
+  at::Tensor largest(const at::Tensor& row_norms) const;
+  at::Tensor winds_of(const at::Tensor& index) const {
+    return winds_.size(0) == 1 ? winds_ : winds_.index_select(0, index);
+  }
+
+  Grid grid_;
+  StepParameters step_;
+  at::Tensor winds_;
+  int64_t channels_;
+};
+
+}  // namespace prdp

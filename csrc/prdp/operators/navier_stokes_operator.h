@@ -1,0 +1,51 @@
+#pragma once
+#include <optional>
+
+#include "prdp/operators/advection_diffusion.h"
+#include "prdp/operators/flow_operator.h"
+
+namespace prdp {
+
+/// One implicit Euler step of the incompressible Navier-Stokes equations in two dimensions, periodic,
+/// linearised about given winds (Oseen), on a staggered grid: u₁ on the left face of a cell, u₂ on its
+/// lower face, p in its centre. On vectors (u₁, u₂, p)
+///   A = [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]],  C_k = I/Δt + Γ_k - ν L,
+/// with divergence D by forward and gradient G = -Dᵀ by backward differences. Γ_k is first-order upwind
+/// with the wind at the points of u_k, the other component averaged over its four neighbours there.
+/// A and Aᵀ have one null vector, constant pressure.
+class NavierStokesOperator final : public FlowOperator {
+ public:
+  /// Raises ValueError unless the winds have shape (batch or 1, 2 or 3, Ny, Nx); a third channel, the
+  /// pressure, has no influence.
+  explicit NavierStokesOperator(const OperatorSpec& spec);
+
+  at::Tensor apply(const at::Tensor& v) const override;
+  at::Tensor apply_transpose(const at::Tensor& v) const override;
+  at::Tensor diagonal() const override;
+  at::Tensor norm() const override;
+  /// v with its mean pressure taken off.
+  at::Tensor project(const at::Tensor& v) const override;
+  /// The solution of least norm to the projected right-hand side.
+  at::Tensor solve_directly(const at::Tensor& b) const override { return solve(regular_matrix(), b); }
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
+    return solve(regular_matrix().mT(), b);
+  }
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+
+ private:
+  /// C₁ and C₂, made when first wanted: the CPU loops never ask for them.
+  struct Momentum {
+    AdvectionDiffusion along_x, along_y;
+  };
+  const Momentum& momentum() const;
+  /// (C₁u₁ + s G₁p, C₂u₂ + s G₂p, s (D₁u₁ + D₂u₂)) out of C₁u₁, C₂u₂ and v = (u₁, u₂, p).
+  at::Tensor couple(const at::Tensor& c1_u1, const at::Tensor& c2_u2, double s, const at::Tensor& v) const;
+  /// A plus the mean of the pressure in each of its rows, (batch or 1, n, n).
+  at::Tensor regular_matrix() const;
+  at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) const;
+
+  mutable std::optional<Momentum> made_;
+};
+
+}  // namespace prdp

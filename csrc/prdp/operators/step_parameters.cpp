@@ -1,0 +1,27 @@
+#include "prdp/operators/step_parameters.h"
+
+#include <cmath>
+
+namespace prdp {
+
+StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t tensors,
+                               const char* expected)
+    : owner(who) {
+  TORCH_CHECK_VALUE(spec.parameters.size() == 1 && spec.tensors.size() == tensors, owner,
+                    ": takes one parameter, dt, and ", expected);
+  dt = spec.parameters[0];
+  nu = spec.tensors.back();
+  TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0.0, owner, ": dt must be finite and > 0, got ", dt);
+  TORCH_CHECK_VALUE(nu.dim() == 0, owner, ": nu must be a number or a 0-dimensional tensor, got shape ",
+                    nu.sizes());
+  TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ",
+                   nu.scalar_type());
+}
+
+void StepParameters::check_values() const {
+  const double value = nu.item<double>();
+  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ",
+                    value);
+}
+
+}  // namespace prdp

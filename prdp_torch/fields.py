@@ -1,0 +1,78 @@
+"""Periodic velocity fields on the staggered grid of `NavierStokes`, in plain differentiable torch.
+
+Fields are (batch, 2 or 3, Ny, Nx) on the unit square, dx = 1/N: channel 0 is u₁ along x, the last axis, on
+the left face of a cell, channel 1 is u₂ along y on its lower face, and a third channel, the pressure in
+the cell's centre, is of no influence.
+"""
+
+import math
+
+import torch
+
+from prdp_torch import _check
+
+_Y, _X = -2, -1
+
+
+def divergence(u):
+    """∂u₁/∂x + ∂u₂/∂y in the cell centres by forward differences: (batch, 1, Ny, Nx)."""
+    u1, u2 = _velocity("divergence", u)
+    return _forward(u1, _X) + _forward(u2, _Y)
+
+
+def curl(u):
+    """The vorticity ∂u₂/∂x - ∂u₁/∂y at the lower left corner of each cell by backward differences:
+    (batch, 1, Ny, Nx)."""
+    u1, u2 = _velocity("curl", u)
+    return _backward(u2, _X) - _backward(u1, _Y)
+
+
+def project(u):
+    """u with the nearest velocity of zero discrete divergence, u - G φ with D G φ = D u by Fourier
+    transform; mean velocity and pressure stay as they are."""
+    u1, u2 = _velocity("project", u)
+    ny, nx = u.shape[-2:]
+    ky, kx = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (ny, nx // 2 + 1))
+    # Eigenvalues of D G, the five-point Laplacian.
+    symbol = -((2 * ny * torch.sin(math.pi / ny * ky)[:, None]) ** 2) - (2 * nx * torch.sin(math.pi / nx * kx)) ** 2
+    symbol[0, 0] = 1.0  # the mean of φ, which G does not see
+    phi = torch.fft.irfft2(torch.fft.rfft2(divergence(u)) / symbol, s=(ny, nx))
+    return torch.cat([u1 - _backward(phi, _X), u2 - _backward(phi, _Y), u[:, 2:]], dim=1)
+
+
+def downsample(u):
+    """Every second point along both axes, at the indices 1, 3, …: (Ny, Nx) odd to ((Ny - 1)/2, (Nx - 1)/2),
+    such as 97 to 48 (paper, appendix C.6)."""
+    _velocity("downsample", u)
+    if any(n % 2 == 0 for n in u.shape[-2:]):
+        raise ValueError(f"downsample: Ny and Nx must be odd, got {tuple(u.shape[-2:])}")
+    return u[..., 1::2, 1::2]
+
+
+def rollout(stepper, u, steps):
+    """The states u, stepper(u), stepper(stepper(u)), …, `steps` steps on, the start included:
+    (batch, steps + 1, channel, *shape). `stepper` is any callable."""
+    if _check.whole("rollout", "steps", steps) < 0:
+        raise ValueError(f"rollout: steps must be >= 0, got {steps}")
+    states = [_check.dense("rollout", "u", u)]
+    for _ in range(steps):
+        states.append(stepper(states[-1]))
+    return torch.stack(states, dim=1)
+
+
+def _velocity(who, u):
+    """u₁ and u₂, each (batch, 1, Ny, Nx)."""
+    _check.dense(who, "u", u)
+    if u.dim() != 4 or u.shape[1] not in (2, 3):
+        raise ValueError(f"{who}: expected (batch, 2 or 3, Ny, Nx), got {tuple(u.shape)}")
+    if u.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{who}: expected float32 or float64, got {u.dtype}")
+    return u[:, 0:1], u[:, 1:2]
+
+
+def _forward(v, axis):
+    return (v.roll(-1, axis) - v) * v.shape[axis]
+
+
+def _backward(v, axis):
+    return (v - v.roll(1, axis)) * v.shape[axis]
