@@ -59,8 +59,10 @@ class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
     const T mean = pressure_mean(v);
     for (int64_t j = 0; j < ny(); ++j) loops_.axpy(-mean, weight(kOne), pressure(v, j), row_);
   }
-  /// |mean of the pressure|: how far a right-hand side v is from having a solution.
-  T inconsistency(const T* v) const { return std::abs(pressure_mean(v)); }
+  /// Norm of what project() takes off: how far a right-hand side v is from having a solution.
+  T inconsistency(const T* v) const {
+    return std::abs(pressure_mean(v)) * std::sqrt(static_cast<T>(ny() * nx()));
+  }
 
   /// Calls body(row, column, value) for the entries of A as applied; those that coincide one by one.
   template <class Body>

@@ -40,6 +40,10 @@ at::Tensor BurgersOperator::solve_rows(const at::Tensor& matrix, const at::Tenso
   return std::get<0>(at::linalg_solve_ex(matrix, b.flatten(2).mT())).mT().reshape_as(b);
 }
 
+KernelParameters BurgersOperator::kernel() const {
+  return BurgersParameters{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+}
+
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<BurgersOperator>(*this);
   chosen->winds_ = winds_of(index);

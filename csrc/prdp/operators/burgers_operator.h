@@ -25,6 +25,7 @@ class BurgersOperator final : public FlowOperator {
   }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+  KernelParameters kernel() const override;
 
  private:
   /// Made when first wanted: the CPU loops never ask for it.

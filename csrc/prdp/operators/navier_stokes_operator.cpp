@@ -102,6 +102,10 @@ at::Tensor NavierStokesOperator::solve(const at::Tensor& matrix, const at::Tenso
   return project(std::get<0>(at::linalg_solve_ex(matrix, rhs)).reshape_as(b));
 }
 
+KernelParameters NavierStokesOperator::kernel() const {
+  return NavierStokesParameters{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+}
+
 std::unique_ptr<Operator> NavierStokesOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<NavierStokesOperator>(*this);
   chosen->winds_ = winds_of(index);

@@ -46,6 +46,12 @@ struct SampleState {
 
 inline constexpr double kDivergenceBound = 1e13;
 
+/// Share of b in the null space that is still rounding, or of no account beside rtol.
+template <class T>
+T consistency_bound(double rtol) {
+  return static_cast<T>(std::max(rtol, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon())));
+}
+
 namespace detail {
 
 /// GMRES and its like: each iteration takes the least residual over a space, which may be exhausted.

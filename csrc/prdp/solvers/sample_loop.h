@@ -29,12 +29,12 @@ struct SampleBatch {
 
 /// Runs the method on the sample that waits scaled in the workspace; returns where u is.
 template <class Kernel, class Factors, class T>
-const T* run_method(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
+T* run_method(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
                     const SampleBatch<T>& batch, std::array<SampleState, 1>& states) {
   SampleSpace<Kernel, Factors> space(kernel, factors, workspace, states);
   space.begin();
   states[0].b2 = space.b2();
-  return with_method(batch.method, batch.restart, space, [&](auto method) -> const T* {
+  return with_method(batch.method, batch.restart, space, [&](auto method) -> T* {
     iterate(space, method, states, batch.rtol);
     return method.x;
   });
@@ -52,6 +52,9 @@ void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is
   SampleState& state = states[0];
   state.cap = batch.caps ? batch.caps[s] : batch.max_iter;
 
+  [[maybe_unused]] const auto norm2 = [&](const T* v) {
+    return kernels::loops<T>().dot(v, v, kernel.length());
+  };
   const auto finish = [&](SolveStatus status, int64_t iterations, double residual) {
     batch.status[s] = static_cast<int64_t>(status);
     batch.iterations[s] = iterations;
@@ -72,9 +75,20 @@ void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is
     return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
 
   const T scale = kernels::power_of_two_scale(magnitude);
-  kernel.load(b, scale, workspace.vector(0));
-  const T* x = run_method(kernel, factors, workspace, batch, states);
+  T* scaled = workspace.vector(0);
+  kernel.load(b, scale, scaled);
+  bool consistent = true;
+  if constexpr (kernels::kHasNullSpace<Kernel>) {
+    const T whole = std::sqrt(norm2(scaled));
+    consistent = kernel.inconsistency(scaled) <= consistency_bound<T>(batch.rtol) * whole;
+    kernel.project(scaled);
+    if (norm2(scaled) <= std::numeric_limits<T>::epsilon() * whole)
+      return hand_out_zeros(SolveStatus::kInconsistent, 1.0);
+  }
+  T* x = run_method(kernel, factors, workspace, batch, states);
+  if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(x);
   kernel.store(x, T(1) / scale, u);
+  if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
   if (!kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
     hand_out_zeros(SolveStatus::kOverflow, 1.0);
   } else {

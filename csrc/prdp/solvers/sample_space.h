@@ -55,10 +55,11 @@ class SampleSpace {
     ++state_.applications;
     return kernel_.template jacobi_sweep<WithResidual>(c, x, next);
   }
-  /// r = b - A x; returns ‖r‖².
+  /// r = b - A x, within the range of A; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(x, r);
     loops_.xpby(b(), T(-1), r, length());
+    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_.project(r);
     return dot(r, r);
   }
   void solve_directly(const T* r, Vector d) {
@@ -87,11 +88,11 @@ class SampleSpace {
     for (int64_t i = 0; i < length(); ++i) out[i] = factor * v[i];
   }
   void dots(const std::vector<Vector>& v, int64_t count, const T* w, Scalar* h) {
-    for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i], w);
+    loops_.multi_dot(v.data(), count, w, h, length());
   }
   /// w -= Σ h_i v_i; returns ‖w‖².
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector w) {
-    for (int64_t i = 0; i < count; ++i) loops_.axpy(-h[i], v[i], w, length());
+    loops_.multi_axpy(h, v.data(), count, w, length());
     return dot(w, w);
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x) {

@@ -41,7 +41,8 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              result.info.status.mutable_data_ptr<int64_t>(),
                              result.info.operator_applications.mutable_data_ptr<int64_t>()};
   const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
-  at::parallel_for(0, size, grain_size(unknowns, request.max_iter), [&](int64_t begin, int64_t end) {
+  const int64_t products = request.max_iter * (request.method == Method::kGmres ? request.restart : 1);
+  at::parallel_for(0, size, grain_size(unknowns, products), [&](int64_t begin, int64_t end) {
     solve_range(a, batch, begin, end);
   });
   return result;

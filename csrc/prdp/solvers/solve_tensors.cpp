@@ -77,6 +77,16 @@ at::Tensor largest_magnitude(const at::Tensor& b) {
   return b.detach().abs().flatten(1).amax(1);
 }
 
+/// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
+std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
+  const double bound =
+      b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
+  const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
+  const auto found = (norm(b - projected) > bound * norm(b)).to(at::kCPU).contiguous();
+  const bool* rows = found.const_data_ptr<bool>();
+  return std::vector<bool>(rows, rows + found.numel());
+}
+
 }  // namespace
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
@@ -94,15 +104,19 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     s.cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : request.max_iter;
     takes_part.mutable_data_ptr<bool>()[i] = s.active;
   }
-  const auto [rhs, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
+  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
+  const auto rhs = a.project(whole);
+  const auto inconsistent = find_inconsistent(whole, rhs, request.rtol);
   TensorSpace space(a, rhs, states);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
 
   auto u = with_method(request.method, request.restart, space, [&](auto method) {
     iterate(space, method, states, request.rtol);
-    return method.x;
+    return a.project(method.x);
   });
+  for (size_t i = 0; i < states.size(); ++i)
+    if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
   u = at::where(per_sample(takes_part.to(b.device()), b), u / scale, at::zeros_like(b));
   const auto finite = u.isfinite().flatten(1).all(1);
   u = at::where(per_sample(finite, b), u, at::zeros_like(u));
@@ -132,10 +146,10 @@ at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& 
   std::vector<SampleState> states(b.size(0));
   for (size_t i = 0; i < states.size(); ++i) states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
-  TensorSpace space(a, rhs, states, /*recording=*/true);
+  TensorSpace space(a, a.project(rhs), states, /*recording=*/true);
   return with_method(solver.method, solver.restart, space, [&](auto m) {
     detail::run(space, m, states, 0.0, /*track=*/false);
-    return m.x / scale;
+    return a.project(m.x) / scale;
   });
 }
 

@@ -58,7 +58,7 @@ class TensorSpace {
   Scalar residual(const Vector& x, Vector& r) {
     Vector product;
     apply(x, product);
-    r = keep_frozen(b_ - product, r);
+    r = keep_frozen(a_.project(b_ - product), r);
     return dot(r, r);
   }
   void solve_directly(const Vector& r, Vector& d);
