@@ -18,6 +18,42 @@ TEST(Vector, DotAddsEveryLength) {
   }
 }
 
+template <class T>
+void expect_sums_over_vectors(double tolerance) {
+  for (const int64_t n : {0, 1, 15, 16, 17, 64, 272})
+    for (int64_t count = 0; count <= 19; ++count) {
+      SCOPED_TRACE(testing::Message() << count << " vectors of " << n);
+      const auto value = [](int64_t j, int64_t i) { return static_cast<T>(std::sin(1.7 * j + 0.3 * i * i)); };
+      std::vector<std::vector<T>> vectors(count + 1, std::vector<T>(n));
+      std::vector<const T*> v;
+      std::vector<T> alpha, h(count + 1, T(7));
+      for (int64_t j = 0; j <= count; ++j) {
+        for (int64_t i = 0; i < n; ++i) vectors[j][i] = value(j, i);
+        v.push_back(vectors[j].data());
+        alpha.push_back(value(j, 99));
+      }
+      auto w = vectors[count];
+      loops<T>().multi_dot(v.data(), count, w.data(), h.data(), n);
+      loops<T>().multi_axpy(alpha.data(), v.data(), count, w.data(), n);
+      std::vector<double> products(count), rest(n);
+      for (int64_t i = 0; i < n; ++i) {
+        const double before = vectors[count][i];
+        rest[i] = before;
+        for (int64_t j = 0; j < count; ++j) {
+          products[j] += before * vectors[j][i];
+          rest[i] -= static_cast<double>(alpha[j]) * vectors[j][i];
+        }
+        EXPECT_NEAR(w[i], rest[i], tolerance);
+      }
+      for (int64_t j = 0; j < count; ++j) EXPECT_NEAR(h[j], products[j], tolerance);
+      EXPECT_EQ(h[count], T(7));
+    }
+}
+TEST(Vector, SumsOverManyVectorsEqualSumsOverEach) {
+  expect_sums_over_vectors<float>(1e-4);
+  expect_sums_over_vectors<double>(1e-12);
+}
+
 TEST(Vector, LargestMagnitudeSeesNaNAndInf) {
   const float nan = std::nanf(""), inf = std::numeric_limits<float>::infinity();
   const float finite[] = {-3.0f, 2.0f, -0.0f}, with_nan[] = {1.0f, -nan, 9.0f}, with_inf[] = {1.0f, -inf};

@@ -1,121 +1,18 @@
 #include <gtest/gtest.h>
 
-#include <Eigen/Dense>
-#include <random>
-
+#include "dense_upwind.h"
+#include "helpers.h"
 #include "prdp/kernels/upwind_factors.h"
+#include "prdp/solvers/solve_cpu.h"
 
 /// The kernels of the upwind operators against dense matrices made from their definitions.
 namespace {
 
 using namespace prdp::kernels;
-using Matrix = Eigen::MatrixXd;
-using Vector = Eigen::VectorXd;
+using namespace prdp_test;
 
-constexpr double kNu = 0.03, kDt = 0.2;
-
-struct Shape {
-  int64_t ny, nx;
-};
 const std::vector<Shape> kLines{{1, 1}, {1, 2}, {1, 3}, {1, 7}, {1, 16}, {1, 17}, {1, 33}};
 const std::vector<Shape> kPlanes{{1, 1}, {2, 2}, {1, 4}, {4, 1}, {2, 16}, {3, 5}, {17, 9}, {5, 16}};
-
-template <class T>
-std::vector<T> random_values(int64_t n, unsigned seed) {
-  std::mt19937 generator(seed);
-  std::normal_distribution<double> normal;
-  std::vector<T> values(n);
-  for (auto& value : values) value = static_cast<T>(normal(generator));
-  return values;
-}
-template <class T>
-Vector as_vector(const std::vector<T>& values) {
-  return Eigen::Map<const Eigen::Matrix<T, Eigen::Dynamic, 1>>(values.data(), values.size()).template cast<double>();
-}
-
-/// A grid whose neighbours go round the ends, and the fields u1 and u2 on it.
-template <class T>
-struct Flow {
-  Shape shape;
-  std::vector<T> values;
-
-  int64_t cells() const { return shape.ny * shape.nx; }
-  int64_t at(int64_t j, int64_t i) const {
-    return (j + shape.ny) % shape.ny * shape.nx + (i + shape.nx) % shape.nx;
-  }
-  double u(int64_t channel, int64_t j, int64_t i) const {
-    return static_cast<double>(values[channel * cells() + at(j, i)]);
-  }
-  UpwindParameters<T> parameters(bool transposed) const {
-    return {values.data(), 0, shape.ny, shape.nx, kNu, kDt, transposed};
-  }
-};
-template <class T>
-Flow<T> random_flow(Shape shape) {
-  return {shape, random_values<T>(2 * shape.ny * shape.nx, 5)};
-}
-
-/// Adds scale·(max(before, 0) B + min(after, 0) F)/dx - diffusion·L to one row, along one axis.
-void add_differences(Matrix& a, int64_t row, int64_t lower, int64_t upper, double n, double before,
-                     double after, double scale, double diffusion) {
-  const double backward = scale * std::max(before, 0.0) * n, forward = scale * std::min(after, 0.0) * n;
-  a(row, row) += backward;
-  a(row, lower) -= backward;
-  a(row, upper) += forward;
-  a(row, row) -= forward;
-  a(row, row) += 2 * diffusion * n * n;
-  a(row, lower) -= diffusion * n * n;
-  a(row, upper) -= diffusion * n * n;
-}
-
-template <class T, int Dim>
-Matrix dense_burgers(const Flow<T>& w) {
-  const auto [ny, nx] = w.shape;
-  Matrix a = Matrix::Identity(Dim * w.cells(), Dim * w.cells());
-  for (int64_t c = 0; c < Dim; ++c)
-    for (int64_t j = 0; j < ny; ++j)
-      for (int64_t i = 0; i < nx; ++i) {
-        const auto at = [&](int64_t dj, int64_t di) { return c * w.cells() + w.at(j + dj, i + di); };
-        add_differences(a, at(0, 0), at(0, -1), at(0, 1), static_cast<double>(nx),
-                        (w.u(0, j, i - 1) + w.u(0, j, i)) / 2, (w.u(0, j, i) + w.u(0, j, i + 1)) / 2, kDt,
-                        kNu * kDt);
-        if (Dim == 1) continue;
-        add_differences(a, at(0, 0), at(-1, 0), at(1, 0), static_cast<double>(ny),
-                        (w.u(1, j - 1, i) + w.u(1, j, i)) / 2, (w.u(1, j, i) + w.u(1, j + 1, i)) / 2, kDt,
-                        kNu * kDt);
-      }
-  return a;
-}
-
-template <class T>
-Matrix dense_navier_stokes(const Flow<T>& w) {
-  const int64_t n = w.cells();
-  const auto x = static_cast<double>(w.shape.nx), y = static_cast<double>(w.shape.ny);
-  Matrix a = Matrix::Zero(3 * n, 3 * n);
-  for (int64_t j = 0; j < w.shape.ny; ++j)
-    for (int64_t i = 0; i < w.shape.nx; ++i) {
-      const int64_t here = w.at(j, i);
-      const double u2_at_u1 = (w.u(1, j, i - 1) + w.u(1, j, i) + w.u(1, j + 1, i - 1) + w.u(1, j + 1, i)) / 4;
-      const double u1_at_u2 = (w.u(0, j - 1, i) + w.u(0, j, i) + w.u(0, j - 1, i + 1) + w.u(0, j, i + 1)) / 4;
-      for (int64_t c = 0; c < 2; ++c) {
-        const double along_x = c == 0 ? w.u(0, j, i) : u1_at_u2, along_y = c == 0 ? u2_at_u1 : w.u(1, j, i);
-        a(c * n + here, c * n + here) += 1 / kDt;
-        add_differences(a, c * n + here, c * n + w.at(j, i - 1), c * n + w.at(j, i + 1), x, along_x, along_x,
-                        1.0, kNu);
-        add_differences(a, c * n + here, c * n + w.at(j - 1, i), c * n + w.at(j + 1, i), y, along_y, along_y,
-                        1.0, kNu);
-      }
-      a(here, 2 * n + here) += x;
-      a(here, 2 * n + w.at(j, i - 1)) -= x;
-      a(n + here, 2 * n + here) += y;
-      a(n + here, 2 * n + w.at(j - 1, i)) -= y;
-      a(2 * n + here, w.at(j, i + 1)) += x;
-      a(2 * n + here, here) -= x;
-      a(2 * n + here, n + w.at(j + 1, i)) += y;
-      a(2 * n + here, n + here) -= y;
-    }
-  return a;
-}
 
 /// A kernel's operations on plain vectors, in padded memory as the solvers use it.
 template <class Kernel>
@@ -181,7 +78,8 @@ void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
   harness.load(b, 2);
   kernel.divide_by_diagonal(harness.vector(2), harness.vector(0));
   harness.load(x, 1);
-  const T squared = kernel.template jacobi_sweep<true>(harness.vector(0), harness.vector(1), harness.vector(2));
+  const T squared =
+      kernel.template jacobi_sweep<true>(harness.vector(0), harness.vector(1), harness.vector(2));
   const Vector residual = as_vector(b) - a * as_vector(x);
   const Vector next = as_vector(x) + residual.cwiseQuotient(a.diagonal());
   const double scale = 30 * kTolerance<T>;
@@ -314,32 +212,47 @@ TEST(UpwindKernels, WindsThatAreNotFiniteAreSeen) {
   }
 }
 
-template <class T>
-void expect_sums_over_vectors() {
-  for (const int64_t n : {0, 1, 15, 16, 17, 64, 272})
-    for (int64_t count = 0; count <= 19; ++count) {
-      SCOPED_TRACE(testing::Message() << count << " vectors of " << n);
-      std::vector<std::vector<T>> vectors;
-      std::vector<const T*> v;
-      for (int64_t j = 0; j < count; ++j) vectors.push_back(random_values<T>(n, 100 + static_cast<unsigned>(j)));
-      for (const auto& vector : vectors) v.push_back(vector.data());
-      auto w = random_values<T>(n, 1);
-      const auto alpha = random_values<T>(count, 2);
-      std::vector<T> h(count + 1, T(7));
-      loops<T>().multi_dot(v.data(), count, w.data(), h.data(), n);
-      Vector expected = as_vector(w);
-      for (int64_t j = 0; j < count; ++j) {
-        EXPECT_NEAR(h[j], as_vector(vectors[j]).dot(as_vector(w)), 100 * kTolerance<T>);
-        expected -= static_cast<double>(alpha[j]) * as_vector(vectors[j]);
-      }
-      EXPECT_EQ(h[count], T(7));
-      loops<T>().multi_axpy(alpha.data(), v.data(), count, w.data(), n);
-      EXPECT_LT((as_vector(w) - expected).norm(), 100 * kTolerance<T>);
-    }
+/// Runs a method on a batch through the tensors' way into the loops.
+template <class T, class Parameters>
+at::Tensor solve_batch(const Parameters& a, const at::Tensor& b, prdp::Method method) {
+  auto u = at::empty_like(b), residual = at::empty({b.size(0)}, b.options());
+  std::vector<int64_t> iterations(b.size(0)), status(b.size(0)), applications(b.size(0));
+  const prdp::SampleBatch<T> batch{method, 500, 1e-5, nullptr, b.const_data_ptr<T>(),
+                                   u.mutable_data_ptr<T>(), iterations.data(), residual.mutable_data_ptr<T>(),
+                                   status.data(), applications.data()};
+  prdp::solve_range(a, batch, 0, b.size(0));
+  return u;
 }
-TEST(Vector, SumsOverManyVectorsEqualSumsOverEach) {
-  expect_sums_over_vectors<float>();
-  expect_sums_over_vectors<double>();
+
+TEST(UpwindKernels, ABatchIsSolvedWithItsOwnOrWithSharedWinds) {
+  const Shape shape{3, 5};
+  for (const int64_t winds : {1, 2})
+    for (const bool transposed : {false, true}) {
+      const auto w = prdp_test::random_field({3, 3, 5}, winds).squeeze(1).to(at::kFloat);
+      const auto b = prdp_test::random_field({3, 3, 5}, 2).squeeze(1).to(at::kFloat).contiguous();
+      const auto flat = b.narrow(1, 0, 2).contiguous();
+      const auto pairs = w.narrow(1, 0, 2).contiguous();
+      const prdp::BurgersParameters burgers{pairs, kNu, kDt, transposed};
+      const prdp::NavierStokesParameters flow{w, kNu, kDt, transposed};
+      const auto direct = solve_batch<float>(burgers, flat, prdp::Method::kDirect);
+      const auto jacobi = solve_batch<float>(burgers, flat, prdp::Method::kJacobi);
+      const auto step = solve_batch<float>(flow, b, prdp::Method::kDirect);
+      EXPECT_LT((direct - jacobi).abs().max().item<float>(), 1e-4);
+      for (int64_t s = 0; s < 2; ++s) {
+        const float* values = pairs[winds == 1 ? 0 : s].const_data_ptr<float>();
+        const Flow<float> sample{shape, {values, values + 30}};
+        const auto expect_solved = [&](Matrix a, const at::Tensor& u, const at::Tensor& rhs) {
+          if (transposed) a.transposeInPlace();
+          using View = Eigen::Map<const Eigen::VectorXf>;
+          const Vector x = View(u.const_data_ptr<float>(), a.rows()).cast<double>();
+          Vector r = View(rhs.const_data_ptr<float>(), a.rows()).cast<double>();
+          if (a.rows() == 45) r.tail(15).array() -= r.tail(15).mean();
+          EXPECT_LT((a * x - r).norm(), 1e-4 * r.norm());
+        };
+        expect_solved(dense_burgers<float, 2>(sample), direct[s], flat[s]);
+        expect_solved(dense_navier_stokes(sample), step[s], b[s]);
+      }
+    }
 }
 
 }  // namespace
