@@ -180,10 +180,10 @@ TEST(UpwindKernels, NavierStokesProjectsThePressureAlone) {
   const double mean = expected.tail(flow.cells()).mean();
   expected.tail(flow.cells()).array() -= mean;
   harness.load(v, 0);
-  EXPECT_NEAR(kernel.inconsistency(harness.vector(0)), std::abs(mean), 1e-15);
+  EXPECT_NEAR(kernel.inconsistency(harness.vector(0)), std::abs(mean) * std::sqrt(17.0 * 9.0), 1e-14);
   kernel.project(harness.vector(0));
   EXPECT_LT((as_vector(harness.store(0)) - expected).norm(), 1e-14);
-  EXPECT_LT(kernel.inconsistency(harness.vector(0)), 1e-15);
+  EXPECT_LT(kernel.inconsistency(harness.vector(0)), 1e-14);
   harness.expect_clean_padding(0);
 }
 
@@ -217,7 +217,7 @@ template <class T, class Parameters>
 at::Tensor solve_batch(const Parameters& a, const at::Tensor& b, prdp::Method method) {
   auto u = at::empty_like(b), residual = at::empty({b.size(0)}, b.options());
   std::vector<int64_t> iterations(b.size(0)), status(b.size(0)), applications(b.size(0));
-  const prdp::SampleBatch<T> batch{method, 500, 1e-5, nullptr, b.const_data_ptr<T>(),
+  const prdp::SampleBatch<T> batch{method, 500, 1e-5, prdp::kDefaultRestart, nullptr, b.const_data_ptr<T>(),
                                    u.mutable_data_ptr<T>(), iterations.data(), residual.mutable_data_ptr<T>(),
                                    status.data(), applications.data()};
   prdp::solve_range(a, batch, 0, b.size(0));
