@@ -65,6 +65,87 @@ TEST(Poisson, SolvesForTheLoadWithItsSign) {
   EXPECT_LT(residual.abs().max().item<double>(), 1e-10);
 }
 
+/// Burgers, 1D, row by row.
+at::Tensor dense_burgers(const at::Tensor& winds, double nu, double dt) {
+  const int64_t n = winds.numel();
+  const auto w = winds.flatten();
+  auto a = at::eye(n, at::kDouble);
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t below = (i + n - 1) % n, above = (i + 1) % n;
+    const double wi = w[i].item<double>();
+    const double in = n * std::max((w[below].item<double>() + wi) / 2, 0.0);
+    const double out = n * std::min((wi + w[above].item<double>()) / 2, 0.0);
+    const double diffusion = nu * static_cast<double>(n * n);
+    a[i][i] += dt * (in - out + 2 * diffusion);
+    a[i][below] -= dt * (in + diffusion);
+    a[i][above] += dt * (out - diffusion);
+  }
+  return a;
+}
+
+TEST(Burgers, StepEqualsDenseSolveAndItsGradientADifferenceOfSteps) {
+  auto burgers = prdp::Burgers({9}, 1e-2, 0.1, prdp::Direct{});
+  auto u = prdp_test::random_field({9}, 2).requires_grad_();
+  const auto next = burgers(u);
+  for (int64_t i = 0; i < 2; ++i) {
+    const auto expected = at::linalg_solve(dense_burgers(u[i].detach(), 1e-2, 0.1), u[i].flatten());
+    EXPECT_LT((next[i].flatten() - expected).abs().max().item<double>(), 1e-12);
+  }
+  const auto g = prdp_test::random_field({9}, 2), direction = prdp_test::random_field({9}, 2);
+  const auto gradient = torch::autograd::grad({next}, {u}, {g})[0];
+  const at::NoGradGuard no_grad;
+  const auto slope = (burgers(u + 1e-6 * direction) - burgers(u - 1e-6 * direction)) / 2e-6;
+  EXPECT_NEAR((gradient * direction).sum().item<double>(), (slope * g).sum().item<double>(), 1e-6);
+}
+
+TEST(NavierStokes, StepIsFreeOfDivergenceAndDifferentiable) {
+  auto flow = prdp::NavierStokes({6, 5}, 1e-3, 0.1, prdp::Direct{}, prdp::Backward::kImplicit, 2);
+  auto u = at::cat({prdp_test::random_field({6, 5}, 2), prdp_test::random_field({6, 5}, 2),
+                    prdp_test::random_field({6, 5}, 2)}, 1).requires_grad_();
+  const auto next = flow(u);
+  EXPECT_TRUE(flow.info()->iterations.eq(2).all().item<bool>());  // two Picard steps
+  const auto b = flow.rhs(u), residual = prdp::make_operator(flow.operator_at(u))->apply(next) - b;
+  EXPECT_LT(residual.select(1, 2).abs().max().item<double>(), 1e-12);
+  EXPECT_LT(next.select(1, 2).mean().abs().item<double>(), 1e-13);
+  (next * next).narrow(1, 0, 2).sum().backward();
+  EXPECT_GT(u.grad().narrow(1, 0, 2).abs().max().item<double>(), 1e-3);
+  EXPECT_EQ(u.grad().select(1, 2).abs().max().item<double>(), 0.0);
+}
+
+TEST(Flows, NormIsTheLargestAbsoluteRowSumAndNaNWhereTheWindsAre) {
+  for (const int64_t batch : {1, 3}) {
+    const auto nu = at::scalar_tensor(1e-2, at::kDouble);
+    const auto u = prdp_test::random_field({4, 5}, batch);
+    const auto winds = at::cat({u, u.flip(2)}, 1);
+    for (const char* kind : {"burgers", "navier_stokes"}) {
+      const auto a = prdp::make_operator({kind, {4, 5}, {0.1}, {winds, nu}});
+      const auto expected = a->dense(winds.options()).abs().sum(-1).amax(-1);
+      EXPECT_EQ(a->norm().sizes(), expected.sizes());
+      EXPECT_TRUE(at::allclose(a->norm(), expected, 1e-12));
+      auto bad = winds.clone();
+      bad[batch - 1][1][2][3] = std::numeric_limits<double>::quiet_NaN();
+      const auto norm = prdp::make_operator({kind, {4, 5}, {0.1}, {bad, nu}})->norm().reshape(-1);
+      for (int64_t i = 0; i < batch; ++i)
+        EXPECT_EQ(std::isnan(norm[i].item<double>()), i == batch - 1);
+    }
+  }
+}
+
+TEST(Flows, ProjectionTakesOffTheMeanPressureAlone) {
+  const auto nu = at::scalar_tensor(1e-2, at::kDouble);
+  const auto u = prdp_test::random_field({4, 5}, 2);
+  const auto v = at::cat({u, u.flip(2), u + 3.0}, 1);
+  for (const bool transposed : {false, true}) {
+    const auto a = prdp::make_operator({"navier_stokes", {4, 5}, {0.1}, {v, nu}, transposed});
+    const auto projected = a->project(v);
+    EXPECT_TRUE(at::equal(projected.narrow(1, 0, 2), v.narrow(1, 0, 2)));
+    EXPECT_TRUE(at::allclose(v.select(1, 2) - projected.select(1, 2),
+                             v.select(1, 2).mean({1, 2}, true).expand({2, 4, 5})));
+    EXPECT_TRUE(at::equal(prdp::make_operator({"burgers", {4, 5}, {0.1}, {v.narrow(1, 0, 2), nu}})
+                              ->project(v), v));
+  }
+}
+
 TEST(Stepper, RefusesBadArgumentsBeforeAnyWork) {
   EXPECT_THROW(prdp::Heat({30}, -1e-3, 1.0, prdp::Jacobi{.max_iter = 1}), c10::ValueError);
   EXPECT_THROW(prdp::Heat({30}, 1e-3, 0.0, prdp::Jacobi{.max_iter = 1}), c10::ValueError);
@@ -74,6 +155,11 @@ TEST(Stepper, RefusesBadArgumentsBeforeAnyWork) {
   auto heat = prdp::Heat({30}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 1});
   EXPECT_THROW(heat(at::zeros({25, 30})), c10::ValueError);
   EXPECT_THROW(heat(at::zeros({25, 1, 30}, at::kLong)), c10::TypeError);
+  EXPECT_THROW(prdp::Burgers({8}, 1e-3, 0.0, prdp::Direct{}), c10::ValueError);
+  EXPECT_THROW(prdp::Burgers({8, 8, 8}, 1e-3, 0.1, prdp::Direct{}), c10::ValueError);
+  EXPECT_THROW(prdp::NavierStokes({8}, 1e-3, 0.1, prdp::Direct{}), c10::ValueError);
+  auto flow = prdp::NavierStokes({4, 5}, 1e-3, 0.1, prdp::Direct{});
+  EXPECT_THROW(flow(at::zeros({2, 2, 4, 5})), c10::ValueError);
 }
 
 }  // namespace

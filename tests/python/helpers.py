@@ -20,10 +20,10 @@ def statuses(info):
     return [prdp.SolveStatus(int(s)).name for s in info.status]
 
 
-def field(shape, batch=2, seed=0, dtype=torch.float64):
-    """Random (batch, 1, *shape)."""
+def field(shape, batch=2, seed=0, dtype=torch.float64, channels=1):
+    """Random (batch, channels, *shape)."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(batch, 1, *shape, generator=generator, dtype=dtype)
+    return torch.randn(batch, channels, *shape, generator=generator, dtype=dtype)
 
 
 def dense_laplacian(shape):
@@ -46,3 +46,52 @@ def spd_matrices(batch, n, seed=0, dtype=torch.float64):
     a = torch.randn(batch, n, n, generator=generator, dtype=dtype)
     a = 0.5 * (a + a.mT)
     return a + 1.5 * torch.diag_embed(a.abs().sum(-1))
+
+
+def advection_diffusion(shape, nu, faces):
+    """Γ - ν L as a matrix, entry by entry; `faces(point, axis, lower, upper)` gives the winds at the
+    lower and the upper face of a point that has these neighbours."""
+    row = np.arange(np.prod(shape)).reshape(shape)
+    c = np.zeros((row.size, row.size))
+    for point in np.ndindex(*shape):
+        for d, n in enumerate(shape):
+            lower, upper = (tuple(np.add(point, s * np.eye(len(shape), dtype=int)[d]) % shape) for s in (-1, 1))
+            below, above = faces(point, d, lower, upper)
+            c[row[point], row[lower]] -= n * max(below, 0) + nu * n**2
+            c[row[point], row[upper]] += n * min(above, 0) - nu * n**2
+            c[row[point], row[point]] += n * max(below, 0) - n * min(above, 0) + 2 * nu * n**2
+    return c
+
+
+def dense_burgers(winds, nu, dt):
+    """The matrix of one Burgers step from `winds` (dim, *shape), in numpy."""
+    dim, *shape = winds.shape
+
+    def faces(point, axis, lower, upper):
+        w = winds[dim - 1 - axis]
+        return (w[lower] + w[point]) / 2, (w[point] + w[upper]) / 2
+
+    c = advection_diffusion(shape, nu, faces)
+    return np.kron(np.eye(dim), np.eye(len(c)) + dt * c)
+
+
+def dense_navier_stokes(velocity, nu, dt):
+    """The matrix of one Navier-Stokes step from `velocity` (2 or 3, Ny, Nx), in numpy."""
+    u1, u2 = np.asarray(velocity[:2])
+    ny, nx = u1.shape
+
+    def wind_at_u1(point, axis, *_):
+        j, i = point
+        across = (u2[j, i - 1] + u2[j, i] + u2[(j + 1) % ny, i - 1] + u2[(j + 1) % ny, i]) / 4
+        return (u1[point] if axis == 1 else across,) * 2
+
+    def wind_at_u2(point, axis, *_):
+        j, i = point
+        across = (u1[j - 1, i] + u1[j, i] + u1[j - 1, (i + 1) % nx] + u1[j, (i + 1) % nx]) / 4
+        return (u2[point] if axis == 0 else across,) * 2
+
+    c1, c2 = (advection_diffusion((ny, nx), nu, wind) for wind in (wind_at_u1, wind_at_u2))
+    one, zero = np.eye(ny * nx), np.zeros((ny * nx, ny * nx))
+    d1 = nx * np.kron(np.eye(ny), np.roll(np.eye(nx), 1, axis=1) - np.eye(nx))
+    d2 = ny * np.kron(np.roll(np.eye(ny), 1, axis=1) - np.eye(ny), np.eye(nx))
+    return np.block([[one / dt + c1, zero, -d1.T], [zero, one / dt + c2, -d2.T], [d1, d2, zero]])

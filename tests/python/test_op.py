@@ -27,8 +27,26 @@ def test_linear_solve_passes_opcheck(backward, solver):
     assert set(result.values()) == {"SUCCESS"}
 
 
-# opcheck looks at the intermediate results of unrolled_vjp, which runs autograd inside.
-@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+# opcheck looks at the .grad of results in between, which the ops made of others have.
+of_several_ops = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+
+
+@of_several_ops
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_solves_and_steps_of_flows_pass_opcheck(backward):
+    _, nu, options = arguments(backward, "direct")
+    for kind, channels, shape in (("burgers", 1, [5]), ("burgers", 2, [3, 4]), ("navier_stokes", 3, [3, 4])):
+        u, b = field(shape, channels=channels).requires_grad_(), field(shape, seed=1, channels=channels)
+        for op, args in (
+            (torch.ops.prdp.linear_solve, (b, [u, nu], kind, shape, [0.1], False, *options)),
+            (torch.ops.prdp.step, (u, [nu], kind, shape, [0.1], 2, *options)),
+            (torch.ops.prdp.apply, (b, [u, nu], kind, shape, [0.1], True)),
+            (torch.ops.prdp.rhs, (u, kind, shape, [0.1])),
+        ):
+            assert set(opcheck(op.default, args).values()) == {"SUCCESS"}
+
+
+@of_several_ops
 def test_matrices_and_the_other_ops_pass_opcheck():
     b, nu, options = arguments()
     m = torch.eye(5, dtype=torch.float64, requires_grad=True)
@@ -97,6 +115,23 @@ def test_ahead_of_time_autograd_gives_the_eager_gradients(solver, backward):
         gradients.append((b.grad, nu.grad))
     assert torch.equal(gradients[0][0], gradients[1][0]) and gradients[0][1] != 0
     torch.testing.assert_close(gradients[0][1], gradients[1][1])
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("stepper, channels, solver", [
+    (prdp.Burgers, 2, prdp.Jacobi), (prdp.Burgers, 2, prdp.Direct), (prdp.NavierStokes, 3, prdp.Direct),
+])  # fmt: skip
+def test_a_compiled_flow_differentiates_through_its_winds_at_any_batch(stepper, channels, solver, backward):
+    torch._dynamo.reset()
+    nu = torch.tensor(1e-2, dtype=torch.float64, requires_grad=True)
+    eager = stepper((3, 4), nu, 0.1, solver=solver(4), backward=backward)
+    compiled = torch.compile(eager, fullgraph=True, backend="aot_eager")
+    for batch in (2, 3, 5):
+        gradients = []
+        for step in (eager, compiled):
+            u = field((3, 4), batch, channels=channels).requires_grad_()
+            gradients.append(torch.autograd.grad((step(step(u)) ** 2).sum(), (u, nu)))
+        torch.testing.assert_close(gradients[1], gradients[0])
 
 
 def test_checkpointing_recomputes_the_solve():

@@ -3,8 +3,8 @@
 
 namespace prdp {
 
-/// Winds along one axis of the grid, (batch or 1, 1, *shape): at the lower and the upper face of each
-/// cell, or twice those at the point itself.
+/// Winds along one axis of the grid, each (batch or 1, 1, *shape): at the lower and at the upper face of
+/// a cell; equal where the wind is taken at the point itself.
 struct AxisWinds {
   at::Tensor lower, upper;
 };

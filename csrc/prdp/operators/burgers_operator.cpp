@@ -9,7 +9,7 @@ BurgersOperator::BurgersOperator(const OperatorSpec& spec)
   grid_.check_field(winds_, channels_);
 }
 
-const AdvectionDiffusion& BurgersOperator::step() const {
+const AdvectionDiffusion& BurgersOperator::block() const {
   if (!made_) {
     std::vector<AxisWinds> faces;
     for (int64_t d = 0; d < grid_.dim(); ++d)
@@ -21,7 +21,7 @@ const AdvectionDiffusion& BurgersOperator::step() const {
 
 std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda,
                                                       const at::Tensor& u) const {
-  const auto [faces, nu] = step().product_rule(lambda, u);
+  const auto [faces, nu] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;
   for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed
     channels.push_back(forward_mean(faces[d].lower, grid_, d) + backward_mean(faces[d].upper, grid_, d));

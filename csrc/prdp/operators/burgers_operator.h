@@ -15,10 +15,10 @@ class BurgersOperator final : public FlowOperator {
   /// Raises ValueError unless the winds have shape (batch or 1, dim, *shape) with dim <= 2.
   explicit BurgersOperator(const OperatorSpec& spec);
 
-  at::Tensor apply(const at::Tensor& v) const override { return step().apply(v); }
-  at::Tensor apply_transpose(const at::Tensor& v) const override { return step().apply_transpose(v); }
-  at::Tensor diagonal() const override { return step().diagonal(); }
-  at::Tensor norm() const override { return largest(step().row_norms()); }
+  at::Tensor apply(const at::Tensor& v) const override { return block().apply(v); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return block().apply_transpose(v); }
+  at::Tensor diagonal() const override { return block().diagonal(); }
+  at::Tensor norm() const override { return largest(block().row_norms()); }
   at::Tensor solve_directly(const at::Tensor& b) const override { return solve_rows(matrix(), b); }
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
     return solve_rows(matrix().mT(), b);
@@ -28,9 +28,9 @@ class BurgersOperator final : public FlowOperator {
   KernelParameters kernel() const override;
 
  private:
-  /// Made when first wanted: the CPU loops never ask for it.
-  const AdvectionDiffusion& step() const;
-  /// (batch or 1, n, n), the block of one channel.
+  /// The block of one channel, made when first wanted: the CPU loops never ask for it.
+  const AdvectionDiffusion& block() const;
+  /// The same as (batch or 1, n, n).
   at::Tensor matrix() const;
   at::Tensor solve_rows(const at::Tensor& matrix, const at::Tensor& b) const;
 

@@ -16,8 +16,8 @@ bool is_flow(const Equation& equation) {
 
 /// A state of the equation in which nothing moves.
 at::Tensor rest(const Equation& equation) {
-  std::vector<int64_t> sizes{1, equation.kind == "navier_stokes"
-                                    ? 3 : static_cast<int64_t>(equation.shape.size())};
+  const bool has_pressure = equation.kind == "navier_stokes";
+  std::vector<int64_t> sizes{1, has_pressure ? 3 : static_cast<int64_t>(equation.shape.size())};
   // A negative extent is left for the operator to refuse.
   for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
   return at::zeros(sizes);
@@ -96,9 +96,8 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
         "str solver, SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, "
-        "float? adjoint_rtol, "
-        "str on_failure, int adjoint_log) -> (Tensor u_next, Tensor iterations, Tensor residual, "
-        "Tensor status, Tensor operator_applications)",
+        "float? adjoint_rtol, str on_failure, int adjoint_log) -> (Tensor u_next, Tensor iterations, "
+        "Tensor residual, Tensor status, Tensor operator_applications)",
         step_op);
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
   m.def("check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "

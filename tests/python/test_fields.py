@@ -1,0 +1,84 @@
+"""Velocity fields on the staggered grid, against closed forms."""
+
+import math
+
+import pytest
+import torch
+from helpers import field
+
+import prdp_torch as prdp
+from prdp_torch import fields
+
+
+@pytest.mark.parametrize("channels", [2, 3])
+@pytest.mark.parametrize("shape", [(4, 4), (5, 8), (9, 6)])
+def test_divergence_and_curl_are_the_differences_between_faces(channels, shape):
+    u = field(shape, channels=channels)
+    ny, nx = shape
+    divergence, curl = fields.divergence(u), fields.curl(u)
+    assert divergence.shape == curl.shape == (2, 1, *shape)
+    for j in range(ny):
+        for i in range(nx):
+            right, above = u[:, 0, j, (i + 1) % nx], u[:, 1, (j + 1) % ny, i]
+            expected = (right - u[:, 0, j, i]) * nx + (above - u[:, 1, j, i]) * ny
+            torch.testing.assert_close(divergence[:, 0, j, i], expected)
+            expected = (u[:, 1, j, i] - u[:, 1, j, i - 1]) * nx - (u[:, 0, j, i] - u[:, 0, j - 1, i]) * ny
+            torch.testing.assert_close(curl[:, 0, j, i], expected)
+
+
+@pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("shape", [(8, 8), (5, 8), (7, 6), (33, 17)])
+def test_project_takes_off_the_gradient_part_alone(dtype, bound, shape):
+    u = field(shape, channels=3).to(dtype)
+    v = fields.project(u)
+    assert v.dtype == dtype and torch.equal(v[:, 2], u[:, 2])
+    assert fields.divergence(v).abs().max() < bound * max(shape)
+    torch.testing.assert_close(fields.project(v), v, rtol=0, atol=bound)
+    torch.testing.assert_close(fields.curl(v), fields.curl(u), rtol=0, atol=10 * bound * max(shape))
+    torch.testing.assert_close(v.mean((2, 3)), u.mean((2, 3)), rtol=0, atol=bound)
+    # Nearest: what was taken off is orthogonal to what stays.
+    assert ((u - v) * v).sum((1, 2, 3)).abs().max() < 1e2 * bound
+
+
+def test_fields_differentiate():
+    u = field((3, 4), channels=2).requires_grad_()
+    for f in (fields.divergence, fields.curl, fields.project):
+        assert torch.autograd.gradcheck(f, u)
+
+
+def test_downsample_takes_every_second_point():
+    u = torch.arange(2 * 97 * 97.0).view(1, 2, 97, 97)
+    v = fields.downsample(u)
+    assert v.shape == (1, 2, 48, 48)
+    assert torch.equal(v[0, 1], u[0, 1, range(1, 96, 2)][:, range(1, 96, 2)])
+    assert fields.downsample(field((5, 7), channels=3)).shape == (2, 3, 2, 3)
+
+
+def test_rollout_stacks_the_states_and_differentiates():
+    step = prdp.Burgers((9,), 1e-2, 0.1, solver=prdp.Direct())
+    u = field((9,)).requires_grad_()
+    states = fields.rollout(step, u, 3)
+    assert states.shape == (2, 4, 1, 9)
+    assert torch.equal(states[:, 0], u) and torch.equal(states[:, 3], step(step(step(u))))
+    expected = torch.autograd.grad(step(step(step(u))).sum(), u)[0]
+    torch.testing.assert_close(torch.autograd.grad(states[:, 3].sum(), u)[0], expected)
+    assert torch.equal(fields.rollout(math.sin, u, 0), u[:, None])
+
+
+@pytest.mark.parametrize(
+    "call, error, message",
+    [
+        (lambda: fields.divergence(field((4, 4))), ValueError,
+         r"divergence: expected \(batch, 2 or 3, Ny, Nx\), got \(2, 1, 4, 4\)"),
+        (lambda: fields.project(torch.zeros(2, 4, 4)), ValueError, r"project: expected .* got \(2, 4, 4\)"),
+        (lambda: fields.curl(torch.zeros(1, 2, 4, 4, dtype=torch.int64)), TypeError, "curl: expected float32 or"),
+        (lambda: fields.downsample(torch.zeros(1, 2, 97, 96)), ValueError,
+         r"downsample: Ny and Nx must be odd, got \(97, 96\)"),
+        (lambda: fields.downsample([0.0]), TypeError, "downsample: u must be a torch tensor, got list"),
+        (lambda: fields.rollout(math.sin, field((4,)), -1), ValueError, "rollout: steps must be >= 0, got -1"),
+        (lambda: fields.rollout(math.sin, field((4,)), 1.5), TypeError, "rollout: steps must be a whole number"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_refused_in_words(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
