@@ -35,9 +35,9 @@ of_several_ops = pytest.mark.filterwarnings("ignore:The .grad attribute of a Ten
 @pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 def test_solves_and_steps_of_flows_pass_opcheck(backward):
     _, nu, options = arguments(backward, "direct")
+    options = (*options[:-2], "return", 0)  # a random pressure has a mean and is inconsistent
     for kind, channels, shape in (("burgers", 1, [5]), ("burgers", 2, [3, 4]), ("navier_stokes", 3, [3, 4])):
         u, b = field(shape, channels=channels).requires_grad_(), field(shape, seed=1, channels=channels)
-        b[:, 2:] = 0.0  # a pressure mean would be inconsistent
         for op, args in (
             (torch.ops.prdp.linear_solve, (b, [u, nu], kind, shape, [0.1], False, *options)),
             (torch.ops.prdp.step, (u, [nu], kind, shape, [0.1], 2, *options)),
