@@ -102,6 +102,11 @@ at::Tensor NavierStokesOperator::solve(const at::Tensor& matrix, const at::Tenso
   return project(std::get<0>(at::linalg_solve_ex(matrix, rhs)).reshape_as(b));
 }
 
+at::Tensor NavierStokesOperator::precondition(const at::Tensor& v, bool transposed) const {
+  if (!stokes_) stokes_.emplace(grid_, step_.nu, step_.dt, v.scalar_type());
+  return (*stokes_)(v, transposed);
+}
+
 KernelParameters NavierStokesOperator::kernel() const {
   return NavierStokesParameters{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
 }

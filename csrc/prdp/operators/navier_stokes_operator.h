@@ -3,6 +3,7 @@
 
 #include "prdp/operators/advection_diffusion.h"
 #include "prdp/operators/flow_operator.h"
+#include "prdp/operators/stokes_solve.h"
 
 namespace prdp {
 
@@ -33,6 +34,8 @@ class NavierStokesOperator final : public FlowOperator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   KernelParameters kernel() const override;
+  /// The same step without winds.
+  at::Tensor precondition(const at::Tensor& v, bool transposed) const override;
 
  private:
   /// C₁ and C₂, made when first wanted: the CPU loops never ask for them.
@@ -47,6 +50,7 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) const;
 
   mutable std::optional<Momentum> made_;
+  mutable std::optional<StokesSolve> stokes_;
 };
 
 }  // namespace prdp

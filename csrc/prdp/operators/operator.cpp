@@ -37,6 +37,10 @@ at::Tensor Operator::dense(const at::TensorOptions& options) const {
   return batch == 1 && norm().dim() == 0 ? matrix.squeeze(0) : matrix;
 }
 
+at::Tensor Operator::precondition(const at::Tensor&, bool) const {
+  TORCH_CHECK_VALUE(false, "GMRES: preconditioner \"stokes\" is for NavierStokes operators alone");
+}
+
 namespace {
 
 /// Aᵀ of any operator.
@@ -52,6 +56,9 @@ class Transposed final : public Operator {
     return a_->product_rule(u, lambda);  // ⟨λ, Aᵀ u⟩ = ⟨u, A λ⟩
   }
   at::Tensor project(const at::Tensor& v) const override { return a_->project(v); }
+  at::Tensor precondition(const at::Tensor& v, bool transposed) const override {
+    return a_->precondition(v, !transposed);
+  }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   at::Tensor solve_directly(const at::Tensor& b) const override {

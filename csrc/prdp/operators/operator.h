@@ -77,6 +77,8 @@ class Operator {
   virtual at::Tensor norm() const = 0;
   /// v without its part in the null space of A and Aᵀ; v itself where A is regular. Differentiable.
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
+  /// M⁻¹ v and M⁻ᵀ v for a cheap M ≈ A that suits this operator; ValueError where there is none.
+  virtual at::Tensor precondition(const at::Tensor& v, bool transposed) const;
   /// Where the first NaN or Inf that A is made of sits: (i, j) in a matrix, (channel, *grid) in winds.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator of the samples `index` (int64) alone, differentiable in the same tensors.

@@ -18,9 +18,12 @@ class GmresMethod {
   using Scalar = typename Space::Scalar;
   using Vector = typename Space::Vector;
 
-  GmresMethod(Space& space, int64_t restart)
-      : x(space.vector()), space_(space), m_(std::min(restart, space.unknowns())), r_(space.vector()),
-        kept_x_(space.vector()), kept_r_(space.vector()), h_(m_ * (m_ + 1)), inverse_(m_), cos_(m_), sin_(m_), g_(m_ + 1), y_(m_), again_(m_ + 1) {
+  /// Preconditioned from the right, by what the space has for A: A M⁻¹ y = b, x = M⁻¹ y.
+  GmresMethod(Space& space, int64_t restart, bool preconditioned)
+      : x(space.vector()), space_(space), preconditioned_(preconditioned),
+        m_(std::min(restart, space.unknowns())), r_(space.vector()), kept_x_(space.vector()),
+        kept_r_(space.vector()), h_(m_ * (m_ + 1)), inverse_(m_), cos_(m_), sin_(m_), g_(m_ + 1), y_(m_),
+        again_(m_ + 1) {
     for (int64_t j = 0; j <= m_; ++j) v_.push_back(space.vector());
     if (space.recording()) products_.resize(m_);
   }
@@ -39,7 +42,7 @@ class GmresMethod {
     space_.copy(r_, kept_r_);
     const int64_t columns = extend_basis();
     minimise(columns);
-    space_.add_combination(y_, v_, columns, x);
+    space_.add_combination(y_, v_, columns, x, preconditioned_);
     ready_ = false;
   }
   /// ‖b - A x‖². A cycle that made it grow was rounding errors and is taken back.
@@ -70,7 +73,7 @@ class GmresMethod {
     space_.scale(r_, space_.inverse(g_[0], g_[0]), v_[0]);
     exhausted_ = space_.is_zero(g_[0]);
     for (int64_t j = 0; j < m_; ++j) {
-      space_.apply(v_[j], v_[j + 1]);
+      space_.apply(v_[j], v_[j + 1], preconditioned_);
       if (space_.recording()) products_[j] = v_[j + 1];
       scale_ = space_.larger(scale_, orthogonalise(j));
       const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
@@ -152,6 +155,7 @@ class GmresMethod {
   }
 
   Space& space_;
+  bool preconditioned_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_;
   std::vector<Vector> v_, products_;  // orthonormal basis; A v_j, kept while recording

@@ -20,7 +20,8 @@ auto with_method(Method method, int64_t restart, Space& space, const Body& body)
     case Method::kJacobi: return body(JacobiMethod<Space>(space));
     case Method::kSteepestDescent: return body(SteepestDescentMethod<Space>(space));
     case Method::kConjugateGradient: return body(ConjugateGradientMethod<Space>(space));
-    case Method::kGmres: return body(GmresMethod<Space>(space, restart));
+    case Method::kGmres: return body(GmresMethod<Space>(space, restart, false));
+    case Method::kGmresStokes: return body(GmresMethod<Space>(space, restart, true));
     case Method::kDirect: break;
   }
   return body(DirectMethod<Space>(space));

@@ -45,7 +45,7 @@ class SampleSpace {
     return loops_.descend(alpha, p, q, x, r, length());
   }
 
-  void apply(const T* v, Vector out) {
+  void apply(const T* v, Vector out, bool /*preconditioned: never, solve() sees to it*/ = false) {
     ++state_.applications;
     kernel_.apply(v, out);
   }
@@ -95,7 +95,8 @@ class SampleSpace {
     loops_.multi_axpy(h, v.data(), count, w, length());
     return dot(w, w);
   }
-  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x) {
+  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x,
+                       bool /*preconditioned*/) {
     for (int64_t i = 0; i < count; ++i) loops_.axpy(y[i], v[i], x, length());
   }
   /// A second pass pays where the first left less than it took.

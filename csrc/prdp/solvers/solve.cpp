@@ -52,7 +52,9 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel();
-  if (!b.is_cpu() || std::holds_alternative<std::monostate>(parameters))
+  const bool has_loops = !std::holds_alternative<std::monostate>(parameters) &&
+                         request.method != Method::kGmresStokes;
+  if (!b.is_cpu() || !has_loops)
     return solve_with_tensors(a, b, request);
   return std::visit(
       [&](const auto& p) -> SolveResult {

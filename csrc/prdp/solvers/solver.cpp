@@ -11,10 +11,11 @@ namespace {
 template <class Enum, size_t N>
 using Names = std::array<std::pair<Enum, std::string_view>, N>;
 
-constexpr Names<Method, 5> kMethods{{{Method::kJacobi, "jacobi"},
+constexpr Names<Method, 6> kMethods{{{Method::kJacobi, "jacobi"},
                                      {Method::kSteepestDescent, "steepest_descent"},
                                      {Method::kConjugateGradient, "cg"},
                                      {Method::kGmres, "gmres"},
+                                     {Method::kGmresStokes, "gmres_stokes"},
                                      {Method::kDirect, "direct"}}};
 constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
                                          {Backward::kUnrolled, "unrolled"},

@@ -7,7 +7,7 @@
 
 namespace prdp {
 
-enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kGmres, kDirect };
+enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kGmres, kGmresStokes, kDirect };
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -41,12 +41,16 @@ struct CG {
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol}; }
 };
-/// Restarted; max_iter counts cycles.
+/// Restarted; max_iter counts cycles. With `stokes`, preconditioned by a Navier-Stokes step without
+/// winds, for NavierStokes alone; it runs in plain tensor operations.
 struct GMRES {
   int64_t restart = kDefaultRestart;
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kGmres, max_iter, rtol, restart}; }
+  bool stokes = false;
+  operator Solver() const {
+    return {stokes ? Method::kGmresStokes : Method::kGmres, max_iter, rtol, restart};
+  }
 };
 /// The cheapest exact method of the operator; an iteration is one direct solve, those after the
 /// first refine its result.

@@ -40,9 +40,9 @@ class TensorSpace {
     return dot(r, r);
   }
 
-  void apply(const Vector& v, Vector& out) {
+  void apply(const Vector& v, Vector& out, bool preconditioned = false) {
     count();
-    out = a_.apply(v);
+    out = a_.apply(preconditioned ? a_.precondition(v, false) : v);
   }
   void divide_by_diagonal(const Vector& b, Vector& c) const { c = b / diagonal_; }
   template <bool WithResidual>
@@ -77,10 +77,11 @@ class TensorSpace {
     for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
     return dot(w.detach(), w.detach());
   }
-  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x) const {
-    auto sum = x;
-    for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
-    x = keep_frozen(sum, x);
+  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
+                       bool preconditioned) const {
+    auto sum = y[0] * v[0];
+    for (int64_t i = 1; i < count; ++i) sum = sum + y[i] * v[i];
+    x = keep_frozen(x + (preconditioned ? a_.precondition(sum, false) : sum), x);
   }
   bool lost_orthogonality(const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
