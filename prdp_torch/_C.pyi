@@ -1,5 +1,7 @@
 """Types of the compiled library, for editors."""
 
+from collections.abc import Callable
+
 from torch import Tensor, dtype
 
 VERSION: str
@@ -7,6 +9,15 @@ DEFAULT_RTOL: float
 DEFAULT_RESTART: int
 SOLVE_STATUSES: dict[str, int]
 PRDP_DEFAULTS: dict[str, float | int | None]
+
+class RegisteredProducts:
+    def __init__(
+        self,
+        apply: Callable[[Tensor, list[Tensor]], Tensor],
+        apply_transpose: Callable[[Tensor, list[Tensor]], Tensor],
+    ) -> None: ...
+    @property
+    def number(self) -> int: ...
 
 def check_operator(kind: str, shape: list[int], parameters: list[float], tensors: list[Tensor]) -> None: ...
 def check_solver(who: str, method: str, max_iter: int, rtol: float, restart: int) -> None: ...

@@ -102,6 +102,28 @@ class NavierStokes(Operator):
         super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt))
 
 
+class Function(Operator):
+    """An operator of your own, by its products `matvec(v, *tensors)` = A v and `transpose(v, *tensors)` =
+    Aᵀ v on batches of vectors (batch, ...), each of the shape and dtype of v. Made of torch operations,
+    they differentiate themselves; samples may differ through `tensors` alone, which get gradients.
+
+    For a symmetric A give the same function twice. `Jacobi` needs a diagonal and refuses; `Direct` probes
+    A with unit vectors, for small systems. Not under `torch.compile`.
+    """
+
+    kind = "function"
+
+    def __init__(self, matvec, transpose, tensors=()):
+        for name, function in (("matvec", matvec), ("transpose", transpose)):
+            if not callable(function):
+                raise TypeError(f"Function: {name} must be callable, got {function!r}")
+        tensors = [_check.dense("Function", "every tensor", t) for t in tensors]
+        self._products = _C.RegisteredProducts(
+            lambda v, given: matvec(v, *given), lambda v, given: transpose(v, *given)
+        )
+        super().__init__([self._products.number], [], tensors)
+
+
 class Matrix(Operator):
     """A tensor (n, n) or (batch, n, n), dense or sparse CSR. Gradients of a sparse one live on its
     pattern."""

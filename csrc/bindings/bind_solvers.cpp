@@ -1,5 +1,8 @@
+#include <pybind11/functional.h>
+
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/solvers/solve.h"
 
 namespace py = pybind11;
@@ -32,6 +35,13 @@ void bind_solvers(py::module_& m) {
   for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
   m.attr("SOLVE_STATUSES") = statuses;
 
+  py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts")
+      .def(py::init([](Products::Product apply, Products::Product apply_transpose) {
+             auto made = RegisteredProducts::make({std::move(apply), std::move(apply_transpose)});
+             return std::const_pointer_cast<RegisteredProducts>(made);
+           }),
+           py::arg("apply"), py::arg("apply_transpose"))
+      .def_property_readonly("number", &RegisteredProducts::number);
   m.def("check_operator",
         [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
            std::vector<at::Tensor> tensors) {

@@ -3,4 +3,5 @@
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/steppers/stepper.h"

@@ -7,6 +7,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/function_operator.h"
 
 namespace prdp {
 
@@ -26,6 +27,7 @@ constexpr const char* kSchema =
 struct Call : torch::CustomClassHolder {
   OperatorSpec a;
   SolveOptions options;
+  std::shared_ptr<const RegisteredProducts> products;  // kept alive for the backward pass
 };
 
 using Signature = Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
@@ -129,6 +131,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     kept->a = call->a;
     kept->a.tensors.clear();
     kept->options = call->options;
+    if (call->a.kind == "function") kept->products = RegisteredProducts::find(call->a.shape[0]);
     ctx->saved_data["call"] = c10::IValue::make_capsule(kept);
     return {u, iterations, residual, status, applications};
   }

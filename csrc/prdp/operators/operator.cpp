@@ -3,6 +3,7 @@
 #include <numeric>
 
 #include "prdp/operators/burgers_operator.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/laplacian_operator.h"
 #include "prdp/operators/matrix_operator.h"
 #include "prdp/operators/navier_stokes_operator.h"
@@ -68,7 +69,8 @@ class Transposed final : public Operator {
     return a_->solve_directly(b);
   }
   std::unique_ptr<Operator> select(const at::Tensor& index) const override {
-    return std::make_unique<Transposed>(a_->select(index));
+    auto chosen = a_->select(index);
+    return chosen ? std::make_unique<Transposed>(std::move(chosen)) : nullptr;
   }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override {
     return a_->first_nonfinite(sample);
@@ -92,9 +94,10 @@ std::unique_ptr<Operator> make_untransposed(const OperatorSpec& spec) {
   if (spec.kind == "burgers") return std::make_unique<BurgersOperator>(spec);
   if (spec.kind == "navier_stokes") return std::make_unique<NavierStokesOperator>(spec);
   if (spec.kind == "dense") return std::make_unique<DenseOperator>(spec);
+  if (spec.kind == "function") return std::make_unique<FunctionOperator>(spec);
   if (spec.kind == "csr") return std::make_unique<CsrOperator>(spec);
   TORCH_CHECK_VALUE(false, "operator: unknown kind '", spec.kind,
-                    "'; allowed: heat, poisson, burgers, navier_stokes, dense, csr");
+                    "'; allowed: heat, poisson, burgers, navier_stokes, dense, csr, function");
 }
 
 }  // namespace

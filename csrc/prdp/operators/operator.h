@@ -81,7 +81,8 @@ class Operator {
   virtual at::Tensor precondition(const at::Tensor& v, bool transposed) const;
   /// Where the first NaN or Inf that A is made of sits: (i, j) in a matrix, (channel, *grid) in winds.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
-  /// The operator of the samples `index` (int64) alone, differentiable in the same tensors.
+  /// The operator of the samples `index` (int64) alone, differentiable in the same tensors; null where
+  /// that is not known.
   virtual std::unique_ptr<Operator> select(const at::Tensor& index) const = 0;
   /// Shape of one vector without its batch axis.
   virtual std::vector<int64_t> vector_shape() const = 0;

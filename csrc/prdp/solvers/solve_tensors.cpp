@@ -138,9 +138,11 @@ at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& 
   if (index.numel() < b.size(0)) {
     const auto zeros = at::zeros_like(b);
     if (index.numel() == 0) return zeros;
-    const auto some = solve_recorded(*a.select(index), b.index_select(0, index), solver,
-                                     caps.index_select(0, index.to(caps.device())));
-    return zeros.index_copy(0, index, some);
+    if (const auto part = a.select(index)) {
+      const auto some = solve_recorded(*part, b.index_select(0, index), solver,
+                                       caps.index_select(0, index.to(caps.device())));
+      return zeros.index_copy(0, index, some);
+    }
   }
   const auto host_caps = caps.to(at::kCPU).contiguous();
   std::vector<SampleState> states(b.size(0));

@@ -25,8 +25,7 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 }  // namespace
 
 TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording)
-    : a_(a), b_(std::move(b)), diagonal_(a.diagonal()), states_(states), recording_(recording) {
-  diagonal_ = diagonal_.to(b_.options());
+    : a_(a), b_(std::move(b)), states_(states), recording_(recording) {
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;

@@ -44,7 +44,10 @@ class TensorSpace {
     count();
     out = a_.apply(preconditioned ? a_.precondition(v, false) : v);
   }
-  void divide_by_diagonal(const Vector& b, Vector& c) const { c = b / diagonal_; }
+  void divide_by_diagonal(const Vector& b, Vector& c) {
+    diagonal_ = a_.diagonal().to(b_.options());
+    c = b / diagonal_;
+  }
   template <bool WithResidual>
   Scalar jacobi_sweep(const Vector& c, const Vector& x, Vector& next) {
     Vector product;
