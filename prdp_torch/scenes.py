@@ -30,8 +30,8 @@ def load(scene):
 
 
 def make_stepper(scene, direct=False, max_iter=None):
-    """The scene's step, with its solver (and another budget) or with the exact method. A failed sample is only reported:
-    coarse physics may well diverge early in a training."""
+    """The scene's step, with its solver, its budget K or another one, or with the exact method. A failed
+    sample is only reported: coarse physics may well diverge early in a training."""
     physics = scene.physics
     options = {
         "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),

@@ -31,6 +31,16 @@ TINY = (
 
 
 @pytest.fixture(autouse=True)
+def one_thread(monkeypatch):
+    """On so small a grid threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache" / "data"
     monkeypatch.setenv("PRDP_CACHE", str(folder))
@@ -116,7 +126,8 @@ def test_other_settings_have_a_file_of_their_own(tmp_path, cache, change):
     other = tiny(tmp_path, (before, f"{before.split(' = ')[0]} = {value}"), name="other")
     first, second = (_C.make_dataset(scenes.load(path)) for path in (tiny(tmp_path), other))
     assert len(list(cache.iterdir())) == 2
-    assert any(not torch.equal(a, b.float()) or b.dtype != a.dtype for a, b in zip(tensors(first), tensors(second)))
+    pairs = zip(tensors(first), tensors(second), strict=True)
+    assert any(a.dtype != b.dtype or not torch.equal(a, b) for a, b in pairs)
 
 
 def test_a_damaged_or_foreign_file_is_refused_with_the_remedy(tmp_path, cache):
@@ -149,7 +160,7 @@ def test_an_interrupted_making_leaves_nothing(tmp_path, cache):
 def test_a_cache_that_cannot_be_written_is_said_before_any_work(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "file" / "below"))
-    with pytest.raises(ValueError, match="data: cannot write to '.*below'; set PRDP_CACHE to a folder"):
+    with pytest.raises(ValueError, match=r"data: cannot write to '.*below'; set PRDP_CACHE to a folder"):
         _C.make_dataset(scenes.load(tiny(tmp_path)), no_solve)
 
 
@@ -179,8 +190,8 @@ def test_both_solves_of_an_update_are_counted(tmp_path):
     scene.backward = "none"
     without = train(scene, Refinement.constant(2))
     assert without["iterations"] == curves["iterations"]
-    # An adjoint costs what its primal does.
-    assert curves["operator_applications"] == [2 * products for products in without["operator_applications"]]
+    # An adjoint costs what its primal does; the first solve starts from data and needs none.
+    assert curves["operator_applications"] == [1.5 * products for products in without["operator_applications"]]
 
 
 def objective(scene, network, solver):
@@ -193,7 +204,7 @@ def objective(scene, network, solver):
     return data, steppers, *training._corrector(scene, steppers, data, network)
 
 
-def test_the_loss_is_that_of_both_times_and_its_gradient_passes_both_solves(tmp_path):
+def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve(tmp_path):
     """Against finite differences of the loss as written out here."""
     scene = scenes.load(tiny(tmp_path, ('"float32"', '"float64"')))
     network = make_network(scene, 0)
@@ -210,10 +221,12 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_both_solves(tmp_
             return float((u1 - data.train_first[batch]).square().mean() + (u2 - data.train_end[batch]).square().mean())
 
     loss = loss_of(batch)
-    assert float(loss) == pytest.approx(written_out(), rel=1e-9)
+    assert float(loss.detach()) == pytest.approx(written_out(), rel=1e-9)
     loss.backward()
     # Not INCONSISTENT, as the network's pressure would have it.
-    assert all(bool((s.adjoint_info.status > 0).all()) and s.converged for s in steppers)
+    first, second = steppers
+    assert first.adjoint_info is None and bool((second.adjoint_info.status > 0).all())
+    assert first.converged and second.converged
     weight = network.lift.weight
     direction = torch.randn(weight.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     step = 1e-5
@@ -227,7 +240,7 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_both_solves(tmp_
 
 def test_the_metric_is_the_x_velocity_after_converged_steps(tmp_path):
     scene = scenes.load(tiny(tmp_path, ('"float32"', '"float64"')))
-    data, steppers, _, metric = objective(scene, torch.zeros_like, prdp.GMRES(restart=8, max_iter=1))
+    data, _, _, metric = objective(scene, torch.zeros_like, prdp.GMRES(restart=8, max_iter=1))
     exact = prdp.NavierStokes([8, 8], 1e-4, 0.1, prdp.Direct())
     u = fields.rollout(exact, data.valid_start, 5)[:, -1, 0]
     error = (u - data.valid_end[:, 0]).flatten(1).norm(dim=1) / data.valid_end[:, 0].flatten(1).norm(dim=1)
