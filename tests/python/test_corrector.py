@@ -229,7 +229,7 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve
     assert first.converged and second.converged
     weight = network.lift.weight
     direction = torch.randn(weight.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    step = 1e-5
+    step = 1e-7  # short, for the winds and the ReLUs have kinks
     with torch.no_grad():
         weight.add_(direction, alpha=step)
         above = written_out()
