@@ -31,19 +31,10 @@ TINY = (
 
 
 @pytest.fixture(autouse=True)
-def one_thread(monkeypatch):
-    """On so small a grid threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache" / "data"
     monkeypatch.setenv("PRDP_CACHE", str(folder))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs: on so small a grid threads wait for each other
     return folder
 
 
