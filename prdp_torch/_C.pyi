@@ -87,6 +87,8 @@ class Data:
     valid: int
     seed: int
     valid_steps: int
+    valid_max_iter: int
+    reference_shape: list[int]
 
 class Network:
     kind: str
@@ -113,6 +115,7 @@ class Scene:
     title: str
     task: str
     unit: str
+    executions: int
     dtype: dtype
     physics: Physics
     data: Data
@@ -130,6 +133,7 @@ class Scene:
 
 class Dataset:
     train_start: Tensor
+    train_first: Tensor | None
     train_end: Tensor
     valid_start: Tensor
     valid_end: Tensor
@@ -141,9 +145,10 @@ class ParameterProblem:
     solution: Tensor
 
 def read_scene(path: str) -> Scene: ...
-def make_dataset(scene: Scene) -> Dataset: ...
+def make_dataset(scene: Scene, on_progress: Callable[[int, int], None] | None = ...) -> Dataset: ...
 def make_parameter_problem(scene: Scene) -> ParameterProblem: ...
 def loss(kind: str, u: Tensor, reference: Tensor) -> Tensor: ...
 def normalised_mse(u: Tensor, reference: Tensor) -> Tensor: ...
+def without_mean_pressure(u: Tensor) -> Tensor: ...
 def half_mse(u: Tensor, reference: Tensor) -> Tensor: ...
 def relative_error(theta: Tensor, reference: Tensor) -> Tensor: ...

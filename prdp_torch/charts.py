@@ -30,6 +30,8 @@ def _figure(panels=1, height=4.2):
 
 
 def _metric_name(scene):
+    if scene.task == "corrector":
+        return f"x-velocity error at t = {scene.data.valid_steps},\nmean of (‖u₁ − u₁_ref‖ / ‖u₁_ref‖)²"
     if scene.task == "emulator":
         steps = f"{scene.data.valid_steps} step{'s' if scene.data.valid_steps > 1 else ''}"
         return f"validation error after {steps},\nmean of (‖u − u_ref‖ / ‖u_ref‖)²"
@@ -201,7 +203,7 @@ def all_charts(scene, rows, table):
     """(name, figure, caption) of every chart, in the order of the report."""
     seeds = len(rows[0].curves)
     spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""
-    if scene.task == "emulator":
+    if scene.task != "parameters":
         cost = (
             accuracy_against_cost(scene, rows),
             "Accuracy against cost; lower left is better, the grey stairs join the runs that no other beats in both.",

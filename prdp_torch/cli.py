@@ -28,7 +28,7 @@ console = Console(highlight=False)
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
-Backward = Annotated[str | None, typer.Option(help="implicit or unrolled, in place of the scene's.")]
+Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
 
 

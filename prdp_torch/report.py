@@ -20,8 +20,8 @@ class Column(NamedTuple):
 
 def columns(scene):
     """The table's columns, in order."""
-    emulator, target = scene.task == "emulator", scene.compare.target
-    error = "validation error" if emulator else "parameter error"
+    network, target = scene.task != "parameters", scene.compare.target
+    error = "validation error" if network else "parameter error"
     until = "" if target is None else f" to an error of {target:g}"
     unit = f"{scene.unit}s"
     reached = []
@@ -29,11 +29,11 @@ def columns(scene):
         reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
     return [
         Column("", "", "Converged: K_ε, the K that the scene takes for converged."),
-        Column("error", f"final {error}", "± one standard deviation over the seeds." if emulator else ""),
+        Column("error", f"final {error}", "± one standard deviation over the seeds." if network else ""),
         Column("last K", "last K"),
         *reached,
         Column(
-            "allowed", f"iterations allowed{until}", f"allowed: K summed over the updates{until}, the paper's count."
+            "allowed", f"iterations allowed{until}", f"allowed: K summed over the solves{until}, the paper's count."
         ),
         Column("saved", "saved", "saved: of the converged run's."),
         Column("taken", "iterations taken", "taken: fewer where a solve meets its tolerance before K."),

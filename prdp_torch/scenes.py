@@ -29,21 +29,21 @@ def load(scene):
     return _C.read_scene(str(known[str(scene)]))
 
 
-def make_stepper(scene, direct=False):
-    """The scene's step, with its solver or with the exact method. A failed sample is only reported:
-    coarse physics may well diverge early in a training."""
+def make_stepper(scene, direct=False, max_iter=None):
+    """The scene's step, with its solver, its budget K or another one, or with the exact method. A failed
+    sample is only reported: coarse physics may well diverge early in a training."""
     physics = scene.physics
     options = {
-        "solver": solvers.Direct() if direct else _solver(scene),
+        "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
         "on_failure": "return",
     }
     if physics.equation == "poisson":
         return steppers.Poisson(physics.shape, **options)
-    kind = steppers.Heat if physics.equation == "heat" else steppers.Burgers
-    return kind(physics.shape, physics.nu, physics.dt, **options)
+    kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
+    return kinds[physics.equation](physics.shape, physics.nu, physics.dt, **options)
 
 
-def _solver(scene):
+def _solver(scene, max_iter):
     extra = {"restart": scene.restart} if scene.method == "gmres" else {}
-    return _SOLVERS[scene.method](max_iter=scene.max_iter, rtol=scene.rtol, **extra)
+    return _SOLVERS[scene.method](max_iter=max_iter, rtol=scene.rtol, **extra)

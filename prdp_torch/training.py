@@ -2,6 +2,7 @@
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
 import math
+import sys
 import time
 
 import torch
@@ -48,7 +49,8 @@ class Refinement:
 def train(scene, refinement, seed=0, network=None, on_interval=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
-    the updates; iterations and operator applications are per sample of a batch, summed over updates.
+    the solves, of which an update of the task "corrector" has two; iterations and operator applications
+    are per sample of a batch, summed over the solves.
     A training whose loss or metric is no longer finite stops there: "diverged" says where and why, the
     metric is NaN from then on, and nothing more is counted.
 
@@ -59,10 +61,10 @@ def train(scene, refinement, seed=0, network=None, on_interval=None):
         network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
         on_interval: called after each interval with (how many are done, the metric, K).
     """
-    stepper = make_stepper(scene, refinement.direct)
-    run = _Run(scene.training.intervals, stepper, refinement.attach([stepper]))
-    task = _emulator if scene.task == "emulator" else _parameters
-    updates, metric = task(scene, stepper, seed, network)
+    steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
+    run = _Run(scene.training.intervals, steppers, refinement.attach(steppers))
+    task = _parameters if scene.task == "parameters" else _network
+    updates, metric = task(scene, steppers, seed, network)
     try:
         run.go(updates, metric, on_interval or (lambda *report: None))
     except _Diverged as divergence:
@@ -77,9 +79,9 @@ class _Diverged(Exception):
 class _Run:
     """What the tasks share: the intervals, their costs, and when a training is lost."""
 
-    def __init__(self, intervals, stepper, controller):
+    def __init__(self, intervals, steppers, controller):
         self.intervals = intervals
-        self.stepper = stepper
+        self.steppers = steppers
         self.controller = controller
         names = ("update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds")
         self.curves = {name: [] for name in names}
@@ -87,25 +89,26 @@ class _Run:
     def go(self, updates, metric, on_interval):
         self._observe(metric(), 0)
         for done in range(1, self.intervals + 1):
-            k, started, count = self.stepper.max_iter, time.perf_counter(), 0
+            k, started, solves = self.controller.max_iter, time.perf_counter(), 0
             iterations = applications = 0.0
             for loss in updates():
-                count += 1
                 self._check(loss, done)
                 self.curves["update_loss"].append(loss)
-                iterations += float(self.stepper.info.iterations.double().mean())
-                for report in (self.stepper.info, self.stepper.adjoint_info):
-                    if report is not None:
-                        applications += float(report.operator_applications.double().mean())
-            self._append(k, k * count, iterations, applications, time.perf_counter() - started)
+                for stepper in self.steppers:
+                    solves += 1
+                    iterations += float(stepper.info.iterations.double().mean())
+                    for report in (stepper.info, stepper.adjoint_info):
+                        if report is not None:
+                            applications += float(report.operator_applications.double().mean())
+            self._append(k, k * solves, iterations, applications, time.perf_counter() - started)
             self._observe(metric(), done)
-            on_interval(done, self.curves["metric"][-1], self.stepper.max_iter)
+            on_interval(done, self.curves["metric"][-1], self.controller.max_iter)
 
     def give_up(self, why):
         self.curves["diverged"] = why
         self.curves["metric"] += [math.nan] * (self.intervals + 1 - len(self.curves["metric"]))
         while len(self.curves["seconds"]) < self.intervals:
-            self._append(self.stepper.max_iter, 0, 0.0, 0.0, 0.0)
+            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0)
 
     def _append(self, *costs):
         for name, value in zip(
@@ -122,14 +125,16 @@ class _Run:
     def _check(self, loss, done):
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
-        if bool((self.stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()):
+        if any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers):
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
-def _emulator(scene, stepper, seed, network):
+def _network(scene, steppers, seed, network):
     """The updates of one epoch, as an iterator over their losses, and the validation metric."""
-    data = _C.make_dataset(scene)
+    data = _C.make_dataset(scene, _report_data)
     network = make_network(scene, seed) if network is None else network
+    objective = _emulator if scene.task == "emulator" else _corrector
+    loss_of, metric_of = objective(scene, steppers, data, network)
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
     done = 0
@@ -140,8 +145,7 @@ def _emulator(scene, stepper, seed, network):
             for group in optimiser.param_groups:
                 group["lr"] = scene.learning_rate(done)
             optimiser.zero_grad()
-            u2 = stepper(network(data.train_start[batch]))
-            loss = _C.loss(scene.training.loss, u2, data.train_end[batch])
+            loss = loss_of(batch)
             loss.backward()
             optimiser.step()
             done += 1
@@ -149,16 +153,60 @@ def _emulator(scene, stepper, seed, network):
 
     def metric():
         with torch.no_grad():
-            u = data.valid_start
-            for _ in range(scene.data.valid_steps):
-                u = network(u)
-            return float(_C.normalised_mse(u, data.valid_end))
+            return float(metric_of())
 
     return updates, metric
 
 
-def _parameters(scene, stepper, seed, network):
+def _report_data(done, total):
+    print(f"data: {done} of {total} reference steps", file=sys.stderr, flush=True)
+
+
+def _emulator(scene, steppers, data, network):
+    """The loss of a batch, and the metric: the network in place of the equation."""
+    (stepper,) = steppers
+
+    def loss(batch):
+        u2 = stepper(network(data.train_start[batch]))
+        return _C.loss(scene.training.loss, u2, data.train_end[batch])
+
+    def metric():
+        u = data.valid_start
+        for _ in range(scene.data.valid_steps):
+            u = network(u)
+        return _C.normalised_mse(u, data.valid_end)
+
+    return loss, metric
+
+
+def _corrector(scene, steppers, data, network):
+    """The loss of a batch, and the metric: the network on top of a coarse step, in the metric a
+    converged one."""
+    first, second = steppers
+    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
+
+    def corrected(stepper, u):
+        coarse = _C.without_mean_pressure(stepper(u))
+        return coarse + network(coarse)
+
+    def loss(batch):
+        u1 = corrected(first, data.train_start[batch])
+        u2 = corrected(second, u1)
+        kind = scene.training.loss
+        return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
+
+    def metric():
+        u = data.valid_start
+        for _ in range(scene.data.valid_steps):
+            u = corrected(converged, u)
+        return _C.normalised_mse(u[:, :1], data.valid_end[:, :1])  # the velocity along x
+
+    return loss, metric
+
+
+def _parameters(scene, steppers, seed, network):
     """The single update of an interval, as an iterator over its loss, and the error of θ."""
+    (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)
     theta = problem.start.clone().requires_grad_()
     done = 0

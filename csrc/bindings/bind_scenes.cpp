@@ -1,3 +1,5 @@
+#include <pybind11/functional.h>
+
 #include "bindings.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
@@ -19,7 +21,9 @@ void bind_scenes(py::module_& m) {
       .def_readonly("train", &Scene::Data::train)
       .def_readonly("valid", &Scene::Data::valid)
       .def_readonly("seed", &Scene::Data::seed)
-      .def_readonly("valid_steps", &Scene::Data::valid_steps);
+      .def_readonly("valid_steps", &Scene::Data::valid_steps)
+      .def_readonly("valid_max_iter", &Scene::Data::valid_max_iter)
+      .def_readonly("reference_shape", &Scene::Data::reference_shape);
   py::class_<Scene::Network>(m, "Network")
       .def_readonly("kind", &Scene::Network::kind)
       .def_readonly("hidden", &Scene::Network::hidden)
@@ -43,11 +47,13 @@ void bind_scenes(py::module_& m) {
       .def_readonly("title", &Scene::title)
       .def_property_readonly("task",
                              [](const Scene& s) {
+                               if (s.task == Scene::Task::kCorrector) return "corrector";
                                return s.task == Scene::Task::kEmulator ? "emulator" : "parameters";
                              })
+      .def_property_readonly("executions", &Scene::executions)
       .def_property_readonly("unit",
                              [](const Scene& s) {
-                               return s.task == Scene::Task::kEmulator ? "epoch" : "update";
+                               return s.task == Scene::Task::kParameters ? "update" : "epoch";
                              })
       .def_readonly("dtype", &Scene::dtype)
       .def_readonly("physics", &Scene::physics)
@@ -69,10 +75,11 @@ void bind_scenes(py::module_& m) {
 
   py::class_<Dataset>(m, "Dataset")
       .def_readonly("train_start", &Dataset::train_start)
+      .def_readonly("train_first", &Dataset::train_first)
       .def_readonly("train_end", &Dataset::train_end)
       .def_readonly("valid_start", &Dataset::valid_start)
       .def_readonly("valid_end", &Dataset::valid_end);
-  m.def("make_dataset", &make_dataset, py::arg("scene"));
+  m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress());
   py::class_<ParameterProblem>(m, "ParameterProblem")
       .def_readonly("modes", &ParameterProblem::modes)
       .def_readonly("start", &ParameterProblem::start)
@@ -82,6 +89,7 @@ void bind_scenes(py::module_& m) {
 
   m.def("loss", &loss, py::arg("kind"), py::arg("u"), py::arg("reference"));
   m.def("normalised_mse", &normalised_mse, py::arg("u"), py::arg("reference"));
+  m.def("without_mean_pressure", &without_mean_pressure, py::arg("u"));
   m.def("half_mse", &half_mse, py::arg("u"), py::arg("reference"));
   m.def("relative_error", &relative_error, py::arg("theta"), py::arg("reference"));
 }

@@ -96,11 +96,16 @@ int run(const Options& options, const std::string& command) {
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
     if (options.resume && is_done(file, scene)) continue;
-    const auto curves = prdp::train::train(scene, refinement, seed, [&](int64_t done, double metric, int64_t k) {
+    const auto on_interval = [&](int64_t done, double metric, int64_t k) {
       if (interrupted) throw Interrupted{};
       if (done % 10 == 0 || done == 1)
         std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
-    });
+    };
+    const auto on_data = [](int64_t done, int64_t total) {
+      if (interrupted) throw Interrupted{};
+      std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
+    };
+    const auto curves = prdp::train::train(scene, refinement, seed, on_interval, on_data);
     write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1));
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
@@ -123,7 +128,7 @@ int main(int argc, char** argv) {
   auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
   auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
   auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
-  app.add_option("--backward", options.backward, "implicit or unrolled, in place of the scene's");
+  app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
   app.add_flag("--resume", options.resume, "keep trainings that are already recorded there");

@@ -5,6 +5,7 @@
 #include <torch/nn/modules/container/any.h>
 #include <torch/optim/adam.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <limits>
@@ -58,10 +59,10 @@ struct Task {
 class Run {
  public:
   Run(const Scene& scene, const Refinement& refinement)
-      : stepper(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver)),
-        intervals_(scene.training.intervals),
-        controller_(refinement.controller()) {
-    stepper.set_max_iter(controller_->max_iter());
+      : intervals_(scene.training.intervals), controller_(refinement.controller()) {
+    for (int64_t i = 0; i < scene.executions(); ++i)
+      steppers.push_back(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver));
+    take_max_iter();
   }
 
   Curves go(const Task& task, const OnInterval& on_interval) {
@@ -70,7 +71,7 @@ class Run {
       for (int64_t done = 1; done <= intervals_; ++done) {
         run_interval(task, done);
         observe(task.metric(), done);
-        on_interval(done, curves_.metric.back(), stepper.max_iter());
+        on_interval(done, curves_.metric.back(), controller_->max_iter());
       }
     } catch (const Diverged& divergence) {
       give_up(divergence.why);
@@ -78,24 +79,30 @@ class Run {
     return curves_;
   }
 
-  Stepper stepper;
+  std::vector<Stepper> steppers;  // of the solves of an update, one after the other
 
  private:
+  void take_max_iter() {
+    for (auto& stepper : steppers) stepper.set_max_iter(controller_->max_iter());
+  }
+
   void run_interval(const Task& task, int64_t done) {
-    const int64_t k = stepper.max_iter();
+    const int64_t k = controller_->max_iter();
     const auto started = std::chrono::steady_clock::now();
-    int64_t updates = 0;
+    int64_t solves = 0;
     double iterations = 0.0, applications = 0.0;
     task.updates([&](double loss) {
-      ++updates;
       check(loss, done);
       curves_.update_loss.push_back(loss);
-      iterations += per_sample(stepper.info()->iterations);
-      applications += per_sample(stepper.info()->operator_applications);
-      if (const auto adjoint = stepper.adjoint_info()) applications += per_sample(adjoint->operator_applications);
+      for (const auto& stepper : steppers) {
+        ++solves;
+        iterations += per_sample(stepper.info()->iterations);
+        applications += per_sample(stepper.info()->operator_applications);
+        if (const auto adjoint = stepper.adjoint_info()) applications += per_sample(adjoint->operator_applications);
+      }
     });
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
-    append(k, k * updates, iterations, applications, elapsed.count());
+    append(k, k * solves, iterations, applications, elapsed.count());
   }
 
   void append(int64_t k, int64_t budget, double iterations, double applications, double seconds) {
@@ -110,22 +117,24 @@ class Run {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(metric)) throw Diverged{interval + ": the metric is " + std::to_string(metric)};
     curves_.metric.push_back(metric);
-    controller_->step(metric, stepper.converged());
-    stepper.set_max_iter(controller_->max_iter());
+    controller_->step(metric, std::all_of(steppers.begin(), steppers.end(),
+                                          [](const Stepper& stepper) { return stepper.converged(); }));
+    take_max_iter();
   }
 
   void check(double loss, int64_t done) const {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
     const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
-    if (stepper.info()->status.le(nonfinite).any().item<bool>())
-      throw Diverged{interval + ": the solver was given NaN or Inf"};
+    for (const auto& stepper : steppers)
+      if (stepper.info()->status.le(nonfinite).any().item<bool>())
+        throw Diverged{interval + ": the solver was given NaN or Inf"};
   }
 
   void give_up(const std::string& why) {
     curves_.diverged = why;
     curves_.metric.resize(intervals_ + 1, std::numeric_limits<double>::quiet_NaN());
-    while (static_cast<int64_t>(curves_.seconds.size()) < intervals_) append(stepper.max_iter(), 0, 0.0, 0.0, 0.0);
+    while (static_cast<int64_t>(curves_.seconds.size()) < intervals_) append(controller_->max_iter(), 0, 0.0, 0.0, 0.0);
   }
 
   int64_t intervals_;
@@ -146,9 +155,52 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   return network;
 }
 
-Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterval& on_interval) {
-  const auto data = make_dataset(scene);
+/// What training a network is about: the loss of a batch, and the metric.
+struct Objective {
+  std::function<at::Tensor(const at::Tensor& batch)> loss;
+  std::function<double()> metric;
+};
+
+Objective emulator(const Scene& scene, Run& run, const Dataset& data, torch::nn::AnyModule& network) {
+  const auto loss_of = [&](const at::Tensor& batch) {
+    const auto u2 = run.steppers[0](network.forward(data.train_start.index_select(0, batch)));
+    return loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+  };
+  const auto metric = [&] {
+    auto u = data.valid_start;
+    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = network.forward(u);
+    return normalised_mse(u, data.valid_end).item<double>();
+  };
+  return {loss_of, metric};
+}
+
+Objective corrector(const Scene& scene, Run& run, const Dataset& data, torch::nn::AnyModule& network) {
+  const auto corrected = [&](Stepper& stepper, const at::Tensor& u) {
+    const auto coarse = without_mean_pressure(stepper(u));
+    return coarse + network.forward(coarse);
+  };
+  const auto loss_of = [&, corrected](const at::Tensor& batch) {
+    const auto u1 = corrected(run.steppers[0], data.train_start.index_select(0, batch));
+    const auto u2 = corrected(run.steppers[1], u1);
+    return loss(scene.training.loss, u1, data.train_first.index_select(0, batch)) +
+           loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+  };
+  auto solver = scene.solver;
+  solver.max_iter = scene.data.valid_max_iter;
+  const auto metric = [&, corrected, converged = scene.stepper(solver)]() mutable {
+    auto u = data.valid_start;
+    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = corrected(converged, u);
+    return normalised_mse(u.narrow(1, 0, 1), data.valid_end.narrow(1, 0, 1)).item<double>();
+  };
+  return {loss_of, metric};
+}
+
+Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterval& on_interval,
+                     const OnProgress& on_data) {
+  const auto data = make_dataset(scene, on_data);
   auto network = make_network(scene, seed);
+  const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, run, data, network)
+                                                              : corrector(scene, run, data, network);
   torch::optim::Adam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
   int64_t done = 0;
@@ -157,8 +209,7 @@ Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterv
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(done));
       optimiser.zero_grad();
-      const auto u2 = run.stepper(network.forward(data.train_start.index_select(0, batch)));
-      const auto error = loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+      const auto error = objective.loss(batch);
       error.backward();
       optimiser.step();
       ++done;
@@ -167,9 +218,7 @@ Curves train_emulator(const Scene& scene, Run& run, int64_t seed, const OnInterv
   };
   const auto metric = [&] {
     const torch::NoGradGuard no_grad;
-    auto u = data.valid_start;
-    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = network.forward(u);
-    return normalised_mse(u, data.valid_end).item<double>();
+    return objective.metric();
   };
   return run.go({updates, metric}, on_interval);
 }
@@ -180,7 +229,7 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
   int64_t done = 0;
 
   const auto updates = [&](const std::function<void(double)>& on_update) {
-    const auto u = run.stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
+    const auto u = run.steppers[0](at::matmul(theta, problem.modes).view({1, 1, -1}));
     const auto error = half_mse(u, problem.solution);
     const auto gradient = torch::autograd::grad({error}, {theta})[0];
     {
@@ -196,10 +245,11 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
 
 }  // namespace
 
-Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval) {
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
+             const OnProgress& on_data) {
   Run run(scene, refinement);
-  return scene.task == Scene::Task::kEmulator ? train_emulator(scene, run, seed, on_interval)
-                                              : train_parameters(scene, run, on_interval);
+  return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, on_interval)
+                                                : train_network(scene, run, seed, on_interval, on_data);
 }
 
 }  // namespace prdp::train

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/controller/controller.h"
+#include "prdp/scenes/data.h"
 #include "prdp/scenes/scene.h"
 
 /// The C++ trainer: the same loops as prdp_torch/training.py.
@@ -21,12 +22,13 @@ Refinement schedule(int64_t start, int64_t step, int64_t maximum);
 Refinement constant(int64_t k);
 Refinement direct();
 
-/// What a training leaves, one entry an interval: an epoch, or an update of the task "parameters".
+/// What a training leaves, one entry an interval: an epoch, or an update of the task "parameters". Costs
+/// are those of all solves of an update, of which a corrector has two.
 struct Curves {
   std::vector<double> update_loss;  // one entry an update
   std::vector<double> metric;       // starts before the first interval
   std::vector<int64_t> max_iter;    // K
-  std::vector<int64_t> budget;      // K times the updates, the paper's count
+  std::vector<int64_t> budget;      // K times the solves, the paper's count
   std::vector<double> iterations, operator_applications;  // per sample of a batch, summed over updates
   std::vector<double> seconds;
   std::string diverged;  // where and why a training was lost; the metric is NaN from there on
@@ -36,6 +38,7 @@ struct Curves {
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
 /// Trains the scene once; `seed` is that of the network's weights and of the shuffling.
-Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval);
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
+             const OnProgress& on_data = {});
 
 }  // namespace prdp::train

@@ -6,8 +6,10 @@
 #include <fstream>
 #include <numbers>
 
+#include "prdp/grid/grid.h"
 #include "prdp/networks/resnet.h"
 #include "prdp/scenes/data.h"
+#include "prdp/scenes/flow_data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"
 
@@ -25,6 +27,14 @@ TEST(Scene, LearningRateDecaysExponentially) {
   EXPECT_DOUBLE_EQ(scene.learning_rate(0), 1e-3);
   EXPECT_DOUBLE_EQ(scene.learning_rate(100), 0.94e-3);
   EXPECT_NEAR(scene.learning_rate(50), 1e-3 * std::sqrt(0.94), 1e-12);
+}
+
+TEST(Scene, LearningRateFallsToATenthAsACosine) {
+  const auto scene = prdp::read_scene(scene_path("navier_stokes"));
+  EXPECT_DOUBLE_EQ(scene.learning_rate(0), 1e-3);
+  EXPECT_NEAR(scene.learning_rate(200), 1e-3 * (0.55 + 0.45 * std::sqrt(0.5)), 1e-15);
+  EXPECT_NEAR(scene.learning_rate(400), 0.55e-3, 1e-15);
+  for (const int64_t update : {800, 1200}) EXPECT_NEAR(scene.learning_rate(update), 1e-4, 1e-15);
 }
 
 TEST(Data, FourierSeriesLiesInTheSpanOfItsModesWithAmplitudesInRange) {
@@ -83,6 +93,66 @@ TEST(Data, HeatTargetsAreExactStepsAsManyAsTheSceneSays) {
   EXPECT_TRUE(at::allclose(exact(exact(exact(data.valid_start))), data.valid_end, 1e-5, 1e-6));
 }
 
+TEST(Data, RandomFlowIsNoiseSmoothedNormalisedAndProjected) {
+  constexpr int64_t kSamples = 3, kNy = 9, kNx = 12, kN = kNy * kNx;
+  const auto u = prdp::random_flow({kNy, kNx}, kSamples, 5);
+  ASSERT_EQ(u.sizes(), (std::vector<int64_t>{kSamples, 3, kNy, kNx}));
+  EXPECT_EQ(u.select(1, 2).abs().max().item<double>(), 0.0);
+  EXPECT_LT(u.mean({-2, -1}).abs().max().item<double>(), 1e-14);
+
+  // The same with matrices: a row of each is the operator applied to a unit field.
+  const prdp::Grid grid("test", {kNy, kNx}, prdp::Boundary::kPeriodic);
+  const auto eye = at::eye(kN, at::kDouble), units = eye.view({kN, 1, kNy, kNx});
+  const auto smoothing = eye - 3e-3 * prdp::laplacian(units, grid).view({kN, kN});
+  const auto dx = prdp::forward_difference(units, grid, 1).view({kN, kN});
+  const auto dy = prdp::forward_difference(units, grid, 0).view({kN, kN});
+  const auto divergence = at::cat({dx, dy});  // of a row (u₁, u₂) from the right
+  EXPECT_LT(at::matmul(u.narrow(1, 0, 2).reshape({kSamples, 2 * kN}), divergence).abs().max().item<double>(), 1e-11);
+
+  auto generator = prdp::make_generator(5);
+  const auto noise = at::randn({kSamples, 2, kN}, generator, at::TensorOptions(at::kDouble));
+  auto v = at::linalg_solve(smoothing, noise.mT()).mT();
+  v = v - v.mean(-1, true);
+  v = (v / v.std(at::IntArrayRef(-1), /*unbiased=*/false, /*keepdim=*/true)).reshape({kSamples, 2 * kN});
+  const auto projected = v - at::matmul(v, at::matmul(divergence, at::linalg_pinv(divergence)));
+  EXPECT_TRUE(at::allclose(u.narrow(1, 0, 2).reshape({kSamples, 2 * kN}), projected, 0.0, 1e-11));
+}
+
+TEST(Data, DownsamplingTakesEverySecondPoint) {
+  const auto u = at::rand({2, 3, 7, 9}, at::kDouble), coarse = prdp::downsample(u);
+  ASSERT_EQ(coarse.sizes(), (std::vector<int64_t>{2, 3, 3, 4}));
+  for (int64_t j = 0; j < 3; ++j)
+    for (int64_t i = 0; i < 4; ++i)
+      EXPECT_TRUE(at::equal(coarse.select(3, i).select(2, j), u.select(3, 2 * i + 1).select(2, 2 * j + 1)));
+}
+
+TEST(Data, FlowsFollowTheConvergedReference) {
+  auto scene = prdp::read_scene(scene_path("navier_stokes"));
+  scene.physics.shape = {4, 3};
+  scene.data = {0, 30, 2, 1, 3, {9, 7}, 0};
+  scene.dtype = at::kDouble;
+  int64_t calls = 0, last = 0;
+  const auto data = prdp::flow_dataset(scene, [&](int64_t done, int64_t total) {
+    EXPECT_EQ(total, 66);
+    EXPECT_GT(done, last);
+    last = done;
+    ++calls;
+  });
+  EXPECT_EQ(calls, 2 * 2 + 3);
+  EXPECT_EQ(last, 66);
+
+  prdp::NavierStokes exact({9, 7}, scene.physics.nu, scene.physics.dt, prdp::Direct{});
+  const auto start = prdp::random_flow({9, 7}, 32, 1), train = start.narrow(0, 0, 30), valid = start.narrow(0, 30, 2);
+  const auto close = [](const at::Tensor& u, const at::Tensor& reference) {
+    return at::allclose(u, prdp::downsample(reference), 0.0, 1e-6);
+  };
+  EXPECT_TRUE(close(data.train_start, train));
+  EXPECT_TRUE(close(data.train_first, exact(train)));
+  EXPECT_TRUE(close(data.train_end, exact(exact(train))));
+  EXPECT_TRUE(close(data.valid_start, valid));
+  EXPECT_TRUE(close(data.valid_end, exact(exact(exact(valid)))));
+}
+
 /// Whether moving the input by `by` points along `axis` moves the output alike.
 bool commutes_with_shift(prdp::ResNet& network, const at::Tensor& u, int64_t by, int64_t axis) {
   return at::allclose(network(u.roll(by, axis)), network(u).roll(by, axis), 1e-9, 1e-12);
@@ -124,6 +194,9 @@ TEST(Loss, NormalisedErrorIsPerSample) {
   const auto u = at::tensor({3.0, 5.0, 0.0, 3.0}).view({2, 1, 2});
   EXPECT_NEAR(prdp::normalised_mse(u, reference).item<double>(), 0.5 * (1.0 / 25.0 + 4.0), 1e-6);
   EXPECT_NEAR(prdp::loss("mse", u, reference).item<double>(), 5.0 / 4.0, 1e-6);
+  const auto flow = at::rand({2, 3, 4, 5}, at::kDouble), free = prdp::without_mean_pressure(flow);
+  EXPECT_LT(free.select(1, 2).mean({-2, -1}).abs().max().item<double>(), 1e-15);
+  EXPECT_TRUE(at::equal(free.narrow(1, 0, 2), flow.narrow(1, 0, 2)));
   EXPECT_THROW(prdp::loss("l1", u, reference), c10::ValueError);
 }
 

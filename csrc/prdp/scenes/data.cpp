@@ -5,6 +5,9 @@
 
 #include <numbers>
 
+#include "prdp/scenes/data_cache.h"
+#include "prdp/scenes/flow_data.h"
+
 namespace prdp {
 
 at::Generator make_generator(int64_t seed) {
@@ -52,7 +55,9 @@ at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_
   return values.reshape(shape).to(dtype);
 }
 
-Dataset make_dataset(const Scene& scene) {
+Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
+  if (scene.task == Scene::Task::kCorrector)
+    return cached_dataset(scene, [&] { return flow_dataset(scene, on_progress); });
   const at::NoGradGuard no_grad;
   const auto& d = scene.data;
   const auto start = fourier_series(scene.physics, d.train + d.valid, d.modes, d.seed, at::kDouble);
@@ -62,7 +67,7 @@ Dataset make_dataset(const Scene& scene) {
     for (int64_t i = 0; i < steps; ++i) u = converged(u);
     return u.to(scene.dtype).contiguous();
   };
-  return {after(0, train), after(2, train), after(0, valid), after(d.valid_steps, valid)};
+  return {after(0, train), after(2, train), after(0, valid), after(d.valid_steps, valid), {}};
 }
 
 ParameterProblem make_parameter_problem(const Scene& scene) {

@@ -1,6 +1,8 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <functional>
+
 #include "prdp/scenes/scene.h"
 
 namespace prdp {
@@ -11,12 +13,17 @@ namespace prdp {
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
+/// Called while data are made with (steps of a sample done, all of them).
+using OnProgress = std::function<void(int64_t, int64_t)>;
+
 /// Initial states and where steps of the converged equation take them, two of them in training and
 /// data.valid_steps in validation; each (samples, channels, *shape).
 struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
+  at::Tensor train_first;  // after one step; of the task "corrector" alone
 };
-Dataset make_dataset(const Scene& scene);
+/// Data of the task "corrector" take minutes: they are kept on disk (data_cache.h).
+Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
 /// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).
 struct ParameterProblem {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <numbers>
 #include <sstream>
 
 #include "prdp/scenes/toml_section.h"
@@ -12,14 +13,29 @@ namespace prdp {
 
 namespace {
 
-/// The derivatives that every task of a scene can be trained with: its only gradient is the solver's.
-const std::vector<std::string> kBackwards{"implicit", "unrolled"};
+using Task = Scene::Task;
 
-Scene::Physics read_physics(TomlSection s) {
+/// The derivatives that a task can be trained with: a corrector has a gradient of its own, the others
+/// have the solver's alone.
+std::vector<std::string> backwards(Task task) {
+  if (task == Task::kCorrector) return {"implicit", "unrolled", "none"};
+  return {"implicit", "unrolled"};
+}
+
+Task read_task(TomlSection& s) {
+  const auto name = s.choice("task", {"emulator", "corrector", "parameters"});
+  if (name == "corrector") return Task::kCorrector;
+  return name == "emulator" ? Task::kEmulator : Task::kParameters;
+}
+
+Scene::Physics read_physics(TomlSection s, Task task) {
   Scene::Physics p;
-  p.equation = s.choice("equation", {"poisson", "heat", "burgers"});
+  const bool flow = task == Task::kCorrector;
+  p.equation = s.choice("equation", flow ? std::vector<std::string>{"navier_stokes"}
+                                         : std::vector<std::string>{"poisson", "heat", "burgers"});
   p.shape = s.wholes("shape", 1);
   if (p.shape.empty() || p.shape.size() > 3) s.fail("shape", "expected 1 to 3 extents");
+  if (flow && p.shape.size() != 2) s.fail("shape", "expected 2 extents");
   if (p.equation != "poisson") {
     p.nu = s.at_least("nu", 0.0);
     p.dt = s.above("dt", 0.0);
@@ -34,13 +50,26 @@ void read_solver(TomlSection s, Scene& scene) {
   scene.solver.max_iter = s.whole("max_iter", 0);
   scene.solver.rtol = s.at_least("rtol", 0.0);
   if (scene.solver.method == Method::kGmres) scene.solver.restart = s.whole("restart", 1);
-  scene.backward = backward_from_name(s.choice("backward", kBackwards));
+  scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
   s.finish();
 }
 
-Scene::Data read_data(TomlSection s) {
-  Scene::Data d{s.whole("modes", 1), s.whole("train", 1), s.whole("valid", 1), s.whole("seed", 0),
-                s.whole("valid_steps", 1)};
+Scene::Data read_data(TomlSection s, const Scene& scene) {
+  Scene::Data d;
+  if (scene.task == Task::kEmulator) {
+    d.modes = s.whole("modes", 1);
+  } else {
+    d.reference_shape = s.wholes("reference_shape", 1);
+    auto finer = scene.physics.shape;
+    for (auto& n : finer) n = 2 * n + 1;
+    if (d.reference_shape != finer)
+      s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
+    d.valid_max_iter = s.whole("valid_max_iter", 1);
+  }
+  d.train = s.whole("train", 1);
+  d.valid = s.whole("valid", 1);
+  d.seed = s.whole("seed", 0);
+  d.valid_steps = s.whole("valid_steps", 1);
   s.finish();
   return d;
 }
@@ -58,13 +87,17 @@ Scene::Network read_network(TomlSection s) {
   return n;
 }
 
-Scene::Training read_training(TomlSection s, Scene::Task task) {
+Scene::Training read_training(TomlSection s, Task task) {
   Scene::Training t;
   t.learning_rate = s.above("learning_rate", 0.0);
-  if (task == Scene::Task::kEmulator) {
+  if (task != Task::kParameters) {
     t.loss = s.choice("loss", {"nmse", "mse"});
-    t.decay = s.above("decay", 0.0);
-    t.decay_steps = s.whole("decay_steps", 1);
+    if (s.has("cosine_updates")) {
+      t.cosine_updates = s.whole("cosine_updates", 1);
+    } else {
+      t.decay = s.above("decay", 0.0);
+      t.decay_steps = s.whole("decay_steps", 1);
+    }
     t.batch = s.whole("batch", 1);
     t.intervals = s.whole("epochs", 1);
   } else {
@@ -122,12 +155,17 @@ Stepper Scene::stepper(Solver with) const {
 }
 
 void Scene::set_backward(const std::string& name) {
-  const bool known = std::find(kBackwards.begin(), kBackwards.end(), name) != kBackwards.end();
-  TORCH_CHECK_VALUE(known, "backward: unknown name '", name, "' for a scene; allowed: implicit, unrolled");
+  const auto known = backwards(task);
+  TORCH_CHECK_VALUE(std::find(known.begin(), known.end(), name) != known.end(), "backward: unknown name '", name,
+                    "' for a scene; allowed: ", c10::Join(", ", known));
   backward = backward_from_name(name);
 }
 
 double Scene::learning_rate(int64_t update) const {
+  if (training.cosine_updates) {
+    const double part = std::min(1.0, static_cast<double>(update) / static_cast<double>(*training.cosine_updates));
+    return training.learning_rate * (0.1 + 0.45 * (1.0 + std::cos(std::numbers::pi * part)));
+  }
   const double periods = static_cast<double>(update) / static_cast<double>(training.decay_steps);
   return training.learning_rate * std::pow(training.decay, periods);
 }
@@ -152,14 +190,13 @@ Scene read_scene(const std::string& path) {
   scene.text = text.str();
   TomlSection s(table, path, "");
   scene.title = s.text("title");
-  scene.task = s.choice("task", {"emulator", "parameters"}) == "emulator" ? Scene::Task::kEmulator
-                                                                          : Scene::Task::kParameters;
+  scene.task = read_task(s);
   scene.dtype = s.choice("dtype", {"float32", "float64"}) == "float32" ? at::kFloat : at::kDouble;
-  scene.physics = read_physics(s.section("physics"));
+  scene.physics = read_physics(s.section("physics"), scene.task);
   read_solver(s.section("solver"), scene);
   scene.training = read_training(s.section("training"), scene.task);
-  if (scene.task == Scene::Task::kEmulator) {
-    scene.data = read_data(s.section("data"));
+  if (scene.task != Task::kParameters) {
+    scene.data = read_data(s.section("data"), scene);
     scene.network = read_network(s.section("network"));
   } else {
     scene.parameters = read_parameters(s.section("parameters"));

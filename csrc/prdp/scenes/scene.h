@@ -13,6 +13,7 @@ namespace prdp {
 struct Scene {
   enum class Task {
     kEmulator,    // a network learns one step of the equation (paper, section 4.2)
+    kCorrector,   // a network corrects the steps of a coarse flow (appendix E)
     kParameters,  // amplitudes of the right-hand side are found from the solution (section 4.1)
   };
   struct Physics {
@@ -20,13 +21,19 @@ struct Scene {
     std::vector<int64_t> shape;
     double nu = 0.0, dt = 0.0;  // not of poisson
 
-    bool periodic() const { return equation == "burgers"; }
-    /// Of a state (batch, channels, *shape): a velocity has a component for each axis.
-    int64_t channels() const { return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1; }
+    bool periodic() const { return equation == "burgers" || equation == "navier_stokes"; }
+    /// Of a state (batch, channels, *shape): a velocity has a component for each axis, a flow a pressure too.
+    int64_t channels() const {
+      if (equation == "navier_stokes") return 3;
+      return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1;
+    }
   };
   struct Data {
     int64_t modes = 0, train = 0, valid = 0, seed = 0;
     int64_t valid_steps = 0;  // how far the metric follows the validation samples
+    // Of a corrector: the grid of the reference, which it never sees, and the converged K of the metric.
+    std::vector<int64_t> reference_shape{};
+    int64_t valid_max_iter = 0;
   };
   struct Network {
     std::string kind;             // "mlp" or "resnet"
@@ -38,8 +45,9 @@ struct Scene {
     double learning_rate = 0.0;
     double decay = 1.0;  // of the learning rate, over decay_steps updates, exponentially
     int64_t decay_steps = 1;
-    int64_t batch = 0;      // emulator
-    int64_t intervals = 0;  // epochs of an emulator, updates of parameters: what the controller counts in
+    std::optional<int64_t> cosine_updates;  // in place of decay: down to a tenth, over so many updates
+    int64_t batch = 0;      // of a network
+    int64_t intervals = 0;  // epochs of a network, updates of parameters: what the controller counts in
   };
   struct Parameters {
     std::vector<double> start, reference;
@@ -66,6 +74,8 @@ struct Scene {
   PRDPSettings prdp;
   Compare compare;
 
+  /// How many solves there are one after the other in an update; K is the budget of each.
+  int64_t executions() const { return task == Task::kCorrector ? 2 : 1; }
   /// The scene's step with this solver; a failed sample does not stop a training.
   Stepper stepper(Solver solver) const;
   /// Replaces the scene's derivative. Raises ValueError for an unknown name, or one that would leave

@@ -1,0 +1,96 @@
+#include "prdp/scenes/flow_data.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <numbers>
+
+#include "prdp/grid/grid.h"
+
+namespace prdp {
+
+namespace {
+
+constexpr int64_t kY = 0, kX = 1;  // the grid's axes
+constexpr int64_t kSamplesAtOnce = 25;
+constexpr double kSmoothing = 3e-3;  // ν Δt
+
+/// Eigenvalues of the periodic five-point Laplacian, as at::fft_rfft2 orders them.
+at::Tensor laplacian_symbol(const std::vector<int64_t>& shape) {
+  const auto along = [](int64_t n, int64_t waves) {
+    const auto k = at::arange(waves, at::TensorOptions().dtype(at::kDouble));
+    return -(2.0 * static_cast<double>(n) * (k * (std::numbers::pi / static_cast<double>(n))).sin()).square();
+  };
+  return along(shape[0], shape[0]).unsqueeze(1) + along(shape[1], shape[1] / 2 + 1);
+}
+
+/// v with its Fourier coefficients divided by `symbol`.
+at::Tensor divide_modes(const at::Tensor& v, const at::Tensor& symbol) {
+  return at::fft_irfft2(at::fft_rfft2(v) / symbol, v.sizes().slice(v.dim() - 2));
+}
+
+/// u - G φ with D G φ = D u.
+at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor symbol) {
+  symbol = symbol.clone();
+  symbol[0][0] = 1.0;  // the mean of φ, which G does not see
+  const auto divergence =
+      forward_difference(u.narrow(1, 0, 1), grid, kX) + forward_difference(u.narrow(1, 1, 1), grid, kY);
+  const auto phi = divide_modes(divergence, symbol);
+  return u - at::cat({backward_difference(phi, grid, kX), backward_difference(phi, grid, kY)}, 1);
+}
+
+/// Tight enough that its error is below float32's rounding.
+Solver reference_solver() { return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8}; }
+
+}  // namespace
+
+at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
+  const Grid grid("random_flow", shape, Boundary::kPeriodic);
+  auto generator = make_generator(seed);
+  const auto real = at::TensorOptions().dtype(at::kDouble);
+  const auto symbol = laplacian_symbol(shape);
+  auto u = divide_modes(at::randn({samples, 2, shape[0], shape[1]}, generator, real), 1.0 - kSmoothing * symbol);
+  u = u - u.mean({-2, -1}, /*keepdim=*/true);
+  u = u / u.square().mean({-2, -1}, /*keepdim=*/true).sqrt();
+  const auto pressure = at::zeros({samples, 1, shape[0], shape[1]}, real);
+  return at::cat({without_divergence(u, grid, symbol), pressure}, 1);
+}
+
+at::Tensor downsample(const at::Tensor& u) {
+  return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2);
+}
+
+Dataset flow_dataset(const Scene& scene, const OnProgress& on_progress) {
+  const at::NoGradGuard no_grad;
+  const auto& d = scene.data;
+  auto fine = scene;
+  fine.physics.shape = d.reference_shape;
+  auto reference = fine.stepper(reference_solver());
+  const int64_t total = 2 * d.train + d.valid_steps * d.valid;
+  int64_t done = 0;
+
+  /// The down-sampled states, the start included: (samples, steps + 1, 3, Ny, Nx).
+  const auto follow = [&](at::Tensor u, int64_t steps) {
+    std::vector<at::Tensor> states{downsample(u)};
+    for (int64_t i = 0; i < steps; ++i) {
+      u = reference(u);
+      TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
+                  reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+      states.push_back(downsample(u));
+      done += u.size(0);
+      if (on_progress) on_progress(done, total);
+    }
+    return at::stack(states, 1).to(scene.dtype);
+  };
+  const auto follow_all = [&](const at::Tensor& u, int64_t steps) {
+    std::vector<at::Tensor> parts;
+    for (const auto& part : u.split(kSamplesAtOnce)) parts.push_back(follow(part, steps));
+    return at::cat(parts);
+  };
+  const auto start = random_flow(d.reference_shape, d.train + d.valid, d.seed);
+  const auto train = follow_all(start.narrow(0, 0, d.train), 2);
+  const auto valid = follow_all(start.narrow(0, d.train, d.valid), d.valid_steps);
+  const auto at_time = [](const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); };
+  return {at_time(train, 0), at_time(train, 2), at_time(valid, 0), at_time(valid, d.valid_steps), at_time(train, 1)};
+}
+
+}  // namespace prdp
