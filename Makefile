@@ -10,13 +10,13 @@ export MAKEFLAGS :=
 .PHONY: demo test clean
 
 demo: $(STAMPS)/configure
-	@echo "prdp: building the library (from scratch some 3 minutes on two cores)"
+	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
 	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/prdp compare heat_1d
 
 test: $(STAMPS)/configure
-	@echo "prdp: building library, trainer and tests (from scratch some 4 minutes on two cores)"
+	@echo "prdp: building library, trainer and tests (from scratch some 6 minutes on two cores)"
 	$(BIN)/cmake --build build --parallel $$(nproc)
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
