@@ -1,8 +1,5 @@
 """GMRES on Burgers and Navier-Stokes: the published iterates, gradients at every scale, the null space."""
 
-import os
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -150,21 +147,3 @@ def test_jacobi_says_that_the_pressure_has_no_diagonal():
     step = navier_stokes(prdp.Jacobi(5), on_failure="return")
     step(FLOW_U)
     assert statuses(step.info) == ["ZERO_DIAGONAL"] * 3
-
-
-def test_two_threads_share_a_batch():
-    """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
-    start = prdp.fields.project(smooth_noise(64, batch=16))
-    step = prdp.NavierStokes((64, 64), 1e-4, 0.1, solver=prdp.GMRES(12, restart=8, rtol=0.0))
-    threads, seconds, results = torch.get_num_threads(), {1: [], 2: []}, {}
-    try:
-        for _ in range(5):
-            for count in seconds:
-                torch.set_num_threads(count)
-                began = time.perf_counter()
-                results[count] = step(start)
-                seconds[count].append(time.perf_counter() - began)
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(results[1], results[2])
-    assert os.cpu_count() == 1 or min(seconds[2]) < 0.9 * min(seconds[1])
