@@ -1,6 +1,7 @@
 #include <pybind11/functional.h>
 
 #include "bindings.h"
+#include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"

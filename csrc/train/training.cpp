@@ -13,6 +13,7 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/networks/resnet.h"
+#include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/solvers/status.h"

@@ -8,6 +8,7 @@
 
 #include "prdp/grid/grid.h"
 #include "prdp/networks/resnet.h"
+#include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/flow_data.h"
 #include "prdp/scenes/loss.h"

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 import prdp_torch as prdp
+from prdp_torch import _C, scenes
 
 DATA = Path(__file__).parents[1] / "data"
 ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
@@ -95,3 +97,30 @@ def dense_navier_stokes(velocity, nu, dt):
     d1 = nx * np.kron(np.eye(ny), np.roll(np.eye(nx), 1, axis=1) - np.eye(nx))
     d2 = ny * np.kron(np.roll(np.eye(ny), 1, axis=1) - np.eye(ny), np.eye(nx))
     return np.block([[one / dt + c1, zero, -d1.T], [zero, one / dt + c2, -d2.T], [d1, d2, zero]])
+
+
+def written(tmp_path, *changes, scene="heat_1d", name="changed"):
+    """The path of a copy of a scene with replacements."""
+    text = scenes.available()[scene].read_text()
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after)
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def line_of(path, text):
+    with open(path) as file:
+        return next(number for number, line in enumerate(file, 1) if text in line)
+
+
+def assert_refused(path, where, message):
+    """Reading the scene fails with `message` and the line that holds `where`."""
+    with pytest.raises(ValueError) as error:
+        _C.read_scene(path)
+    text = str(error.value)
+    assert message in text and text.startswith(path + ":")
+    number = int(text.removeprefix(path + ":").split(":")[0])
+    # A missing table has no line of its own: the file's first table stands for it.
+    assert number == line_of(path, where) or where == "title"

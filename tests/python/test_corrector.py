@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import assert_refused, written
 
 import prdp_torch as prdp
 from prdp_torch import _C, charts, fields, scenes, training
@@ -40,13 +41,7 @@ def cache(tmp_path, monkeypatch):
 
 def tiny(tmp_path, *changes, name="tiny"):
     """The path of a small copy of the scene, with replacements."""
-    text = scenes.available()["navier_stokes"].read_text()
-    for before, after in (*TINY, *changes):
-        assert before in text
-        text = text.replace(before, after)
-    path = tmp_path / f"{name}.toml"
-    path.write_text(text)
-    return str(path)
+    return written(tmp_path, *TINY, *changes, scene="navier_stokes", name=name)
 
 
 def tensors(data):
@@ -87,14 +82,7 @@ def test_the_scene_holds_the_papers_settings():
     ],
 )  # fmt: skip
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):
-    text = scenes.available()["navier_stokes"].read_text()
-    assert before in text
-    path = tmp_path / "wrong.toml"
-    path.write_text(text.replace(before, after))
-    with pytest.raises(ValueError) as error:
-        scenes.load(str(path))
-    number = next(n for n, line in enumerate(path.read_text().splitlines(), 1) if where in line)
-    assert str(error.value).startswith(f"{path}:{number}: ") and message in str(error.value)
+    assert_refused(written(tmp_path, (before, after), scene="navier_stokes"), where, message)
 
 
 def test_data_are_made_once_and_read_from_then_on(tmp_path, cache):

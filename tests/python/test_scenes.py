@@ -2,24 +2,9 @@
 
 import pytest
 import torch
+from helpers import assert_refused, written
 
 from prdp_torch import _C, charts, scenes
-
-
-def written(tmp_path, *changes, scene="heat_1d"):
-    """A copy of a scene with replacements."""
-    text = scenes.available()[scene].read_text()
-    for before, after in changes:
-        assert before in text
-        text = text.replace(before, after)
-    path = tmp_path / "changed.toml"
-    path.write_text(text)
-    return str(path)
-
-
-def line_of(path, text):
-    with open(path) as file:
-        return next(number for number, line in enumerate(file, 1) if text in line)
 
 
 def test_the_projects_scenes_hold_the_papers_settings():
@@ -98,16 +83,6 @@ def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, m
 )  # fmt: skip
 def test_mistakes_of_gmres_and_the_resnet_are_named_too(tmp_path, before, after, where, message):
     assert_refused(written(tmp_path, (before, after), scene="burgers_1d"), where, message)
-
-
-def assert_refused(path, where, message):
-    with pytest.raises(ValueError) as error:
-        _C.read_scene(path)
-    text = str(error.value)
-    assert message in text and text.startswith(path + ":")
-    number = int(text.removeprefix(path + ":").split(":")[0])
-    # A missing table has no line of its own: the file's first table stands for it.
-    assert number == line_of(path, where) or where == "title"
 
 
 def test_missing_files_and_unknown_scenes():

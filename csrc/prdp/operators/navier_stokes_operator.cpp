@@ -20,6 +20,11 @@ at::Tensor at_u2_points(const at::Tensor& u1, const Grid& grid) {
 
 }  // namespace
 
+at::Tensor without_mean_pressure(const at::Tensor& u) {
+  const auto p = part(u, 2);
+  return at::cat({u.narrow(-3, 0, 2), p - p.mean({-2, -1}, /*keepdim=*/true)}, -3);
+}
+
 NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec)
     : FlowOperator("NavierStokes", spec, 3) {
   TORCH_CHECK_VALUE(grid_.dim() == 2, "NavierStokes: shape must have 2 extents, got ",
@@ -70,11 +75,6 @@ at::Tensor NavierStokesOperator::norm() const {
   const double x = 2.0 / grid_.dx(kX), y = 2.0 / grid_.dx(kY);  // the rows of G₁ and G₂
   const auto n1 = c1.row_norms() + x;
   return largest(at::cat({n1, c2.row_norms() + y, at::full_like(n1, x + y)}, 1));
-}
-
-at::Tensor NavierStokesOperator::project(const at::Tensor& v) const {
-  const auto p = part(v, 2);
-  return at::cat({v.narrow(-3, 0, 2), p - p.mean({-2, -1}, /*keepdim=*/true)}, -3);
 }
 
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda,

@@ -7,6 +7,10 @@
 
 namespace prdp {
 
+/// A flow (batch, 3, Ny, Nx) with the mean of its pressure taken off, which the flow does not determine.
+/// A cotangent without it passes through an implicit solve, which refuses one with a mean.
+at::Tensor without_mean_pressure(const at::Tensor& u);
+
 /// One implicit Euler step of the incompressible Navier-Stokes equations in two dimensions, periodic,
 /// linearised about given winds (Oseen), on a staggered grid: u₁ on the left face of a cell, u₂ on its
 /// lower face, p in its centre. On vectors (u₁, u₂, p)
@@ -25,7 +29,7 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor diagonal() const override;
   at::Tensor norm() const override;
   /// v with its mean pressure taken off.
-  at::Tensor project(const at::Tensor& v) const override;
+  at::Tensor project(const at::Tensor& v) const override { return without_mean_pressure(v); }
   /// The solution of least norm to the projected right-hand side.
   at::Tensor solve_directly(const at::Tensor& b) const override { return solve(regular_matrix(), b); }
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override {

@@ -15,11 +15,6 @@ at::Tensor loss(std::string_view kind, const at::Tensor& u, const at::Tensor& re
   return at::mse_loss(u, reference);
 }
 
-at::Tensor without_mean_pressure(const at::Tensor& u) {
-  const auto p = u.narrow(1, 2, 1);
-  return at::cat({u.narrow(1, 0, 2), p - p.mean({-2, -1}, /*keepdim=*/true)}, 1);
-}
-
 at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference) {
   return 0.5 * at::mse_loss(u, reference);
 }

@@ -12,10 +12,6 @@ at::Tensor normalised_mse(const at::Tensor& u, const at::Tensor& reference);
 /// "nmse", or "mse", the mean over all values of (u - reference)².
 at::Tensor loss(std::string_view kind, const at::Tensor& u, const at::Tensor& reference);
 
-/// A flow (batch, 3, Ny, Nx) with the mean of its pressure taken off, which the flow does not determine:
-/// so a cotangent passes through an implicit solve, which refuses one with a mean.
-at::Tensor without_mean_pressure(const at::Tensor& u);
-
 /// ‖u - reference‖² / (2 N) of the task "parameters".
 at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference);
 
