@@ -1,5 +1,7 @@
 #include "prdp/operators/burgers_operator.h"
 
+#include "prdp/operators/dense.h"
+
 namespace prdp {
 
 BurgersOperator::BurgersOperator(const OperatorSpec& spec)
@@ -37,7 +39,7 @@ at::Tensor BurgersOperator::matrix() const {
 }
 
 at::Tensor BurgersOperator::solve_rows(const at::Tensor& matrix, const at::Tensor& b) const {
-  return std::get<0>(at::linalg_solve_ex(matrix, b.flatten(2).mT())).mT().reshape_as(b);
+  return solve_dense(matrix, b.flatten(2).mT()).mT().reshape_as(b);
 }
 
 KernelParameters BurgersOperator::kernel() const {

@@ -6,6 +6,8 @@
 #include <mutex>
 #include <unordered_map>
 
+#include "prdp/operators/dense.h"
+
 namespace prdp {
 
 namespace {
@@ -42,7 +44,7 @@ at::Tensor probe(const Product& product, const at::Tensor& like) {
 }
 
 at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
-  return std::get<0>(at::linalg_solve_ex(matrix, b.flatten(1).unsqueeze(-1))).reshape_as(b);
+  return solve_dense(matrix, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
 
 }  // namespace

@@ -1,5 +1,7 @@
 #include "prdp/operators/matrix_operator.h"
 
+#include "prdp/operators/dense.h"
+
 namespace prdp {
 
 namespace {
@@ -24,7 +26,7 @@ at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
 
 at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b) {
   // A singular matrix gives a non-finite solution here, and a status there.
-  return std::get<0>(at::linalg_solve_ex(matrix, b.unsqueeze(-1))).squeeze(-1);
+  return solve_dense(matrix, b.unsqueeze(-1)).squeeze(-1);
 }
 
 }  // namespace

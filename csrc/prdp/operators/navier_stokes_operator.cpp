@@ -1,5 +1,7 @@
 #include "prdp/operators/navier_stokes_operator.h"
 
+#include "prdp/operators/dense.h"
+
 namespace prdp {
 
 namespace {
@@ -99,7 +101,7 @@ at::Tensor NavierStokesOperator::regular_matrix() const {
 
 at::Tensor NavierStokesOperator::solve(const at::Tensor& matrix, const at::Tensor& b) const {
   const auto rhs = project(b).flatten(1).unsqueeze(-1);
-  return project(std::get<0>(at::linalg_solve_ex(matrix, rhs)).reshape_as(b));
+  return project(solve_dense(matrix, rhs).reshape_as(b));
 }
 
 at::Tensor NavierStokesOperator::precondition(const at::Tensor& v, bool transposed) const {

@@ -1,0 +1,72 @@
+"""Threads over the samples of a batch, each test in a process of its own: torch.set_num_threads stays set."""
+
+import os
+import subprocess
+import sys
+
+SETUP = """
+import time, torch, prdp_torch as prdp
+torch.manual_seed(0)
+def with_threads(count, call):
+    torch.set_num_threads(count)
+    began = time.perf_counter()
+    return call(), time.perf_counter() - began
+"""
+
+
+def run(script):
+    done = subprocess.run([sys.executable, "-c", SETUP + script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    return done.stdout
+
+
+def test_threads_do_not_change_a_bit():
+    assert "5 solvers" in run("""
+solvers = [prdp.Jacobi(30, rtol=0), prdp.SteepestDescent(30, rtol=0), prdp.CG(30, rtol=0),
+           prdp.GMRES(6, rtol=0, restart=5), prdp.Direct()]
+for solver in solvers:
+    heat = prdp.Heat((64, 33), 1e-3, 1.0, solver=solver)
+    b, g = torch.randn(40, 1, 64, 33), torch.randn(40, 1, 64, 33)
+    results = []
+    for count in (1, 2, 3):
+        u0 = b.clone().requires_grad_()
+        def both():
+            u = heat(u0)
+            u.backward(g)
+            return u
+        results.append((with_threads(count, both)[0], u0.grad))
+    for u, grad in results[1:]:
+        assert torch.equal(u, results[0][0]) and torch.equal(grad, results[0][1]), solver
+print(len(solvers), "solvers")
+""")
+
+
+def test_two_threads_share_a_batch():
+    """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
+    one, two = map(
+        float,
+        run("""
+start = prdp.fields.project(torch.randn(16, 3, 64, 64))
+step = prdp.NavierStokes((64, 64), 1e-4, 0.1, solver=prdp.GMRES(12, restart=8, rtol=0.0))
+seconds = {1: [], 2: []}
+for _ in range(8):
+    for count in seconds:
+        seconds[count].append(with_threads(count, lambda: step(start))[1])
+print(*map(min, seconds.values()))
+""").split(),
+    )
+    assert os.cpu_count() == 1 or two < 0.9 * one
+
+
+def test_dense_matrices_of_a_batch_are_factored_soundly():
+    """torch's own batched LU is not, after set_num_threads (pytorch issue 142815)."""
+    assert "sound" in run("""
+torch.set_num_threads(2)
+a = torch.randn(6, 300, 300, dtype=torch.float64) + 300 * torch.eye(300)
+b = torch.randn(6, 300, dtype=torch.float64)
+times = prdp.operators.Function(lambda v, a: torch.einsum("bij,bj->bi", a, v),
+                                lambda v, a: torch.einsum("bji,bj->bi", a, v), (a,))
+u, _ = prdp.linear_solve(times, b, prdp.Direct())
+assert torch.allclose(torch.einsum("bij,bj->bi", a, u), b, rtol=1e-12, atol=1e-12)
+print("sound")
+""")
