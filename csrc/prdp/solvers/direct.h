@@ -1,4 +1,5 @@
 #pragma once
+#include <tuple>
 
 namespace prdp {
 
@@ -27,6 +28,10 @@ class DirectMethod {
     ready_ = true;
     return residual2_;
   }
+
+  /// What the next iteration starts from; resume() once it has been put back.
+  auto carried() { return std::tie(x); }
+  void resume() { ready_ = false; }
 
   typename Space::Vector x;
 

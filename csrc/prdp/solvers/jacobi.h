@@ -1,4 +1,5 @@
 #pragma once
+#include <tuple>
 
 namespace prdp {
 
@@ -32,9 +33,13 @@ class JacobiMethod {
     return space_.residual(x, r);
   }
 
+  /// What the next iteration starts from; resume() once it has been put back.
+  auto carried() { return std::tie(x); }
+  void resume() { ready_ = false; }
+
   typename Space::Vector x;
 
- private:
+ protected:
   Space& space_;
   typename Space::Vector c_, next_;  // D⁻¹ b; the iterate after x
   typename Space::Scalar residual2_{};

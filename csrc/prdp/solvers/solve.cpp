@@ -15,14 +15,6 @@ SolveInfo empty_info(const at::Tensor& b) {
           at::empty({batch}, counts), at::empty({batch}, counts)};
 }
 
-/// Samples a thread takes at least: below some 100 µs of work, handing it over costs more than it saves.
-int64_t grain_size(int64_t unknowns, int64_t iterations) {
-  constexpr double nanoseconds_per_point = 0.5, worthwhile = 1e5;
-  const double sample = nanoseconds_per_point * static_cast<double>(unknowns) *
-                        static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
-  return std::max<int64_t>(1, static_cast<int64_t>(worthwhile / sample));
-}
-
 template <class T, class Parameters>
 SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
   const auto rhs = b.contiguous();
@@ -49,6 +41,13 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 }
 
 }  // namespace
+
+int64_t grain_size(int64_t unknowns, int64_t products) {
+  constexpr double nanoseconds_per_point = 0.5, worthwhile = 1e5;
+  const double sample = nanoseconds_per_point * static_cast<double>(unknowns) *
+                        static_cast<double>(std::min<int64_t>(products, 1000) + 4);
+  return std::max<int64_t>(1, static_cast<int64_t>(worthwhile / sample));
+}
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel();

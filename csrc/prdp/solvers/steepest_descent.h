@@ -1,4 +1,5 @@
 #pragma once
+#include <tuple>
 
 namespace prdp {
 
@@ -16,18 +17,22 @@ class SteepestDescentMethod {
   }
   void step() {
     space_.apply(r_, q_);
-    const auto alpha = space_.step_length(rr_, space_.dot(r_, q_), rr_, space_.dot(q_, q_));
-    rr_ = space_.descend(alpha, r_, q_, x, r_);
+    alpha_ = space_.step_length(rr_, space_.dot(r_, q_), rr_, space_.dot(q_, q_));
+    rr_ = space_.descend(alpha_, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() { return rr_ = space_.residual(x, r_); }
 
+  /// What the next iteration starts from, beside x; resume() once it has been put back.
+  auto carried() { return std::tie(r_, rr_); }
+  void resume() {}
+
   typename Space::Vector x;
 
- private:
+ protected:
   Space& space_;
   typename Space::Vector r_, q_;  // residual; A r
-  typename Space::Scalar rr_{};
+  typename Space::Scalar rr_{}, alpha_{};
 };
 
 }  // namespace prdp
