@@ -160,15 +160,122 @@ def test_no_steps_return_the_start():
 
 
 def test_a_failure_says_in_which_step_and_which_sample():
-    # Jacobi diverges on Poisson's matrix in two of three samples only where their state is not zero.
-    u = field((5,), batch=3)
-    u[1] = 1e300
-    heat = prdp.Heat((5,), 1e-3, 1.0, solver=prdp.Jacobi(5))
-    poisson = prdp.Poisson((5,), solver=prdp.CG(20))
-    u[1] = 0
+    def flow(on_failure):  # CG does not fit it, and blows up sooner or later
+        return prdp.NavierStokes((4, 4), 1e-3, 0.1, solver=prdp.CG(60, rtol=0.0), on_failure=on_failure)
+
+    u, steps = fields.project(field((4, 4), batch=8, dtype=torch.float32, channels=3)), 60
+    failed = torch.stack([info.status < -2 for info in chain(flow("return"), u, steps)[1]])
+    step, sample = failed.nonzero()[0].tolist()
+    assert step > 0 and not failed[step].all()
+    what = rf"step {step + 1} of {steps}: linear_solve: {int(failed[step].sum())} of 8 samples failed: sample {sample} "
+    with pytest.raises(torch.linalg.LinAlgError, match=what):
+        flow("raise").rollout(u, steps)
+    with pytest.warns(UserWarning, match=what):
+        flow("warn").rollout(u, steps)
+    heat = prdp.Heat((5,), 1e-3, 1.0, solver=prdp.Jacobi(3))
+    with pytest.raises(torch.linalg.LinAlgError, match=r"^linear_solve: 1 of 2 samples"):  # a lone step has no number
+        heat(torch.full((2, 1, 5), float("nan")).index_fill(0, torch.tensor([0]), 1.0))
+
+
+@steppers
+def test_a_failed_adjoint_solve_says_it_too(name):
+    stepper = make(name, viscosity(), solver_for(name, exact=False))
+    stepper.on_failure = "raise"
+    for create_graph in (False, True):
+        states = stepper.rollout(start(name, batch=3).requires_grad_(), 4)
+        cotangent = torch.zeros_like(states)
+        cotangent[1, 3] = float("nan")
+        with pytest.raises(
+            torch.linalg.LinAlgError, match="step 3 of 4: adjoint solve: 1 of 3 samples failed: sample 1 NONFINITE_INPUT"
+        ):
+            states.backward(cotangent, create_graph=create_graph)
+
+
+def test_refused_samples_carry_no_gradient():
+    nu, u = viscosity(), field((9,), batch=3)
     u[1, 0, 2] = float("nan")
-    with pytest.raises(torch.linalg.LinAlgError, match=r"step 1 of 4: linear_solve: 1 of 3 .*sample 1 NONFINITE_INPUT"):
-        heat.rollout(u, 4)
-    u[1] = 1e308  # Poisson's solution is smaller by 1/8 a step, heat's not larger: no failure
-    assert statuses(SolveInfoOf(poisson, u))
-    heat.rollout(field((5,)), 2)
+    u.requires_grad_()
+    results = []
+    for rolled in (False, True):
+        burgers = prdp.Burgers((9,), nu, 0.1, solver=prdp.Jacobi(4), on_failure="return")
+        states = burgers.rollout(u, 3) if rolled else chain(burgers, u, 3)[0]
+        results.append(torch.autograd.grad(states[:, 1:].sum(), (u, nu)))
+    assert statuses(burgers.info._replace(status=burgers.info.status[:, 0]))[1] == "NONFINITE_INPUT"
+    assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
+    assert results[0][0].isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+@modes
+def test_the_ops_pass_opcheck(backward):
+    options = ("gmres", 3, 1e-5, 3, backward, None, None, "return", 0)
+    nu = torch.tensor(1e-2, dtype=torch.float64, requires_grad=True)
+    counts = torch.full((2, 4), 3), torch.full((2, 4), -1)
+    for kind, shape, channels in (("heat", [5], 1), ("burgers", [3, 4], 2), ("navier_stokes", [3, 4], 3)):
+        u, states = field(shape, channels=channels), torch.randn(2, 5, channels, *shape, dtype=torch.float64)
+        equation = ([nu], kind, shape, [0.1], 2)
+        for op, args in (
+            (torch.ops.prdp.rollout_solves, (u.requires_grad_(), *equation, 4, *options)),
+            (torch.ops.prdp.rollout, (u, *equation, 2, *options)),
+            (torch.ops.prdp.rollout_vjp,
+             (states, states, *counts, [1, 1], [nu.detach()], *equation[1:], *options)),
+        ):  # fmt: skip
+            assert set(opcheck(op.default, args).values()) == {"SUCCESS"}
+
+
+@modes
+@pytest.mark.parametrize("name", ["heat", "burgers_1d"])
+def test_a_compiled_rollout_follows_k_and_compiles_at_most_twice(name, backward):
+    torch._dynamo.reset()
+    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    eager = make(name, 1e-2, prdp.Jacobi(1), backward=backward)
+    compiled = torch.compile(eager.rollout, fullgraph=True, backend=counter)
+    for k in range(1, 8):
+        eager.max_iter = k
+        gradients = []
+        for rollout in (eager.rollout, compiled):
+            u = start(name).requires_grad_()
+            states = rollout(u, 3)
+            (states**2).sum().backward()
+            gradients.append(u.grad)
+            assert eager.info.iterations.tolist() == [[k] * 3] * 2
+        assert torch.equal(*gradients)
+    assert counter.frame_count <= 2
+
+
+def test_a_compiled_rollout_takes_the_number_of_steps():
+    torch._dynamo.reset()
+    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    burgers = prdp.Burgers((9,), 1e-2, 0.1, solver=prdp.Jacobi(3), picard_steps=2)
+    compiled = torch.compile(burgers.rollout, fullgraph=True, backend=counter)
+    for steps in range(2, 9):
+        u, v = (field((9,)).requires_grad_() for _ in range(2))
+        (compiled(u, steps) ** 2).sum().backward()
+        (burgers.rollout(v, steps) ** 2).sum().backward()
+        assert torch.equal(u.grad, v.grad)
+    assert counter.frame_count <= 2
+
+
+def test_fields_rollout_takes_it_unless_forward_is_the_users():
+    class Forced(prdp.Heat):
+        def forward(self, u):
+            return super().forward(u) + 1.0
+
+    u = field((9,)).requires_grad_()
+    heat, forced = (cls((9,), 1e-3, 1.0, solver=prdp.Jacobi(3)) for cls in (prdp.Heat, Forced))
+    assert "RolloutSolves" in fields.rollout(heat, u, 2).grad_fn.name()
+    assert torch.equal(fields.rollout(forced, u, 2), torch.stack([u, forced(u), forced(forced(u))], 1))
+
+
+@pytest.mark.parametrize(
+    "call, error, message",
+    [
+        (lambda heat, u: heat.rollout(u, -1), ValueError, "rollout: steps must be >= 0, got -1"),
+        (lambda heat, u: heat.rollout(u, 1.5), TypeError, "rollout: steps must be a whole number, got 1.5"),
+        (lambda heat, u: heat.rollout(u[0], 2), ValueError, r"Heat: expected \(batch, 1, 9\), got \[1, 9\]"),
+        (lambda heat, u: heat.rollout(None, 2), TypeError, "Heat: u must be a torch tensor, got NoneType"),
+    ],
+)
+def test_bad_arguments_are_refused_in_words(call, error, message):
+    with pytest.raises(error, match=message):
+        call(prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3)), field((9,)))
