@@ -2,6 +2,7 @@
 
 import functools
 import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -24,6 +25,8 @@ app = typer.Typer(
     help="Train through PDE solves that stop early, and see what it saves.",
 )
 console = Console(highlight=False)
+
+SUITES = ("accuracy", "size", "roofline", "change_of_k", "training")  # modules of benchmarks/
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
@@ -150,6 +153,26 @@ def compare(
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
 
 
+@command
+def bench(
+    suites: Annotated[list[str] | None, typer.Argument(metavar="[SUITE]...", help=f"{', '.join(SUITES)}; all.")] = None,
+    out: out("runs/bench") = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
+):
+    """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
+    project = Path(__file__).resolve().parent.parent
+    if not (project / "benchmarks").is_dir():
+        raise ValueError("bench: the benchmarks are in the project's folder, not in the installed package; clone it")
+    for suite in suites or ():
+        if suite not in SUITES:
+            raise ValueError(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
+    folder = records.prepare_folder(out or Path("runs") / "bench").resolve()
+    arguments = [*(suites or ()), "--out", folder, *(["--quick"] if quick else [])]
+    done = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], cwd=project)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
+
+
 def _load(scene, backward, intervals):
     loaded = scene_files.load(scene)
     if backward is not None:
@@ -195,3 +218,7 @@ def _print_table(scene, table):
 
 def main():
     app()
+
+
+if __name__ == "__main__":
+    main()
