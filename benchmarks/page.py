@@ -24,12 +24,14 @@ def write(results, environment, folder):
 
 
 def sections(results):
-    for name, points in results.get("accuracy", {}).items():
-        title = PROBLEMS[name]().title
+    for name, found in results.get("accuracy", {}).items():
+        title, points = PROBLEMS[name]().title, found["points"]
+        failed = "".join(f" {label} failed: {error}." for label, error in found["failures"].items())
         yield {
             "name": f"accuracy_{name}", "title": f"{title}: accuracy against cost",
             "text": "Batch of 25, float32. A curve is a solver with growing K, a large mark another library or an "
-            "exact method. Lower left is better. Errors are measured in float64, the gradient's against the exact one.",
+            "exact method. Lower left is better. Errors are measured in float64, the gradient's against the exact one."
+            + failed,
             "figure": charts.accuracy(title, points), "table": accuracy_table(points),
         }  # fmt: skip
     if "size" in results:
