@@ -84,7 +84,7 @@ def size(series):
         axes.grid(alpha=0.3, which="both", lw=0.4)
     for name, held in CACHES.items():  # three vectors of float32 fill the cache
         left.axvline(held / 12, color="#999999", lw=0.8, ls=":")
-        left.text(held / 12, left.get_ylim()[1], name, ha="right", va="top", color="#666666", fontsize=9)
+        left.text(held / 13, 0.98, name, transform=left.get_xaxis_transform(), ha="right", va="top", color="#666666")
     left.set(xlabel="unknowns of one sample (batch 1)", ylabel="ns per unknown and product with A")
     right.set(xlabel="samples in the batch")
     right.legend(frameon=False, fontsize=9)
@@ -121,7 +121,7 @@ def change_of_k(found):
         first, later = (1e3 * float(np.median([p[key] for p in points])) for key in ("first_seconds", "later_seconds"))
         axes.barh(at, first, color="#D55E00", height=0.7)
         axes.barh(at, later, color="#0072B2", height=0.7)
-        axes.text(first, at, f" {first:,.3g} ms", va="center", fontsize=9)
+        axes.text(first, at, f" {first:,.0f} ms" if first > 10 else f" {first:.2g} ms", va="center", fontsize=9)
     axes.set_yticks(range(len(names)), [f"{problem}: {label}" for problem, label in reversed(names)])
     axes.set(xscale="log", xlabel="ms, solve and gradient of a batch of 25 (median over five changes)")
     axes.margins(x=0.15)
