@@ -30,7 +30,7 @@ SUITES = ("accuracy", "size", "roofline", "change_of_k", "training")  # modules 
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
 
@@ -47,7 +47,8 @@ def command(function):
         try:
             function(*args, **kwargs)
         except KeyboardInterrupt:
-            print("prdp: interrupted; finished trainings are kept, --resume goes on from them", file=sys.stderr)
+            kept = "--resume keeps finished trainings and goes on from the last checkpoint"
+            print(f"prdp: interrupted; {kept}", file=sys.stderr)
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output has left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prdp_torch import records
+from prdp_torch.checkpoint import Checkpoint
 from prdp_torch.training import Refinement, train
 
 
@@ -71,7 +72,8 @@ def rows_of(scene):
 
 
 def run(scene, seeds, folder, resume=False, progress=None):
-    """Train every row with every seed, writing a record each; with `resume`, finished ones are read.
+    """Train every row with every seed, writing a record each; with `resume`, finished ones are read and
+    unfinished ones go on from their checkpoints.
 
     progress: called with (row, seed, intervals done of this training) as it goes.
     """
@@ -96,7 +98,8 @@ def run(scene, seeds, folder, resume=False, progress=None):
 
 
 def run_one(scene, label, refinement, seed, folder, environment, resume, on_interval):
-    """One training with its record; curves of a finished record of the same settings if `resume`."""
+    """One training with its record; if `resume`, the curves of a finished record of the same settings, or
+    the training goes on from its checkpoint."""
     path = folder / label / f"seed_{seed}.json"
     if resume and path.exists():
         record = records.read(path)
@@ -106,12 +109,19 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
             on_interval(len(curves["seconds"]), curves["metric"][-1], curves["max_iter"][-1])
             return curves
     path.parent.mkdir(parents=True, exist_ok=True)
-    curves = train(scene, refinement, seed, on_interval=on_interval)
+    versions = environment["versions"]
+    checkpoint = Checkpoint(
+        path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.settings(scene), versions=versions
+    )
+    if not resume:
+        checkpoint.remove()
+    curves = train(scene, refinement, seed, on_interval=on_interval, checkpoint=checkpoint)
     on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
     records.write(
         path,
         {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves},
     )
+    checkpoint.remove()
     return curves
 
 

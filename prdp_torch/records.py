@@ -66,7 +66,12 @@ def write(path, content):
 
 
 def read(path):
-    return json.loads(Path(path).read_text())
+    """A record. ValueError, naming it, for a damaged one."""
+    try:
+        return json.loads(Path(path).read_text())
+    except ValueError:
+        message = f"record: '{path}' is damaged; delete it, and its training is run again"
+        raise ValueError(message) from None
 
 
 def _null_for_nan(content):
