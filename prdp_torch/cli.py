@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from prdp_torch import compare as comparison
-from prdp_torch import records, report
+from prdp_torch import records, report, trajectories
 from prdp_torch import scenes as scene_files
 from prdp_torch.training import Refinement
 
@@ -111,7 +111,9 @@ def train(
             def show(done, metric, k, task=task):
                 progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
 
-            curves = comparison.run_one(loaded, refinement.label, refinement, seed, folder, environment, resume, show)
+            curves = comparison.run_one(
+                loaded, refinement.label, refinement, seed, folder, environment, resume, show, _bar(progress, "data")
+            )
             if "diverged" in curves:
                 diverged[seed] = curves["diverged"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)
@@ -143,13 +145,14 @@ def compare(
             finished[row.label, seed] = done
             progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
 
-        rows = comparison.run(loaded, seeds, folder, resume, show)
-    table = comparison.summarise(loaded, rows)
-    records.write(
-        folder / "summary.json",
-        {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
-    )
-    report.write(loaded, rows, table, folder)
+        rows = comparison.run(loaded, seeds, folder, resume, show, _bar(progress, "data"))
+        table = comparison.summarise(loaded, rows)
+        records.write(
+            folder / "summary.json",
+            {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
+        )
+        shown = trajectories.collect(loaded, rows, folder, _bar(progress, "reference for the pictures"))
+    report.write(loaded, rows, table, shown, folder)
     _print_table(loaded, table)
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
 
@@ -201,6 +204,19 @@ def _progress():
         TextColumn("{task.fields[note]}"),
     )
     return Progress(*columns, console=console)
+
+
+def _bar(progress, name):
+    """A callback (done, total) that shows itself as a bar of its own from its first call on."""
+    task = None
+
+    def show(done, total):
+        nonlocal task
+        if task is None:
+            task = progress.add_task(name, total=total, note="steps of a sample")
+        progress.update(task, completed=done)
+
+    return show
 
 
 def _print_table(scene, table):

@@ -2,14 +2,13 @@
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
 import math
-import sys
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, fields
 from prdp_torch.controller import LinearSchedule, PRDPController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -48,7 +47,7 @@ class Refinement:
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
 
 
-def train(scene, refinement, seed=0, network=None, on_interval=None, checkpoint=None):
+def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=None, checkpoint=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
     the solves, of which an update of the task "corrector" has two; iterations and operator applications
@@ -63,6 +62,7 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, checkpoint=
         network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
         on_interval: called after each interval with (how many are done, the metric, K), and where a
             checkpoint is gone on from.
+        on_data: called while data are made that are not on disk yet, with (steps of a sample done, all of them).
         checkpoint: a `prdp_torch.checkpoint.Checkpoint` to go on from where it has a state, bit for bit on
             the same machine with as many threads, and to keep the training in whenever it is due.
     """
@@ -70,7 +70,7 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, checkpoint=
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene.training.intervals, steppers, refinement.attach(steppers), checkpoint)
     make_task = _parameters if scene.task == "parameters" else _network
-    task = make_task(scene, steppers, seed, network)
+    task = make_task(scene, steppers, seed, network, on_data)
     try:
         run.go(task, saved, on_interval or (lambda *report: None))
     except _Diverged as divergence:
@@ -166,12 +166,28 @@ class _Run:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
-def _network(scene, steppers, seed, network):
+def propagator(scene, network):
+    """A trained network as a step u → u_next: the network itself, or (task "corrector") a converged step
+    of the coarse solver with the network on top."""
+    if scene.task == "emulator":
+        return network
+    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
+    return lambda u: _corrected(converged, network, u)
+
+
+def error(scene, u, reference):
+    """The mean over the samples of (‖u - reference‖ / ‖reference‖)², of a corrector of the velocity along
+    x: what the validation metric says at its step."""
+    of = slice(0, 1) if scene.task == "corrector" else slice(None)
+    return float(_C.normalised_mse(u[:, of], reference[:, of]))
+
+
+def _network(scene, steppers, seed, network, on_data):
     """An interval is an epoch, the metric that of validation."""
-    data = _C.make_dataset(scene, _report_data)
+    data = _C.make_dataset(scene, on_data)
     network = make_network(scene, seed) if network is None else network
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of, metric_of = objective(scene, steppers, data, network)
+    loss_of = objective(scene, steppers, data, network)
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
@@ -186,10 +202,6 @@ def _network(scene, steppers, seed, network):
             optimiser.step()
             yield float(loss.detach())
 
-    def metric():
-        with torch.no_grad():
-            return float(metric_of())
-
     def state():
         parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
         return {**parts, "shuffling": generator.get_state()}
@@ -199,56 +211,50 @@ def _network(scene, steppers, seed, network):
         optimiser.load_state_dict(saved["optimiser"])
         generator.set_state(saved["shuffling"])
 
-    return _Task(updates, metric, state, load)
+    return _Task(updates, _metric(scene, data, network), state, load)
 
 
-def _report_data(done, total):
-    print(f"data: {done} of {total} reference steps", file=sys.stderr, flush=True)
+def _metric(scene, data, network):
+    step = propagator(scene, network)
+
+    def metric():
+        with torch.no_grad():
+            reached = fields.rollout(step, data.valid_start, scene.data.valid_steps)[:, -1]
+        return error(scene, reached, data.valid_end)
+
+    return metric
 
 
 def _emulator(scene, steppers, data, network):
-    """The loss of a batch, and the metric: the network in place of the equation."""
+    """The loss of a batch: the network in place of the equation."""
     (stepper,) = steppers
 
     def loss(batch):
         u2 = stepper(network(data.train_start[batch]))
         return _C.loss(scene.training.loss, u2, data.train_end[batch])
 
-    def metric():
-        u = data.valid_start
-        for _ in range(scene.data.valid_steps):
-            u = network(u)
-        return _C.normalised_mse(u, data.valid_end)
+    return loss
 
-    return loss, metric
+
+def _corrected(stepper, network, u):
+    coarse = _C.without_mean_pressure(stepper(u))
+    return coarse + network(coarse)
 
 
 def _corrector(scene, steppers, data, network):
-    """The loss of a batch, and the metric: the network on top of a coarse step, in the metric a
-    converged one."""
+    """The loss of a batch: the network on top of a coarse step, twice."""
     first, second = steppers
-    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
-
-    def corrected(stepper, u):
-        coarse = _C.without_mean_pressure(stepper(u))
-        return coarse + network(coarse)
 
     def loss(batch):
-        u1 = corrected(first, data.train_start[batch])
-        u2 = corrected(second, u1)
+        u1 = _corrected(first, network, data.train_start[batch])
+        u2 = _corrected(second, network, u1)
         kind = scene.training.loss
         return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
 
-    def metric():
-        u = data.valid_start
-        for _ in range(scene.data.valid_steps):
-            u = corrected(converged, u)
-        return _C.normalised_mse(u[:, :1], data.valid_end[:, :1])  # the velocity along x
-
-    return loss, metric
+    return loss
 
 
-def _parameters(scene, steppers, seed, network):
+def _parameters(scene, steppers, seed, network, on_data):
     """An interval is a single update, the metric the error of θ."""
     (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)

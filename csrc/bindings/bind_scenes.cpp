@@ -82,6 +82,8 @@ void bind_scenes(py::module_& m) {
       .def_readonly("valid_start", &Dataset::valid_start)
       .def_readonly("valid_end", &Dataset::valid_end);
   m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress());
+  m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
+        py::arg("on_progress") = OnProgress());
   py::class_<ParameterProblem>(m, "ParameterProblem")
       .def_readonly("modes", &ParameterProblem::modes)
       .def_readonly("start", &ParameterProblem::start)

@@ -48,7 +48,7 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
 def test_the_report_is_one_file_with_labelled_pictures(comparison):
     folder, _ = comparison
     html = (folder / "runs/heat_1d/report.html").read_text()
-    assert len(re.findall(r'<img alt="[^"]{30,}" src="data:image/svg\+xml;base64,', html)) == 4
+    assert len(re.findall(r'<img alt="[^"]{30,}" src="data:image/svg\+xml;base64,', html)) == 6
     assert not re.search(r'(src|href)="(?!data:)', html)  # nothing is fetched from elsewhere
 
 
@@ -68,10 +68,11 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
     "options, label", [([], "prdp"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
                        (["--direct"], "direct")]
 )  # fmt: skip
-def test_train_writes_one_record_a_seed(tmp_path, options, label):
+def test_train_writes_one_record_and_the_weights_of_each_seed(tmp_path, options, label):
     done = prdp("train", "heat_1d", *options, "--seeds", 2, "--intervals", 2, "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in (tmp_path / "here" / label).iterdir()) == ["seed_0.json", "seed_1.json"]
+    written = sorted(path.name for path in (tmp_path / "here" / label).iterdir())
+    assert written == ["seed_0.json", "seed_0.pt", "seed_1.json", "seed_1.pt"]
 
 
 def test_scenes_are_listed(tmp_path):
