@@ -12,7 +12,7 @@ from PIL import Image
 from test_corrector import cache, tiny  # noqa: F401, cache is a fixture of every test here
 
 import prdp_torch as prdp
-from prdp_torch import _C, compare, fields, report, scenes, trajectories, trajectory_charts
+from prdp_torch import _C, compare, fields, records, report, scenes, trajectories, trajectory_charts
 from prdp_torch.networks import make_network
 
 PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
@@ -132,8 +132,9 @@ def test_no_record_stands_beside_weights_of_another_training(tmp_path, monkeypat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(compare.records, "write_weights", interrupted)
+    prdp, environment = compare.Refinement.prdp(scene), records.environment()
     with pytest.raises(KeyboardInterrupt):
-        compare.run_one(scene, "prdp", compare.Refinement.prdp(scene), 0, tmp_path, {}, False, lambda *_: None)
+        compare.run_one(scene, "prdp", prdp, 0, tmp_path, environment, False, lambda *_: None)
     assert not record.exists() and not list(tmp_path.rglob("*.part"))
 
 
