@@ -2,6 +2,7 @@
 
 import functools
 import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -25,9 +26,11 @@ app = typer.Typer(
 )
 console = Console(highlight=False)
 
+SUITES = ("accuracy", "size", "roofline", "change_of_k", "training")  # modules of benchmarks/
+
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
 
@@ -44,7 +47,8 @@ def command(function):
         try:
             function(*args, **kwargs)
         except KeyboardInterrupt:
-            print("prdp: interrupted; finished trainings are kept, --resume goes on from them", file=sys.stderr)
+            kept = "--resume keeps finished trainings and goes on from the last checkpoint"
+            print(f"prdp: interrupted; {kept}", file=sys.stderr)
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output has left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -161,6 +165,26 @@ def compare(
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
 
 
+@command
+def bench(
+    suites: Annotated[list[str] | None, typer.Argument(metavar="[SUITE]...", help=f"{', '.join(SUITES)}; all.")] = None,
+    out: out("runs/bench") = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
+):
+    """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
+    project = Path(__file__).resolve().parent.parent
+    if not (project / "benchmarks").is_dir():
+        raise ValueError("bench: the benchmarks are in the project's folder, not in the installed package; clone it")
+    for suite in suites or ():
+        if suite not in SUITES:
+            raise ValueError(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
+    folder = records.prepare_folder(out or Path("runs") / "bench").resolve()
+    arguments = [*(suites or ()), "--out", folder, *(["--quick"] if quick else [])]
+    done = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], cwd=project)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
+
+
 def _load(scene, backward, intervals):
     loaded = scene_files.load(scene)
     if backward is not None:
@@ -219,3 +243,7 @@ def _print_table(scene, table):
 
 def main():
     app()
+
+
+if __name__ == "__main__":
+    main()

@@ -85,7 +85,12 @@ def read_weights(path, network):
 
 
 def read(path):
-    return json.loads(Path(path).read_text())
+    """A record. ValueError, naming it, for a damaged one."""
+    try:
+        return json.loads(Path(path).read_text())
+    except ValueError:
+        message = f"record: '{path}' is damaged; delete it, and its training is run again"
+        raise ValueError(message) from None
 
 
 def _null_for_nan(content):

@@ -1,6 +1,7 @@
 """The command `prdp`, run as users run it."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -122,6 +123,24 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     assert process.returncode == 130 and b"interrupted" in errors
     assert json.loads(first.read_text())["curves"]["metric"]
     assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path, ignored):
+    """With a torch that presses Ctrl-C; in the background, where it is ignored, it stays so."""
+    (tmp_path / "torch.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('went on')\n")
+    setting = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); " if ignored else ""
+    done = subprocess.run(
+        [sys.executable, "-c", setting + "from prdp_command import main; main()", "scenes"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    if ignored:
+        assert done.stdout == "went on\n" and "module 'torch' has no attribute" in done.stderr
+    else:
+        assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 @pytest.mark.parametrize(

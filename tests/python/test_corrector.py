@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import assert_refused, written
+from helpers import assert_refused, tiny, written
 
 import prdp_torch as prdp
 from prdp_torch import _C, charts, fields, scenes, training
@@ -18,17 +18,6 @@ from prdp_torch.training import Refinement, train
 ROOT = Path(__file__).parents[2]
 PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
 TRAINER = ROOT / "build" / "prdp_train"
-TINY = (
-    ("shape = [48, 48]", "shape = [8, 8]"),
-    ("reference_shape = [97, 97]", "reference_shape = [17, 17]"),
-    ("train = 200", "train = 8"),
-    ("valid = 5", "valid = 2"),
-    ("blocks = 3", "blocks = 1"),
-    ("width = 64", "width = 8"),
-    ("batch = 25", "batch = 2"),
-    ("epochs = 100", "epochs = 5"),
-    ("constant = [2, 5, 10, 20]", "constant = [2]"),
-)
 
 
 @pytest.fixture(autouse=True)
@@ -37,11 +26,6 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("PRDP_CACHE", str(folder))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs: on so small a grid threads wait for each other
     return folder
-
-
-def tiny(tmp_path, *changes, name="tiny"):
-    """The path of a small copy of the scene, with replacements."""
-    return written(tmp_path, *TINY, *changes, scene="navier_stokes", name=name)
 
 
 def tensors(data):
