@@ -112,7 +112,15 @@ def train(
                 progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
 
             curves = comparison.run_one(
-                loaded, refinement.label, refinement, seed, folder, environment, resume, show, _bar(progress, "data")
+                loaded,
+                refinement.label,
+                refinement,
+                seed,
+                folder,
+                environment,
+                resume,
+                show,
+                _bar(progress, "data, steps"),
             )
             if "diverged" in curves:
                 diverged[seed] = curves["diverged"]
@@ -145,13 +153,13 @@ def compare(
             finished[row.label, seed] = done
             progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
 
-        rows = comparison.run(loaded, seeds, folder, resume, show, _bar(progress, "data"))
+        rows = comparison.run(loaded, seeds, folder, resume, show, _bar(progress, "data, steps"))
         table = comparison.summarise(loaded, rows)
         records.write(
             folder / "summary.json",
             {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
         )
-        shown = trajectories.collect(loaded, rows, folder, _bar(progress, "reference for the pictures"))
+        shown = trajectories.collect(loaded, rows, folder, _bar(progress, "pictures, steps"))
     report.write(loaded, rows, table, shown, folder)
     _print_table(loaded, table)
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
@@ -207,13 +215,13 @@ def _progress():
 
 
 def _bar(progress, name):
-    """A callback (done, total) that shows itself as a bar of its own from its first call on."""
+    """A callback (done, total) that has a bar of its own from its first call on."""
     task = None
 
     def show(done, total):
         nonlocal task
         if task is None:
-            task = progress.add_task(name, total=total, note="steps of a sample")
+            task = progress.add_task(name, total=total, note="")
         progress.update(task, completed=done)
 
     return show

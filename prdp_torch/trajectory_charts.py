@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.animation import PillowWriter
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -11,7 +12,7 @@ from prdp_torch.trajectories import field
 _COARSE = ("#0072b2", "--")
 _SEEN = 2  # steps that the loss covers, in either task
 _STATE, _DIFFERENCE = "RdBu_r", "PuOr_r"  # both safe for colour-blind readers
-_LARGEST_GIF = 1_500_000  # bytes
+_LARGEST_GIF = 2_000_000  # bytes
 
 
 def pictures(scene, shown):
@@ -19,12 +20,12 @@ def pictures(scene, shown):
     snapshots."""
     missing = f" Left out, for want of weights: {'; '.join(shown.missing)}." if shown.missing else ""
     drawn = [("error_over_time", error_over_time(scene, shown), _error_caption(scene, shown) + missing)]
-    first = (
-        f"The first validation sample, networks of the first seed; colours reach to what the reference has from "
-        f"t = {_SEEN} on.{missing}"
-    )
+    first = f"The first validation sample, networks of the first seed.{missing}"
     if len(scene.physics.shape) == 1:
-        caption = f"Space and time: reference, emulators and, on a scale of their own, the differences. {first}"
+        caption = (
+            "Space and time: reference and emulators, in colours that reach to the reference's largest value from "
+            f"t = {_SEEN} on, and on a scale of their own the differences. {first}"
+        )
         drawn.append(("space_time", space_time(scene, shown), caption))
     elif len(scene.physics.shape) == 2:
         drawn.append(("snapshots", snapshots(scene, shown), f"{_field_caption(scene)} {first}"))
@@ -84,46 +85,53 @@ def space_time(scene, shown):
 
 
 def snapshots(scene, shown):
-    """The fields in rows, at a few times in columns."""
+    """The fields in rows, at a few times in columns; a colour scale for each time."""
     contents = _fields(scene, shown)
     metric, last = scene.data.valid_steps, shown.reference.shape[1] - 1
     times = sorted({_SEEN, metric, 2 * metric, last})
-    scale = _scale(contents[0][1][_SEEN:])
-    figure, panels = _grid(len(contents), len(times), height=0.5 + 2.0 * len(contents))
-    for line, (name, content) in zip(panels, contents, strict=True):
-        line[0].set_ylabel(name)
-        for axes, t in zip(line, times, strict=True):
-            image = _draw_field(axes, content[t], scale)
-    for axes, t in zip(panels[0], times, strict=True):
-        axes.set_title(f"t = {t}", fontsize=10)
-    figure.colorbar(image, ax=panels, label=_field_name(scene), extend="both", shrink=0.6)
+    figure, panels = _grid(len(contents), len(times), height=1.2 + 2.1 * len(contents))
+    for column, t in zip(panels.T, times, strict=True):
+        images = _draw_fields(column, contents, t)
+        column[0].set_title(f"t = {t}", fontsize=10)
+        figure.colorbar(images[0], ax=list(column), location="bottom", extend="both", aspect=15, pad=0.01)
+    for axes, (name, _) in zip(panels[:, 0], contents, strict=True):
+        axes.set_ylabel(name)
+    figure.supxlabel(_field_name(scene), fontsize=10)
     return figure
 
 
 def animate(scene, shown, path):
     """Write the fields over time as a GIF, whole or not at all and small enough for a page."""
     contents = _fields(scene, shown)
-    scale = _scale(contents[0][1][_SEEN:])
     figure, (panels,) = _grid(1, len(contents), height=2.9)
-    images = [_draw_field(axes, content[0], scale) for axes, (_, content) in zip(panels, contents, strict=True)]
+    images = _draw_fields(panels, contents, 0)
     for axes, (name, _) in zip(panels, contents, strict=True):
         axes.set_title(name, fontsize=9)
     figure.colorbar(images[0], ax=panels, label=_field_name(scene), extend="both")
     clock = figure.supxlabel("t", fontsize=10)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # nothing moves from now on but the fields
+
+    def show(t):
+        clock.set_text(f"t = {t} step{'s' if t != 1 else ''} of Δt = {scene.physics.dt:g}")
+        scale = _scale(contents[0][1][t])
+        images[0].set_clim(-scale, scale)  # all images and the bar have the same norm
+        for image, (_, content) in zip(images, contents, strict=True):
+            image.set_data(content[t])
+
     unfinished = path.with_name(f"{path.stem}.part{path.suffix}")
-    for dpi in (110, 80, 60, 40):
-        writer = PillowWriter(fps=4)
-        with writer.saving(figure, unfinished, dpi):
-            for t in range(len(contents[0][1])):
-                clock.set_text(f"t = {t} steps of Δt = {scene.physics.dt:g}")
-                for image, (_, content) in zip(images, contents, strict=True):
-                    image.set_data(content[t])
-                writer.grab_frame()
-        if unfinished.stat().st_size <= _LARGEST_GIF:
-            break
-    unfinished.replace(path)
+    try:
+        for dpi in (110, 80, 60, 40):
+            writer = PillowWriter(fps=4)
+            with writer.saving(figure, unfinished, dpi):
+                for t in range(len(contents[0][1])):
+                    show(t)
+                    writer.grab_frame()
+            if unfinished.stat().st_size <= _LARGEST_GIF:
+                break
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _grid(rows, columns, height):
@@ -152,7 +160,9 @@ def _field_name(scene):
 
 
 def _field_caption(scene):
-    return f"{_field_name(scene)[0].upper()}{_field_name(scene)[1:]} over the unit square, one colour scale for all."
+    return (
+        f"{_field_name(scene)[0].upper()}{_field_name(scene)[1:]} over the unit square; each time has its colour scale."
+    )
 
 
 def _error_caption(scene, shown):
@@ -161,7 +171,7 @@ def _error_caption(scene, shown):
     of = "relative error of the velocity along x" if scene.task == "corrector" else "relative error"
     return (
         f"The error from the validation samples on, over more steps than the training knows{spread}: at the step of "
-        f"the metric it is the metric. It is the square of the {of}: 1e-2 is a tenth of the reference."
+        f"the metric it is the metric. It is the mean square of the {of}: 1e-2 is a tenth of the reference."
     )
 
 
@@ -171,9 +181,16 @@ def _fields(scene, shown):
     return [(name.replace(" (", "\n("), field(scene, states[0]).numpy()) for name, states in named]
 
 
-def _draw_field(axes, content, scale):
-    axes.set(xticks=[], yticks=[])
-    return axes.imshow(content, cmap=_STATE, vmin=-scale, vmax=scale, origin="lower", interpolation="none")
+def _draw_fields(panels, contents, t):
+    """Step t of each field in a panel of its own, in the colour scale of the first, the reference."""
+    scale = _scale(contents[0][1][t])
+    norm = Normalize(-scale, scale)
+    for axes in panels:
+        axes.set(xticks=[], yticks=[])
+    return [
+        axes.imshow(content[t], cmap=_STATE, norm=norm, origin="lower", interpolation="none")
+        for axes, (_, content) in zip(panels, contents, strict=True)
+    ]
 
 
 def _scale(content):
