@@ -85,7 +85,7 @@ class _Diverged(Exception):
 class _Task(NamedTuple):
     """What a task supplies."""
 
-    updates: Callable  # the number of the first update → an iterator over the losses of an interval's
+    updates: Callable  # the number of the first → an iterator over the losses of an interval's updates
     metric: Callable
     state: Callable  # all that the updates change
     load: Callable  # its inverse
@@ -111,7 +111,7 @@ class _Run:
         while self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
             self._observe(task.metric(), self._done())
-            if self.checkpoint and self._done() < self.intervals and self.checkpoint.due():
+            if self.checkpoint is not None and self._done() < self.intervals and self.checkpoint.due():
                 self._keep(task)
             on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
 

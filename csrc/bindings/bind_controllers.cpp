@@ -57,5 +57,6 @@ void bind_controllers(py::module_& m) {
                                                "maximum"_a = s.maximum());
                              })
       .def(
-          "_load", [](LinearSchedule& s, int64_t max_iter) { s.load_state({max_iter}); }, py::arg("max_iter"));
+          "_load", [](LinearSchedule& s, int64_t max_iter) { s.load_state({max_iter}); },
+          py::arg("max_iter"));
 }

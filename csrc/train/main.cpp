@@ -67,7 +67,8 @@ bool is_done(const fs::path& path, const prdp::Scene& scene) {
   if (!file) return false;
   const auto record = Json::parse(file, nullptr, /*allow_exceptions=*/false);
   if (!record.is_object())
-    throw std::runtime_error("record: '" + path.string() + "' is damaged; delete it, and its training is run again");
+    throw std::runtime_error("record: '" + path.string() +
+                             "' is damaged; delete it, and its training is run again");
   return record.value("settings", Json()) == settings(scene);
 }
 
@@ -146,7 +147,8 @@ int main(int argc, char** argv) {
   try {
     return run(options, command);
   } catch (const Interrupted&) {
-    std::fprintf(stderr, "prdp_train: interrupted; --resume keeps finished seeds and goes on from the last checkpoint\n");
+    std::fprintf(stderr, "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
+                         "last checkpoint\n");
     return 130;
   } catch (const c10::Error& error) {
     std::fprintf(stderr, "prdp_train: %s\n", error.what_without_backtrace());

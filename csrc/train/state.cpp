@@ -16,7 +16,9 @@ T read(InputArchive& archive, const std::string& key) {
 }  // namespace
 
 void save(OutputArchive& archive, const Curves& curves, const Controller& controller) {
-  each_curve(curves, [&](const std::string& name, const auto& values) { archive.write(name, c10::IValue(values)); });
+  each_curve(curves, [&](const std::string& name, const auto& values) {
+    archive.write(name, c10::IValue(values));
+  });
   const auto& state = controller.state();
   std::vector<double> metric, smoothed;
   std::vector<int64_t> max_iter, refined;
@@ -49,8 +51,8 @@ void load(InputArchive& archive, Curves& curves, Controller& controller) {
   controller.load_state(std::move(state));
 }
 
-void save(OutputArchive& archive, const torch::nn::Module& network, const torch::optim::Optimizer& optimiser,
-          const at::Generator& shuffling) {
+void save(OutputArchive& archive, const torch::nn::Module& network,
+          const torch::optim::Optimizer& optimiser, const at::Generator& shuffling) {
   OutputArchive weights(archive.compilation_unit()), moments(archive.compilation_unit());
   network.save(weights);
   optimiser.save(moments);

@@ -14,8 +14,8 @@ void save(OutputArchive& archive, const Curves& curves, const Controller& contro
 void load(InputArchive& archive, Curves& curves, Controller& controller);
 
 /// What that of a network has beside; `shuffling` is the generator that orders its samples.
-void save(OutputArchive& archive, const torch::nn::Module& network, const torch::optim::Optimizer& optimiser,
-          const at::Generator& shuffling);
+void save(OutputArchive& archive, const torch::nn::Module& network,
+          const torch::optim::Optimizer& optimiser, const at::Generator& shuffling);
 void load(InputArchive& archive, torch::nn::Module& network, torch::optim::Optimizer& optimiser,
           at::Generator& shuffling);
 

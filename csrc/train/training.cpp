@@ -74,11 +74,11 @@ class Run {
   }
 
   Curves go(const Task& task, const OnInterval& on_interval) {
-    const auto report = [&](int64_t done) { on_interval(done, curves_.metric.back(), controller_->max_iter()); };
+    const auto report = [&] { on_interval(done(), curves_.metric.back(), controller_->max_iter()); };
     try {
       if (saved_) {
         restore(task);
-        report(done());
+        report();
       } else {
         observe(task.metric(), 0);
       }
@@ -86,7 +86,7 @@ class Run {
         run_interval(task, done() + 1);
         observe(task.metric(), done());
         if (done() < intervals_ && checkpoint_.due()) keep(task);
-        report(done());
+        report();
       }
     } catch (const Diverged& divergence) {
       give_up(divergence.why);
@@ -252,8 +252,9 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
     const torch::NoGradGuard no_grad;
     return objective.metric();
   };
-  const auto save_all = [&](OutputArchive& archive) { save(archive, *network.ptr(), optimiser, generator); };
-  const auto load_all = [&](InputArchive& archive) { load(archive, *network.ptr(), optimiser, generator); };
+  auto& module = *network.ptr();
+  const auto save_all = [&](OutputArchive& archive) { save(archive, module, optimiser, generator); };
+  const auto load_all = [&](InputArchive& archive) { load(archive, module, optimiser, generator); };
   return run.go({updates, metric, save_all, load_all}, on_interval);
 }
 

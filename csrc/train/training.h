@@ -47,7 +47,8 @@ void each_curve(AnyCurves& curves, const F& f) {
   f("seconds", curves.seconds);
 }
 
-/// Called after each interval with (how many are done, the metric, K), and where a checkpoint is gone on from.
+/// Called after each interval with (how many are done, the metric, K), and where a checkpoint is gone on
+/// from.
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
 /// Trains the scene once; `seed` is that of the network's weights and of the shuffling. Goes on from the

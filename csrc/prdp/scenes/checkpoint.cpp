@@ -21,13 +21,15 @@ double seconds() {
   if (!chosen || !*chosen) return kSeconds;
   char* rest = nullptr;
   const double value = std::strtod(chosen, &rest);
-  TORCH_CHECK_VALUE(*rest == '\0' && value >= 0.0, "PRDP_CHECKPOINT_SECONDS: expected a number >= 0, got '", chosen,
-                    "'");
+  TORCH_CHECK_VALUE(*rest == '\0' && value >= 0.0,
+                    "PRDP_CHECKPOINT_SECONDS: expected a number >= 0, got '", chosen, "'");
   return value;
 }
 
 /// The first line: what tells a whole file of this format.
-std::string mark(const std::string& content) { return "prdp checkpoint 1, " + std::to_string(fingerprint(content)); }
+std::string mark(const std::string& content) {
+  return "prdp checkpoint 1, " + std::to_string(fingerprint(content));
+}
 
 }  // namespace
 

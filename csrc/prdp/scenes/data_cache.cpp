@@ -88,8 +88,8 @@ Dataset read(const fs::path& path, const std::string& settings, const Scene& sce
 Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
   const auto settings = settings_of(scene);
   std::ostringstream name;
-  name << scene.physics.equation << '-' << std::hex << std::setw(16) << std::setfill('0') << fingerprint(settings)
-       << ".pt";
+  name << scene.physics.equation << '-' << std::hex << std::setw(16) << std::setfill('0')
+       << fingerprint(settings) << ".pt";
   const auto path = cache_folder() / name.str();
   if (fs::exists(path)) return read(path, settings, scene);
   const auto data = make();
