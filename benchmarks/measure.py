@@ -3,7 +3,7 @@
 import statistics
 import time
 
-ROUNDS = 9
+ROUNDS = 5
 SAMPLE_SECONDS = 0.02  # what a reading takes at least; a call is repeated to reach it
 
 
