@@ -89,7 +89,8 @@ def test_missing_files_and_unknown_scenes():
     with pytest.raises(ValueError, match=r"scene: cannot read 'nowhere.toml'"):
         scenes.load("nowhere.toml")
     with pytest.raises(
-        ValueError, match="no scene 'heat1d'; available: burgers_1d, heat_1d, navier_stokes, poisson_1p"
+        ValueError,
+        match="no scene 'heat1d'; available: burgers_1d, heat_1d, heat_2d, heat_3d, navier_stokes, poisson_1p",
     ):
         scenes.load("heat1d")
 
