@@ -55,6 +55,13 @@ at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_
   return values.reshape(shape).to(dtype);
 }
 
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u) {
+  auto next = reference(u);
+  TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
+              reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+  return next;
+}
+
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
   if (scene.task == Scene::Task::kCorrector)
     return cached_dataset(scene, [&] { return flow_dataset(scene, on_progress); });
@@ -62,9 +69,9 @@ Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto& d = scene.data;
   const auto start = fourier_series(scene.physics, d.train + d.valid, d.modes, d.seed, at::kDouble);
   const auto train = start.narrow(0, 0, d.train), valid = start.narrow(0, d.train, d.valid);
-  auto converged = scene.stepper(Direct{});
+  auto reference = scene.stepper(scene.reference_solver());
   const auto after = [&](int64_t steps, at::Tensor u) {
-    for (int64_t i = 0; i < steps; ++i) u = converged(u);
+    for (int64_t i = 0; i < steps; ++i) u = converged_step(reference, u);
     return u.to(scene.dtype).contiguous();
   };
   return {after(0, train), after(2, train), after(0, valid), after(d.valid_steps, valid), {}};

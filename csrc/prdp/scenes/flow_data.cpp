@@ -38,9 +38,6 @@ at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor 
   return u - at::cat({backward_difference(phi, grid, kX), backward_difference(phi, grid, kY)}, 1);
 }
 
-/// Tight enough that its error is below float32's rounding.
-Solver reference_solver() { return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8}; }
-
 }  // namespace
 
 at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
@@ -64,7 +61,7 @@ Dataset flow_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto& d = scene.data;
   auto fine = scene;
   fine.physics.shape = d.reference_shape;
-  auto reference = fine.stepper(reference_solver());
+  auto reference = fine.stepper(fine.reference_solver());
   const int64_t total = 2 * d.train + d.valid_steps * d.valid;
   int64_t done = 0;
 
@@ -72,9 +69,7 @@ Dataset flow_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto follow = [&](at::Tensor u, int64_t steps) {
     std::vector<at::Tensor> states{downsample(u)};
     for (int64_t i = 0; i < steps; ++i) {
-      u = reference(u);
-      TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
-                  reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+      u = converged_step(reference, u);
       states.push_back(downsample(u));
       done += u.size(0);
       if (on_progress) on_progress(done, total);
