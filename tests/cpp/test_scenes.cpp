@@ -114,6 +114,9 @@ TEST(Data, HeatTargetsAreExactStepsAsManyAsTheSceneSays) {
   auto exact = scene.stepper(prdp::Direct{});
   EXPECT_TRUE(at::allclose(exact(exact(data.train_start)), data.train_end, 1e-5, 1e-6));
   EXPECT_TRUE(at::allclose(exact(exact(exact(data.valid_start))), data.valid_end, 1e-5, 1e-6));
+  EXPECT_TRUE(at::equal(prdp::validation_trajectories(scene, 4).select(1, 3), data.valid_end));
+  EXPECT_THROW(prdp::validation_trajectories(scene, -1), c10::ValueError);
+  EXPECT_THROW(prdp::validation_trajectories(prdp::read_scene(scene_path("poisson_1p")), 1), c10::ValueError);
 }
 
 TEST(Data, RandomFlowIsNoiseSmoothedNormalisedAndProjected) {
@@ -155,7 +158,7 @@ TEST(Data, FlowsFollowTheConvergedReference) {
   scene.data = {0, 30, 2, 1, 3, {9, 7}, 0};
   scene.dtype = at::kDouble;
   int64_t calls = 0, last = 0;
-  const auto data = prdp::flow_dataset(scene, [&](int64_t done, int64_t total) {
+  const auto data = prdp::compute_dataset(scene, [&](int64_t done, int64_t total) {
     EXPECT_EQ(total, 66);
     EXPECT_GT(done, last);
     last = done;
@@ -174,6 +177,12 @@ TEST(Data, FlowsFollowTheConvergedReference) {
   EXPECT_TRUE(close(data.train_end, exact(exact(train))));
   EXPECT_TRUE(close(data.valid_start, valid));
   EXPECT_TRUE(close(data.valid_end, exact(exact(exact(valid)))));
+
+  const auto further = prdp::validation_trajectories(scene, 4);
+  ASSERT_EQ(further.sizes(), (std::vector<int64_t>{2, 5, 3, 4, 3}));
+  EXPECT_TRUE(at::equal(further.select(1, 0), data.valid_start));
+  EXPECT_TRUE(at::equal(further.select(1, 3), data.valid_end));
+  EXPECT_TRUE(close(further.select(1, 4), exact(exact(exact(exact(valid))))));
 }
 
 /// Whether moving the input by `by` points along `axis` moves the output alike.
