@@ -80,6 +80,7 @@ class Physics:
     dt: float
     channels: int
     periodic: bool
+    direct_is_cheap: bool
 
 class Data:
     modes: int

@@ -56,7 +56,7 @@ def rows_of(scene):
     """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, PRDP, constant K."""
     converged = scene.max_iter
     rows = [Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged)]
-    if scene.task != "corrector":  # the exact solver of a flow is out of all proportion
+    if scene.physics.direct_is_cheap:
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
     rows.append(Row("prdp", "PRDP", "prdp", Refinement.prdp(scene)))
     if scene.compare.growth is not None:

@@ -17,7 +17,8 @@ void bind_scenes(py::module_& m) {
       .def_readonly("nu", &Scene::Physics::nu)
       .def_readonly("dt", &Scene::Physics::dt)
       .def_property_readonly("channels", &Scene::Physics::channels)
-      .def_property_readonly("periodic", &Scene::Physics::periodic);
+      .def_property_readonly("periodic", &Scene::Physics::periodic)
+      .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);
   py::class_<Scene::Data>(m, "Data")
       .def_readonly("modes", &Scene::Data::modes)
       .def_readonly("train", &Scene::Data::train)

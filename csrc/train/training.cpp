@@ -3,13 +3,13 @@
 #include <c10/util/accumulate.h>
 #include <torch/csrc/autograd/autograd.h>
 #include <torch/nn/modules/container/any.h>
-#include <torch/optim/adam.h>
 
 #include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <limits>
 
+#include "fused_adam.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/networks/resnet.h"
@@ -234,7 +234,7 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
   auto network = make_network(scene, seed);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, run, data, network)
                                                               : corrector(scene, run, data, network);
-  torch::optim::Adam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
+  FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
 
   const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {

@@ -55,6 +55,13 @@ at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_
   return values.reshape(shape).to(dtype);
 }
 
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u) {
+  auto next = reference(u);
+  TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
+              reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+  return next;
+}
+
 namespace {
 
 /// Initial states of all samples, on the grid of the reference; those of the training come first.
@@ -69,9 +76,9 @@ at::Tensor starts(const Scene& scene) {
 at::Tensor follow(const Scene& scene, at::Tensor u, int64_t steps, const OnSteps& on_steps) {
   const at::NoGradGuard no_grad;
   if (scene.task == Scene::Task::kCorrector) return follow_flow(scene, u, steps, on_steps).to(scene.dtype);
-  auto exact = scene.stepper(Direct{});
+  auto reference = scene.stepper(scene.reference_solver());
   std::vector<at::Tensor> states{u};
-  for (int64_t i = 0; i < steps; ++i) states.push_back(u = exact(u));
+  for (int64_t i = 0; i < steps; ++i) states.push_back(u = converged_step(reference, u));
   return at::stack(states, 1).to(scene.dtype);
 }
 

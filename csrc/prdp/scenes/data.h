@@ -13,6 +13,9 @@ namespace prdp {
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
+/// reference(u); raises RuntimeError where the solve does not converge.
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
+
 /// Called while data are made with (steps of a sample done, all of them).
 using OnProgress = std::function<void(int64_t, int64_t)>;
 

@@ -36,9 +36,6 @@ at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor 
   return u - at::cat({backward_difference(phi, grid, kX), backward_difference(phi, grid, kY)}, 1);
 }
 
-/// Tight enough that its error is below float32's rounding.
-Solver reference_solver() { return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8}; }
-
 }  // namespace
 
 at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
@@ -60,14 +57,12 @@ at::Tensor downsample(const at::Tensor& u) {
 at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
   auto fine = scene;
   fine.physics.shape = scene.data.reference_shape;
-  auto reference = fine.stepper(reference_solver());
+  auto reference = fine.stepper(fine.reference_solver());
   std::vector<at::Tensor> parts;
   for (auto u : start.split(kSamplesAtOnce)) {
     std::vector<at::Tensor> states{downsample(u)};
     for (int64_t i = 0; i < steps; ++i) {
-      u = reference(u);
-      TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
-                  reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+      u = converged_step(reference, u);
       states.push_back(downsample(u));
       on_steps(u.size(0));
     }
