@@ -123,11 +123,15 @@ UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const
 UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                                   at::IntArrayRef needed, int64_t log) {
   const at::AutoGradMode record(true);
-  const auto [u, applications] = solve_recorded(*make_operator(solve.a), b, solve.solver, solve.iterations);
+  // Partial derivatives: b and the tensors may be one tensor, or depend on each other further back.
+  const auto rhs = at::alias(b);
+  auto a = solve.a;
+  for (auto& t : a.tensors) t = at::alias(t);
+  const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.solver, solve.iterations);
   UnrolledVjp found{std::vector<at::Tensor>(needed.size()), 2 * applications};
   std::vector<at::Tensor> inputs;
   for (size_t i = 0; i < needed.size(); ++i)
-    if (needed[i]) inputs.push_back(i == 0 ? b : solve.a.tensors[i - 1]);
+    if (needed[i]) inputs.push_back(i == 0 ? rhs : a.tensors[i - 1]);
   if (u.requires_grad()) {  // not where no sample took an iteration
     const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
                                                  /*create_graph=*/true, /*allow_unused=*/true);
