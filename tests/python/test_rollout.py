@@ -4,6 +4,7 @@ import re
 
 import pytest
 import torch
+import torch._dynamo.testing
 from helpers import field, statuses
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
