@@ -96,29 +96,26 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
                         unrolled ? iterations : at::Tensor(),
                         unrolled || may_have_failed ? status : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
-    ctx->save_for_backward(saved);
+    ctx->save_for_backward(std::move(saved));
 
-    auto kept = c10::make_intrusive<Call>();
-    kept->a = call->a;
-    kept->a.tensors.clear();
-    kept->options = call->options;
-    if (call->a.kind == "function") kept->products = RegisteredProducts::find(call->a.shape[0]);
-    ctx->saved_data["call"] = c10::IValue::make_capsule(kept);
+    if (call->a.kind == "function") call->products = RegisteredProducts::find(call->a.shape[0]);
+    call->a.tensors.clear();  // they are among the saved ones
+    ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {u, iterations, residual, status, applications};
   }
 
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
     const auto saved = ctx->get_saved_variables();
-    auto call = c10::make_intrusive<Call>(*c10::static_intrusive_pointer_cast<Call>(
-        ctx->saved_data["call"].toCapsule()));
-    call->a.tensors.assign(saved.begin() + 3, saved.end());
-    const size_t inputs = call->a.tensors.size() + 1;
+    const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
+    auto a = call->a;
+    a.tensors.assign(saved.begin() + 3, saved.end());
+    const size_t inputs = a.tensors.size() + 1;
     variable_list out(inputs + 1);  // b, the tensors, and the call, which has no gradient
     if (!grads[0].defined()) return out;
     std::vector<int64_t> needed(inputs);
     for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
     const auto found =
-        solve_vjp(grads[0], {saved[0], saved[0], saved[1], saved[2]}, call->a, call->options, needed);
+        solve_vjp(grads[0], {saved[0], saved[0], saved[1], saved[2]}, a, call->options, needed);
     std::copy(found.gradients.begin(), found.gradients.end(), out.begin());
     return out;
   }
@@ -127,7 +124,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
 template <class... Args>
 Outputs autograd_kernel(const at::Tensor& b, Args... args) {
   const auto call = unpack(args...);
-  const auto& tensors = call->a.tensors;
+  const auto tensors = call->a.tensors;
   const bool differentiable =
       at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
       (b.requires_grad() || std::any_of(tensors.begin(), tensors.end(),

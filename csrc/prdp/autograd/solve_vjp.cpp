@@ -1,5 +1,6 @@
 #include "prdp/autograd/solve_vjp.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/autograd/unrolled_vjp.h"
@@ -13,6 +14,19 @@ at::Tensor per_sample(const at::Tensor& t, const at::Tensor& like) {
   auto wide = t;
   for (int64_t d = 1; d < like.dim(); ++d) wide = wide.unsqueeze(-1);
   return wide;
+}
+
+/// Zeros for the refused samples, whose u is the constant zero.
+at::Tensor without_refused(const at::Tensor& cotangent, const at::Tensor& status) {
+  if (status.is_cpu() && !at::isTensorSubclassLike(status)) {  // numbers that can be read
+    const auto read = status.accessor<int64_t, 1>();
+    int64_t refused = 0;
+    for (int64_t i = 0; i < read.size(0); ++i) refused += is_refused(static_cast<SolveStatus>(read[i]));
+    if (refused == 0) return cotangent;
+  }
+  const auto refused = status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
+                           .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
+  return cotangent.masked_fill(per_sample(refused, cotangent), 0.0);
 }
 
 /// Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Again differentiable: the solve is the same op.
@@ -49,14 +63,9 @@ SolveVjp unrolled(const at::Tensor& cotangent, const Solved& solved, const Opera
 
 SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
                    const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
-  if (options.on_failure != OnFailure::kRaise) {
-    // A refused sample's u is the constant zero.
-    const auto refused = solved.status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
-                             .logical_or(solved.status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
-    cotangent = cotangent.masked_fill(per_sample(refused, cotangent), 0.0);
-  }
-  return options.backward == Backward::kUnrolled ? unrolled(cotangent, solved, a, options, needed)
-                                                 : implicit(cotangent, solved.u, a, options, needed, adjoint_solve);
+  if (options.on_failure != OnFailure::kRaise) cotangent = without_refused(cotangent, solved.status);
+  if (options.backward == Backward::kUnrolled) return unrolled(cotangent, solved, a, options, needed);
+  return implicit(cotangent, solved.u, a, options, needed, adjoint_solve);
 }
 
 }  // namespace prdp

@@ -5,9 +5,9 @@
 #include <torch/custom_class.h>
 #include <torch/library.h>
 
-#include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/flat_options.h"
-#include "prdp/autograd/solve_vjp.h"
+#include "prdp/solvers/solve.h"
+#include "prdp/steppers/rollout_vjp.h"
 
 namespace prdp {
 
@@ -55,30 +55,9 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
   make_operator(equation_operator(equation, u))->check_vector(u);
 }
 
-/// (batch,) of each solve → (batch, solves).
-at::Tensor side_by_side(const std::vector<at::Tensor>& of_solves, const at::Tensor& u, at::ScalarType dtype) {
-  if (of_solves.empty()) return at::empty({u.size(0), 0}, u.options().dtype(dtype));
-  return at::stack(of_solves, 1);
+bool any_requires_grad(at::TensorList tensors) {
+  return std::any_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) { return t.requires_grad(); });
 }
-
-/// SolveInfo of the solves, one after the other.
-struct Reports {
-  std::vector<at::Tensor> iterations, residual, status, applications;
-
-  void push(const SolveInfo& info) {
-    iterations.push_back(info.iterations);
-    residual.push_back(info.residual);
-    status.push_back(info.status);
-    applications.push_back(info.operator_applications);
-  }
-  void reverse() {
-    for (auto* list : {&iterations, &residual, &status, &applications}) std::reverse(list->begin(), list->end());
-  }
-  SolveInfo joined(const at::Tensor& u) const {
-    return {side_by_side(iterations, u, at::kLong), side_by_side(residual, u, u.scalar_type()),
-            side_by_side(status, u, at::kLong), side_by_side(applications, u, at::kLong)};
-  }
-};
 
 /// Below autograd.
 template <class... Options>
@@ -118,60 +97,6 @@ Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_vie
           of_dtype(at::kLong), of_dtype(at::kLong)};
 }
 
-/// What the solves keep for their derivative; undefined where it is not wanted.
-struct Kept {
-  at::Tensor solutions, iterations, status;  // (batch, solves (+ 1), …)
-};
-
-at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
-  return of_solves.defined() ? of_solves.select(1, s) : of_solves;
-}
-
-void add_to(at::Tensor& sum, const at::Tensor& term) {
-  if (term.defined()) sum = sum.defined() ? sum + term : term;
-}
-
-/// Gradients of u and of each tensor for the cotangent of all solutions, undefined where `needed` (u
-/// first) holds 0. Sums run in the order in which autograd takes the steps of a chain.
-std::vector<at::Tensor> reverse(const at::Tensor& cotangent, const Kept& kept, const Equation& equation,
-                                const SolveOptions& options, at::IntArrayRef needed,
-                                decltype(linear_solve)& adjoint_solve) {
-  const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
-  const bool rhs_is_state = equation.kind == "heat" || equation.kind == "burgers";
-  const bool flow = is_flow(equation);
-  auto each = options;
-  each.adjoint_log = 0;
-  auto bars = cotangent.unbind(1);
-  std::vector<at::Tensor> of_tensors(equation.tensors.size());
-  Reports reports;
-  at::Tensor rhs_bar;
-  for (int64_t s = solves - 1; s >= 0; --s) {
-    const FailuresOfStep here(s / picard + 1, solves / picard);
-    const int64_t first = s - s % picard;
-    const auto a = equation_operator(equation, at_solve(kept.solutions, s));
-    Solved solved{{}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s)};
-    if (options.backward == Backward::kUnrolled)
-      solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
-    std::vector<int64_t> wanted(needed.begin(), needed.end());
-    wanted[0] = needed[0] || first > 0;
-    if (flow) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
-    const auto [gradients, info] = solve_vjp(bars[s + 1], solved, a, each, wanted, adjoint_solve);
-    reports.push(info);
-    add_to(rhs_is_state ? bars[first] : rhs_bar, gradients[0]);
-    if (flow) add_to(bars[s], gradients[1]);
-    if (s == first && rhs_bar.defined()) {
-      add_to(bars[s], equation_rhs_transposed(equation, rhs_bar));
-      rhs_bar = at::Tensor();
-    }
-    for (size_t i = 0; i < of_tensors.size(); ++i) add_to(of_tensors[i], gradients[gradients.size() - of_tensors.size() + i]);
-  }
-  reports.reverse();
-  if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, reports.joined(cotangent));
-  std::vector<at::Tensor> found{needed[0] ? bars[0] : at::Tensor()};
-  found.insert(found.end(), of_tensors.begin(), of_tensors.end());
-  return found;
-}
-
 template <class... Options>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
@@ -180,9 +105,10 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
                                    Options... flat) {
   const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  const Kept kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
+  const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
                   status.value_or(at::Tensor())};
-  const auto found = reverse(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
+  const auto found =
+      vjp_of_solves(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < found.size(); ++i) {
     if (!needed[i]) continue;
@@ -224,17 +150,14 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     ctx->mark_non_differentiable({iterations, residual, status, applications});
     ctx->set_materialize_grads(false);
     const bool unrolled = options.backward == Backward::kUnrolled;
-    const bool a_varies = is_flow(call->equation) || std::any_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) {
-      return t.requires_grad();
-    });
+    const bool a_varies = is_flow(call->equation) || any_requires_grad(tensors);
     const bool may_have_failed = options.on_failure != OnFailure::kRaise;
     variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
                         unrolled || may_have_failed ? status : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(saved);
-    auto kept = c10::make_intrusive<Call>(*call);
-    kept->equation.tensors.clear();
-    ctx->saved_data["call"] = c10::IValue::make_capsule(kept);
+    call->equation.tensors.clear();  // they are among the saved ones
+    ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {solutions, iterations, residual, status, applications};
   }
 
@@ -251,7 +174,8 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
 
     // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
     if (at::GradMode::is_enabled()) {
-      const auto found = reverse(grads[0], {saved[0], saved[1], saved[2]}, equation, call->options, needed, linear_solve);
+      const KeptSolves kept{saved[0], saved[1], saved[2]};
+      const auto found = vjp_of_solves(grads[0], kept, equation, call->options, needed, linear_solve);
       std::copy(found.begin(), found.end(), out.begin());
       return out;
     }
@@ -280,13 +204,12 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
   call->options = unflatten(std::move(flat)...);
   const bool differentiable =
       at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
-      (u.requires_grad() || std::any_of(tensors.begin(), tensors.end(),
-                                        [](const at::Tensor& t) { return t.requires_grad(); }));
+      (u.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) {
     const at::AutoDispatchBelowADInplaceOrView below;
     return call_solves(call->equation, u, call->solves, call->options);
   }
-  const auto out = RolloutSolves::apply(u, at::TensorList(call->equation.tensors), call);
+  const auto out = RolloutSolves::apply(u, tensors, call);
   return {out[0], out[1], out[2], out[3], out[4]};
 }
 
