@@ -1,9 +1,10 @@
 #pragma once
+#include <cstdint>
 
 namespace prdp {
 
 /// u ← u + D⁻¹(b - A u). From zero the first iterate is D⁻¹ b for free; from then on one product an
-/// iteration, which also tells the residual of the iterate that it starts from.
+/// iteration. A product whose residual is looked at makes the next iterate as well.
 template <class Space>
 class JacobiMethod {
  public:
@@ -17,20 +18,22 @@ class JacobiMethod {
     residual2_ = space_.b2();
     ready_ = true;
   }
-  void step() {
-    if (!ready_) space_.template jacobi_sweep<false>(c_, x, next_);
-    space_.advance(x, next_);
+  void step(int64_t n) {
+    if (ready_) {
+      space_.advance(x, next_);
+      --n;
+    }
+    if (n > 0) space_.jacobi_sweeps(c_, x, next_, n);
     ready_ = false;
   }
   auto residual2() {
-    if (!ready_) residual2_ = space_.template jacobi_sweep<true>(c_, x, next_);
+    if (!ready_) residual2_ = space_.jacobi_sweep(c_, x, next_);
     ready_ = true;
     return residual2_;
   }
-  auto recompute_residual() {
-    auto r = space_.scratch();
-    return space_.residual(x, r);
-  }
+  auto recompute_residual() { return residual2(); }  // it is that of x, not of a recurrence
+  /// With a symmetric iteration matrix G, ‖Gr‖² = r·G²r <= ‖r‖ ‖G²r‖: the residual falls by ever less.
+  bool residual_is_log_convex() const { return space_.sweeps_contract(); }
 
   typename Space::Vector x;
 

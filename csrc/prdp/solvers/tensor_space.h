@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <vector>
 
 #include "prdp/operators/operator.h"
@@ -44,20 +45,27 @@ class TensorSpace {
     count();
     out = a_.apply(preconditioned ? a_.precondition(v, false) : v);
   }
+  std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
+    apply(v, out);
+    return {dot(v, out), dot(out, out)};
+  }
   void divide_by_diagonal(const Vector& b, Vector& c) {
     diagonal_ = a_.diagonal().to(b_.options());
     c = b / diagonal_;
   }
-  template <bool WithResidual>
+  void jacobi_sweeps(const Vector& c, Vector& x, Vector& next, int64_t n) {
+    for (; n > 0; --n) {
+      next = x + jacobi_change(c, x);
+      advance(x, next);
+    }
+  }
   Scalar jacobi_sweep(const Vector& c, const Vector& x, Vector& next) {
-    Vector product;
-    apply(x, product);
-    const auto change = c - product / diagonal_;
+    const auto change = jacobi_change(c, x);
     next = x + change;
-    if constexpr (!WithResidual) return {};
     const auto r = diagonal_ * change;
     return dot(r, r);
   }
+  static constexpr bool sweeps_contract() { return false; }  // not known of the operator
   Scalar residual(const Vector& x, Vector& r) {
     Vector product;
     apply(x, product);
@@ -86,7 +94,7 @@ class TensorSpace {
     for (int64_t i = 1; i < count; ++i) sum = sum + y[i] * v[i];
     x = keep_frozen(x + (preconditioned ? a_.precondition(sum, false) : sum), x);
   }
-  bool lost_orthogonality(const Scalar&, const Scalar&) const { return true; }  // for some sample
+  bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
@@ -117,6 +125,11 @@ class TensorSpace {
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
+  }
+  Vector jacobi_change(const Vector& c, const Vector& x) {
+    Vector product;
+    apply(x, product);
+    return c - product / diagonal_;
   }
   void set_active(const std::vector<bool>& active);
   void count();
