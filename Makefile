@@ -1,5 +1,6 @@
 # make demo   set everything up, then compare PRDP with constant K on the 1D heat equation
 # make test   set everything up, then run all C++ and Python tests
+# make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
 BIN := .venv/bin
@@ -7,7 +8,7 @@ STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
 
-.PHONY: demo test clean
+.PHONY: demo test bench-peers clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -22,6 +23,17 @@ test: $(STAMPS)/configure
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
 	$(BIN)/ctest --test-dir build --output-on-failure
 	$(BIN)/pytest
+
+bench-peers: $(STAMPS)/configure $(STAMPS)/peers
+	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
+	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
+	.venv-peers/bin/python -m prdp_torch.cli bench
+
+$(STAMPS)/peers: benchmarks/requirements-peers.txt $(STAMPS)/python
+	$(PYTHON) -m venv .venv-peers
+	ls -d $(CURDIR)/.venv/lib/python*/site-packages > "$$(ls -d .venv-peers/lib/python*/site-packages)/prdp.pth"
+	.venv-peers/bin/pip install --quiet --disable-pip-version-check -r benchmarks/requirements-peers.txt
+	@touch $@
 
 # Headers that no pip package carries; one sentence where they cannot be installed.
 $(STAMPS)/system:
@@ -47,4 +59,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .stamps build runs prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-peers .stamps build runs prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info

@@ -5,8 +5,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+WIDTH = 9.2  # inches, of every picture
+
 # Colours that stay apart in greyscale and for colour-blind readers.
-_FIXED = {
+FIXED = {
     "converged": ("#222222", "-"),
     "direct": ("#7f7f7f", "--"),
     "prdp": ("#d62728", "-"),
@@ -17,46 +19,51 @@ _FIXED = {
 
 def _style(row, rows):
     """Colour and line of a row; constant K run through one colour map, from coarse to fine."""
-    if row.kind in _FIXED:
-        return _FIXED[row.kind]
+    if row.kind in FIXED:
+        return FIXED[row.kind]
     sweep = [r.k for r in rows if r.kind == "constant"]
     position = sweep.index(row.k) / max(1, len(sweep) - 1)
     return matplotlib.colormaps["viridis"](0.05 + 0.85 * position), "-"
 
 
-def _figure(panels=1, height=4.2):
-    figure = Figure(figsize=(9.2, height), layout="constrained")
+def make_figure(panels=1, height=4.2):
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(1, panels, squeeze=False)[0]
 
 
-def _metric_name(scene):
+def error_measure(scene):
+    """What the validation metric measures, and how."""
     if scene.task == "corrector":
-        return f"x-velocity error at t = {scene.data.valid_steps},\nmean of (‖u₁ − u₁_ref‖ / ‖u₁_ref‖)²"
-    if scene.task == "emulator":
-        steps = f"{scene.data.valid_steps} step{'s' if scene.data.valid_steps > 1 else ''}"
-        return f"validation error after {steps},\nmean of (‖u − u_ref‖ / ‖u_ref‖)²"
-    return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
+        return "x-velocity error", "mean of (‖u₁ − u₁_ref‖ / ‖u₁_ref‖)²"
+    return "validation error", "mean of (‖u − u_ref‖ / ‖u_ref‖)²"
+
+
+def _metric_name(scene):
+    if scene.task == "parameters":
+        return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
+    error, measure = error_measure(scene)
+    steps = scene.data.valid_steps
+    if scene.task == "corrector":
+        return f"{error} at t = {steps},\n{measure}"
+    return f"{error} after {steps} step{'s' if steps > 1 else ''},\n{measure}"
+
+
+def mean_and_band(axes, x, values, label, colour, line, lead=True):
+    """Geometric mean of `values` (seeds, x) as a line, and their spread over the seeds as a band; both end
+    where a seed is no longer finite."""
+    logs = np.log10(np.maximum(np.where(np.isfinite(values), values, np.nan), 1e-300))
+    mean, spread = logs.mean(0), logs.std(0)
+    axes.plot(x, 10**mean, color=colour, ls=line, lw=2.2 if lead else 1.3, label=label, zorder=3 if lead else 2)
+    if len(logs) > 1:
+        axes.fill_between(x, 10 ** (mean - spread), 10 ** (mean + spread), color=colour, alpha=0.15, lw=0)
 
 
 def metric_over_intervals(scene, rows):
     """Metric over epochs for every way of choosing K: geometric mean and spread over the seeds."""
-    figure, (axes,) = _figure(height=4.8)
+    figure, (axes,) = make_figure(height=4.8)
     for row in rows:
-        colour, line = _style(row, rows)
-        logs = np.log10(np.maximum(row.stack("metric"), 1e-300))
-        mean, spread = logs.mean(0), logs.std(0)
-        axes.plot(
-            10**mean,
-            color=colour,
-            ls=line,
-            lw=2.2 if row.kind in _FIXED else 1.3,
-            label=row.title,
-            zorder=3 if row.kind in _FIXED else 2,
-        )
-        if len(logs) > 1:
-            axes.fill_between(
-                range(len(mean)), 10 ** (mean - spread), 10 ** (mean + spread), color=colour, alpha=0.15, lw=0
-            )
+        values = row.stack("metric")
+        mean_and_band(axes, range(values.shape[1]), values, row.title, *_style(row, rows), lead=row.kind in FIXED)
     axes.set(yscale="log", xlabel=scene.unit, ylabel=_metric_name(scene))
     axes.margins(x=0.01)
     axes.grid(alpha=0.3)
@@ -66,7 +73,7 @@ def metric_over_intervals(scene, rows):
 
 def k_over_intervals(scene, rows):
     """K over epochs: each seed thin, their mean bold."""
-    figure, (axes,) = _figure()
+    figure, (axes,) = make_figure()
     for row in rows:
         if row.kind not in ("prdp", "growth", "schedule"):
             continue
@@ -87,7 +94,7 @@ def total_iterations(scene, rows, table):
     """Iterations of a whole training as bars, with what incomplete convergence (K ends below the
     converged one) and progressive refinement (K starts lower still) save of the converged run's."""
     chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
-    figure, (axes,) = _figure(height=1.6 + 0.55 * len(chosen))
+    figure, (axes,) = make_figure(height=1.6 + 0.55 * len(chosen))
     base = max(1.0, chosen[0]["budget"])
     spent = np.array([entry["budget"] / base for entry in chosen])
     saved = np.maximum(0.0, 1 - spent)
@@ -132,7 +139,7 @@ _COSTS = (
 
 def _cost_panels(scene, draw):
     """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one."""
-    figure, panels = _figure(panels=2, height=4.8)
+    figure, panels = make_figure(panels=2, height=4.8)
     for axes, (cost, label) in zip(panels, _COSTS, strict=True):
         draw(axes, cost)
         axes.set(yscale="log", xlabel=label, xlim=(0, None))
@@ -179,7 +186,7 @@ def error_against_cost(scene, rows):
         for row in rows:
             colour, line = _style(row, rows)
             cost = np.concatenate([[0.0], np.cumsum(row.stack(name).mean(0))])
-            lead = row.kind in _FIXED
+            lead = row.kind in FIXED
             axes.plot(
                 cost, row.stack("metric").mean(0), color=colour, ls=line, lw=2.2 if lead else 1.3, label=row.title,
                 zorder=3 if lead else 2,

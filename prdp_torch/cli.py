@@ -2,6 +2,7 @@
 
 import functools
 import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from prdp_torch import compare as comparison
-from prdp_torch import records, report
+from prdp_torch import records, report, trajectories
 from prdp_torch import scenes as scene_files
 from prdp_torch.training import Refinement
 
@@ -25,9 +26,11 @@ app = typer.Typer(
 )
 console = Console(highlight=False)
 
+SUITES = ("accuracy", "size", "roofline", "change_of_k", "training")  # modules of benchmarks/
+
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep trainings that are already recorded there.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
 
@@ -44,7 +47,8 @@ def command(function):
         try:
             function(*args, **kwargs)
         except KeyboardInterrupt:
-            print("prdp: interrupted; finished trainings are kept, --resume goes on from them", file=sys.stderr)
+            kept = "--resume keeps finished trainings and goes on from the last checkpoint"
+            print(f"prdp: interrupted; {kept}", file=sys.stderr)
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output has left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -107,7 +111,17 @@ def train(
             def show(done, metric, k, task=task):
                 progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
 
-            curves = comparison.run_one(loaded, refinement.label, refinement, seed, folder, environment, resume, show)
+            curves = comparison.run_one(
+                loaded,
+                refinement.label,
+                refinement,
+                seed,
+                folder,
+                environment,
+                resume,
+                show,
+                _bar(progress, "data, steps"),
+            )
             if "diverged" in curves:
                 diverged[seed] = curves["diverged"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)
@@ -139,15 +153,36 @@ def compare(
             finished[row.label, seed] = done
             progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
 
-        rows = comparison.run(loaded, seeds, folder, resume, show)
-    table = comparison.summarise(loaded, rows)
-    records.write(
-        folder / "summary.json",
-        {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
-    )
-    report.write(loaded, rows, table, folder)
+        rows = comparison.run(loaded, seeds, folder, resume, show, _bar(progress, "data, steps"))
+        table = comparison.summarise(loaded, rows)
+        records.write(
+            folder / "summary.json",
+            {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
+        )
+        shown = trajectories.collect(loaded, rows, folder, _bar(progress, "pictures, steps"))
+    report.write(loaded, rows, table, shown, folder)
     _print_table(loaded, table)
     console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
+
+
+@command
+def bench(
+    suites: Annotated[list[str] | None, typer.Argument(metavar="[SUITE]...", help=f"{', '.join(SUITES)}; all.")] = None,
+    out: out("runs/bench") = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
+):
+    """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
+    project = Path(__file__).resolve().parent.parent
+    if not (project / "benchmarks").is_dir():
+        raise ValueError("bench: the benchmarks are in the project's folder, not in the installed package; clone it")
+    for suite in suites or ():
+        if suite not in SUITES:
+            raise ValueError(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
+    folder = records.prepare_folder(out or Path("runs") / "bench").resolve()
+    arguments = [*(suites or ()), "--out", folder, *(["--quick"] if quick else [])]
+    done = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], cwd=project)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
 
 
 def _load(scene, backward, intervals):
@@ -179,6 +214,19 @@ def _progress():
     return Progress(*columns, console=console)
 
 
+def _bar(progress, name):
+    """A callback (done, total) that has a bar of its own from its first call on."""
+    task = None
+
+    def show(done, total):
+        nonlocal task
+        if task is None:
+            task = progress.add_task(name, total=total, note="")
+        progress.update(task, completed=done)
+
+    return show
+
+
 def _print_table(scene, table):
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     # Eighty columns hold all but one; the report has it.
@@ -195,3 +243,7 @@ def _print_table(scene, table):
 
 def main():
     app()
+
+
+if __name__ == "__main__":
+    main()

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from prdp_torch import records
+from prdp_torch.checkpoint import Checkpoint
+from prdp_torch.networks import make_network
 from prdp_torch.training import Refinement, train
 
 
@@ -54,7 +56,7 @@ def rows_of(scene):
     """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, PRDP, constant K."""
     converged = scene.max_iter
     rows = [Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged)]
-    if scene.task != "corrector":  # the exact solver of a flow is out of all proportion
+    if scene.physics.direct_is_cheap:
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
     rows.append(Row("prdp", "PRDP", "prdp", Refinement.prdp(scene)))
     if scene.compare.growth is not None:
@@ -70,10 +72,12 @@ def rows_of(scene):
     return rows
 
 
-def run(scene, seeds, folder, resume=False, progress=None):
-    """Train every row with every seed, writing a record each; with `resume`, finished ones are read.
+def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
+    """Train every row with every seed, writing a record each; with `resume`, finished ones are read and
+    unfinished ones go on from their checkpoints.
 
     progress: called with (row, seed, intervals done of this training) as it goes.
+    on_data: as in `train`.
     """
     report = progress or (lambda *event: None)
     environment = records.environment()
@@ -90,13 +94,15 @@ def run(scene, seeds, folder, resume=False, progress=None):
                     environment,
                     resume,
                     lambda done, metric, k, row=row, seed=seed: report(row, seed, done),
+                    on_data,
                 )
             )
     return rows
 
 
-def run_one(scene, label, refinement, seed, folder, environment, resume, on_interval):
-    """One training with its record; curves of a finished record of the same settings if `resume`."""
+def run_one(scene, label, refinement, seed, folder, environment, resume, on_interval, on_data=None):
+    """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
+    the curves of a finished record of the same settings, or the training goes on from its checkpoint."""
     path = folder / label / f"seed_{seed}.json"
     if resume and path.exists():
         record = records.read(path)
@@ -106,12 +112,23 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
             on_interval(len(curves["seconds"]), curves["metric"][-1], curves["max_iter"][-1])
             return curves
     path.parent.mkdir(parents=True, exist_ok=True)
-    curves = train(scene, refinement, seed, on_interval=on_interval)
+    versions = environment["versions"]
+    checkpoint = Checkpoint(
+        path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.settings(scene), versions=versions
+    )
+    if not resume:
+        checkpoint.remove()
+    network = None if scene.task == "parameters" else make_network(scene, seed)
+    curves = train(scene, refinement, seed, network, on_interval, on_data, checkpoint)
     on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
+    if network is not None:
+        path.unlink(missing_ok=True)  # a record vouches for the weights beside it
+        records.write_weights(path.with_suffix(".pt"), network)
     records.write(
         path,
         {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves},
     )
+    checkpoint.remove()
     return curves
 
 

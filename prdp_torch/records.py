@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import pickle
 import platform
 import subprocess
 import sys
@@ -65,8 +66,31 @@ def write(path, content):
     unfinished.replace(path)
 
 
+def write_weights(path, network):
+    """Write the network's `state_dict` whole or not at all."""
+    unfinished = path.with_name(path.name + ".part")
+    torch.save(network.state_dict(), unfinished)
+    unfinished.replace(path)
+
+
+def read_weights(path, network):
+    """Load what `write_weights` wrote into a network of the same make. ValueError if the file does not fit."""
+    try:
+        network.load_state_dict(torch.load(path, weights_only=True))
+    except (RuntimeError, EOFError, pickle.UnpicklingError):
+        raise ValueError(
+            f"weights: '{path}' is damaged or of another network; delete it, and its pictures are left out"
+        ) from None
+    return network
+
+
 def read(path):
-    return json.loads(Path(path).read_text())
+    """A record. ValueError, naming it, for a damaged one."""
+    try:
+        return json.loads(Path(path).read_text())
+    except ValueError:
+        message = f"record: '{path}' is damaged; delete it, and its training is run again"
+        raise ValueError(message) from None
 
 
 def _null_for_nan(content):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jinja2
 
-from prdp_torch import charts, records
+from prdp_torch import charts, records, trajectory_charts
 
 
 class Column(NamedTuple):
@@ -118,11 +118,17 @@ def _svg(figure):
     return base64.b64encode(image.getvalue()).decode()
 
 
-def write(scene, rows, table, folder):
-    """`report.html`, one self-contained file with table, charts and the scene, and each chart as PNG."""
+def write(scene, rows, table, shown, folder):
+    """`report.html`, one self-contained file with table, pictures and the scene; each chart also as PNG, and
+    `trajectories.gif` for fields in 2D. shown: from `trajectories.collect`, or None."""
     drawn = charts.all_charts(scene, rows, table)
-    for name, figure, _ in drawn:
+    learned = trajectory_charts.pictures(scene, shown) if shown else []
+    for name, figure, _ in [*drawn, *learned]:
         figure.savefig(folder / f"{name}.png", dpi=120)
+    animation = folder / "trajectories.gif"
+    animation.unlink(missing_ok=True)
+    if shown and len(scene.physics.shape) == 2:
+        trajectory_charts.animate(scene, shown, animation)
     template = jinja2.Environment(autoescape=True).from_string(
         Path(__file__).with_name("report.html.j2").read_text(encoding="utf-8")
     )
@@ -135,5 +141,7 @@ def write(scene, rows, table, folder):
         cells=[{"kind": entry["kind"], "cells": cells(scene, entry)} for entry in table],
         notes=notes(scene),
         charts=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in drawn],
+        learned=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in learned],
+        animation=base64.b64encode(animation.read_bytes()).decode() if animation.exists() else None,
     )
     records.write(folder / "report.html", html)

@@ -2,12 +2,13 @@
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
 import math
-import sys
 import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, fields
 from prdp_torch.controller import LinearSchedule, PRDPController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -46,7 +47,7 @@ class Refinement:
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
 
 
-def train(scene, refinement, seed=0, network=None, on_interval=None):
+def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=None, checkpoint=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
     the solves, of which an update of the task "corrector" has two; iterations and operator applications
@@ -59,14 +60,19 @@ def train(scene, refinement, seed=0, network=None, on_interval=None):
         refinement: a `Refinement`.
         seed: of the network's weights and of the shuffling; the data stay the same.
         network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
-        on_interval: called after each interval with (how many are done, the metric, K).
+        on_interval: called after each interval with (how many are done, the metric, K), and where a
+            checkpoint is gone on from.
+        on_data: called while data are made that are not on disk yet, with (steps of a sample done, all of them).
+        checkpoint: a `prdp_torch.checkpoint.Checkpoint` to go on from where it has a state, bit for bit on
+            the same machine with as many threads, and to keep the training in whenever it is due.
     """
+    saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene.training.intervals, steppers, refinement.attach(steppers))
-    task = _parameters if scene.task == "parameters" else _network
-    updates, metric = task(scene, steppers, seed, network)
+    run = _Run(scene.training.intervals, steppers, refinement.attach(steppers), checkpoint)
+    make_task = _parameters if scene.task == "parameters" else _network
+    task = make_task(scene, steppers, seed, network, on_data)
     try:
-        run.go(updates, metric, on_interval or (lambda *report: None))
+        run.go(task, saved, on_interval or (lambda *report: None))
     except _Diverged as divergence:
         run.give_up(str(divergence))
     return run.curves
@@ -76,33 +82,64 @@ class _Diverged(Exception):
     pass
 
 
+class _Task(NamedTuple):
+    """What a task supplies."""
+
+    updates: Callable  # the number of the first → an iterator over the losses of an interval's updates
+    metric: Callable
+    state: Callable  # all that the updates change
+    load: Callable  # its inverse
+
+
 class _Run:
     """What the tasks share: the intervals, their costs, and when a training is lost."""
 
-    def __init__(self, intervals, steppers, controller):
+    def __init__(self, intervals, steppers, controller, checkpoint):
         self.intervals = intervals
         self.steppers = steppers
         self.controller = controller
+        self.checkpoint = checkpoint
         names = ("update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds")
         self.curves = {name: [] for name in names}
 
-    def go(self, updates, metric, on_interval):
-        self._observe(metric(), 0)
-        for done in range(1, self.intervals + 1):
-            k, started, solves = self.controller.max_iter, time.perf_counter(), 0
-            iterations = applications = 0.0
-            for loss in updates():
-                self._check(loss, done)
-                self.curves["update_loss"].append(loss)
-                for stepper in self.steppers:
-                    solves += 1
-                    iterations += float(stepper.info.iterations.double().mean())
-                    for report in (stepper.info, stepper.adjoint_info):
-                        if report is not None:
-                            applications += float(report.operator_applications.double().mean())
-            self._append(k, k * solves, iterations, applications, time.perf_counter() - started)
-            self._observe(metric(), done)
-            on_interval(done, self.curves["metric"][-1], self.controller.max_iter)
+    def go(self, task, saved, on_interval):
+        if saved is None:
+            self._observe(task.metric(), 0)
+        else:
+            self._restore(task, saved)
+            on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
+        while self._done() < self.intervals:
+            self._run_interval(task, self._done() + 1)
+            self._observe(task.metric(), self._done())
+            if self.checkpoint is not None and self._done() < self.intervals and self.checkpoint.due():
+                self._keep(task)
+            on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
+
+    def _done(self):
+        return len(self.curves["seconds"])
+
+    def _keep(self, task):
+        controller = self.controller.state_dict()
+        self.checkpoint.save({"task": task.state(), "controller": controller, "curves": self.curves})
+
+    def _restore(self, task, saved):
+        task.load(saved["task"])
+        self.controller.load_state_dict(saved["controller"])
+        self.curves = saved["curves"]
+
+    def _run_interval(self, task, number):
+        k, started, solves = self.controller.max_iter, time.perf_counter(), 0
+        iterations = applications = 0.0
+        for loss in task.updates(len(self.curves["update_loss"])):
+            self._check(loss, number)
+            self.curves["update_loss"].append(loss)
+            for stepper in self.steppers:
+                solves += 1
+                iterations += float(stepper.info.iterations.double().mean())
+                for report in (stepper.info, stepper.adjoint_info):
+                    if report is not None:
+                        applications += float(report.operator_applications.double().mean())
+        self._append(k, k * solves, iterations, applications, time.perf_counter() - started)
 
     def give_up(self, why):
         self.curves["diverged"] = why
@@ -129,99 +166,112 @@ class _Run:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
-def _network(scene, steppers, seed, network):
-    """The updates of one epoch, as an iterator over their losses, and the validation metric."""
-    data = _C.make_dataset(scene, _report_data)
+def propagator(scene, network):
+    """A trained network as a step u → u_next: the network itself, or (task "corrector") a converged step
+    of the coarse solver with the network on top."""
+    if scene.task == "emulator":
+        return network
+    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
+    return lambda u: _corrected(converged, network, u)
+
+
+def error(scene, u, reference):
+    """The mean over the samples of (‖u - reference‖ / ‖reference‖)², of a corrector of the velocity along
+    x: what the validation metric says at its step."""
+    of = slice(0, 1) if scene.task == "corrector" else slice(None)
+    return float(_C.normalised_mse(u[:, of], reference[:, of]))
+
+
+def _network(scene, steppers, seed, network, on_data):
+    """An interval is an epoch, the metric that of validation."""
+    data = _C.make_dataset(scene, on_data)
     network = make_network(scene, seed) if network is None else network
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of, metric_of = objective(scene, steppers, data, network)
+    loss_of = objective(scene, steppers, data, network)
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
-    done = 0
 
-    def updates():
-        nonlocal done
-        for batch in torch.randperm(len(data.train_start), generator=generator).split(scene.training.batch):
+    def updates(first):
+        order = torch.randperm(len(data.train_start), generator=generator)
+        for number, batch in enumerate(order.split(scene.training.batch), first):
             for group in optimiser.param_groups:
-                group["lr"] = scene.learning_rate(done)
+                group["lr"] = scene.learning_rate(number)
             optimiser.zero_grad()
             loss = loss_of(batch)
             loss.backward()
             optimiser.step()
-            done += 1
             yield float(loss.detach())
+
+    def state():
+        parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
+        return {**parts, "shuffling": generator.get_state()}
+
+    def load(saved):
+        network.load_state_dict(saved["network"])
+        optimiser.load_state_dict(saved["optimiser"])
+        generator.set_state(saved["shuffling"])
+
+    return _Task(updates, _metric(scene, data, network), state, load)
+
+
+def _metric(scene, data, network):
+    step = propagator(scene, network)
 
     def metric():
         with torch.no_grad():
-            return float(metric_of())
+            reached = fields.rollout(step, data.valid_start, scene.data.valid_steps)[:, -1]
+        return error(scene, reached, data.valid_end)
 
-    return updates, metric
-
-
-def _report_data(done, total):
-    print(f"data: {done} of {total} reference steps", file=sys.stderr, flush=True)
+    return metric
 
 
 def _emulator(scene, steppers, data, network):
-    """The loss of a batch, and the metric: the network in place of the equation."""
+    """The loss of a batch: the network in place of the equation."""
     (stepper,) = steppers
 
     def loss(batch):
         u2 = stepper(network(data.train_start[batch]))
         return _C.loss(scene.training.loss, u2, data.train_end[batch])
 
-    def metric():
-        u = data.valid_start
-        for _ in range(scene.data.valid_steps):
-            u = network(u)
-        return _C.normalised_mse(u, data.valid_end)
+    return loss
 
-    return loss, metric
+
+def _corrected(stepper, network, u):
+    coarse = _C.without_mean_pressure(stepper(u))
+    return coarse + network(coarse)
 
 
 def _corrector(scene, steppers, data, network):
-    """The loss of a batch, and the metric: the network on top of a coarse step, in the metric a
-    converged one."""
+    """The loss of a batch: the network on top of a coarse step, twice."""
     first, second = steppers
-    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
-
-    def corrected(stepper, u):
-        coarse = _C.without_mean_pressure(stepper(u))
-        return coarse + network(coarse)
 
     def loss(batch):
-        u1 = corrected(first, data.train_start[batch])
-        u2 = corrected(second, u1)
+        u1 = _corrected(first, network, data.train_start[batch])
+        u2 = _corrected(second, network, u1)
         kind = scene.training.loss
         return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
 
-    def metric():
-        u = data.valid_start
-        for _ in range(scene.data.valid_steps):
-            u = corrected(converged, u)
-        return _C.normalised_mse(u[:, :1], data.valid_end[:, :1])  # the velocity along x
-
-    return loss, metric
+    return loss
 
 
-def _parameters(scene, steppers, seed, network):
-    """The single update of an interval, as an iterator over its loss, and the error of θ."""
+def _parameters(scene, steppers, seed, network, on_data):
+    """An interval is a single update, the metric the error of θ."""
     (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)
     theta = problem.start.clone().requires_grad_()
-    done = 0
 
-    def updates():
-        nonlocal done
+    def updates(number):
         u = stepper((theta @ problem.modes)[None, None])
         loss = _C.half_mse(u, problem.solution)
         (gradient,) = torch.autograd.grad(loss, theta)
         with torch.no_grad():
-            theta.sub_(gradient, alpha=scene.learning_rate(done))
-        done += 1
+            theta.sub_(gradient, alpha=scene.learning_rate(number))
         yield float(loss.detach())
 
     def metric():
         return float(_C.relative_error(theta.detach(), problem.reference))
 
-    return updates, metric
+    def load(saved):
+        theta.detach().copy_(saved["theta"])
+
+    return _Task(updates, metric, lambda: {"theta": theta.detach()}, load)

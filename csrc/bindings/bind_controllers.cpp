@@ -56,5 +56,7 @@ void bind_controllers(py::module_& m) {
                                return py::dict("initial"_a = s.initial(), "increment"_a = s.increment(),
                                                "maximum"_a = s.maximum());
                              })
-      .def("_load", &LinearSchedule::set_max_iter, py::arg("max_iter"));
+      .def(
+          "_load", [](LinearSchedule& s, int64_t max_iter) { s.load_state({max_iter}); },
+          py::arg("max_iter"));
 }

@@ -2,6 +2,7 @@
 
 #include "bindings.h"
 #include "prdp/operators/navier_stokes_operator.h"
+#include "prdp/scenes/checkpoint.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"
@@ -16,7 +17,8 @@ void bind_scenes(py::module_& m) {
       .def_readonly("nu", &Scene::Physics::nu)
       .def_readonly("dt", &Scene::Physics::dt)
       .def_property_readonly("channels", &Scene::Physics::channels)
-      .def_property_readonly("periodic", &Scene::Physics::periodic);
+      .def_property_readonly("periodic", &Scene::Physics::periodic)
+      .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);
   py::class_<Scene::Data>(m, "Data")
       .def_readonly("modes", &Scene::Data::modes)
       .def_readonly("train", &Scene::Data::train)
@@ -81,12 +83,25 @@ void bind_scenes(py::module_& m) {
       .def_readonly("valid_start", &Dataset::valid_start)
       .def_readonly("valid_end", &Dataset::valid_end);
   m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress());
+  m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
+        py::arg("on_progress") = OnProgress());
   py::class_<ParameterProblem>(m, "ParameterProblem")
       .def_readonly("modes", &ParameterProblem::modes)
       .def_readonly("start", &ParameterProblem::start)
       .def_readonly("reference", &ParameterProblem::reference)
       .def_readonly("solution", &ParameterProblem::solution);
   m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"));
+
+  py::class_<Checkpoint>(m, "Checkpoint")
+      .def(py::init<std::string, std::string>(), py::arg("path"), py::arg("settings"))
+      .def("due", &Checkpoint::due)
+      .def("write", [](Checkpoint& c, const py::bytes& state) { c.write(state); }, py::arg("state"))
+      .def("read",
+           [](const Checkpoint& c) {
+             const auto state = c.read();
+             return state ? std::optional<py::bytes>(*state) : std::nullopt;
+           })
+      .def("remove", &Checkpoint::remove);
 
   m.def("loss", &loss, py::arg("kind"), py::arg("u"), py::arg("reference"));
   m.def("normalised_mse", &normalised_mse, py::arg("u"), py::arg("reference"));

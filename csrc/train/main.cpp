@@ -9,7 +9,9 @@
 #include <fstream>
 #include <nlohmann/json.hpp>
 #include <thread>
+#include <utility>
 
+#include "prdp/scenes/files.h"
 #include "training.h"
 
 namespace {
@@ -34,39 +36,40 @@ Json settings(const prdp::Scene& scene) {
           {"intervals", scene.training.intervals}};
 }
 
+Json versions() { return {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}; }
+
 Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, const std::string& command,
             const prdp::train::Curves& c) {
-  Json curves{{"update_loss", c.update_loss},
-              {"metric", c.metric},
-              {"max_iter", c.max_iter},
-              {"budget", c.budget},
-              {"iterations", c.iterations},
-              {"operator_applications", c.operator_applications},
-              {"seconds", c.seconds}};
+  Json curves;
+  prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
   if (!c.diverged.empty()) curves["diverged"] = c.diverged;
   return {{"label", label},
           {"seed", seed},
           {"settings", settings(scene)},
-          {"versions", {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}},
+          {"versions", versions()},
           {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
           {"command", command},
           {"curves", curves}};
 }
 
-/// Writes beside the place and moves it there: a file is whole or not there.
-void write_whole(const fs::path& path, const std::string& text) {
-  auto unfinished = path;
-  unfinished += ".part";
-  std::ofstream file(unfinished);
-  file << text << '\n';
-  file.close();
-  if (!file) throw std::runtime_error("--out: cannot write '" + path.string() + "'");
-  fs::rename(unfinished, path);
+/// Beside the record to come; without --resume what an earlier run has left there is gone.
+prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const prdp::Scene& scene,
+                               const std::string& label, int64_t seed) {
+  const Json all{{"trainer", "C++"}, {"label", label}, {"seed", seed}, {"settings", settings(scene)},
+                 {"versions", versions()}};
+  prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), all.dump());
+  if (!options.resume) checkpoint.remove();
+  return checkpoint;
 }
 
 bool is_done(const fs::path& path, const prdp::Scene& scene) {
   std::ifstream file(path);
-  return file && Json::parse(file).value("settings", Json()) == settings(scene);
+  if (!file) return false;
+  const auto record = Json::parse(file, nullptr, /*allow_exceptions=*/false);
+  if (!record.is_object())
+    throw std::runtime_error("record: '" + path.string() +
+                             "' is damaged; delete it, and its training is run again");
+  return record.value("settings", Json()) == settings(scene);
 }
 
 prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
@@ -96,17 +99,19 @@ int run(const Options& options, const std::string& command) {
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
     if (options.resume && is_done(file, scene)) continue;
-    const auto on_interval = [&](int64_t done, double metric, int64_t k) {
+    auto checkpoint = checkpoint_of(file, options, scene, refinement.label, seed);
+    const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
-      if (done % 10 == 0 || done == 1)
+      if (std::exchange(first, false) || done % 10 == 0)
         std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
     };
     const auto on_data = [](int64_t done, int64_t total) {
       if (interrupted) throw Interrupted{};
       std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
-    const auto curves = prdp::train::train(scene, refinement, seed, on_interval, on_data);
-    write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1));
+    const auto curves = prdp::train::train(scene, refinement, seed, on_interval, checkpoint, on_data);
+    prdp::write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1) + '\n');
+    checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
     } else {
@@ -131,7 +136,7 @@ int main(int argc, char** argv) {
   app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
-  app.add_flag("--resume", options.resume, "keep trainings that are already recorded there");
+  app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
   k->excludes(s)->excludes(d);
   s->excludes(d);
   CLI11_PARSE(app, argc, argv);
@@ -142,7 +147,8 @@ int main(int argc, char** argv) {
   try {
     return run(options, command);
   } catch (const Interrupted&) {
-    std::fprintf(stderr, "prdp_train: interrupted; finished seeds are kept, --resume goes on from them\n");
+    std::fprintf(stderr, "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
+                         "last checkpoint\n");
     return 130;
   } catch (const c10::Error& error) {
     std::fprintf(stderr, "prdp_train: %s\n", error.what_without_backtrace());

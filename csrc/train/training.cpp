@@ -3,13 +3,13 @@
 #include <c10/util/accumulate.h>
 #include <torch/csrc/autograd/autograd.h>
 #include <torch/nn/modules/container/any.h>
-#include <torch/optim/adam.h>
 
 #include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <limits>
 
+#include "fused_adam.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/networks/resnet.h"
@@ -17,6 +17,7 @@
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/solvers/status.h"
+#include "state.h"
 
 namespace prdp::train {
 
@@ -50,29 +51,42 @@ struct Diverged {
   std::string why;
 };
 
-/// What a task supplies: the updates of one interval, each reporting its loss, and the metric.
+/// What a task supplies: the updates of one interval, numbered from `update` and each reporting its loss;
+/// the metric; and all that the updates change, to and from an archive.
 struct Task {
-  std::function<void(const std::function<void(double)>& on_update)> updates;
+  std::function<void(int64_t update, const std::function<void(double)>& on_update)> updates;
   std::function<double()> metric;
+  std::function<void(OutputArchive&)> save;
+  std::function<void(InputArchive&)> load;
 };
 
 /// What the tasks share: the intervals, their costs, and when a training is lost.
 class Run {
  public:
-  Run(const Scene& scene, const Refinement& refinement)
-      : intervals_(scene.training.intervals), controller_(refinement.controller()) {
+  Run(const Scene& scene, const Refinement& refinement, Checkpoint& checkpoint)
+      : intervals_(scene.training.intervals),
+        controller_(refinement.controller()),
+        checkpoint_(checkpoint),
+        saved_(checkpoint.read()) {
     for (int64_t i = 0; i < scene.executions(); ++i)
       steppers.push_back(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver));
     take_max_iter();
   }
 
   Curves go(const Task& task, const OnInterval& on_interval) {
+    const auto report = [&] { on_interval(done(), curves_.metric.back(), controller_->max_iter()); };
     try {
-      observe(task.metric(), 0);
-      for (int64_t done = 1; done <= intervals_; ++done) {
-        run_interval(task, done);
-        observe(task.metric(), done);
-        on_interval(done, curves_.metric.back(), controller_->max_iter());
+      if (saved_) {
+        restore(task);
+        report();
+      } else {
+        observe(task.metric(), 0);
+      }
+      while (done() < intervals_) {
+        run_interval(task, done() + 1);
+        observe(task.metric(), done());
+        if (done() < intervals_ && checkpoint_.due()) keep(task);
+        report();
       }
     } catch (const Diverged& divergence) {
       give_up(divergence.why);
@@ -87,12 +101,28 @@ class Run {
     for (auto& stepper : steppers) stepper.set_max_iter(controller_->max_iter());
   }
 
+  int64_t done() const { return static_cast<int64_t>(curves_.seconds.size()); }
+
+  void keep(const Task& task) {
+    OutputArchive archive;
+    task.save(archive);
+    save(archive, curves_, *controller_);
+    checkpoint_.write(bytes_of(archive));
+  }
+
+  void restore(const Task& task) {
+    auto archive = archive_of(*saved_);
+    task.load(archive);
+    load(archive, curves_, *controller_);
+    take_max_iter();
+  }
+
   void run_interval(const Task& task, int64_t done) {
     const int64_t k = controller_->max_iter();
     const auto started = std::chrono::steady_clock::now();
     int64_t solves = 0;
     double iterations = 0.0, applications = 0.0;
-    task.updates([&](double loss) {
+    task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss) {
       check(loss, done);
       curves_.update_loss.push_back(loss);
       for (const auto& stepper : steppers) {
@@ -140,6 +170,8 @@ class Run {
 
   int64_t intervals_;
   std::unique_ptr<Controller> controller_;
+  Checkpoint& checkpoint_;
+  std::optional<std::string> saved_;
   Curves curves_;
 };
 
@@ -202,18 +234,17 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
   auto network = make_network(scene, seed);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, run, data, network)
                                                               : corrector(scene, run, data, network);
-  torch::optim::Adam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
+  FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
-  int64_t done = 0;
 
-  const auto updates = [&](const std::function<void(double)>& on_update) {
+  const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
-      for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(done));
+      for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
       optimiser.zero_grad();
       const auto error = objective.loss(batch);
       error.backward();
       optimiser.step();
-      ++done;
+      ++update;
       on_update(error.item<double>());
     }
   };
@@ -221,34 +252,37 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
     const torch::NoGradGuard no_grad;
     return objective.metric();
   };
-  return run.go({updates, metric}, on_interval);
+  auto& module = *network.ptr();
+  const auto save_all = [&](OutputArchive& archive) { save(archive, module, optimiser, generator); };
+  const auto load_all = [&](InputArchive& archive) { load(archive, module, optimiser, generator); };
+  return run.go({updates, metric, save_all, load_all}, on_interval);
 }
 
 Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
   auto theta = problem.start.clone().requires_grad_();
-  int64_t done = 0;
 
-  const auto updates = [&](const std::function<void(double)>& on_update) {
+  const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
     const auto u = run.steppers[0](at::matmul(theta, problem.modes).view({1, 1, -1}));
     const auto error = half_mse(u, problem.solution);
     const auto gradient = torch::autograd::grad({error}, {theta})[0];
     {
       const torch::NoGradGuard no_grad;
-      theta.sub_(gradient, scene.learning_rate(done));
+      theta.sub_(gradient, scene.learning_rate(update));
     }
-    ++done;
     on_update(error.item<double>());
   };
   const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
-  return run.go({updates, metric}, on_interval);
+  const auto save_theta = [&](OutputArchive& archive) { archive.write("theta", theta); };
+  const auto load_theta = [&](InputArchive& archive) { archive.read("theta", theta); };
+  return run.go({updates, metric, save_theta, load_theta}, on_interval);
 }
 
 }  // namespace
 
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
-             const OnProgress& on_data) {
-  Run run(scene, refinement);
+             Checkpoint& checkpoint, const OnProgress& on_data) {
+  Run run(scene, refinement, checkpoint);
   return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, on_interval)
                                                 : train_network(scene, run, seed, on_interval, on_data);
 }

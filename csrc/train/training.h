@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/controller/controller.h"
+#include "prdp/scenes/checkpoint.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/scene.h"
 
@@ -34,11 +35,25 @@ struct Curves {
   std::string diverged;  // where and why a training was lost; the metric is NaN from there on
 };
 
-/// Called after each interval with (how many are done, the metric, K).
+/// Calls f(name, values) for each of them that has an entry for every interval or update.
+template <class AnyCurves, class F>
+void each_curve(AnyCurves& curves, const F& f) {
+  f("update_loss", curves.update_loss);
+  f("metric", curves.metric);
+  f("max_iter", curves.max_iter);
+  f("budget", curves.budget);
+  f("iterations", curves.iterations);
+  f("operator_applications", curves.operator_applications);
+  f("seconds", curves.seconds);
+}
+
+/// Called after each interval with (how many are done, the metric, K), and where a checkpoint is gone on
+/// from.
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
-/// Trains the scene once; `seed` is that of the network's weights and of the shuffling.
+/// Trains the scene once; `seed` is that of the network's weights and of the shuffling. Goes on from the
+/// checkpoint where there is one, and keeps itself there whenever one is due after an interval.
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
-             const OnProgress& on_data = {});
+             Checkpoint& checkpoint, const OnProgress& on_data = {});
 
 }  // namespace prdp::train

@@ -102,4 +102,28 @@ TEST(LinearSchedule, GrowsByItsStepUpToTheMaximum) {
   EXPECT_THROW(prdp::LinearSchedule(25, 6, 24), c10::ValueError);
 }
 
+TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
+  const auto goes_on = [](prdp::Controller& whole, prdp::Controller& rest) {
+    for (int i = 0; i < 40; ++i) {
+      const double metric = 1.0 / (1 + i / 4);
+      const bool raised = whole.step(metric);
+      if (i < 16) continue;
+      if (i == 16) {
+        rest.load_state(whole.state());
+      } else {
+        EXPECT_EQ(rest.step(metric), raised);
+      }
+      EXPECT_EQ(rest.max_iter(), whole.max_iter());
+    }
+  };
+  PRDPController a, b;
+  goes_on(a, b);
+  EXPECT_GT(a.max_iter(), 2);
+  prdp::LinearSchedule c(1, 2, 60), d(1, 2, 60);
+  goes_on(c, d);
+  EXPECT_EQ(c.max_iter(), 60);
+  EXPECT_THROW(c.load_state({0}), c10::ValueError);
+  EXPECT_THROW(c.load_state({61}), c10::ValueError);
+}
+
 }  // namespace

@@ -69,6 +69,28 @@ TEST(Data, PeriodicSeriesHoldsItsModesAloneWithTheAmplitudesThatWereDrawn) {
   EXPECT_LT(spectrum.narrow(1, kModes + 1, kN / 2 - kModes).abs().max().item<double>(), 1e-13);
 }
 
+TEST(Data, SeriesInSpaceSumsEveryProductOfSinesAndCosines) {
+  constexpr int64_t kSamples = 2, kModes = 3;
+  const std::vector<int64_t> shape{3, 4, 5};  // z, y, x
+  const auto u = prdp::fourier_series({"heat", shape}, kSamples, kModes, 9, at::kDouble);
+  auto generator = prdp::make_generator(9);
+  const auto drawn = at::rand({kSamples, 1, kModes, 8}, generator, at::TensorOptions(at::kDouble)) * 2.0 - 1.0;
+  const auto wave = [&](int64_t axis, int64_t i, int64_t n, int64_t cosine) {
+    const double angle = 2.0 * n * std::numbers::pi * static_cast<double>(i + 1) / static_cast<double>(shape[axis] + 1);
+    return cosine ? std::cos(angle) : std::sin(angle);
+  };
+  auto expected = at::zeros_like(u);
+  for (int64_t s = 0; s < kSamples; ++s)
+    for (int64_t z = 0; z < shape[0]; ++z)
+      for (int64_t y = 0; y < shape[1]; ++y)
+        for (int64_t x = 0; x < shape[2]; ++x)
+          for (int64_t n = 1; n <= kModes; ++n)
+            for (int64_t p = 0; p < 8; ++p)
+              expected[s][0][z][y][x] += drawn[s][0][n - 1][p] * wave(0, z, n, p & 1) * wave(1, y, n, p >> 1 & 1) *
+                                         wave(2, x, n, p >> 2);
+  EXPECT_TRUE(at::allclose(u, expected, 0.0, 1e-13));
+}
+
 TEST(Data, AVelocityHasAComponentOfItsOwnForEachAxis) {
   const auto u = prdp::fourier_series({"burgers", {8, 10}}, 3, 2, 0, at::kDouble);
   EXPECT_EQ(u.sizes(), (std::vector<int64_t>{3, 2, 8, 10}));
@@ -92,6 +114,9 @@ TEST(Data, HeatTargetsAreExactStepsAsManyAsTheSceneSays) {
   auto exact = scene.stepper(prdp::Direct{});
   EXPECT_TRUE(at::allclose(exact(exact(data.train_start)), data.train_end, 1e-5, 1e-6));
   EXPECT_TRUE(at::allclose(exact(exact(exact(data.valid_start))), data.valid_end, 1e-5, 1e-6));
+  EXPECT_TRUE(at::equal(prdp::validation_trajectories(scene, 4).select(1, 3), data.valid_end));
+  EXPECT_THROW(prdp::validation_trajectories(scene, -1), c10::ValueError);
+  EXPECT_THROW(prdp::validation_trajectories(prdp::read_scene(scene_path("poisson_1p")), 1), c10::ValueError);
 }
 
 TEST(Data, RandomFlowIsNoiseSmoothedNormalisedAndProjected) {
@@ -133,7 +158,7 @@ TEST(Data, FlowsFollowTheConvergedReference) {
   scene.data = {0, 30, 2, 1, 3, {9, 7}, 0};
   scene.dtype = at::kDouble;
   int64_t calls = 0, last = 0;
-  const auto data = prdp::flow_dataset(scene, [&](int64_t done, int64_t total) {
+  const auto data = prdp::compute_dataset(scene, [&](int64_t done, int64_t total) {
     EXPECT_EQ(total, 66);
     EXPECT_GT(done, last);
     last = done;
@@ -152,6 +177,12 @@ TEST(Data, FlowsFollowTheConvergedReference) {
   EXPECT_TRUE(close(data.train_end, exact(exact(train))));
   EXPECT_TRUE(close(data.valid_start, valid));
   EXPECT_TRUE(close(data.valid_end, exact(exact(exact(valid)))));
+
+  const auto further = prdp::validation_trajectories(scene, 4);
+  ASSERT_EQ(further.sizes(), (std::vector<int64_t>{2, 5, 3, 4, 3}));
+  EXPECT_TRUE(at::equal(further.select(1, 0), data.valid_start));
+  EXPECT_TRUE(at::equal(further.select(1, 3), data.valid_end));
+  EXPECT_TRUE(close(further.select(1, 4), exact(exact(exact(exact(valid))))));
 }
 
 /// Whether moving the input by `by` points along `axis` moves the output alike.

@@ -12,6 +12,17 @@ from prdp_torch import _C, scenes
 DATA = Path(__file__).parents[1] / "data"
 ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
 SOLVERS = [*ITERATIVE, prdp.Direct]
+TINY = (
+    ("shape = [48, 48]", "shape = [8, 8]"),
+    ("reference_shape = [97, 97]", "reference_shape = [17, 17]"),
+    ("train = 200", "train = 8"),
+    ("valid = 5", "valid = 2"),
+    ("blocks = 3", "blocks = 1"),
+    ("width = 64", "width = 8"),
+    ("batch = 25", "batch = 2"),
+    ("epochs = 100", "epochs = 5"),
+    ("constant = [2, 5, 10, 20]", "constant = [2]"),
+)
 
 
 def golden(name):
@@ -108,6 +119,11 @@ def written(tmp_path, *changes, scene="heat_1d", name="changed"):
     path = tmp_path / f"{name}.toml"
     path.write_text(text)
     return str(path)
+
+
+def tiny(tmp_path, *changes, name="tiny"):
+    """The path of a small copy of the scene navier_stokes, with replacements."""
+    return written(tmp_path, *TINY, *changes, scene="navier_stokes", name=name)
 
 
 def line_of(path, text):

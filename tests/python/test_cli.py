@@ -1,6 +1,7 @@
 """The command `prdp`, run as users run it."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -47,7 +48,7 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
 def test_the_report_is_one_file_with_labelled_pictures(comparison):
     folder, _ = comparison
     html = (folder / "runs/heat_1d/report.html").read_text()
-    assert len(re.findall(r'<img alt="[^"]{30,}" src="data:image/svg\+xml;base64,', html)) == 4
+    assert len(re.findall(r'<img alt="[^"]{30,}" src="data:image/svg\+xml;base64,', html)) == 6
     assert not re.search(r'(src|href)="(?!data:)', html)  # nothing is fetched from elsewhere
 
 
@@ -67,10 +68,11 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
     "options, label", [([], "prdp"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
                        (["--direct"], "direct")]
 )  # fmt: skip
-def test_train_writes_one_record_a_seed(tmp_path, options, label):
+def test_train_writes_one_record_and_the_weights_of_each_seed(tmp_path, options, label):
     done = prdp("train", "heat_1d", *options, "--seeds", 2, "--intervals", 2, "--out", "here", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in (tmp_path / "here" / label).iterdir()) == ["seed_0.json", "seed_1.json"]
+    written = sorted(path.name for path in (tmp_path / "here" / label).iterdir())
+    assert written == ["seed_0.json", "seed_0.pt", "seed_1.json", "seed_1.pt"]
 
 
 def test_scenes_are_listed(tmp_path):
@@ -121,6 +123,24 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     assert process.returncode == 130 and b"interrupted" in errors
     assert json.loads(first.read_text())["curves"]["metric"]
     assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path, ignored):
+    """With a torch that presses Ctrl-C; in the background, where it is ignored, it stays so."""
+    (tmp_path / "torch.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nprint('went on')\n")
+    setting = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); " if ignored else ""
+    done = subprocess.run(
+        [sys.executable, "-c", setting + "from prdp_command import main; main()", "scenes"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    if ignored:
+        assert done.stdout == "went on\n" and "module 'torch' has no attribute" in done.stderr
+    else:
+        assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 @pytest.mark.parametrize(

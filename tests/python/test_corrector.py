@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import assert_refused, written
+from helpers import assert_refused, tiny, written
 
 import prdp_torch as prdp
 from prdp_torch import _C, charts, fields, scenes, training
@@ -18,17 +18,6 @@ from prdp_torch.training import Refinement, train
 ROOT = Path(__file__).parents[2]
 PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
 TRAINER = ROOT / "build" / "prdp_train"
-TINY = (
-    ("shape = [48, 48]", "shape = [8, 8]"),
-    ("reference_shape = [97, 97]", "reference_shape = [17, 17]"),
-    ("train = 200", "train = 8"),
-    ("valid = 5", "valid = 2"),
-    ("blocks = 3", "blocks = 1"),
-    ("width = 64", "width = 8"),
-    ("batch = 25", "batch = 2"),
-    ("epochs = 100", "epochs = 5"),
-    ("constant = [2, 5, 10, 20]", "constant = [2]"),
-)
 
 
 @pytest.fixture(autouse=True)
@@ -37,11 +26,6 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("PRDP_CACHE", str(folder))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs: on so small a grid threads wait for each other
     return folder
-
-
-def tiny(tmp_path, *changes, name="tiny"):
-    """The path of a small copy of the scene, with replacements."""
-    return written(tmp_path, *TINY, *changes, scene="navier_stokes", name=name)
 
 
 def tensors(data):
@@ -180,14 +164,14 @@ def objective(scene, network, solver):
         for _ in range(2)
     ]
     data = _C.make_dataset(scene)
-    return data, steppers, *training._corrector(scene, steppers, data, network)
+    return data, steppers, training._corrector(scene, steppers, data, network)
 
 
 def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve(tmp_path):
     """Against finite differences of the loss as written out here."""
     scene = scenes.load(tiny(tmp_path, ('"float32"', '"float64"')))
     network = make_network(scene, 0)
-    data, steppers, loss_of, _ = objective(scene, network, prdp.GMRES(restart=8, max_iter=500, rtol=1e-12))
+    data, steppers, loss_of = objective(scene, network, prdp.GMRES(restart=8, max_iter=500, rtol=1e-12))
     batch = torch.tensor([3, 1, 6])
     exact = prdp.NavierStokes([8, 8], 1e-4, 0.1, prdp.Direct())
 
@@ -219,7 +203,8 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve
 
 def test_the_metric_is_the_x_velocity_after_converged_steps(tmp_path):
     scene = scenes.load(tiny(tmp_path, ('"float32"', '"float64"')))
-    data, _, _, metric = objective(scene, torch.zeros_like, prdp.GMRES(restart=8, max_iter=1))
+    data = _C.make_dataset(scene)
+    metric = training._metric(scene, data, torch.zeros_like)
     exact = prdp.NavierStokes([8, 8], 1e-4, 0.1, prdp.Direct())
     u = fields.rollout(exact, data.valid_start, 5)[:, -1, 0]
     error = (u - data.valid_end[:, 0]).flatten(1).norm(dim=1) / data.valid_end[:, 0].flatten(1).norm(dim=1)

@@ -58,9 +58,11 @@ def test_what_happens_at_one_end_is_seen_at_the_other_where_it_is_periodic(shape
     assert seen[-4:].any() == periodic
 
 
-def test_a_resnet_is_what_its_description_says():
-    """Against numpy, with the weights read by name."""
-    network = resnet((11,), False, channels=2, blocks=2, width=3)
+@pytest.mark.parametrize("shape", [(11,), (5, 6), (4, 5, 3)])
+@pytest.mark.parametrize("periodic", [True, False])
+def test_a_resnet_is_what_its_description_says(shape, periodic):
+    """Against numpy, with the weights read by name: every tap of a kernel is a shift of the padded field."""
+    network = resnet(shape, periodic, channels=2, blocks=2, width=3)
     weights = {name: p.detach().numpy() for name, p in network.named_parameters()}
     assert list(weights)[:6] == [
         "lift.weight", "lift.bias", "blocks.0.0.weight", "blocks.0.0.bias", "blocks.0.2.weight", "blocks.0.2.bias",
@@ -69,11 +71,14 @@ def test_a_resnet_is_what_its_description_says():
     def conv(x, name):
         weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
         reach = weight.shape[2] // 2
-        padded = np.pad(x, ((0, 0), (reach, reach)))
-        taps = [weight[:, :, k] @ padded[:, k : k + x.shape[1]] for k in range(weight.shape[2])]
-        return sum(taps) + bias[:, None]
+        padded = np.pad(x, [(0, 0)] + [(reach, reach)] * len(shape), mode="wrap" if periodic else "constant")
+        out = np.zeros((len(weight), *shape))
+        for tap in np.ndindex(*weight.shape[2:]):
+            window = padded[(slice(None), *(slice(k, k + n) for k, n in zip(tap, shape, strict=True)))]
+            out += np.tensordot(weight[(slice(None), slice(None), *tap)], window, axes=1)
+        return out + bias.reshape(-1, *[1] * len(shape))
 
-    u = np.random.default_rng(0).standard_normal((2, 11))
+    u = np.random.default_rng(0).standard_normal((2, *shape))
     x = conv(u, "lift")
     for i in range(2):
         x = np.maximum(x + conv(np.maximum(conv(x, f"blocks.{i}.0"), 0), f"blocks.{i}.2"), 0)
@@ -92,6 +97,16 @@ def test_a_resnet_has_as_many_parameters_as_its_kernels_say(dim, channels, block
 def test_a_resnet_has_at_most_three_axes():
     with pytest.raises(ValueError, match="ResNet: dim must be 1, 2 or 3, got 4"):
         ResNet(4, 1, 1, 8, True)
+
+
+def test_the_scenes_networks_see_beyond_the_grid_what_the_equation_sees():
+    """Zeros around a Dirichlet grid, the other end of a periodic one; sizes as the paper has them."""
+    for name, modes, parameters in (("heat_3d", "zeros", 332257), ("burgers_1d", "circular", 37345)):
+        network = make_network(scenes.load(name), 0)
+        kernels = [module for module in network.blocks.modules() if hasattr(module, "padding_mode")]
+        assert {kernel.padding_mode for kernel in kernels} == {modes}
+        assert sum(p.numel() for p in network.parameters()) == parameters
+    assert sum(p.numel() for p in make_network(scenes.load("heat_2d"), 0).parameters()) == 23409900
 
 
 @pytest.mark.parametrize("name", ["heat_1d", "burgers_1d"])

@@ -17,6 +17,17 @@ def test_the_projects_scenes_hold_the_papers_settings():
         "tau_step": 0.98, "tau_stop": 0.9, "delta": 3, "window": 8, "initial": 1, "increment": 1,
         "maximum": None, "growth": 1.0,
     }  # fmt: skip
+    square, cube = scenes.load("heat_2d"), scenes.load("heat_3d")
+    assert (square.method, square.max_iter, square.backward) == ("jacobi", 43, "unrolled")
+    assert (cube.method, cube.max_iter, cube.backward) == ("jacobi", 31, "unrolled")
+    assert (square.physics.shape, cube.physics.shape) == ([30, 30], [20, 20, 20])
+    assert (square.network.hidden, cube.network.blocks, cube.network.width) == ([3000, 3000, 3000], 6, 32)
+    assert (square.learning_rate(100), cube.learning_rate(100)) == (pytest.approx(9e-4), pytest.approx(0.92e-4))
+    assert (square.training.intervals, cube.training.intervals) == (70, 100)
+    for scene, tau_step in ((square, 0.9), (cube, 0.97)):
+        assert (scene.physics.nu, scene.physics.dt, scene.rtol, scene.training.batch) == (1e-3, 1.0, 1e-5, 25)
+        assert (scene.data.modes, scene.data.train, scene.data.valid, scene.data.valid_steps) == (5, 200, 5, 2)
+        assert scene.prdp == heat.prdp | {"tau_step": tau_step, "window": 6}
     one, three = scenes.load("poisson_1p"), scenes.load("poisson_3p")
     assert (one.max_iter, one.training.intervals, one.learning_rate(100)) == (600, 170, 275.0)
     assert (three.max_iter, three.training.intervals, three.learning_rate(0)) == (450, 750, 3500.0)
@@ -89,7 +100,8 @@ def test_missing_files_and_unknown_scenes():
     with pytest.raises(ValueError, match=r"scene: cannot read 'nowhere.toml'"):
         scenes.load("nowhere.toml")
     with pytest.raises(
-        ValueError, match="no scene 'heat1d'; available: burgers_1d, heat_1d, navier_stokes, poisson_1p"
+        ValueError,
+        match="no scene 'heat1d'; available: burgers_1d, heat_1d, heat_2d, heat_3d, navier_stokes, poisson_1p",
     ):
         scenes.load("heat1d")
 

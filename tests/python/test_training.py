@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import written
 
 from prdp_torch import _C, scenes
 from prdp_torch.training import Refinement, train
@@ -63,19 +64,24 @@ class Linear(torch.nn.Module):
         return self.layer(u)
 
 
-def heat_with_a_resnet(tmp_path):
-    text = scenes.available()["heat_1d"].read_text()
-    mlp = 'kind = "mlp"\nhidden = [64, 64, 64]'
-    assert mlp in text
-    path = tmp_path / "heat_resnet.toml"
-    path.write_text(text.replace(mlp, 'kind = "resnet"\nblocks = 2\nwidth = 8'))
-    return str(path)
+SMALLER = {
+    "heat_1d": [('kind = "mlp"\nhidden = [64, 64, 64]', 'kind = "resnet"\nblocks = 2\nwidth = 8')],
+    "heat_2d": [("shape = [30, 30]", "shape = [12, 10]"), ("[3000, 3000, 3000]", "[300, 300]")],
+    "heat_3d": [
+        ("shape = [20, 20, 20]", "shape = [6, 5, 7]"),
+        ("blocks = 6", "blocks = 2"),
+        ("width = 32", "width = 8"),
+        ("rate = 1e-4", "rate = 1e-3"),
+    ],
+}
 
 
-def test_both_languages_train_a_resnet_alike(tmp_path):
-    path = heat_with_a_resnet(tmp_path)
-    cpp = in_cpp(tmp_path, path, "--constant", "25", "--intervals", "5")
-    python = train(short(path, intervals=5), Refinement.constant(25))
+@pytest.mark.parametrize("name", SMALLER)
+def test_both_languages_train_smaller_copies_alike(tmp_path, name):
+    """Large scenes with small grids and networks, and heat_1d with a residual network."""
+    path = written(tmp_path, *SMALLER[name], scene=name)
+    cpp = in_cpp(tmp_path, path, "--constant", "20", "--intervals", "5")
+    python = train(short(path, intervals=5), Refinement.constant(20))
     assert len(python["update_loss"]) == 40
     np.testing.assert_allclose(cpp["update_loss"][:20], python["update_loss"][:20], rtol=1e-5)
     np.testing.assert_allclose(cpp["metric"][:3], python["metric"][:3], rtol=1e-5)

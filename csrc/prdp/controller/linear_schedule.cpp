@@ -7,7 +7,7 @@
 namespace prdp {
 
 LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum)
-    : initial_(initial), increment_(increment), maximum_(maximum), max_iter_(initial) {
+    : initial_(initial), increment_(increment), maximum_(maximum), state_{initial} {
   TORCH_CHECK_VALUE(initial >= 0, "LinearSchedule: initial must be >= 0, got ", initial);
   TORCH_CHECK_VALUE(increment >= 0, "LinearSchedule: increment must be >= 0, got ", increment);
   TORCH_CHECK_VALUE(maximum >= initial, "LinearSchedule: maximum must be >= initial = ", initial,
@@ -15,16 +15,16 @@ LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maxim
 }
 
 bool LinearSchedule::step(double, bool) {
-  const int64_t before = max_iter_;
-  max_iter_ = std::min(maximum_, max_iter_ + increment_);
-  return max_iter_ > before;
+  const int64_t before = state_.max_iter;
+  state_.max_iter = std::min(maximum_, before + increment_);
+  return state_.max_iter > before;
 }
 
-void LinearSchedule::set_max_iter(int64_t max_iter) {
-  TORCH_CHECK_VALUE(max_iter >= initial_ && max_iter <= maximum_,
+void LinearSchedule::load_state(State state) {
+  TORCH_CHECK_VALUE(state.max_iter >= initial_ && state.max_iter <= maximum_,
                     "LinearSchedule: max_iter must lie in [", initial_, ", ", maximum_, "], got ",
-                    max_iter);
-  max_iter_ = max_iter;
+                    state.max_iter);
+  state_ = std::move(state);
 }
 
 }  // namespace prdp

@@ -10,17 +10,18 @@ class LinearSchedule final : public Controller {
   /// Raises ValueError unless 0 <= initial <= maximum and increment >= 0.
   LinearSchedule(int64_t initial, int64_t increment, int64_t maximum);
 
-  int64_t max_iter() const override { return max_iter_; }
+  int64_t max_iter() const override { return state_.max_iter; }
   bool step(double metric = 0.0, bool converged = false) override;
-  /// Raises ValueError unless initial <= max_iter <= maximum.
-  void set_max_iter(int64_t max_iter);
+  const State& state() const override { return state_; }
+  void load_state(State state) override;
 
   int64_t initial() const { return initial_; }
   int64_t increment() const { return increment_; }
   int64_t maximum() const { return maximum_; }
 
  private:
-  int64_t initial_, increment_, maximum_, max_iter_;
+  int64_t initial_, increment_, maximum_;
+  State state_;
 };
 
 }  // namespace prdp

@@ -1,7 +1,5 @@
 #pragma once
-#include <limits>
 #include <optional>
-#include <vector>
 
 #include "prdp/controller/controller.h"
 
@@ -29,20 +27,6 @@ struct PRDPSettings {
 /// tolerance, which more iterations would not change.
 class PRDPController final : public Controller {
  public:
-  /// What was decided at one call of step().
-  struct Record {
-    double metric;
-    double smoothed;   // L̃ with this metric
-    int64_t max_iter;  // K before the decision
-    bool refined;
-  };
-  /// All that step() depends on beside the settings.
-  struct State {
-    int64_t max_iter;
-    double checkpoint = std::numeric_limits<double>::infinity();  // c
-    std::vector<Record> history;
-  };
-
   /// Raises ValueError for a setting outside its range, naming it.
   explicit PRDPController(PRDPSettings settings = {});
 
@@ -51,9 +35,8 @@ class PRDPController final : public Controller {
   bool step(double metric, bool converged = false) override;
 
   const PRDPSettings& settings() const { return settings_; }
-  const State& state() const { return state_; }
-  /// Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
-  void load_state(State state);
+  const State& state() const override { return state_; }
+  void load_state(State state) override;
 
  private:
   bool should_refine() const;

@@ -55,19 +55,65 @@ at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_
   return values.reshape(shape).to(dtype);
 }
 
-Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
-  if (scene.task == Scene::Task::kCorrector)
-    return cached_dataset(scene, [&] { return flow_dataset(scene, on_progress); });
-  const at::NoGradGuard no_grad;
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u) {
+  auto next = reference(u);
+  TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
+              reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+  return next;
+}
+
+namespace {
+
+/// Initial states of all samples, on the grid of the reference; those of the training come first.
+at::Tensor starts(const Scene& scene) {
   const auto& d = scene.data;
-  const auto start = fourier_series(scene.physics, d.train + d.valid, d.modes, d.seed, at::kDouble);
-  const auto train = start.narrow(0, 0, d.train), valid = start.narrow(0, d.train, d.valid);
-  auto converged = scene.stepper(Direct{});
-  const auto after = [&](int64_t steps, at::Tensor u) {
-    for (int64_t i = 0; i < steps; ++i) u = converged(u);
-    return u.to(scene.dtype).contiguous();
+  const int64_t samples = d.train + d.valid;
+  if (scene.task == Scene::Task::kCorrector) return random_flow(d.reference_shape, samples, d.seed);
+  return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
+}
+
+/// The states of `steps` steps of the converged equation: (samples, steps + 1, channels, *shape).
+at::Tensor follow(const Scene& scene, at::Tensor u, int64_t steps, const OnSteps& on_steps) {
+  const at::NoGradGuard no_grad;
+  if (scene.task == Scene::Task::kCorrector) return follow_flow(scene, u, steps, on_steps).to(scene.dtype);
+  auto reference = scene.stepper(scene.reference_solver());
+  std::vector<at::Tensor> states{u};
+  for (int64_t i = 0; i < steps; ++i) states.push_back(u = converged_step(reference, u));
+  return at::stack(states, 1).to(scene.dtype);
+}
+
+/// Adds steps up towards `total`.
+OnSteps counted(int64_t total, const OnProgress& on_progress) {
+  return [=, done = int64_t{0}](int64_t steps) mutable {
+    done += steps;
+    if (on_progress) on_progress(done, total);
   };
-  return {after(0, train), after(2, train), after(0, valid), after(d.valid_steps, valid), {}};
+}
+
+}  // namespace
+
+Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
+  const auto& d = scene.data;
+  const auto on_steps = counted(2 * d.train + d.valid_steps * d.valid, on_progress);
+  const auto start = starts(scene);
+  const auto train = follow(scene, start.narrow(0, 0, d.train), 2, on_steps);
+  const auto valid = follow(scene, start.narrow(0, d.train, d.valid), d.valid_steps, on_steps);
+  const auto at_time = [](const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); };
+  return {at_time(train, 0), at_time(train, 2), at_time(valid, 0), at_time(valid, d.valid_steps),
+          scene.task == Scene::Task::kCorrector ? at_time(train, 1) : at::Tensor()};
+}
+
+Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
+  const auto make = [&] { return compute_dataset(scene, on_progress); };
+  return scene.task == Scene::Task::kCorrector ? cached_dataset(scene, make) : make();
+}
+
+at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress) {
+  TORCH_CHECK_VALUE(scene.task != Scene::Task::kParameters,
+                    "validation_trajectories: the task \"parameters\" has no validation samples");
+  TORCH_CHECK_VALUE(steps >= 0, "validation_trajectories: steps must be >= 0, got ", steps);
+  const auto& d = scene.data;
+  return follow(scene, starts(scene).narrow(0, d.train, d.valid), steps, counted(steps * d.valid, on_progress));
 }
 
 ParameterProblem make_parameter_problem(const Scene& scene) {

@@ -13,6 +13,9 @@ namespace prdp {
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
+/// reference(u); raises RuntimeError where the solve does not converge.
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
+
 /// Called while data are made with (steps of a sample done, all of them).
 using OnProgress = std::function<void(int64_t, int64_t)>;
 
@@ -24,6 +27,13 @@ struct Dataset {
 };
 /// Data of the task "corrector" take minutes: they are kept on disk (data_cache.h).
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
+/// The same without the file on disk.
+Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
+
+/// The validation samples and the states of `steps` steps of the converged equation from them, in all
+/// (samples, steps + 1, channels, *shape): at step data.valid_steps what `make_dataset` gives, and as far
+/// beyond as wanted. Raises ValueError for the task "parameters", which has no samples, and for steps < 0.
+at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
 
 /// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).
 struct ParameterProblem {

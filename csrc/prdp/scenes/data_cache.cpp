@@ -10,6 +10,8 @@
 #include <iterator>
 #include <sstream>
 
+#include "prdp/scenes/files.h"
+
 namespace prdp {
 
 namespace {
@@ -28,13 +30,6 @@ std::string settings_of(const Scene& scene) {
        << ", dt " << p.dt << ", train " << d.train << ", valid " << d.valid << ", valid_steps " << d.valid_steps
        << ", seed " << d.seed << ", " << scene.dtype;
   return text.str();
-}
-
-/// FNV-1a, the same on every machine.
-uint64_t hash(const std::string& text) {
-  uint64_t h = 14695981039346656037u;
-  for (const unsigned char c : text) h = (h ^ c) * 1099511628211u;
-  return h;
 }
 
 fs::path cache_folder() {
@@ -56,14 +51,8 @@ std::vector<at::Tensor> tensors_of(const Dataset& d) {
 void write(const fs::path& path, const std::string& settings, const Dataset& data) {
   const auto bytes = torch::jit::pickle_save(
       c10::ivalue::Tuple::create({settings, c10::List<at::Tensor>(at::ArrayRef<at::Tensor>(tensors_of(data)))}));
-  auto unfinished = path;
-  unfinished += std::to_string(getpid()) + ".part";  // another process may be writing the same
-  std::ofstream file(unfinished, std::ios::binary);
-  file.write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
-  file.close();
-  if (!file) fs::remove(unfinished);
-  TORCH_CHECK_VALUE(file, "data: cannot write '", path.string(), "'; is the disk full?");
-  fs::rename(unfinished, path);
+  // Another process may be writing the same.
+  write_whole(path, {bytes.data(), bytes.size()}, std::to_string(getpid()) + ".part");
 }
 
 bool fits(const Dataset& data, const Scene& scene) {
@@ -99,7 +88,8 @@ Dataset read(const fs::path& path, const std::string& settings, const Scene& sce
 Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
   const auto settings = settings_of(scene);
   std::ostringstream name;
-  name << scene.physics.equation << '-' << std::hex << std::setw(16) << std::setfill('0') << hash(settings) << ".pt";
+  name << scene.physics.equation << '-' << std::hex << std::setw(16) << std::setfill('0')
+       << fingerprint(settings) << ".pt";
   const auto path = cache_folder() / name.str();
   if (fs::exists(path)) return read(path, settings, scene);
   const auto data = make();

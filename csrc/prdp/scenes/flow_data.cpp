@@ -1,7 +1,5 @@
 #include "prdp/scenes/flow_data.h"
 
-#include <ATen/core/grad_mode.h>
-
 #include <numbers>
 
 #include "prdp/grid/grid.h"
@@ -38,9 +36,6 @@ at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor 
   return u - at::cat({backward_difference(phi, grid, kX), backward_difference(phi, grid, kY)}, 1);
 }
 
-/// Tight enough that its error is below float32's rounding.
-Solver reference_solver() { return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8}; }
-
 }  // namespace
 
 at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
@@ -59,38 +54,21 @@ at::Tensor downsample(const at::Tensor& u) {
   return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2);
 }
 
-Dataset flow_dataset(const Scene& scene, const OnProgress& on_progress) {
-  const at::NoGradGuard no_grad;
-  const auto& d = scene.data;
+at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
   auto fine = scene;
-  fine.physics.shape = d.reference_shape;
-  auto reference = fine.stepper(reference_solver());
-  const int64_t total = 2 * d.train + d.valid_steps * d.valid;
-  int64_t done = 0;
-
-  /// The down-sampled states, the start included: (samples, steps + 1, 3, Ny, Nx).
-  const auto follow = [&](at::Tensor u, int64_t steps) {
+  fine.physics.shape = scene.data.reference_shape;
+  auto reference = fine.stepper(fine.reference_solver());
+  std::vector<at::Tensor> parts;
+  for (auto u : start.split(kSamplesAtOnce)) {
     std::vector<at::Tensor> states{downsample(u)};
     for (int64_t i = 0; i < steps; ++i) {
-      u = reference(u);
-      TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
-                  reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+      u = converged_step(reference, u);
       states.push_back(downsample(u));
-      done += u.size(0);
-      if (on_progress) on_progress(done, total);
+      on_steps(u.size(0));
     }
-    return at::stack(states, 1).to(scene.dtype);
-  };
-  const auto follow_all = [&](const at::Tensor& u, int64_t steps) {
-    std::vector<at::Tensor> parts;
-    for (const auto& part : u.split(kSamplesAtOnce)) parts.push_back(follow(part, steps));
-    return at::cat(parts);
-  };
-  const auto start = random_flow(d.reference_shape, d.train + d.valid, d.seed);
-  const auto train = follow_all(start.narrow(0, 0, d.train), 2);
-  const auto valid = follow_all(start.narrow(0, d.train, d.valid), d.valid_steps);
-  const auto at_time = [](const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); };
-  return {at_time(train, 0), at_time(train, 2), at_time(valid, 0), at_time(valid, d.valid_steps), at_time(train, 1)};
+    parts.push_back(at::stack(states, 1));
+  }
+  return at::cat(parts);
 }
 
 }  // namespace prdp

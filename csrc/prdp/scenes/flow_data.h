@@ -11,8 +11,12 @@ at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64
 /// Every second point of the last two axes, at the indices 1, 3, …
 at::Tensor downsample(const at::Tensor& u);
 
-/// The data of the task "corrector": trajectories of the converged equation on data.reference_shape,
-/// down-sampled. Raises RuntimeError where a reference solve does not converge.
-Dataset flow_dataset(const Scene& scene, const OnProgress& on_progress);
+/// Called with the number of samples that have just been taken a step on.
+using OnSteps = std::function<void(int64_t)>;
+
+/// The reference of the task "corrector": the states of `steps` steps of the converged equation from
+/// `start` on data.reference_shape, the start included, down-sampled: (samples, steps + 1, 3, Ny, Nx).
+/// Raises RuntimeError where a reference solve does not converge.
+at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps);
 
 }  // namespace prdp

@@ -145,6 +145,11 @@ Scene::Compare read_compare(TomlSection s) {
 
 }  // namespace
 
+Solver Scene::reference_solver() const {
+  if (physics.direct_is_cheap()) return Direct{};
+  return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8};
+}
+
 Stepper Scene::stepper(Solver with) const {
   Equation equation{physics.equation, physics.shape, {}, {}};
   if (physics.equation != "poisson") {

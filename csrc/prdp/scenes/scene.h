@@ -27,6 +27,9 @@ struct Scene {
       if (equation == "navier_stokes") return 3;
       return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1;
     }
+    /// Whether an exact solve costs about what an iterative one does: not that of a flow in the plane, whose
+    /// sparse LU takes tens of times as long.
+    bool direct_is_cheap() const { return !(periodic() && shape.size() > 1); }
   };
   struct Data {
     int64_t modes = 0, train = 0, valid = 0, seed = 0;
@@ -76,6 +79,9 @@ struct Scene {
 
   /// How many solves there are one after the other in an update; K is the budget of each.
   int64_t executions() const { return task == Task::kCorrector ? 2 : 1; }
+  /// The converged solver of data and references: exact where that is cheap, else iterated until its error is
+  /// below float32's rounding.
+  Solver reference_solver() const;
   /// The scene's step with this solver; a failed sample does not stop a training.
   Stepper stepper(Solver solver) const;
   /// Replaces the scene's derivative. Raises ValueError for an unknown name, or one that would leave

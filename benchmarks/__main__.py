@@ -1,0 +1,57 @@
+"""Runs the suites on one thread; `prdp bench` calls this in a process of its own."""
+
+import argparse
+import importlib
+import importlib.metadata
+import os
+import sys
+from pathlib import Path
+
+PEERS = ("torch", "jax", "lineax", "scipy")
+
+
+def use_one_thread():
+    """Before any library starts its pool. XLA has no switch that holds, so the process keeps to one core."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+def peer_versions():
+    found = {}
+    for name in PEERS:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="prdp bench")
+    parser.add_argument("suites", nargs="*", metavar="SUITE")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    use_one_thread()
+    import torch  # only now: it reads the environment
+
+    from benchmarks import page
+    from prdp_torch import cli, records
+
+    torch.set_num_threads(1)
+    folder = records.prepare_folder(options.out)
+    environment = records.environment() | {"peers": peer_versions()}
+    environment["command"] = " ".join(["prdp", "bench", *sys.argv[1:]])
+    results = {}
+    for suite in options.suites or cli.SUITES:
+        module = importlib.import_module(f"benchmarks.{suite}")
+        results[suite] = module.run(lambda text: print(text, file=sys.stderr, flush=True), options.quick)
+        records.write(folder / f"{suite}.json", {**environment, "quick": options.quick, suite: results[suite]})
+    page.write(results, environment, folder)
+    print(f"page: {folder / 'page.html'}")
+
+
+if __name__ == "__main__":
+    main()

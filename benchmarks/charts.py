@@ -1,0 +1,151 @@
+"""The pictures of the benchmarks, each a matplotlib figure with its caption."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
+
+# One colour a method, whoever runs it; Okabe and Ito's, which colour-blind readers can tell apart.
+COLOURS = {"Jacobi": "#0072B2", "steepest descent": "#CC79A7", "CG": "#E69F00",
+           "GMRES": "#D55E00", "Stokes": "#56B4E9", "direct": "#222222", "LU": "#999999"}  # fmt: skip
+MARKS = {"torch eager": "s", "torch.compile": "P", "JAX jit": "^", "lineax": "v", "SciPy": "D"}
+
+
+def colour(label):
+    found = [name for name in COLOURS if name in label]
+    return COLOURS[found[-1]] if found else "#666666"
+
+
+def library(label):
+    return next((name for name in MARKS if label.startswith(name)), None)
+
+
+def accuracy(title, points):
+    """Rows: residual of the solution, error of the gradient. Columns: time, products with A."""
+    figure = Figure(figsize=(11, 8.4), layout="constrained")
+    panels = figure.subplots(2, 2, sharey="row")
+    rows = (("residual", "forward", "relative residual"), ("gradient_error", "both", "relative error of the gradient"))
+    for panel_row, (error, cost, name) in zip(panels, rows, strict=True):
+        for axes, measure in zip(panel_row, ("seconds", "products"), strict=True):
+            _curves(axes, points, error, cost, measure)
+            axes.set(xscale="log", yscale="log")
+            axes.grid(alpha=0.3, lw=0.4)
+        work = "solve" if cost == "forward" else "solve and gradient"
+        panel_row[0].set(ylabel=f"{name}, worst of the batch", xlabel=f"{work}, ms for the batch")
+        panel_row[1].set(xlabel=f"{work}, products with A a sample")
+    figure.suptitle(title)
+    figure.legend(handles=_legend(points), loc="outside right upper", frameon=False)
+    return figure
+
+
+def _curves(axes, points, error, cost, measure):
+    series = {}
+    for p in points:
+        if cost == "forward" and p["mode"] == "unrolled":
+            continue  # the same solve as implicit
+        x = 1e3 * p[f"{cost}_seconds"]["min"] if measure == "seconds" else p.get(f"{cost}_products")
+        if x is not None:
+            series.setdefault((p["label"], p["mode"]), []).append((x, max(p[error], 1e-16)))
+    for (label, mode), values in series.items():
+        x, y = zip(*values, strict=True)
+        mark = MARKS.get(library(label), "o")
+        style = {"ls": "--", "mfc": "white"} if mode == "unrolled" else {"ls": "-"}
+        size = 9 if library(label) or label == "direct" else 4
+        axes.plot(x, y, color=colour(label), marker=mark, ms=size, lw=1.4, mec=colour(label), **style)
+
+
+def _legend(points):
+    handles = []
+    for label in dict.fromkeys(p["label"] for p in points):
+        mark = MARKS.get(library(label), "o")
+        line = "" if library(label) or label == "direct" else "-"
+        size = 9 if not line else 4
+        handles.append(Line2D([], [], color=colour(label), marker=mark, ls=line, ms=size, label=label))
+    if any(p["mode"] == "unrolled" for p in points):
+        dashed = {"ls": "--", "marker": "o", "mfc": "white", "ms": 4}
+        handles.append(Line2D([], [], color="#666666", label="dashed: unrolled", **dashed))
+    return handles
+
+
+CACHES = {"L1": 48 << 10, "L2": 1 << 20, "L3": 32 << 20}
+
+
+def size(series):
+    """Time per unknown and iteration over the size of a sample, and over the batch."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    marks = dict(zip(series["size"], "osD^", strict=True))
+    shades = dict(zip(series["size"], ("#0072B2", "#009E73", "#E69F00", "#D55E00"), strict=True))
+    for axes, which, along in ((left, "size", "unknowns"), (right, "batch", "batch")):
+        for name, points in series[which].items():
+            x, y = zip(*((p[along], 1e9 * p["per_unknown"]) for p in points), strict=True)
+            axes.plot(x, y, marker=marks[name], color=shades[name], ms=4, lw=1.4, label=name)
+        axes.set(xscale="log", yscale="log")
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+    for name, held in CACHES.items():  # three vectors of float32 fill the cache
+        left.axvline(held / 12, color="#999999", lw=0.8, ls=":")
+        left.text(held / 13, 0.98, name, transform=left.get_xaxis_transform(), ha="right", va="top", color="#666666")
+    left.set(xlabel="unknowns of one sample (batch 1)", ylabel="ns per unknown and product with A")
+    right.set(xlabel="samples in the batch")
+    right.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def roofline(found):
+    """Arithmetic against arithmetic intensity, under the limits measured in the same run."""
+    limits = found["limits"]
+    figure = Figure(figsize=(9.2, 5), layout="constrained")
+    axes = figure.subplots()
+    intensity = np.geomspace(0.05, 10, 50)
+    for (level, bandwidth), line in zip(limits["gb_per_s"].items(), ("-", "--", "-.", ":"), strict=True):
+        axes.plot(intensity, np.minimum(limits["gflops"], bandwidth * intensity), color="#999999", ls=line, lw=1.2,
+                  label=f"{level}: {bandwidth:.0f} GB/s")  # fmt: skip
+    axes.axhline(limits["gflops"], color="#222222", lw=1, label=f"arithmetic: {limits['gflops']:.0f} GFLOP/s")
+    marks = dict(zip(dict.fromkeys(p["problem"] for p in found["points"]), "osD^vP", strict=False))
+    for p in found["points"]:
+        axes.plot(p["gflops"] / p["gb_per_s"], p["gflops"], marks[p["problem"]], color=colour(p["label"]), ms=8,
+                  mec="white", label=f"{p['problem']}: {p['label']}")  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="operations per byte of vectors read or written", ylabel="GFLOP/s")
+    axes.grid(alpha=0.3, which="both", lw=0.4)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
+    return figure
+
+
+def change_of_k(found):
+    """Bars: the first call with a new K, and a later one."""
+    names = list(dict.fromkeys((p["problem"], p["label"]) for p in found))
+    figure = Figure(figsize=(9.2, 1.2 + 0.42 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    for at, name in enumerate(reversed(names)):
+        points = [p for p in found if (p["problem"], p["label"]) == name][1:]  # the first K of all warms up
+        first, later = (1e3 * float(np.median([p[key] for p in points])) for key in ("first_seconds", "later_seconds"))
+        axes.barh(at, first, color="#D55E00", height=0.7)
+        axes.barh(at, later, color="#0072B2", height=0.7)
+        axes.text(first, at, f" {first:,.0f} ms" if first > 10 else f" {first:.2g} ms", va="center", fontsize=9)
+    axes.set_yticks(range(len(names)), [f"{problem}: {label}" for problem, label in reversed(names)])
+    axes.set(xscale="log", xlabel="ms, solve and gradient of a batch of 25 (median over five changes)")
+    axes.margins(x=0.15)
+    axes.spines[["top", "right"]].set_visible(False)
+    handles = [Line2D([], [], color=c, lw=8, label=text)
+               for c, text in (("#D55E00", "first call with a new K"), ("#0072B2", "the next call"))]  # fmt: skip
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def training(found):
+    """An update in parts: the network with its optimiser, and what the physics adds."""
+    names = [f"{p['scene']}, K = {p['k']}" for p in found]
+    figure = Figure(figsize=(9.2, 1.2 + 0.4 * len(found)), layout="constrained")
+    axes = figure.subplots()
+    for at, p in enumerate(reversed(found)):
+        added = 100 * (p["update_seconds"] / p["network_seconds"] - 1)
+        axes.barh(at, 100, color="#999999", height=0.7)
+        axes.barh(at, added, left=100, color="#D55E00", height=0.7)
+        text = f" {added:+.1f} %, network {1e3 * p['network_seconds']:.3g} ms"
+        axes.text(100 + max(0, added), at, text, va="center", fontsize=9)
+    axes.set_yticks(range(len(found)), list(reversed(names)))
+    axes.set(xlabel="% of the update without physics", xlim=(0, None))
+    axes.margins(x=0.3)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure

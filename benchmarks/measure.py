@@ -1,0 +1,28 @@
+"""Times of calls, side by side: all in turn, many rounds, minimum and median."""
+
+import statistics
+import time
+
+ROUNDS = 5
+SAMPLE_SECONDS = 0.02  # what a reading takes at least; a call is repeated to reach it
+
+
+def interleaved(calls, rounds=ROUNDS, sample_seconds=SAMPLE_SECONDS):
+    """Seconds a call, {name: {"min": …, "median": …}}, of callables {name: call} that end when their work
+    has ended. Neighbours on the machine disturb all of them alike."""
+    repeats = {}
+    for name, call in calls.items():
+        call()  # warm-up: caches, workspaces, compilers
+        repeats[name] = max(1, round(sample_seconds / max(_seconds(call, 1), 1e-7)))
+    readings = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            readings[name].append(_seconds(call, repeats[name]))
+    return {name: {"min": min(r), "median": statistics.median(r)} for name, r in readings.items()}
+
+
+def _seconds(call, repeats):
+    started = time.perf_counter()
+    for _ in range(repeats):
+        call()
+    return (time.perf_counter() - started) / repeats

@@ -1,0 +1,31 @@
+"""Checkpoints: a training kept while it runs, so that a killed one goes on from its last interval."""
+
+import io
+import json
+
+import torch
+
+from prdp_torch import _C
+
+
+class Checkpoint(_C.Checkpoint):
+    """The file of one training. csrc/prdp/scenes/checkpoint.h says when one is due and what makes it valid.
+
+    Args:
+        path: of the file; it is written to a temporary name first.
+        settings: all that the training depends on; a file of other settings is not read.
+    """
+
+    def __init__(self, path, **settings):
+        super().__init__(str(path), json.dumps({"trainer": "Python", **settings}))
+
+    def save(self, state):
+        """Replace the file by this state: tensors, state_dicts and plain values. ValueError if it cannot be written."""
+        content = io.BytesIO()
+        torch.save(state, content)
+        self.write(content.getvalue())
+
+    def load(self):
+        """The state last saved, None where there is none of these settings. ValueError for a damaged file."""
+        content = self.read()
+        return None if content is None else torch.load(io.BytesIO(content), weights_only=True)

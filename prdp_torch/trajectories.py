@@ -1,0 +1,82 @@
+"""What trained networks do from the validation samples on, beside the reference: the arrays behind the
+pictures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from prdp_torch import _C, fields, records
+from prdp_torch.networks import make_network
+from prdp_torch.training import error, propagator
+
+_FURTHER = 4  # the pictures go on to this many times the step of the metric
+
+
+@dataclass
+class Course:
+    """One way of stepping on from the validation samples."""
+
+    title: str
+    kind: str
+    """Of the row; or "coarse", the coarse solver without a network."""
+    states: torch.Tensor
+    """(samples, steps + 1, channels, *shape), the start included; with the first seed's network."""
+    errors: np.ndarray
+    """(seeds, steps), after each step, as the validation metric measures them."""
+
+
+@dataclass
+class Trajectories:
+    reference: torch.Tensor
+    """(samples, steps + 1, channels, *shape), as `_C.validation_trajectories` makes them."""
+    courses: list
+    missing: list
+    """Titles of the trainings that left no weights, or diverged."""
+
+
+def collect(scene, rows, folder, on_data=None):
+    """Follow the validation samples with the networks of converged training and of PRDP, whose weights lie
+    beside their records in `folder`. None for a task without a network, or if there are no weights at all.
+
+    on_data: called while the reference is made with (steps of a sample done, all of them).
+    """
+    if scene.task == "parameters":
+        return None
+    rows = [row for row in rows if row.kind in ("converged", "prdp")]
+    networks = {row.label: _networks(scene, row, folder) for row in rows}
+    if not any(networks.values()):
+        return None
+    reference = _C.validation_trajectories(scene, _FURTHER * scene.data.valid_steps, on_data)
+    courses = [
+        _follow(scene, row.title, row.kind, networks[row.label], reference) for row in rows if networks[row.label]
+    ]
+    if scene.task == "corrector":
+        courses.insert(0, _follow(scene, "coarse solver alone", "coarse", [torch.zeros_like], reference))
+    return Trajectories(reference, courses, [row.title for row in rows if not networks[row.label]])
+
+
+def field(scene, states):
+    """What the pictures show of states (time, channels, *shape), as (time, *shape): the vorticity of a flow,
+    else the first component."""
+    if scene.physics.equation == "navier_stokes":
+        states = fields.curl(states)
+    return states[:, 0]
+
+
+def _networks(scene, row, folder):
+    """The networks of the seeds that did not diverge and whose weights are there."""
+    paths = [(seed, folder / row.label / f"seed_{seed}.pt") for seed in range(len(row.curves))]
+    return [
+        records.read_weights(path, make_network(scene, seed))
+        for seed, path in paths
+        if path.exists() and "diverged" not in row.curves[seed]
+    ]
+
+
+def _follow(scene, title, kind, networks, reference):
+    steps = reference.shape[1] - 1
+    with torch.no_grad():
+        runs = [fields.rollout(propagator(scene, network), reference[:, 0], steps) for network in networks]
+    errors = [[error(scene, run[:, n], reference[:, n]) for n in range(1, steps + 1)] for run in runs]
+    return Course(title, kind, runs[0], np.array(errors))

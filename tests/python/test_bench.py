@@ -1,0 +1,96 @@
+"""The benchmarks: what they call the truth, the products they count, and that all of it runs."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import dense_burgers, dense_navier_stokes
+
+import prdp_torch as prdp
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+from benchmarks import measure, ours, problems  # noqa: E402
+from benchmarks.peers import stencils, torch_eager  # noqa: E402
+
+SMALL = {
+    "heat_1d": lambda: problems.heat((7,), 5, batch=2),
+    "heat_3d": lambda: problems.heat((3, 4, 5), 5, batch=2),
+    "burgers_1d": lambda: problems.burgers((9,), 4, batch=2),
+    "navier_stokes": lambda: problems.navier_stokes((6, 4), 3, batch=2),
+}
+small = pytest.mark.parametrize("name", SMALL)
+
+
+def dense(problem, sample):
+    winds = None if problem.winds is None else problem.winds[sample].double().numpy()
+    if problem.name.startswith("heat"):
+        return prdp.operators.Heat(problem.shape, problem.nu, problem.dt).dense().numpy()
+    return (dense_burgers if problem.name == "burgers_1d" else dense_navier_stokes)(winds, problem.nu, problem.dt)
+
+
+@small
+def test_the_exact_answers_solve_the_dense_systems(name):
+    problem = SMALL[name]()
+    u, gradient = problem.exact
+    for i in range(2):
+        a = dense(problem, i)
+        np.testing.assert_allclose(a @ u[i].flatten().numpy(), problem.b[i].flatten().double().numpy(), atol=1e-6)
+        np.testing.assert_allclose(a.T @ gradient[i].flatten().numpy(), problem.g[i].flatten().numpy(), atol=1e-6)
+    residual, error = problem.errors(u.float(), 1.01 * gradient)
+    assert residual < 1e-5 and error == pytest.approx(0.01, rel=1e-6)
+
+
+@small
+def test_the_stencils_of_the_peers_are_the_operators(name):
+    problem = SMALL[name]()
+    stencil = stencils.make(problem, torch_eager.Backend, torch.from_numpy)
+    v = torch.randn_like(problem.b)
+    for applied, matrix in ((stencil.apply(v), dense), (stencil.transpose(v), lambda *of: dense(*of).T)):
+        for i in range(2):
+            expected = matrix(problem, i) @ v[i].flatten().double().numpy()
+            np.testing.assert_allclose(applied[i].flatten(), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+@small
+def test_torch_eager_runs_the_same_iteration(name):
+    problem = SMALL[name]()
+    (entry,) = torch_eager.entries(problem)
+    solver, _ = ours.methods(problem)[entry.same_as]
+    forward, both = entry.prepare(problem.k)
+    u, gradient = both()
+    expected_u, expected_gradient = ours.calls(problem, solver(problem.k), "implicit")[1]()
+    torch.testing.assert_close(u, expected_u, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(gradient, expected_gradient, rtol=1e-3, atol=1e-3)
+    assert torch.equal(forward(), u)
+
+
+def test_readings_are_taken_in_turn():
+    order = []
+    seconds = measure.interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, 0.0)
+    assert order == ["a", "a", "b", "b", *"ababab"]
+    assert all(0 <= reading["min"] <= reading["median"] for reading in seconds.values())
+
+
+def test_all_suites_run_and_leave_a_page(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "prdp_torch.cli", "bench", "roofline", "training", "--quick", "--out", tmp_path],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "page.html").read_text()
+    assert "limits of this machine" in page and page.count("<figure>") == 2
+    found = json.loads((tmp_path / "roofline.json").read_text())
+    assert found["machine"]["threads"] == 1
+    for point in found["roofline"]["points"]:
+        assert 0 < point["residual"] < 1 and 0 < point["gflops"] < found["roofline"]["limits"]["gflops"]
+
+
+def test_an_unknown_suite_is_refused():
+    done = subprocess.run([sys.executable, "-m", "prdp_torch.cli", "bench", "speed"], cwd=ROOT, capture_output=True,
+                          text=True)  # fmt: skip
+    assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, size" in done.stderr

@@ -1,0 +1,320 @@
+"""Trainings that are stopped and go on: the same curves, bit for bit, as of those that were left alone."""
+
+import io
+import json
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from signal import SIGINT, SIGKILL, SIGTERM
+
+import pytest
+import torch
+from helpers import tiny, written
+
+import prdp_torch as prdp
+from prdp_torch import compare, records, scenes
+from prdp_torch.checkpoint import Checkpoint
+from prdp_torch.training import Refinement, train
+
+ROOT = Path(__file__).parents[2]
+TRAINERS = {
+    "python": [sys.executable, "-c", "from prdp_torch.cli import main; main()", "train"],
+    "cpp": [ROOT / "build" / "prdp_train"],
+}
+
+
+@pytest.fixture(autouse=True)
+def environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs
+    monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
+
+
+def scene_of(task, tmp_path):
+    """The path of a scene of this task."""
+    if task == "corrector":
+        return tiny(tmp_path)
+    return written(tmp_path, scene={"emulator": "heat_1d", "parameters": "poisson_1p"}[task])
+
+
+def without_seconds(curves):
+    return {name: values for name, values in curves.items() if name != "seconds"}
+
+
+# ---- programs that are killed
+
+
+def start(trainer, scene, out, *arguments):
+    command = [*TRAINERS[trainer], scene, "--out", out, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def run(*arguments):
+    """Exit status and errors of a trainer that is left alone."""
+    process = start(*arguments)
+    _, errors = process.communicate(timeout=300)
+    return process.returncode, errors
+
+
+def stop(process, checkpoint, signal):
+    """Send the signal once a few checkpoints were written; the exit status."""
+    seen = set()
+    while len(seen) < 4:
+        assert process.poll() is None, process.communicate()
+        if checkpoint.exists():
+            seen.add(checkpoint.stat().st_mtime_ns)
+        time.sleep(0.001)
+    process.send_signal(signal)
+    process.communicate(timeout=300)
+    return process.returncode
+
+
+def seconds_in(trainer, checkpoint):
+    """Of the intervals that it holds."""
+    state = io.BytesIO(checkpoint.read_bytes().split(b"\n", 2)[2])  # behind two lines of text
+    if trainer == "python":
+        return torch.load(state, weights_only=True)["curves"]["seconds"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return torch.jit.load(state).seconds
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize(
+    "task, intervals, signals",
+    [("emulator", 150, [SIGKILL, SIGTERM, SIGINT]), ("parameters", 500, [SIGKILL]), ("corrector", 40, [SIGKILL])],
+)
+def test_a_killed_training_goes_on_bit_for_bit(tmp_path, trainer, task, intervals, signals):
+    scene = scene_of(task, tmp_path)
+    assert run(trainer, scene, tmp_path / "alone", "--intervals", intervals)[0] == 0
+    alone = json.loads((tmp_path / "alone/prdp/seed_0.json").read_text())["curves"]
+    assert len(set(alone["max_iter"])) > 1  # the controller has something to remember
+
+    record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
+    arguments = (trainer, scene, tmp_path / "killed", "--intervals", intervals, "--resume")
+    kept = []
+    for signal in signals:
+        assert stop(start(*arguments), checkpoint, signal) == (130 if signal == SIGINT else -signal)
+        assert not record.exists()
+        before, kept = kept, seconds_in(trainer, checkpoint)
+        assert kept[: len(before)] == before and len(before) < len(kept) < intervals
+    assert run(*arguments)[0] == 0
+    curves = json.loads(record.read_text())["curves"]
+    assert without_seconds(curves) == without_seconds(alone)
+    assert curves["seconds"][: len(kept)] == kept and len(curves["seconds"]) == intervals
+    assert record.exists() and not checkpoint.exists() and not list(record.parent.glob("*.part"))
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_damaged_checkpoint_is_one_line_and_harms_nothing(tmp_path, trainer):
+    checkpoint = tmp_path / "here/prdp/seed_0.checkpoint"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_text("nothing of the kind\n")
+    arguments = (trainer, scene_of("emulator", tmp_path), tmp_path / "here", "--intervals", 2)
+    status, errors = run(*arguments, "--resume")
+    assert status == 2 and checkpoint.read_text() == "nothing of the kind\n"
+    assert errors.endswith(f"checkpoint: '{checkpoint}' is damaged; delete it, and its training starts afresh\n")
+    assert errors.count("\n") == 1
+    status, errors = run(*arguments)
+    assert status == 0 and (checkpoint.parent / "seed_0.json").exists() and not checkpoint.exists(), errors
+
+
+def test_a_checkpoint_of_other_settings_is_not_gone_on_from_in_cpp(tmp_path):
+    scene, out = scene_of("emulator", tmp_path), tmp_path / "killed"
+    stop(start("cpp", scene, out, "--intervals", 1000), out / "prdp/seed_0.checkpoint", SIGKILL)
+    assert run("cpp", scene, out, "--intervals", 3, "--resume")[0] == 0
+    assert run("cpp", scene, tmp_path / "alone", "--intervals", 3)[0] == 0
+    there, here = (json.loads((tmp_path / run / "prdp/seed_0.json").read_text()) for run in ("killed", "alone"))
+    assert without_seconds(there["curves"]) == without_seconds(here["curves"])
+
+
+# ---- trainings that are interrupted in this process
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop_after(interval):
+    def on_interval(done, metric, k):
+        if done == interval:
+            raise Stopped
+
+    return on_interval
+
+
+class Linear(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer = torch.nn.Linear(30, 30)
+
+    def forward(self, u):
+        return self.layer(u)
+
+
+@pytest.mark.parametrize(
+    "task, refine, make_network",
+    [
+        ("emulator", lambda scene: Refinement.prdp(scene, growth=1.5), None),
+        ("emulator", Refinement.prdp, Linear),
+        ("emulator", lambda scene: Refinement.schedule(2, 3, 25), None),
+        ("emulator", lambda scene: Refinement.exact(), None),
+        ("parameters", lambda scene: Refinement.schedule(25, 6, 600), None),
+        ("corrector", lambda scene: Refinement.constant(2), None),
+    ],
+)
+def test_every_kind_of_training_goes_on_from_any_interval(tmp_path, task, refine, make_network):
+    scene = scenes.load(scene_of(task, tmp_path))
+    scene.training.intervals = 12
+
+    def curves(checkpoint=None, on_interval=None):
+        network = make_network() if make_network else None
+        return train(scene, refine(scene), network=network, on_interval=on_interval, checkpoint=checkpoint)
+
+    alone = curves()
+    checkpoint = Checkpoint(tmp_path / "kept")
+    reports = []
+    for interval in (1, 2, 6, 11):
+        with pytest.raises(Stopped):
+            curves(checkpoint, stop_after(interval))
+    assert without_seconds(curves(checkpoint, lambda *report: reports.append(report))) == without_seconds(alone)
+    assert [done for done, _, _ in reports] == [11, 12] and reports[0][1] == alone["metric"][11]
+
+
+def recorded(scene, folder, resume, on_interval=lambda *report: None, seed=0):
+    environment = records.environment()
+    return compare.run_one(scene, "prdp", Refinement.prdp(scene), seed, folder, environment, resume, on_interval)
+
+
+def test_only_resume_with_the_same_settings_goes_on(tmp_path):
+    folder, scene = tmp_path / "here", scenes.load("heat_1d")
+    scene.training.intervals = 8
+
+    def first_report(**changes):
+        """The interval that a training starts with that follows a stopped one."""
+        scene.training.intervals = 8
+        with pytest.raises(Stopped):
+            recorded(scene, folder, False, stop_after(5))
+        scene.training.intervals = changes.pop("intervals", 8)
+        reports = []
+        recorded(scene, folder, changes.pop("resume", True), lambda done, *_: reports.append(done), **changes)
+        checkpoint = folder / "prdp/seed_0.checkpoint"
+        assert checkpoint.exists() == ("seed" in changes)  # another training's is left alone
+        (folder / "prdp/seed_0.json").unlink(missing_ok=True)
+        return reports[0]
+
+    assert first_report() == 5
+    assert first_report(resume=False) == first_report(intervals=9) == first_report(seed=1) == 1
+
+
+def test_a_finished_record_needs_no_checkpoint(tmp_path):
+    scene = scenes.load("heat_1d")
+    scene.training.intervals = 2
+    curves = recorded(scene, tmp_path, False)
+    assert sorted(path.name for path in (tmp_path / "prdp").iterdir()) == ["seed_0.json", "seed_0.pt"]
+    assert recorded(scene, tmp_path, True) == curves
+    (tmp_path / "prdp/seed_0.json").write_text("{")
+    with pytest.raises(ValueError, match=r"record: '.*seed_0.json' is damaged; delete it, and its training is run"):
+        recorded(scene, tmp_path, True)
+
+
+def test_a_loop_of_ones_own_goes_on_as_the_readme_says(tmp_path):
+    class Loop:
+        def __init__(self):
+            torch.manual_seed(0)
+            self.heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
+            self.network = Linear()
+            self.optimiser = torch.optim.Adam(self.network.parameters(), lr=3e-3)
+            self.controller = prdp.PRDPController([self.heat], window=1, delta=2, tau_step=0.9)
+            self.u0 = torch.randn(40, 1, 30, generator=torch.Generator().manual_seed(1))
+
+        def epochs(self, count):
+            for _ in range(count):
+                for batch in torch.randperm(40).split(10):
+                    self.optimiser.zero_grad()
+                    loss = (self.heat(self.network(self.u0[batch])) - 0.5 * self.u0[batch]).square().mean()
+                    loss.backward()
+                    self.optimiser.step()
+                self.controller.step(loss.detach())
+
+    whole = Loop()
+    whole.epochs(20)
+    first = Loop()
+    first.epochs(8)
+    parts = {"network": first.network, "optimiser": first.optimiser, "controller": first.controller}
+    states = {name: part.state_dict() for name, part in parts.items()}
+    torch.save({**states, "random": torch.get_rng_state()}, tmp_path / "training.pt")
+
+    rest = Loop()
+    saved = torch.load(tmp_path / "training.pt")
+    rest.network.load_state_dict(saved["network"])
+    rest.optimiser.load_state_dict(saved["optimiser"])
+    rest.controller.load_state_dict(saved["controller"])
+    torch.set_rng_state(saved["random"])
+    assert rest.heat.max_iter == first.heat.max_iter > 1
+    rest.epochs(12)
+    assert rest.controller.history == whole.controller.history and rest.heat.max_iter > first.heat.max_iter
+    assert torch.equal(rest.network.layer.weight, whole.network.layer.weight)
+
+
+# ---- the file
+
+
+def test_a_state_comes_back_and_another_settings_does_not(tmp_path):
+    path = tmp_path / "kept"
+    checkpoint = Checkpoint(path, seed=0, text="two\nlines")
+    assert checkpoint.load() is None
+    state = {"u": torch.tensor([1.0, float("nan")]), "k": 3, "curve": [0.1, float("inf")], "history": [(1.0, True)]}
+    checkpoint.save(state)
+    found = Checkpoint(path, seed=0, text="two\nlines").load()
+    assert torch.equal(found.pop("u").isnan(), state.pop("u").isnan()) and found == state
+    assert Checkpoint(path, seed=1, text="two\nlines").load() is None
+    assert list(tmp_path.iterdir()) == [path]
+    checkpoint.remove()
+    checkpoint.remove()
+    assert checkpoint.load() is None and list(tmp_path.iterdir()) == []
+
+
+def test_a_changed_byte_or_a_missing_end_is_found(tmp_path):
+    path = tmp_path / "kept"
+    checkpoint = Checkpoint(path, seed=0)
+    checkpoint.save({"weight": torch.arange(6.0)})
+    whole = path.read_bytes()
+    changed = (whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :] for i in range(0, len(whole), 3))
+    for damaged in (*changed, *(whole[:n] for n in range(0, len(whole), 50)), whole + b"\0"):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=f"checkpoint: '{path}' is damaged; delete it"):
+            checkpoint.load()
+    path.write_bytes(whole)
+    assert checkpoint.load()["weight"].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path):
+    path = tmp_path / "kept"
+    checkpoint = Checkpoint(path, seed=0)
+    checkpoint.save(1)
+    (tmp_path / "kept.part").mkdir()
+    with pytest.raises(ValueError, match=f"cannot write '{path}'"):
+        checkpoint.save(2)
+    assert checkpoint.load() == 1
+
+
+def test_checkpoints_are_ten_seconds_apart_or_as_the_environment_says(tmp_path, monkeypatch):
+    assert Checkpoint(tmp_path / "kept").due()
+    monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0.05")
+    checkpoint = Checkpoint(tmp_path / "kept")
+    time.sleep(0.06)
+    assert checkpoint.due()
+    monkeypatch.delenv("PRDP_CHECKPOINT_SECONDS")
+    assert not Checkpoint(tmp_path / "kept").due()
+    scene = scenes.load("heat_1d")
+    scene.training.intervals = 3
+    train(scene, Refinement.prdp(scene), checkpoint=Checkpoint(tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
+    for wrong in ("soon", "-1", "nan"):
+        monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", wrong)
+        with pytest.raises(ValueError, match=f"PRDP_CHECKPOINT_SECONDS: expected a number >= 0, got '{wrong}'"):
+            Checkpoint(tmp_path / "kept")
