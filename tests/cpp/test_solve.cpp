@@ -81,7 +81,7 @@ TEST(Solve, CountsProductsWithTheOperator) {
   EXPECT_EQ(products(Method::kSteepestDescent, 10, 0.0), 11);
   EXPECT_EQ(products(Method::kConjugateGradient, 10, 0.0), 11);
   EXPECT_EQ(products(Method::kDirect, 1, 0.0), 1);
-  EXPECT_EQ(products(Method::kJacobi, 10, 1e-30), 10);
+  EXPECT_EQ(products(Method::kJacobi, 10, 1e-30), 11);
 }
 
 TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {

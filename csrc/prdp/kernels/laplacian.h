@@ -67,16 +67,18 @@ class Laplacian {
   /// c = D⁻¹ b
   void divide_by_diagonal(const T* b, T* c) const { loops_.scale(T(1) / centre_, b, c, length()); }
 
-  static constexpr bool kSweepsContract = true;
-  /// n sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use.
-  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n) const {
-    if (loops_.sweeps[Dim - 1](stencil(sweep_weights_), c, x, y, n, nullptr) != x) std::swap(x, y);
+  /// n sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use. With omega, one for each,
+  /// Chebyshev's x ← y + omega (that - y), where y holds the iterate before x, before and after.
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega = nullptr) const {
+    if (loops_.sweeps[Dim - 1](stencil(sweep_weights_), c, x, y, n, omega) != x) std::swap(x, y);
   }
   /// One of them, from x to y; returns ‖b - A x‖².
-  T jacobi_sweep(const T* c, const T* x, T* y) const {
-    const T change2 = loops_.sweep_and_measure[Dim - 1](stencil(sweep_weights_), c, x, y, nullptr);
+  T jacobi_sweep(const T* c, const T* x, T* y, const T* omega = nullptr) const {
+    const T change2 = loops_.sweep_and_measure[Dim - 1](stencil(sweep_weights_), c, x, y, omega);
     return centre_ * centre_ * change2;
   }
+  /// The spectral radius of I - D⁻¹A.
+  double radius() const { return jacobi_radius(parameters_); }
 
  private:
   PaddedStencil<T> stencil(const std::vector<T>& weights) const {

@@ -15,9 +15,10 @@ template <class Kernel>
 inline constexpr bool kHasNullSpace =
     requires(const Kernel& a, typename Kernel::Scalar* v) { a.project(v); };
 
-/// Jacobi's iteration matrix is symmetric with its eigenvalues within the unit circle.
+/// Whether the spectrum of I - D⁻¹A is known; there it is symmetric, so that norms of Jacobi's residuals
+/// are a convex sequence on a logarithmic scale.
 template <class Kernel>
-inline constexpr bool kSweepsContract = requires { Kernel::kSweepsContract; };
+inline constexpr bool kHasSpectrum = requires(const Kernel& kernel) { kernel.radius(); };
 
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {

@@ -65,17 +65,25 @@ class SampleSpace {
     kernel_->apply(v, out);
   }
   void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
-  /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖².
-  void jacobi_sweeps(const T* c, Vector& x, Vector& next, int64_t n) {
+  /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
+  /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
+  void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
     state_->applications += n;
-    kernel_->jacobi_sweeps(c, x, next, n);
+    if constexpr (kernels::kHasSpectrum<Kernel>) kernel_->jacobi_sweeps(c, x, next, n, omega);
+    else kernel_->jacobi_sweeps(c, x, next, n);
   }
-  Scalar jacobi_sweep(const T* c, const T* x, Vector next) {
+  Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
     ++state_->applications;
-    return kernel_->jacobi_sweep(c, x, next);
+    if constexpr (kernels::kHasSpectrum<Kernel>) return kernel_->jacobi_sweep(c, x, next, omega);
+    else return kernel_->jacobi_sweep(c, x, next);
+  }
+  /// The square of the spectral radius of I - D⁻¹A; solve() sees to it that there is one.
+  Scalar radius2() const {
+    if constexpr (kernels::kHasSpectrum<Kernel>) return static_cast<T>(kernel_->radius() * kernel_->radius());
+    else return 0;
   }
   /// Whether the norms of Jacobi's residuals are a convex sequence on a logarithmic scale.
-  static constexpr bool sweeps_contract() { return kernels::kSweepsContract<Kernel>; }
+  static constexpr bool sweeps_contract() { return kernels::kHasSpectrum<Kernel>; }
   /// r = b - A x, within the range of A; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(x, r);

@@ -52,10 +52,11 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel();
-  const bool has_loops = !std::holds_alternative<std::monostate>(parameters) &&
-                         request.method != Method::kGmresStokes;
-  if (!b.is_cpu() || !has_loops)
-    return solve_with_tensors(a, b, request);
+  const bool has_loops =
+      request.method == Method::kChebyshev ? std::holds_alternative<kernels::LaplacianParameters>(parameters)
+                                           : !std::holds_alternative<std::monostate>(parameters) &&
+                                                 request.method != Method::kGmresStokes;
+  if (!b.is_cpu() || !has_loops) return solve_with_tensors(a, b, request);
   return std::visit(
       [&](const auto& p) -> SolveResult {
         if constexpr (std::is_same_v<std::decay_t<decltype(p)>, std::monostate>) {

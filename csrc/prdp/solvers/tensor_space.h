@@ -31,7 +31,12 @@ class TensorSpace {
   void fill_zero(Vector& v) { v = at::zeros_like(b_); }
   void copy(const Vector& from, Vector& to) { to = keep_frozen(from, to); }
   void assign(const Scalar& from, Scalar& to) { to = keep_frozen(from, to); }
-  void advance(Vector& x, const Vector& next) { x = keep_frozen(next, x); }
+  /// x takes the value of next, and next that of x.
+  void advance(Vector& x, Vector& next) {
+    const auto before = x;
+    x = keep_frozen(next, x);
+    next = before;
+  }
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
   void xpby(const Vector& x, const Scalar& beta, Vector& y) { y = keep_frozen(x + beta * y, y); }
   Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
@@ -53,18 +58,19 @@ class TensorSpace {
     diagonal_ = a_.diagonal().to(b_.options());
     c = b / diagonal_;
   }
-  void jacobi_sweeps(const Vector& c, Vector& x, Vector& next, int64_t n) {
-    for (; n > 0; --n) {
-      next = x + jacobi_change(c, x);
+  void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
+    for (int64_t s = 0; s < n; ++s) {
+      next = swept(x, jacobi_change(c, x), next, omega ? omega + s : nullptr);
       advance(x, next);
     }
   }
-  Scalar jacobi_sweep(const Vector& c, const Vector& x, Vector& next) {
+  Scalar measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega) {
     const auto change = jacobi_change(c, x);
-    next = x + change;
+    next = swept(x, change, next, omega);
     const auto r = diagonal_ * change;
     return dot(r, r);
   }
+  Scalar radius2() const { return a_.jacobi_radius().square(); }
   static constexpr bool sweeps_contract() { return false; }  // not known of the operator
   Scalar residual(const Vector& x, Vector& r) {
     Vector product;
@@ -125,6 +131,9 @@ class TensorSpace {
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
+  }
+  static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
+    return omega ? before + *omega * (x + change - before) : x + change;
   }
   Vector jacobi_change(const Vector& c, const Vector& x) {
     Vector product;
