@@ -69,11 +69,12 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const at::Tensor
                          iterations,
                          status};
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
-  if (unrolled.solver.method == Method::kJacobi && for_b_alone) {
-    // K sweeps from zero are u = Σ_k (I - D⁻¹A)ᵏ D⁻¹ b; transposed, that is K sweeps with Aᵀ.
+  const auto method = unrolled.solver.method;
+  if ((method == Method::kJacobi || method == Method::kChebyshev) && for_b_alone) {
+    // K sweeps from zero are u = p(I - D⁻¹A) D⁻¹ b with a polynomial p; transposed, that is K sweeps with Aᵀ.
     auto transpose = unrolled.a;
     transpose.transposed = !transposed;
-    const SolveRequest request{Method::kJacobi, 0, 0.0, restart, iterations};
+    const SolveRequest request{method, 0, 0.0, restart, iterations};
     std::vector<at::Tensor> gradients{prdp::solve(*make_operator(transpose), cotangent, request).u};
     add_derivative_at_zero(gradients, cotangent, unrolled, needed);
     return gradients;

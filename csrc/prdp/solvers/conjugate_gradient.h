@@ -16,8 +16,8 @@ class ConjugateGradientMethod {
     rr_ = pp_ = space_.b2();
   }
   void step() {
-    space_.apply(p_, q_);
-    const auto alpha = space_.step_length(rr_, space_.dot(p_, q_), pp_, space_.dot(q_, q_));
+    const auto [pq, qq] = space_.apply_with_dots(p_, q_);
+    const auto alpha = space_.step_length(rr_, pq, pp_, qq);
     const auto rr = space_.descend(alpha, p_, q_, x, r_);
     const auto beta = space_.ratio(rr, rr_);
     space_.xpby(r_, beta, p_);

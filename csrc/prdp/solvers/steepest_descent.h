@@ -15,8 +15,8 @@ class SteepestDescentMethod {
     rr_ = space_.b2();
   }
   void step() {
-    space_.apply(r_, q_);
-    const auto alpha = space_.step_length(rr_, space_.dot(r_, q_), rr_, space_.dot(q_, q_));
+    const auto [rq, qq] = space_.apply_with_dots(r_, q_);
+    const auto alpha = space_.step_length(rr_, rq, rr_, qq);
     rr_ = space_.descend(alpha, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
