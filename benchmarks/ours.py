@@ -29,6 +29,7 @@ def methods(problem):
         few = budgets(max(6, problem.k // 3))
         return {
             "Jacobi": (problem.solver, budgets(problem.k)),
+            "Chebyshev": (lambda k: prdp.Chebyshev(k, rtol=0.0), budgets(problem.k // 2)),
             "steepest descent": (lambda k: prdp.SteepestDescent(k, rtol=0.0), budgets(problem.k)),
             "CG": (lambda k: prdp.CG(k, rtol=0.0), few),
         } | exact

@@ -61,6 +61,7 @@ def _gmres(dim, problem):
 # Operations and vectors read or written, per unknown and iteration.
 COUNTS = {
     "Jacobi": lambda dim, problem: (2 * dim + 1, 3),
+    "Chebyshev": lambda dim, problem: (2 * dim + 4, 4),
     "steepest descent": lambda dim, problem: (2 * dim + 2 + 8, 8),
     "CG": lambda dim, problem: (2 * dim + 2 + 10, 9),
     "GMRES(2)": _gmres,

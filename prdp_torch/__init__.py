@@ -13,7 +13,7 @@ _load.check_torch()
 from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
-from prdp_torch.solvers import CG, GMRES, Direct, Jacobi, SteepestDescent  # noqa: E402
+from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent  # noqa: E402
 from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson, Stepper  # noqa: E402
 
 __version__ = _C.VERSION
@@ -22,6 +22,7 @@ __all__ = [
     "CG",
     "GMRES",
     "Burgers",
+    "Chebyshev",
     "Direct",
     "Heat",
     "Jacobi",

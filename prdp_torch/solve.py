@@ -80,7 +80,7 @@ def linear_solve(
         A: an operator of `prdp_torch.operators`, or a tensor (n, n) or (batch, n, n), dense or sparse CSR.
         b: (batch, channel, *shape) for stencil operators, (n,) or (batch, n) for matrices; float32 or
             float64, any strides.
-        solver: `Jacobi`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
         backward: "implicit", one adjoint solve with the same method: b̄ = λ with Aᵀλ = ū truncated like
             the primal, ḡ = -λᵀ ∂(A u)/∂g; "unrolled", the exact derivative of the iterations that ran;
             "none".

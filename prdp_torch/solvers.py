@@ -39,6 +39,14 @@ class Jacobi(Solver):
 
 
 @dataclass
+class Chebyshev(Solver):
+    """Chebyshev's semi-iteration on Jacobi's (Golub and Varga 1961): two to three times fewer iterations at
+    the same cost each, by weights from the spectrum, which is known of Heat and Poisson alone."""
+
+    method: ClassVar[str] = "chebyshev"
+
+
+@dataclass
 class SteepestDescent(Solver):
     """α = r·r / r·Ar; u += α r; r -= α A r. Fits definite operators of either sign."""
 

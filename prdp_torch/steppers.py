@@ -40,7 +40,7 @@ class Stepper(torch.nn.Module):
 
     Args of every stepper beside its physics:
         shape: grid of unknowns in the unit domain, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-        solver: `Jacobi`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
 
     Attributes:

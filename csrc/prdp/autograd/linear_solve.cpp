@@ -37,8 +37,8 @@ Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& 
   static const auto op = c10::Dispatcher::singleton()
                              .findSchemaOrThrow("prdp::linear_solve", "")
                              .typed<Signature>();
-  return call_with_options(op, o, b, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-                           at::ArrayRef<double>(a.parameters), a.transposed);
+  return call_with_options(op, o, b, at::TensorList(a.tensors), c10::string_view(a.kind),
+                           at::IntArrayRef(a.shape), at::ArrayRef<double>(a.parameters), a.transposed);
 }
 
 /// The op's arguments as structures; raises for names that do not exist.
@@ -53,7 +53,8 @@ c10::intrusive_ptr<Call> unpack(at::TensorList tensors, c10::string_view kind, a
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
 
-std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options) {
+std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b,
+                                           const SolveOptions& options) {
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);

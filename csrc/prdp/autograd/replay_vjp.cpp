@@ -19,24 +19,23 @@ class Replay {
 
   Replay(MakeOperator make, StepwiseSolve& solve, std::vector<at::Tensor> inputs, at::IntArrayRef needed,
          const at::Tensor& cotangent)
-      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)), needed_(needed) {
-    at::Tensor x_bar;
+      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)),
+        needed_(needed) {
     // u = P x / scale is linear in x, and its own transpose.
-    x_bar = solve_.scaled_back(*make_(tensors()), cotangent);
-    bars_.push_back(x_bar);
+    bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent));
   }
 
   void start() { now_ = {}, done_ = 0; }
   void save(int64_t slot) {
     if (static_cast<size_t>(slot) >= kept_.size()) kept_.resize(slot + 1);
-    kept_[slot] = {now_, done_};
+    kept_[slot] = now_;
   }
-  void load(int64_t slot) { std::tie(now_, done_) = kept_[slot]; }
+  void load(int64_t slot, int64_t k) { now_ = kept_[slot], done_ = k; }
   void step() { now_ = solve_.step(*make_(tensors()), inputs_[0], now_, done_++); }
 
   void step_back(int64_t slot, int64_t k) {
     std::vector<at::Tensor> leaves, inputs = inputs_;
-    State before = kept_[slot].first;
+    State before = kept_[slot];
     for (auto& part : before) leaves.push_back(part = part.detach().requires_grad_());
     for (size_t i = 0; i < inputs.size(); ++i)
       if (needed_[i] || i == 0) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
@@ -70,7 +69,7 @@ class Replay {
   at::IntArrayRef needed_;
   State now_;
   int64_t done_ = 0;
-  std::vector<std::pair<State, int64_t>> kept_;
+  std::vector<State> kept_;
   std::vector<at::Tensor> bars_;  // of the state, x first
 };
 

@@ -3,14 +3,14 @@
 namespace prdp {
 
 template <class T>
-void reverse_range(const DenseParameters& a, const DenseParameters& transpose, const ReverseBatch<T>& batch, int64_t begin,
-                   int64_t end) {
+void reverse_range(const DenseParameters& a, const DenseParameters& transpose, const ReverseBatch<T>& batch,
+                   int64_t begin, int64_t end) {
   detail::reverse_range(a, transpose, batch, begin, end);
 }
 
 template <class T>
-void reverse_range(const CsrParameters& a, const CsrParameters& transpose, const ReverseBatch<T>& batch, int64_t begin,
-                   int64_t end) {
+void reverse_range(const CsrParameters& a, const CsrParameters& transpose, const ReverseBatch<T>& batch,
+                   int64_t begin, int64_t end) {
   detail::reverse_range(a, transpose, batch, begin, end);
 }
 

@@ -47,8 +47,8 @@ struct KeptIterates {
 
 /// A sample as a space for sweeps: what methods need, Aᵀ, and where states are kept.
 template <class Kernel>
-class SweepSpace : public SampleSpace<Kernel, void> {
-  using Base = SampleSpace<Kernel, void>;
+class SweepSpace : public SampleSpace<Kernel> {
+  using Base = SampleSpace<Kernel>;
 
  public:
   using T = typename Kernel::Scalar;
@@ -59,9 +59,8 @@ class SweepSpace : public SampleSpace<Kernel, void> {
     T lambda_scale, v_scale;
   };
   SweepSpace(const Kernel& a, const Kernel& transpose, kernels::Workspace<T>& workspace,
-             std::array<SampleState, 1>& states, KeptIterates<T>& kept, Gradient gradient)
-      : Base(a, nullptr, workspace, states), a_(a), transpose_(transpose), state_(states[0]), kept_(kept),
-        gradient_(gradient) {}
+             SampleState& state, KeptIterates<T>& kept, Gradient gradient)
+      : Base(a, workspace), a_(a), transpose_(transpose), state_(state), kept_(kept), gradient_(gradient) {}
 
   void axpy(T alpha, const T* x, T* y) { loops_.axpy(alpha, x, y, a_.length()); }
   void apply_transpose(const T* v, T* out) {
@@ -101,7 +100,8 @@ inline int64_t sweep_vectors_of(Method method, int64_t restart) {
 
 /// Runs the sweep of `method` with x̄ in the vector `x_bar`; returns where b̄ is.
 template <class Space, class T>
-T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpoints& plan, T** diagonal_bar) {
+T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpoints& plan,
+             T** diagonal_bar) {
   const auto run = [&](auto sweep) -> T* {
     run_back(sweep, plan);
     if constexpr (requires { sweep.diagonal_bar(); }) *diagonal_bar = sweep.diagonal_bar();
@@ -122,15 +122,15 @@ void reverse_sample(const Kernel& a, const Kernel& transpose, kernels::Workspace
   const T* b = batch.b + s * n;
   const T* cotangent = batch.cotangent + s * n;
   T* b_bar = batch.b_bar + s * n;
-  std::array<SampleState, 1> states;
+  SampleState state;
   const auto scale = kernels::power_of_two_scale(kernels::largest_magnitude(b, n));
   const auto bar_scale = kernels::power_of_two_scale(kernels::largest_magnitude(cotangent, n));
   std::optional<ProductRows> rows;
   if (batch.rows) rows.emplace(batch.rows(s));
-  SweepSpace<Kernel> space(a, transpose, workspace, states, kept, {rows ? &*rows : nullptr, bar_scale, scale});
+  SweepSpace<Kernel> space(a, transpose, workspace, state, kept, {rows ? &*rows : nullptr, bar_scale, scale});
   a.load(b, scale, space.b());
   space.project(space.b());
-  space.begin();
+  space.begin(state);
   T* x_bar = space.vector();
   a.load(cotangent, bar_scale, x_bar);
   space.project(x_bar);
@@ -142,7 +142,7 @@ void reverse_sample(const Kernel& a, const Kernel& transpose, kernels::Workspace
     a.store(diagonal_bar, T(1) / bar_scale, batch.diagonal_bar + s * n);
     for (int64_t i = 0; i < n; ++i) batch.diagonal_bar[s * n + i] /= scale;
   }
-  batch.applications[s] = states[0].applications;
+  batch.applications[s] = state.applications;
   if (rows) batch.take_gradients(s, rows->finish());
 }
 
@@ -157,8 +157,8 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
                        batch.method == Method::kConjugateGradient ? 2 : 1, a.length(), a.halo());
   for (int64_t s = begin; s < end; ++s) {
     // Zeros for the cotangents, and nothing left of a sample before that was not finite.
-    workspace.prepare(2 + vectors_of(batch.method, restart) + sweep_vectors_of(batch.method, restart), a.length(),
-                      a.halo());
+    workspace.prepare(2 + vectors_of(batch.method, restart) + sweep_vectors_of(batch.method, restart),
+                      a.length(), a.halo());
     if (batch.iterations[s] == 0) {
       std::fill_n(batch.b_bar + s * n, n, T(0));
       if (batch.diagonal_bar) std::fill_n(batch.diagonal_bar + s * n, n, T(0));
@@ -183,8 +183,8 @@ template <class T>
 void reverse_range(const CsrParameters& a, const CsrParameters& transpose, const ReverseBatch<T>& batch,
                    int64_t begin, int64_t end);
 template <class T>
-void reverse_range(const BurgersParameters& a, const BurgersParameters& transpose, const ReverseBatch<T>& batch,
-                   int64_t begin, int64_t end);
+void reverse_range(const BurgersParameters& a, const BurgersParameters& transpose,
+                   const ReverseBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>
 void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters& transpose,
                    const ReverseBatch<T>& batch, int64_t begin, int64_t end);
@@ -192,8 +192,8 @@ void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters
 namespace detail {
 
 template <class T, class Parameters>
-void reverse_range(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t begin,
-                   int64_t end) {
+void reverse_range(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch,
+                   int64_t begin, int64_t end) {
   with_kernel<T>(a, [&](const auto& kernel) {
     with_kernel<T>(transpose, [&](const auto& transposed) {
       if constexpr (std::is_same_v<decltype(kernel), decltype(transposed)>)

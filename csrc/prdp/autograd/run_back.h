@@ -24,11 +24,14 @@ struct Checkpoints {
 
 /// Runs the iterations of a sweep forward, keeping what `plan` says, and then back, one by one: whatever
 /// is kept, the arithmetic and so the result is the same to the last bit. A sweep has start(), step(),
-/// save(slot), load(slot), and step_back(slot, k): from the cotangents after iteration k, which starts
-/// from the state in the slot and has just been run again, to those before it.
+/// save(slot), load(slot, k) of what k iterations have made, and step_back(slot, k): from the cotangents
+/// after iteration k, which starts from the state in the slot and has just been run again, to those
+/// before it.
 template <class Sweep>
 void run_back(Sweep& sweep, const Checkpoints& plan) {
-  const auto length = [&](int64_t segment) { return std::min(plan.stride, plan.iterations - segment * plan.stride); };
+  const auto length = [&](int64_t segment) {
+    return std::min(plan.stride, plan.iterations - segment * plan.stride);
+  };
   sweep.start();
   for (int64_t segment = 0; segment < plan.segments(); ++segment) {
     sweep.save(plan.stride + segment);
@@ -36,15 +39,16 @@ void run_back(Sweep& sweep, const Checkpoints& plan) {
     for (int64_t i = 0; i < plan.stride; ++i) sweep.step();
   }
   for (int64_t segment = plan.segments() - 1; segment >= 0; --segment) {
-    sweep.load(plan.stride + segment);
+    sweep.load(plan.stride + segment, segment * plan.stride);
     for (int64_t i = 0; i < length(segment); ++i) {
       sweep.save(i);
       if (i + 1 < length(segment)) sweep.step();
     }
     for (int64_t i = length(segment) - 1; i >= 0; --i) {
-      sweep.load(i);
+      const int64_t k = segment * plan.stride + i;
+      sweep.load(i, k);
       sweep.step();
-      sweep.step_back(i, segment * plan.stride + i);
+      sweep.step_back(i, k);
     }
   }
 }

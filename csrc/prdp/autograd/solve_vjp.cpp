@@ -31,7 +31,8 @@ at::Tensor without_refused(const at::Tensor& cotangent, const at::Tensor& status
 
 /// Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Again differentiable: the solve is the same op.
 SolveVjp implicit(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
-                  const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
+                  const SolveOptions& options, at::IntArrayRef needed,
+                  decltype(linear_solve)& adjoint_solve) {
   auto transpose = a;
   transpose.transposed = !a.transposed;
   auto o = options;
@@ -62,7 +63,8 @@ SolveVjp unrolled(const at::Tensor& cotangent, const Solved& solved, const Opera
 }  // namespace
 
 SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
-                   const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
+                   const SolveOptions& options, at::IntArrayRef needed,
+                   decltype(linear_solve)& adjoint_solve) {
   if (options.on_failure != OnFailure::kRaise) cotangent = without_refused(cotangent, solved.status);
   if (options.backward == Backward::kUnrolled) return unrolled(cotangent, solved, a, options, needed);
   return implicit(cotangent, solved.u, a, options, needed, adjoint_solve);

@@ -18,8 +18,8 @@ void add_sample(at::Tensor& gradient, const at::Tensor& tensor, const at::Tensor
 
 /// ∂⟨D̄, D(g)⟩/∂g for the diagonal D of A, of the samples that took an iteration: a refused operator
 /// would send NaN even from behind zeros.
-void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagonal_bar, const UnrolledSolve& solve,
-                   at::IntArrayRef needed) {
+void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagonal_bar,
+                   const UnrolledSolve& solve, at::IntArrayRef needed) {
   const auto index = solve.iterations.gt(0).nonzero().flatten();
   if (index.numel() == 0) return;
   auto spec = solve.a;
@@ -54,8 +54,10 @@ void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<
 
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
   const auto method = solve.solver.method;
-  return b.is_cpu() && method != Method::kDirect && method != Method::kGmresStokes &&
-         !std::holds_alternative<std::monostate>(a.kernel());
+  // Chebyshev's weights depend on A too: autograd knows how.
+  const bool written_out =
+      method != Method::kDirect && method != Method::kGmresStokes && method != Method::kChebyshev;
+  return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel());
 }
 
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -73,7 +75,8 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
 
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t most = size == 0 ? 0 : iterations.max().item<int64_t>();
-  const int64_t grain = grain_size(unknowns, 4 * most * (solve.solver.method == Method::kGmres ? solve.solver.restart : 1));
+  const int64_t products = solve.solver.method == Method::kGmres ? solve.solver.restart : 1;
+  const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most * products);
   const auto run = [&]<class T>(T) {
     ReverseBatch<T> batch{solve.solver.method,
                           solve.solver.restart,
@@ -87,7 +90,9 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
                           {},
                           {}};
     if (for_a) {
-      batch.rows = [&](int64_t s) { return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs.options()); };
+      batch.rows = [&](int64_t s) {
+        return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs.options());
+      };
       batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };
     }
     std::visit(

@@ -24,9 +24,9 @@ class SweepBase : public Method {
   void save(int64_t slot) {
     each([&](auto& part, int64_t v, int64_t s) { put(part, slot, v, s); });
   }
-  void load(int64_t slot) {
+  void load(int64_t slot, int64_t k) {
     each([&](auto& part, int64_t v, int64_t s) { get(part, slot, v, s); });
-    this->resume();
+    this->resume(k);
   }
 
  protected:
@@ -48,16 +48,29 @@ class SweepBase : public Method {
     };
     std::apply([&](auto&... parts) { (visit(parts), ...); }, this->carried());
   }
-  void put(Vector& part, int64_t slot, int64_t v, int64_t) { sweep_space_.copy(part, sweep_space_.slot(slot, v)); }
+  void put(Vector& part, int64_t slot, int64_t v, int64_t) {
+    sweep_space_.copy(part, sweep_space_.slot(slot, v));
+  }
   void put(Scalar& part, int64_t slot, int64_t, int64_t s) { sweep_space_.slot_scalar(slot, s) = part; }
-  void get(Vector& part, int64_t slot, int64_t v, int64_t) { sweep_space_.copy(sweep_space_.slot(slot, v), part); }
+  void get(Vector& part, int64_t slot, int64_t v, int64_t) {
+    sweep_space_.copy(sweep_space_.slot(slot, v), part);
+  }
   void get(Scalar& part, int64_t slot, int64_t, int64_t s) { part = sweep_space_.slot_scalar(slot, s); }
+};
+
+/// One iteration at a time, and x alone: the iterate before it is Chebyshev's.
+template <class Space>
+class SingleJacobi : public JacobiMethod<Space> {
+ public:
+  using JacobiMethod<Space>::JacobiMethod;
+  void step() { JacobiMethod<Space>::step(1); }
+  auto carried() { return std::tie(this->x); }
 };
 
 /// x' = x + D⁻¹(b - A x)
 template <class Space>
-class JacobiSweep : public SweepBase<JacobiMethod<Space>, Space> {
-  using Base = SweepBase<JacobiMethod<Space>, Space>;
+class JacobiSweep : public SweepBase<SingleJacobi<Space>, Space> {
+  using Base = SweepBase<SingleJacobi<Space>, Space>;
   using Vector = typename Space::Vector;
   using Base::sweep_space_, Base::x_bar_;
 
@@ -178,8 +191,12 @@ class GmresSweep : public SweepBase<GmresMethod<Space>, Space> {
 
  public:
   GmresSweep(Space& space, Vector x_bar, int64_t restart)
-      : Base(space, x_bar, restart, false), b_bar_(space.vector()), r_bar_(space.vector()), e_(space.vector()),
-        p_bar_(space.vector()), t_(space.vector()) {
+      : Base(space, x_bar, restart, false),
+        b_bar_(space.vector()),
+        r_bar_(space.vector()),
+        e_(space.vector()),
+        p_bar_(space.vector()),
+        t_(space.vector()) {
     for (int64_t j = 0; j < this->m_; ++j) v_bar_.push_back(space.vector());
   }
 

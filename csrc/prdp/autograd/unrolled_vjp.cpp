@@ -47,10 +47,11 @@ void log_sweeps(const UnrolledVjp& found, const UnrolledSolve& solve, const at::
   if (log != 0) adjoint_log::write(log, unrolled_info(found, solve, b));
 }
 
-Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorList tensors, at::IntArrayRef needed,
-                   c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed,
-                   c10::string_view solver, c10::SymInt max_iter, double rtol, int64_t restart,
-                   const at::Tensor& iterations, const at::Tensor& status, int64_t checkpoint_every, int64_t log) {
+Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorList tensors,
+                   at::IntArrayRef needed, c10::string_view kind, at::IntArrayRef shape,
+                   at::ArrayRef<double> parameters, bool transposed, c10::string_view solver,
+                   c10::SymInt max_iter, double rtol, int64_t restart, const at::Tensor& iterations,
+                   const at::Tensor& status, int64_t checkpoint_every, int64_t log) {
   const at::NoGradGuard no_grad;
   UnrolledSolve unrolled{{std::string(kind), shape.vec(), parameters.vec(), {}, transposed},
                          {method_from_name(solver), max_iter, rtol, restart},
@@ -61,11 +62,12 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorL
   const auto rhs = b.detach();
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
   UnrolledVjp found;
-  if (unrolled.solver.method == Method::kJacobi && for_b_alone) {
-    // K sweeps from zero are u = Σ_k (I - D⁻¹A)ᵏ D⁻¹ b; transposed, that is K sweeps with Aᵀ.
+  const auto method = unrolled.solver.method;
+  if ((method == Method::kJacobi || method == Method::kChebyshev) && for_b_alone) {
+    // K sweeps from zero are u = p(I - D⁻¹A) D⁻¹ b with a polynomial p; transposed, that is K sweeps with Aᵀ.
     auto transpose = unrolled.a;
     transpose.transposed = !transposed;
-    const SolveRequest request{Method::kJacobi, 0, 0.0, restart, iterations};
+    const SolveRequest request{method, 0, 0.0, restart, iterations};
     const auto [b_bar, info] = prdp::solve(*make_operator(transpose), cotangent, request);
     found = {std::vector<at::Tensor>(needed.size()), info.operator_applications};
     found.gradients[0] = b_bar;
@@ -88,8 +90,9 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorL
 }
 
 Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, at::TensorList tensors, at::IntArrayRef needed,
-                    c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool, c10::string_view, c10::SymInt,
-                    double, int64_t, const at::Tensor& iterations, const at::Tensor&, int64_t, int64_t) {
+                    c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool, c10::string_view,
+                    c10::SymInt, double, int64_t, const at::Tensor& iterations, const at::Tensor&, int64_t,
+                    int64_t) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -120,8 +123,8 @@ UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const
   return found;
 }
 
-UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
-                                  at::IntArrayRef needed, int64_t log) {
+UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
+                                  const UnrolledSolve& solve, at::IntArrayRef needed, int64_t log) {
   const at::AutoGradMode record(true);
   // Partial derivatives: b and the tensors may be one tensor, or depend on each other further back.
   const auto rhs = at::alias(b);

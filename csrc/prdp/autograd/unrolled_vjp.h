@@ -35,8 +35,8 @@ UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const
                          at::IntArrayRef needed, int64_t log);
 
 /// The same, recorded by autograd, for second derivatives; it keeps all iterates.
-UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
-                                  at::IntArrayRef needed, int64_t log);
+UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
+                                  const UnrolledSolve& solve, at::IntArrayRef needed, int64_t log);
 
 /// The ways of the op. By hand-written sweeps in the CPU loops, where `has_sweep`: one sample at a time.
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
@@ -51,8 +51,8 @@ UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const U
 template <class Body>
 auto with_autograd(const Body& body) {
   const auto keys = c10::impl::tls_local_dispatch_key_set();
-  const c10::impl::ForceDispatchKeyGuard guard(keys.included_,
-                                               keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
+  const c10::impl::ForceDispatchKeyGuard guard(
+      keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
   const at::AutoGradMode record(true);
   return body();
 }

@@ -1,5 +1,8 @@
 #pragma once
+#include <algorithm>
+#include <array>
 #include <cmath>
+#include <utility>
 
 #include "prdp/kernels/laplacian_parameters.h"
 #include "prdp/kernels/loops.h"
@@ -23,17 +26,14 @@ class Laplacian {
         row_(round_up_to_lanes<T>(nx_ + 1)),
         plane_((Dim > 2 ? ny_ + 1 : ny_) * row_),
         centre_(static_cast<T>(p.centre)),
-        apply_weights_((Dim + 1) * row_, T(0)),
+        apply_weights_(Dim * row_, T(0)),
         sweep_weights_(Dim * row_, T(0)) {
     norm_ = std::abs(p.centre);
-    for (int64_t i = 0; i < nx_; ++i) apply_weights_[i] = centre_;
     for (int d = 0; d < Dim; ++d) {
       const double off = p.off[Dim - 1 - d];
       norm_ += 2.0 * std::abs(off);
-      for (int64_t i = 0; i < nx_; ++i) {
-        apply_weights_[(d + 1) * row_ + i] = static_cast<T>(off);
-        sweep_weights_[d * row_ + i] = static_cast<T>(-off / p.centre);
-      }
+      std::fill_n(apply_weights_.begin() + d * row_, nx_, static_cast<T>(off));
+      std::fill_n(sweep_weights_.begin() + d * row_, nx_, static_cast<T>(-off / p.centre));
     }
   }
 
@@ -49,36 +49,40 @@ class Laplacian {
 
   /// dst = scale·src, from a contiguous sample into the padded layout; and back.
   void load(const T* src, T scale, T* dst) const {
-    for (int64_t r = 0; r < nz_ * ny_; ++r)
-      for (int64_t i = 0; i < nx_; ++i) dst[padded(r) + i] = scale * src[r * nx_ + i];
+    for (int64_t z = 0; z < nz_; ++z)
+      loops_.copy_rows(scale, src + z * ny_ * nx_, nx_, dst + z * plane_, row_, ny_, nx_);
   }
   void store(const T* src, T scale, T* dst) const {
-    for (int64_t r = 0; r < nz_ * ny_; ++r)
-      for (int64_t i = 0; i < nx_; ++i) dst[r * nx_ + i] = scale * src[padded(r) + i];
+    for (int64_t z = 0; z < nz_; ++z)
+      loops_.copy_rows(scale, src + z * plane_, row_, dst + z * ny_ * nx_, nx_, ny_, nx_);
   }
 
-  /// out = A v
-  void apply(const T* v, T* out) const { loops_.apply[Dim - 1](stencil(apply_weights_), v, out); }
+  /// out = A v; returns v·out and ‖out‖².
+  std::array<T, 2> apply(const T* v, T* out) const {
+    std::array<T, 2> dots;
+    loops_.apply[Dim - 1](stencil(apply_weights_), v, out, dots.data());
+    return dots;
+  }
 
   /// c = D⁻¹ b
-  void divide_by_diagonal(const T* b, T* c) const {
-    for (int64_t i = 0; i < length(); ++i) c[i] = b[i] / centre_;
-  }
+  void divide_by_diagonal(const T* b, T* c) const { loops_.scale(T(1) / centre_, b, c, length()); }
 
-  /// One Jacobi sweep y = x + D⁻¹(b - A x) with c = D⁻¹ b. Returns ‖b - A x‖² if asked for.
-  template <bool WithResidual>
-  T jacobi_sweep(const T* c, const T* x, T* y) const {
-    const auto a = stencil(sweep_weights_);
-    if constexpr (WithResidual) return centre_ * centre_ * loops_.sweep_and_measure[Dim - 1](a, c, x, y);
-    loops_.sweep[Dim - 1](a, c, x, y);
-    return T(0);
+  /// n sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use. With omega, one for each,
+  /// Chebyshev's x ← y + omega (that - y), where y holds the iterate before x, before and after.
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega = nullptr) const {
+    if (loops_.sweeps[Dim - 1](stencil(sweep_weights_), c, x, y, n, omega) != x) std::swap(x, y);
   }
+  /// One of them, from x to y; returns ‖b - A x‖².
+  T jacobi_sweep(const T* c, const T* x, T* y, const T* omega = nullptr) const {
+    const T change2 = loops_.sweep_and_measure[Dim - 1](stencil(sweep_weights_), c, x, y, omega);
+    return centre_ * centre_ * change2;
+  }
+  /// The spectral radius of I - D⁻¹A.
+  double radius() const { return jacobi_radius(parameters_); }
 
  private:
-  /// Where row r (counted over all planes) starts in the padded layout.
-  int64_t padded(int64_t r) const { return r / ny_ * plane_ + r % ny_ * row_; }
   PaddedStencil<T> stencil(const std::vector<T>& weights) const {
-    return {ny_, nz_, row_, plane_, weights.data()};
+    return {ny_, nz_, row_, plane_, centre_, weights.data()};
   }
 
   const Loops<T>& loops_ = kernels::loops<T>();
@@ -86,7 +90,7 @@ class Laplacian {
   int64_t nx_, ny_, nz_, row_, plane_;
   T centre_;
   double norm_;
-  std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: (centre,) x, y, z
+  std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: x, y, z
 };
 
 }  // namespace prdp::kernels

@@ -1,6 +1,8 @@
 #pragma once
 #include <array>
+#include <cmath>
 #include <cstdint>
+#include <numbers>
 
 namespace prdp::kernels {
 
@@ -12,5 +14,13 @@ struct LaplacianParameters {
   double centre = 0.0;
   std::array<double, 3> off{};
 };
+
+/// The spectral radius of I - D⁻¹A; the eigenvalues are ± in pairs.
+inline double jacobi_radius(const LaplacianParameters& a) {
+  double sum = 0;
+  for (int64_t d = 0; d < a.dim; ++d)
+    sum += 2 * std::abs(a.off[d]) * std::cos(std::numbers::pi / static_cast<double>(a.shape[d] + 1));
+  return sum / std::abs(a.centre);
+}
 
 }  // namespace prdp::kernels

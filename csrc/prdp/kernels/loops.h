@@ -12,10 +12,12 @@ template <class T>
 inline constexpr int64_t kLanes = 64 / static_cast<int64_t>(sizeof(T));
 
 /// A stencil on one sample in padded rows: `row` values a row, `plane` a plane of `ny` rows. The
-/// weights hold a row each (centre, then x, y, z), with zeros in the padding so that it stays zero.
+/// weights of the neighbours hold a row each for x, y and z, with zeros in the padding so that it stays
+/// zero. The centre has one weight; sweeps have none.
 template <class T>
 struct PaddedStencil {
   int64_t ny, nz, row, plane;
+  T centre;
   const T* weights;
 };
 
@@ -43,23 +45,33 @@ template <class T>
 struct Loops {
   const char* level;  // "baseline", "x86-64-v3", "x86-64-v4"
 
+  /// max |x_i|; NaN or Inf if any x_i is not finite; any n.
+  T (*largest_magnitude)(const T* x, int64_t n);
+  /// to = factor·from for rows of n values, which lie `stride` apart.
+  void (*copy_rows)(T factor, const T* from, int64_t from_stride, T* to, int64_t to_stride, int64_t rows,
+                    int64_t n);
   /// Σ a_i b_i; any n.
   T (*dot)(const T* a, const T* b, int64_t n);
+  /// out = factor·x; out may be x. From here on n is that of padded vectors where not said otherwise.
+  void (*scale)(T factor, const T* x, T* out, int64_t n);
   /// y += alpha x; any n.
   void (*axpy)(T alpha, const T* x, T* y, int64_t n);
   /// y = x + beta y
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
-  /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself. n: padded.
+  /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself.
   T (*descend)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
-  /// h_j = v_j·w for `count` vectors; and w -= Σ alpha_j v_j. Any count, any n.
+  /// h_j = v_j·w for `count` vectors; and w += sign·Σ alpha_j v_j, which returns ‖w‖². Any count.
   void (*multi_dot)(const T* const* v, int64_t count, const T* w, T* h, int64_t n);
-  void (*multi_axpy)(const T* alpha, const T* const* v, int64_t count, T* w, int64_t n);
+  T (*multi_axpy)(T sign, const T* alpha, const T* const* v, int64_t count, T* w, int64_t n);
 
-  /// By the number of dimensions less one. out = A v.
-  void (*apply[3])(const PaddedStencil<T>& a, const T* v, T* out);
-  /// y = c + (neighbours of x, weighted); the other one returns ‖y - x‖² as well.
-  void (*sweep[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y);
-  T (*sweep_and_measure[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y);
+  /// By the number of dimensions less one. out = A v; dots = {v·out, ‖out‖²}.
+  void (*apply[3])(const PaddedStencil<T>& a, const T* v, T* out, T* dots);
+  /// n sweeps x ← c + (neighbours of x, weighted). Returns the one of x and y that holds the result; the
+  /// other one is overwritten. With omega, one for each sweep, x ← y + omega (that - y) instead, where y
+  /// holds the iterate before x, before and after.
+  T* (*sweeps[3])(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega);
+  /// One of them, with its result in y; returns ‖c + neighbours - x‖².
+  T (*sweep_and_measure[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y, const T* omega);
 
   /// Upwind differences and diffusion along one axis: advection (max(w⁻, 0) B + min(w⁺, 0) F) plus
   /// diffusion times minus the second difference, with w⁻ and w⁺ the means of the winds here and on

@@ -1,5 +1,6 @@
 #pragma once
 #include <algorithm>
+#include <utility>
 
 #include "prdp/kernels/vector.h"
 
@@ -29,23 +30,29 @@ class MatrixBase {
   void divide_by_diagonal(const T* b, T* c) const {
     for (int64_t i = 0; i < n_; ++i) c[i] = b[i] / self().diagonal(i);
   }
-  /// One Jacobi sweep y = x + D⁻¹(b - A x) with c = D⁻¹ b. Returns ‖b - A x‖² if asked for.
-  template <bool WithResidual>
-  T jacobi_sweep(const T* c, const T* x, T* y) const {
-    self().apply(x, y);
-    T residual = 0;
-    for (int64_t i = 0; i < n_; ++i) {
-      const T d = self().diagonal(i), change = c[i] - y[i] / d;
-      y[i] = x[i] + change;
-      if constexpr (WithResidual) residual += d * change * d * change;
-    }
-    return residual;
+  /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use.
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n) const {
+    for (; n > 0; --n, std::swap(x, y)) sweep<false>(c, x, y);
   }
+  /// One of them, from x to y; returns ‖b - A x‖².
+  T jacobi_sweep(const T* c, const T* x, T* y) const { return sweep<true>(c, x, y); }
 
  protected:
   int64_t n_;
 
  private:
+  template <bool Measure>
+  T sweep(const T* c, const T* x, T* y) const {
+    self().apply(x, y);
+    T residual = 0;
+    for (int64_t i = 0; i < n_; ++i) {
+      const T d = self().diagonal(i), change = c[i] - y[i] / d;
+      y[i] = x[i] + change;
+      if constexpr (Measure) residual += d * change * d * change;
+    }
+    return residual;
+  }
+
   const Matrix& self() const { return static_cast<const Matrix&>(*this); }
 };
 

@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/kernels/loops.h"
+#include "prdp/kernels/registers.h"
 
 /// The part of loops.cpp for operators on periodic grids; included there only, and for the same reason
 /// all of internal linkage.
@@ -31,58 +31,84 @@ int64_t row_above(const PeriodicStencil<T>& a, int64_t j) {
   return (j + 1 < a.ny ? j + 1 : 0) * a.row;
 }
 
-template <int Dim, class T>
-void periodic_row(const PeriodicStencil<T>& a, int64_t j, const T* field, T* result) {
-  const int64_t row = a.row;
-  const T *w = a.coefficients + j * (2 * Dim + 1) * row, *wraps = a.wraps + 2 * j;
-  const T *v = field + j * row, *below = field + row_below(a, j), *above = field + row_above(a, j);
-  T* __restrict out = result + j * row;
-  for (int64_t i = 0; i < row; i += kLanes<T>) {
-#pragma GCC ivdep
-    for (int64_t l = i; l < i + kLanes<T>; ++l) {
-      T sum = w[l] * v[l] + w[row + l] * v[l - 1] + w[2 * row + l] * v[l + 1];
-      if constexpr (Dim > 1) sum += w[3 * row + l] * below[l] + w[4 * row + l] * above[l];
-      out[l] = sum;
-    }
+/// Goes along a row register by register, with the ones before and after for the neighbours. What these
+/// hold beyond the ends of the row meets weights of zero.
+template <class T>
+struct Line {
+  const T* v;
+  Register<T> before = {}, here = {}, after;
+
+  explicit Line(const T* row) : v(row), after(load(row)) {}
+  void step_to(int64_t i) {
+    before = here;
+    here = after;
+    after = load(v + i + kWidth<T>);
   }
-  out[0] += wraps[0] * v[a.nx - 1];
-  out[a.nx - 1] += wraps[1] * v[0];
-}
+  Register<T> left() const { return lanes_from<T, kWidth<T> - 1>(before, here); }
+  Register<T> right() const { return lanes_from<T, 1>(here, after); }
+};
+
+/// Row j of a field and what lies below and above it; its coefficients in A.
+template <int Dim, class T>
+struct PeriodicRow {
+  const PeriodicStencil<T>& a;
+  int64_t row;
+  const T *w, *wraps, *below, *above;
+  Line<T> line;
+
+  PeriodicRow(const PeriodicStencil<T>& stencil, int64_t j, const T* field)
+      : a(stencil), row(stencil.row), w(stencil.coefficients + j * (2 * Dim + 1) * row),
+        wraps(stencil.wraps + 2 * j), below(field + row_below(stencil, j)),
+        above(field + row_above(stencil, j)), line(field + j * row) {}
+
+  /// A v at register i, but for the wraps, which are added to the whole row at its end.
+  Register<T> product(int64_t i) {
+    line.step_to(i);
+    Register<T> sum = load(w + i) * line.here;
+    sum += load(w + row + i) * line.left();
+    sum += load(w + 2 * row + i) * line.right();
+    if constexpr (Dim > 1) {
+      sum += load(w + 3 * row + i) * load(below + i);
+      sum += load(w + 4 * row + i) * load(above + i);
+    }
+    return sum;
+  }
+  void add_wraps(T* out) const {
+    out[0] += wraps[0] * line.v[a.nx - 1];
+    out[a.nx - 1] += wraps[1] * line.v[0];
+  }
+};
 
 template <int Dim, class T>
 void apply_periodic(const PeriodicStencil<T>& a, const T* v, T* out) {
-  for (int64_t j = 0; j < a.ny; ++j) periodic_row<Dim>(a, j, v, out);
-}
-
-/// Adds the pressure gradient to row j of both velocities, and sets the divergence in it.
-template <class T>
-void couple_row(const StaggeredStencil<T>& a, int64_t j, const T* v, T* result) {
-  const auto& grid = a.velocity[0];
-  const int64_t row = grid.row, nx = grid.nx, field = grid.ny * row, at = j * row;
-  const T *u1 = v + at, *u2 = u1 + field, *u2_above = v + field + row_above(grid, j);
-  const T *p = u2 + field, *p_below = v + 2 * field + row_below(grid, j);
-  const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
-  T *__restrict g1 = result + at, *__restrict g2 = g1 + field, *__restrict d = g2 + field;
-  for (int64_t i = 0; i < row; i += kLanes<T>) {
-#pragma GCC ivdep
-    for (int64_t l = i; l < i + kLanes<T>; ++l) {
-      g1[l] += x[l] * p[l] - x_lower[l] * p[l - 1];
-      g2[l] += y[l] * (p[l] - p_below[l]);
-      d[l] = x_upper[l] * u1[l + 1] - x[l] * u1[l] + y[l] * (u2_above[l] - u2[l]);
-    }
+  for (int64_t j = 0; j < a.ny; ++j, out += a.row) {
+    PeriodicRow<Dim, T> u(a, j, v);
+    for (int64_t i = 0; i < u.row; i += kWidth<T>) store(out + i, u.product(i));
+    u.add_wraps(out);
   }
-  g1[0] -= x[0] * p[nx - 1];
-  d[nx - 1] += x[0] * u1[0];
 }
 
 template <class T>
 void apply_staggered(const StaggeredStencil<T>& a, const T* v, T* out) {
   const auto& grid = a.velocity[0];
-  const int64_t field = grid.ny * grid.row;
-  for (int64_t j = 0; j < grid.ny; ++j) {
-    periodic_row<2>(a.velocity[0], j, v, out);
-    periodic_row<2>(a.velocity[1], j, v + field, out + field);
-    couple_row(a, j, v, out);
+  const int64_t row = grid.row, field = grid.ny * row, last = grid.nx - 1;
+  const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
+  T *out1 = out, *out2 = out + field, *divergence = out + 2 * field;
+  for (int64_t j = 0; j < grid.ny; ++j, out1 += row, out2 += row, divergence += row) {
+    PeriodicRow<2, T> u1(a.velocity[0], j, v), u2(a.velocity[1], j, v + field);
+    Line<T> p(v + 2 * field + j * row);
+    const T* p_below = v + 2 * field + row_below(grid, j);
+    for (int64_t i = 0; i < row; i += kWidth<T>) {
+      p.step_to(i);
+      store<T>(out1 + i, u1.product(i) + load(x + i) * p.here - load(x_lower + i) * p.left());
+      store<T>(out2 + i, u2.product(i) + load(y + i) * (p.here - load(p_below + i)));
+      store<T>(divergence + i, load(x_upper + i) * u1.line.right() - load(x + i) * u1.line.here +
+                                   load(y + i) * (load(u2.above + i) - u2.line.here));
+    }
+    u1.add_wraps(out1);
+    u2.add_wraps(out2);
+    out1[0] -= x[0] * p.v[last];
+    divergence[last] += x[0] * u1.line.v[0];
   }
 }
 

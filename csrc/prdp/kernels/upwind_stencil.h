@@ -1,6 +1,7 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "prdp/kernels/vector.h"
 
@@ -173,22 +174,12 @@ class PeriodicBase {
       for (int64_t i = 0; i < nx(); ++i) c[r * row_ + i] = b[r * row_ + i] / d[i];
     }
   }
-  /// One Jacobi sweep y = x + D⁻¹(b - A x) with c = D⁻¹ b. Returns ‖b - A x‖² if asked for.
-  template <bool WithResidual>
-  T jacobi_sweep(const T* c, const T* x, T* y) const {
-    self().apply(x, y);
-    T residual = 0;
-    for (int64_t r = 0; r < rows(); ++r) {
-      const T* d = self().diagonal(r);
-      const int64_t at = r * row_;
-      for (int64_t i = 0; i < nx(); ++i) {
-        const T change = c[at + i] - y[at + i] / d[i];
-        y[at + i] = x[at + i] + change;
-        if constexpr (WithResidual) residual += d[i] * change * d[i] * change;
-      }
-    }
-    return residual;
+  /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use.
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n) const {
+    for (; n > 0; --n, std::swap(x, y)) sweep<false>(c, x, y);
   }
+  /// One of them, from x to y; returns ‖b - A x‖².
+  T jacobi_sweep(const T* c, const T* x, T* y) const { return sweep<true>(c, x, y); }
 
  protected:
   int64_t nx() const { return parameters_.nx; }
@@ -202,6 +193,22 @@ class PeriodicBase {
   bool finite_;
 
  private:
+  template <bool Measure>
+  T sweep(const T* c, const T* x, T* y) const {
+    self().apply(x, y);
+    T residual = 0;
+    for (int64_t r = 0; r < rows(); ++r) {
+      const T* d = self().diagonal(r);
+      const int64_t at = r * row_;
+      for (int64_t i = 0; i < nx(); ++i) {
+        const T change = c[at + i] - y[at + i] / d[i];
+        y[at + i] = x[at + i] + change;
+        if constexpr (Measure) residual += d[i] * change * d[i] * change;
+      }
+    }
+    return residual;
+  }
+
   static constexpr int64_t kWinds = std::min(Channels, 2);
 
   const Kernel& self() const { return static_cast<const Kernel&>(*this); }

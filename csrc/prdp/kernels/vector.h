@@ -3,7 +3,6 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <type_traits>
 #include <vector>
 
 #include "prdp/kernels/loops.h"
@@ -16,26 +15,20 @@ template <class Kernel>
 inline constexpr bool kHasNullSpace =
     requires(const Kernel& a, typename Kernel::Scalar* v) { a.project(v); };
 
+/// Whether the spectrum of I - D⁻¹A is known; there it is symmetric, so that norms of Jacobi's residuals
+/// are a convex sequence on a logarithmic scale.
+template <class Kernel>
+inline constexpr bool kHasSpectrum = requires(const Kernel& kernel) { kernel.radius(); };
+
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
 }
 
-/// max |x_i|; NaN or Inf if any x_i is not finite. Compares the bits without their sign, which order
-/// like the numbers and have NaN and Inf on top, so that nothing slips through a comparison with NaN.
+/// max |x_i|; NaN or Inf if any x_i is not finite.
 template <class T>
 T largest_magnitude(const T* x, int64_t n) {
-  using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
-  Bits largest = 0;
-  for (int64_t i = 0; i < n; ++i) {
-    Bits bits;
-    std::memcpy(&bits, x + i, sizeof bits);
-    bits &= ~Bits(0) >> 1;
-    largest = bits > largest ? bits : largest;
-  }
-  T value;
-  std::memcpy(&value, &largest, sizeof value);
-  return value;
+  return loops<T>().largest_magnitude(x, n);
 }
 
 /// Power of two s with s·magnitude in [1, 2) (near the subnormals, as close as s and 1/s allow).
@@ -59,7 +52,9 @@ class Workspace {
   /// Makes room for `count` vectors of `length` values with `halo` zeros on each side.
   void prepare(int64_t count, int64_t length, int64_t halo) {
     halo = round_up_to_lanes<T>(halo);
-    stride_ = round_up_to_lanes<T>(length) + 2 * halo;
+    // Vectors that start at the same place in their pages would wait for each other's stores.
+    constexpr int64_t page = 4096 / sizeof(T), apart = 11 * kLanes<T>;
+    stride_ = (round_up_to_lanes<T>(length) + 2 * halo + page - 1) / page * page + apart;
     halo_ = halo;
     count_ = count;
     const auto needed = static_cast<size_t>(count * stride_ + kLanes<T>);

@@ -19,6 +19,11 @@ at::Tensor LaplacianOperator::norm() const {
   return at::scalar_tensor(std::abs(alpha + beta * centre) + std::abs(beta * centre), at::kDouble);
 }
 
+at::Tensor LaplacianOperator::jacobi_radius() const {
+  const auto slowest = laplacian_eigenvalues(grid_, at::TensorOptions().dtype(at::kDouble)).amax();
+  return 1.0 - symbol(slowest) / diagonal();
+}
+
 std::vector<int64_t> LaplacianOperator::vector_shape() const {
   std::vector<int64_t> shape{1};
   shape.insert(shape.end(), grid_.shape().begin(), grid_.shape().end());

@@ -14,6 +14,7 @@ class LaplacianOperator : public Operator {
   at::Tensor solve_directly(const at::Tensor& b) const override;
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
   at::Tensor norm() const override;
+  at::Tensor jacobi_radius() const override;
   std::vector<int64_t> vector_shape() const override;
   KernelParameters kernel() const override;
 

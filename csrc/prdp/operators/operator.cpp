@@ -42,6 +42,10 @@ at::Tensor Operator::precondition(const at::Tensor&, bool) const {
   TORCH_CHECK_VALUE(false, "GMRES: preconditioner \"stokes\" is for NavierStokes operators alone");
 }
 
+at::Tensor Operator::jacobi_radius() const {
+  TORCH_CHECK_VALUE(false, "Chebyshev: the spectrum is known of Heat and Poisson operators alone; for others take CG or GMRES");
+}
+
 namespace {
 
 /// Aᵀ of any operator.
@@ -60,6 +64,7 @@ class Transposed final : public Operator {
   at::Tensor precondition(const at::Tensor& v, bool transposed) const override {
     return a_->precondition(v, !transposed);
   }
+  at::Tensor jacobi_radius() const override { return a_->jacobi_radius(); }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   at::Tensor solve_directly(const at::Tensor& b) const override {

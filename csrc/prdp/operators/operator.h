@@ -79,6 +79,9 @@ class Operator {
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
   /// M⁻¹ v and M⁻ᵀ v for a cheap M ≈ A that suits this operator; ValueError where there is none.
   virtual at::Tensor precondition(const at::Tensor& v, bool transposed) const;
+  /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ; differentiable in the tensors of
+  /// A. ValueError where it is not known.
+  virtual at::Tensor jacobi_radius() const;
   /// Where the first NaN or Inf that A is made of sits: (i, j) in a matrix, (channel, *grid) in winds.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator of the samples `index` (int64) alone, differentiable in the same tensors; null where

@@ -1,4 +1,5 @@
 #pragma once
+#include <cstdint>
 #include <tuple>
 
 namespace prdp {
@@ -17,8 +18,8 @@ class ConjugateGradientMethod {
     rr_ = pp_ = space_.b2();
   }
   void step() {
-    space_.apply(p_, q_);
-    alpha_ = space_.step_length(rr_, space_.dot(p_, q_), pp_, space_.dot(q_, q_));
+    const auto [pq, qq] = space_.apply_with_dots(p_, q_);
+    alpha_ = space_.step_length(rr_, pq, pp_, qq);
     const auto rr = space_.descend(alpha_, p_, q_, x, r_);
     beta_ = space_.ratio(rr, rr_);
     space_.xpby(r_, beta_, p_);
@@ -35,7 +36,7 @@ class ConjugateGradientMethod {
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, p_, rr_, pp_); }
-  void resume() {}
+  void resume(int64_t) {}
 
   typename Space::Vector x;
 

@@ -1,4 +1,5 @@
 #pragma once
+#include <cstdint>
 #include <tuple>
 
 namespace prdp {
@@ -31,7 +32,7 @@ class DirectMethod {
 
   /// What the next iteration starts from; resume() once it has been put back.
   auto carried() { return std::tie(x); }
-  void resume() { ready_ = false; }
+  void resume(int64_t) { ready_ = false; }
 
   typename Space::Vector x;
 

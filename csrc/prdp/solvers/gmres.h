@@ -64,7 +64,7 @@ class GmresMethod {
 
   /// What the next cycle starts from once residual2() is known; resume() once it has been put back.
   auto carried() { return std::tie(x, scale_); }
-  void resume() {
+  void resume(int64_t) {
     residual2_ = space_.b2() / 0;  // no cycle before to take back
     ready_ = false;
   }
@@ -80,6 +80,7 @@ class GmresMethod {
     g_[0] = space_.constant(sqrt(residual2_));
     space_.scale(r_, space_.inverse(g_[0], g_[0]), v_[0]);
     exhausted_ = space_.is_zero(g_[0]);
+    loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
       space_.apply(v_[j], v_[j + 1], preconditioned_);
       if (space_.recording()) products_[j] = v_[j + 1];
@@ -103,7 +104,7 @@ class GmresMethod {
     Scalar taken2 = column[0] * column[0];
     for (int64_t i = 1; i <= j; ++i) taken2 = taken2 + column[i] * column[i];
     const Scalar length = sqrt(taken2 + left2);
-    if (space_.lost_orthogonality(left2, taken2)) {
+    if (space_.lost_orthogonality(left2, taken2, loss_)) {
       space_.dots(v_, j + 1, v_[j + 1], again_.data());
       left2 = space_.subtract_combination(again_.data(), v_, j + 1, v_[j + 1]);
       for (int64_t i = 0; i <= j; ++i) column[i] = column[i] + again_[i];
@@ -176,6 +177,7 @@ class GmresMethod {
   std::vector<Scalar> h_, inverse_;   // by columns, R once rotated; 1/R_jj
   std::vector<Scalar> cos_, sin_, g_, y_, again_;
   Scalar residual2_{}, exhausted_{}, grew_{};
+  Scalar loss_{};   // of orthogonality, in units of rounding
   Scalar scale_{};  // largest ‖A v‖ so far: what is rounding beside it is zero
   int64_t columns_ = 0;  // of the last cycle
   bool ready_ = false;   // r_ and residual2_ belong to x

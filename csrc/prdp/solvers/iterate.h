@@ -22,6 +22,9 @@ struct SampleState {
   int64_t iterations = 0;
   int64_t applications = 0;
   double residual2 = 0.0;
+  int64_t looked = 0;   // iterations when the residual was last looked at; when it is to be next
+  int64_t look = 0;
+  double looked2 = 0.0; // the residual then
   int64_t best = 0;  // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
   int64_t still = 0;   // cycles since the residual last fell, for methods whose residual never grows
@@ -38,7 +41,7 @@ struct SampleState {
     active = cap > 0;
     settled = claims = false;
     status = SolveStatus::kMaxIter;
-    iterations = still = 0;
+    iterations = still = look = 0;
     fallen2 = std::numeric_limits<double>::infinity();
     refuted2 = std::numeric_limits<double>::infinity();
   }
@@ -58,16 +61,13 @@ namespace detail {
 template <class Method>
 inline constexpr bool kLeastResidual = requires(const Method& m) { m.exhausted(); };
 
+/// Methods that may say how their residual falls, and then take several iterations in one step.
+template <class Method>
+inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n); };
+
 /// The iterates have run away: the last one is of no use.
 inline bool lost(const SampleState& s) {
   return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
-}
-
-/// A residual of this size is rounding: ε ‖A‖ ‖u‖. An exhausted space is judged with some slack.
-template <class Space>
-bool at_rounding_floor(const Space& space, const SampleState& s, double norm_a, double u2) {
-  const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : 1.0;
-  return std::sqrt(s.residual2) <= slack * space.epsilon() * norm_a * std::sqrt(u2);
 }
 
 /// The true residual no longer follows the method's own: a second false claim, after the method has
@@ -100,6 +100,38 @@ inline void judge_progress(SampleState& s, bool exhausted) {
   if (++s.still >= patience) s.stop(SolveStatus::kStagnated);
 }
 
+/// Stops those of the `doubtful` samples whose residual is rounding, ε ‖A‖ ‖u‖. An exhausted space is
+/// judged with some slack.
+template <class Space, class Method, class Predicate>
+void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
+                            const Predicate& doubtful) {
+  if (std::none_of(states.begin(), states.end(), doubtful)) return;
+  const auto norm_a = space.operator_norm();
+  const auto u2 = space.lanes(space.dot(method.x, method.x));
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : 1.0;
+    if (doubtful(s) && std::sqrt(s.residual2) <= slack * space.epsilon() * norm_a[i] * std::sqrt(u2[i]))
+      s.stop(SolveStatus::kStagnated);
+  }
+}
+
+/// Sets when the residual is to be looked at next. Where it is log-convex it falls no faster from here
+/// on than it did since the last look, and cannot come below rtol before that; twice rtol leaves room
+/// for rounding.
+inline void plan_next_look(SampleState& s, bool log_convex, double rtol) {
+  constexpr double longest = 64.0;
+  double stride = 1.0;
+  if (log_convex && rtol > 0.0 && s.iterations > 0 && s.residual2 > 4.0 * rtol * rtol * s.b2) {
+    const double fall = std::log(s.residual2 / s.looked2) / static_cast<double>(s.iterations - s.looked);
+    const double to_go = std::log(4.0 * rtol * rtol * s.b2 / s.residual2);
+    stride = fall < 0.0 ? std::min(std::ceil(to_go / fall), longest) : longest;
+  }
+  s.looked = s.iterations;
+  s.looked2 = s.residual2;
+  s.look = s.iterations + static_cast<int64_t>(stride);
+}
+
 /// Takes the residuals that the method knows. Freezes what diverged, overflowed or broke down, and
 /// confirms what seems converged by the true residual: a recursive one may have drifted from it.
 template <class Space, class Method>
@@ -127,6 +159,7 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     if constexpr (kLeastResidual<Method>) {
       if (s.active && rtol > 0.0) judge_progress(s, exhausted[i] != 0.0);
     }
+    if constexpr (kTakesStrides<Method>) plan_next_look(s, method.residual_is_log_convex(), rtol);
     if (s.status != SolveStatus::kConverged) continue;
     s.status = SolveStatus::kMaxIter;  // only a claim so far; with rtol = 0 nothing stops early
     s.active = true;
@@ -137,24 +170,33 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
 
   space.freeze_unless(states, [](const SampleState& s) { return s.claims; });
   const auto true2 = space.lanes(method.recompute_residual());
-  const auto norm_a = space.operator_norm();
-  const auto u2 = space.lanes(space.dot(method.x, method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (!s.claims) continue;
     s.residual2 = true2[i];
     judge(s, rtol);
-    if (s.active && (at_rounding_floor(space, s, norm_a[i], u2[i]) || parted_ways(s, rtol)))
-      s.stop(SolveStatus::kStagnated);
+    if (s.active && parted_ways(s, rtol)) s.stop(SolveStatus::kStagnated);
     if constexpr (kLeastResidual<Method>) {
       if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
     }
     s.refuted2 = s.residual2;
-    s.settled = !s.active;
   }
+  stop_at_rounding_floor(space, method, states, [](const SampleState& s) { return s.claims && s.active; });
+  for (auto& s : states)
+    if (s.claims) s.settled = !s.active;
 }
 
-/// At most `cap` iterations of each active sample. With `track`, every residual is looked at.
+/// Iterations until one of the samples comes to its end or, with `track`, is to be looked at.
+template <class States>
+int64_t stride(const States& states, bool track) {
+  int64_t n = std::numeric_limits<int64_t>::max();
+  for (const auto& s : states)
+    if (s.active) n = std::min(n, (track ? std::min(s.cap, s.look) : s.cap) - s.iterations);
+  return n;
+}
+
+/// At most `cap` iterations of each active sample. With `track`, every residual is looked at that may be
+/// small enough.
 template <class Space, class Method>
 void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   method.start();
@@ -167,8 +209,14 @@ void run(Space& space, Method& method, typename Space::States& states, double rt
     }
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
     if (!any_active) return;
-    method.step();
-    for (auto& s : states) s.iterations += s.active;
+    int64_t n = 1;
+    if constexpr (kTakesStrides<Method>) {
+      n = stride(states, track);
+      method.step(n);
+    } else {
+      method.step();
+    }
+    for (auto& s : states) s.iterations += s.active ? n : 0;
   }
 }
 
@@ -179,8 +227,6 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
   if (std::none_of(states.begin(), states.end(), open)) return;
   space.freeze_unless(states, open);
   const auto residual2 = space.lanes(method.recompute_residual());
-  const auto u2 = space.lanes(space.dot(method.x, method.x));
-  const auto norm_a = space.operator_norm();
   const auto broken = space.broken();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
@@ -188,10 +234,13 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
     s.residual2 = residual2[i];
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!lost(s)) judge(s, rtol);
-    const bool may_stagnate = s.status == SolveStatus::kMaxIter ||
-                              (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
-    if (may_stagnate && rtol > 0.0 && at_rounding_floor(space, s, norm_a[i], u2[i]))
-      s.status = SolveStatus::kStagnated;
+  }
+  stop_at_rounding_floor(space, method, states, [rtol](const SampleState& s) {
+    const bool unsolved = s.status == SolveStatus::kMaxIter ||
+                          (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
+    return rtol > 0.0 && !s.settled && unsolved;
+  });
+  for (auto& s : states) {
     s.active = false;
     s.settled = true;
   }

@@ -1,15 +1,26 @@
 #pragma once
+#include <cstdint>
 #include <tuple>
+#include <vector>
 
 namespace prdp {
 
 /// u ← u + D⁻¹(b - A u). From zero the first iterate is D⁻¹ b for free; from then on one product an
-/// iteration, which also tells the residual of the iterate that it starts from.
+/// iteration. A product whose residual is looked at makes the next iterate as well.
+///
+/// Accelerated, it is Chebyshev's semi-iteration (Golub and Varga 1961): with ρ, the spectral radius of
+/// I - D⁻¹A, whose eigenvalues come in pairs ±μ, u_{k+1} = u_{k-1} + ω_{k+1} (u_k + D⁻¹(b - A u_k) - u_{k-1}),
+/// ω₁ = 1, ω₂ = 1/(1 - ρ²/2), ω_{k+1} = 1/(1 - ρ² ω_k/4). No dot products.
 template <class Space>
 class JacobiMethod {
  public:
-  explicit JacobiMethod(Space& space)
-      : x(space.vector()), space_(space), c_(space.vector()), next_(space.vector()) {}
+  explicit JacobiMethod(Space& space, bool accelerated = false)
+      : x(space.vector()),
+        space_(space),
+        accelerated_(accelerated),
+        c_(space.vector()),
+        next_(space.vector()),
+        r_(space.vector()) {}
 
   void start() {
     space_.divide_by_diagonal(space_.b(), c_);
@@ -17,33 +28,59 @@ class JacobiMethod {
     space_.copy(c_, next_);
     residual2_ = space_.b2();
     ready_ = true;
+    done_ = 0;
   }
-  void step() {
-    if (!ready_) space_.template jacobi_sweep<false>(c_, x, next_);
-    space_.advance(x, next_);
+  void step(int64_t n) {
+    done_ += n;
+    if (ready_) {
+      space_.advance(x, next_);
+      --n;
+    }
+    if (n > 0) space_.sweeps(c_, x, next_, n, weights(done_ - n, n));
     ready_ = false;
   }
   auto residual2() {
-    if (!ready_) residual2_ = space_.template jacobi_sweep<true>(c_, x, next_);
+    if (!ready_) residual2_ = space_.measured_sweep(c_, x, next_, weights(done_, 1));
     ready_ = true;
     return residual2_;
   }
-  auto recompute_residual() {
-    auto r = space_.scratch();
-    return space_.residual(x, r);
-  }
+  /// Of its own, as a sweep at a fixed point of its rounding changes nothing, however large b - A x is.
+  auto recompute_residual() { return space_.residual(x, r_); }
+  /// With a symmetric iteration matrix G, ‖Gr‖² = r·G²r <= ‖r‖ ‖G²r‖: the residual falls by ever less.
+  bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_contract(); }
 
-  /// What the next iteration starts from; resume() once it has been put back.
-  auto carried() { return std::tie(x); }
-  void resume() { ready_ = false; }
+  /// What the next iteration starts from; resume() once it has been put back, as after `done` iterations.
+  auto carried() { return std::tie(x, next_); }
+  void resume(int64_t done) {
+    ready_ = false;
+    done_ = done;
+  }
 
   typename Space::Vector x;
 
  protected:
+  using Scalar = typename Space::Scalar;
+
+  /// ω of n iterations after the first `first`, which is at least one; null without acceleration.
+  const Scalar* weights(int64_t first, int64_t n) {
+    if (!accelerated_) return nullptr;
+    if (omega_.empty()) {
+      radius2_ = space_.radius2();
+      omega_.push_back(1 / (1 - radius2_ / 2));
+    }
+    while (static_cast<int64_t>(omega_.size()) < first + n - 1)
+      omega_.push_back(1 / (1 - radius2_ * omega_.back() / 4));
+    return omega_.data() + first - 1;
+  }
+
   Space& space_;
-  typename Space::Vector c_, next_;  // D⁻¹ b; the iterate after x
-  typename Space::Scalar residual2_{};
+  bool accelerated_;
+  typename Space::Vector c_, next_, r_;  // D⁻¹ b; the iterate after x if `ready_`, else the one before it
+  Scalar residual2_{};
   bool ready_ = false;  // next_ and residual2_ belong to x
+  int64_t done_ = 0;
+  Scalar radius2_{};            // ρ²
+  std::vector<Scalar> omega_;  // from the second iteration on
 };
 
 }  // namespace prdp

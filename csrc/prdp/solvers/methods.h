@@ -18,6 +18,7 @@ template <class Space, class Body>
 auto with_method(Method method, int64_t restart, Space& space, const Body& body) {
   switch (method) {
     case Method::kJacobi: return body(JacobiMethod<Space>(space));
+    case Method::kChebyshev: return body(JacobiMethod<Space>(space, /*accelerated=*/true));
     case Method::kSteepestDescent: return body(SteepestDescentMethod<Space>(space));
     case Method::kConjugateGradient: return body(ConjugateGradientMethod<Space>(space));
     case Method::kGmres: return body(GmresMethod<Space>(space, restart, false));

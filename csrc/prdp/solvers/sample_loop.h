@@ -27,24 +27,11 @@ struct SampleBatch {
   int64_t* applications;
 };
 
-/// Runs the method on the sample that waits scaled in the workspace; returns where u is.
-template <class Kernel, class Factors, class T>
-T* run_method(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
-                    const SampleBatch<T>& batch, std::array<SampleState, 1>& states) {
-  SampleSpace<Kernel, Factors> space(kernel, factors, workspace, states);
-  space.begin();
-  states[0].b2 = space.b2();
-  return with_method(batch.method, batch.restart, space, [&](auto method) -> T* {
-    iterate(space, method, states, batch.rtol);
-    return method.x;
-  });
-}
-
 /// Solves sample `s`. b is scaled by a power of two to the order of one, so that no square over- or
 /// underflows and solve(2^k b) = 2^k solve(b) holds to the last bit.
-template <class Kernel, class Factors, class T>
-void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is_finite,
-                  kernels::Workspace<T>& workspace, const SampleBatch<T>& batch, int64_t s) {
+template <class Kernel, class Iteration, class T>
+void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Kernel>& space, Iteration& method,
+                  const SampleBatch<T>& batch, int64_t s) {
   const int64_t n = kernel.unknowns();
   const T* b = batch.b + s * n;
   T* u = batch.u + s * n;
@@ -75,7 +62,7 @@ void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is
     return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
 
   const T scale = kernels::power_of_two_scale(magnitude);
-  T* scaled = workspace.vector(0);
+  T* scaled = space.b();
   kernel.load(b, scale, scaled);
   bool consistent = true;
   if constexpr (kernels::kHasNullSpace<Kernel>) {
@@ -85,9 +72,11 @@ void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is
     if (norm2(scaled) <= std::numeric_limits<T>::epsilon() * whole)
       return hand_out_zeros(SolveStatus::kInconsistent, 1.0);
   }
-  T* x = run_method(kernel, factors, workspace, batch, states);
-  if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(x);
-  kernel.store(x, T(1) / scale, u);
+  space.begin(state);
+  state.b2 = space.b2();
+  iterate(space, method, states, batch.rtol);
+  if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(method.x);
+  kernel.store(method.x, T(1) / scale, u);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
   if (!kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
     hand_out_zeros(SolveStatus::kOverflow, 1.0);
@@ -95,26 +84,27 @@ void solve_sample(const Kernel& kernel, const Factors* factors, bool operator_is
     finish(state.status, state.iterations, std::sqrt(state.residual2 / state.b2));
   }
   // Whatever a failure left in the padding must not reach the next sample.
-  if (is_failure(static_cast<SolveStatus>(batch.status[s])))
-    for (int64_t i = 0; i < workspace.count(); ++i) workspace.clear(i);
+  if (is_failure(static_cast<SolveStatus>(batch.status[s]))) space.clear();
 }
 
 /// Solves the samples [begin, end) on this thread.
 template <class Kernel, class T>
 void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
-  using Factors = typename kernels::FactorsOf<Kernel>::Type;
   auto& workspace = kernels::Workspace<T>::local();
   const int64_t restart = std::min(batch.restart, kernel.unknowns());
   workspace.prepare(2 + vectors_of(batch.method, restart), kernel.length(), kernel.halo());
-  const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
-    const bool finite = a.operator_is_finite();
-    std::optional<Factors> factors;
-    if (batch.method == Method::kDirect && finite) factors.emplace(a);
-    for (int64_t s = from; s < to; ++s)
-      solve_sample(a, factors ? &*factors : nullptr, finite, workspace, batch, s);
-  };
-  if (kernel.is_shared()) return solve(kernel, begin, end);
-  for (int64_t s = begin; s < end; ++s) solve(kernel.sample(s), s, s + 1);
+  SampleSpace<Kernel> space(kernel, workspace);
+  with_method(batch.method, restart, space, [&](auto method) {
+    const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
+      const bool finite = a.operator_is_finite();
+      std::optional<typename SampleSpace<Kernel>::Factors> factors;
+      if (batch.method == Method::kDirect && finite) factors.emplace(a);
+      space.set_operator(a, factors ? &*factors : nullptr);
+      for (int64_t s = from; s < to; ++s) solve_sample(a, finite, space, method, batch, s);
+    };
+    if (kernel.is_shared()) return solve(kernel, begin, end);
+    for (int64_t s = begin; s < end; ++s) solve(kernel.sample(s), s, s + 1);
+  });
 }
 
 }  // namespace prdp

@@ -5,33 +5,41 @@
 #include <utility>
 #include <vector>
 
-#include "prdp/kernels/vector.h"
+#include "prdp/kernels/direct_factors.h"
 #include "prdp/solvers/iterate.h"
 
 namespace prdp {
 
-/// One sample as a space for iterate(): vectors are padded memory of the thread's workspace, and
-/// every operation is a plain loop in place. `Kernel` is one of kernels/, `Factors` its direct method.
-template <class Kernel, class Factors>
+/// One sample after the other as a space for iterate(): vectors are padded memory of the thread's
+/// workspace, and every operation is a plain loop in place. `Kernel` is one of kernels/.
+template <class Kernel>
 class SampleSpace {
  public:
   using T = typename Kernel::Scalar;
+  using Factors = typename kernels::FactorsOf<Kernel>::Type;
   using Vector = T*;
   using Scalar = T;
   using States = std::array<SampleState, 1>;
 
-  SampleSpace(const Kernel& kernel, const Factors* factors, kernels::Workspace<T>& workspace,
-              States& states)
-      : kernel_(kernel), factors_(factors), workspace_(workspace), state_(states[0]) {}
+  SampleSpace(const Kernel& kernel, kernels::Workspace<T>& workspace) : kernel_(&kernel), workspace_(workspace) {}
 
-  /// Takes over b, which the caller has put into the first vector of the workspace.
-  void begin() { b2_ = dot(b(), b()); }
+  /// The operator of the samples that follow, with its direct method where that is wanted.
+  void set_operator(const Kernel& kernel, const Factors* factors) {
+    kernel_ = &kernel;
+    factors_ = factors;
+  }
+  /// Takes over a sample, whose b the caller has put into b().
+  void begin(SampleState& state) {
+    state_ = &state;
+    broken_ = false;
+    b2_ = dot(b(), b());
+  }
 
   Vector vector() { return workspace_.vector(used_++); }
   Vector scratch() { return workspace_.vector(1); }
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
-  int64_t unknowns() const { return kernel_.unknowns(); }
+  int64_t unknowns() const { return kernel_->unknowns(); }
   double epsilon() const { return std::numeric_limits<T>::epsilon() / 2; }
 
   void fill_zero(Vector v) { std::fill(v, v + length(), T(0)); }
@@ -45,21 +53,42 @@ class SampleSpace {
     return loops_.descend(alpha, p, q, x, r, length());
   }
 
+  /// out = A v; returns v·out and ‖out‖².
+  std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
+    ++state_->applications;
+    if constexpr (requires { kernel_->apply(v, out)[0]; }) return kernel_->apply(v, out);
+    kernel_->apply(v, out);
+    return {dot(v, out), dot(out, out)};
+  }
   void apply(const T* v, Vector out, bool /*preconditioned: never, solve() sees to it*/ = false) {
-    ++state_.applications;
-    kernel_.apply(v, out);
+    ++state_->applications;
+    kernel_->apply(v, out);
   }
-  void divide_by_diagonal(const T* b, Vector c) { kernel_.divide_by_diagonal(b, c); }
-  template <bool WithResidual>
-  Scalar jacobi_sweep(const T* c, const T* x, Vector next) {
-    ++state_.applications;
-    return kernel_.template jacobi_sweep<WithResidual>(c, x, next);
+  void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
+  /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
+  /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
+  void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
+    state_->applications += n;
+    if constexpr (kernels::kHasSpectrum<Kernel>) kernel_->jacobi_sweeps(c, x, next, n, omega);
+    else kernel_->jacobi_sweeps(c, x, next, n);
   }
+  Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
+    ++state_->applications;
+    if constexpr (kernels::kHasSpectrum<Kernel>) return kernel_->jacobi_sweep(c, x, next, omega);
+    else return kernel_->jacobi_sweep(c, x, next);
+  }
+  /// The square of the spectral radius of I - D⁻¹A; solve() sees to it that there is one.
+  Scalar radius2() const {
+    if constexpr (kernels::kHasSpectrum<Kernel>) return static_cast<T>(kernel_->radius() * kernel_->radius());
+    else return 0;
+  }
+  /// Whether the norms of Jacobi's residuals are a convex sequence on a logarithmic scale.
+  static constexpr bool sweeps_contract() { return kernels::kHasSpectrum<Kernel>; }
   /// r = b - A x, within the range of A; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(x, r);
     loops_.xpby(b(), T(-1), r, length());
-    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_.project(r);
+    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_->project(r);
     return dot(r, r);
   }
   void solve_directly(const T* r, Vector d) {
@@ -85,22 +114,27 @@ class SampleSpace {
   static constexpr bool recording() { return false; }
   Scalar constant(Scalar value) const { return value; }
   void scale(const T* v, Scalar factor, Vector out) {
-    for (int64_t i = 0; i < length(); ++i) out[i] = factor * v[i];
+    loops_.scale(factor, v, out, length());
   }
   void dots(const std::vector<Vector>& v, int64_t count, const T* w, Scalar* h) {
     loops_.multi_dot(v.data(), count, w, h, length());
   }
   /// w -= Σ h_i v_i; returns ‖w‖².
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector w) {
-    loops_.multi_axpy(h, v.data(), count, w, length());
-    return dot(w, w);
+    return loops_.multi_axpy(T(-1), h, v.data(), count, w, length());
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x,
                        bool /*preconditioned*/) {
-    for (int64_t i = 0; i < count; ++i) loops_.axpy(y[i], v[i], x, length());
+    loops_.multi_axpy(T(1), y.data(), v.data(), count, x, length());
   }
-  /// A second pass pays where the first left less than it took.
-  bool lost_orthogonality(Scalar left2, Scalar taken2) const { return left2 < taken2; }
+  /// Whether w, of which `left2` is left beside the `taken2` that went along the basis, needs another
+  /// pass: each takes a share of the digits away, and three may be missing.
+  bool lost_orthogonality(Scalar left2, Scalar taken2, Scalar& loss) const {
+    const Scalar grown = (loss + 1) * std::sqrt((left2 + taken2) / left2);
+    if (!(grown < 1000)) return true;
+    loss = grown;
+    return false;
+  }
   /// 1/value; 0 where value is rounding beside `scale`.
   Scalar inverse(Scalar value, Scalar scale) const {
     return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
@@ -117,7 +151,7 @@ class SampleSpace {
 
   std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
-  std::array<double, 1> operator_norm() const { return {kernel_.norm()}; }
+  std::array<double, 1> operator_norm() const { return {kernel_->norm()}; }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}  // a lone sample stops by leaving the loop
   template <class Function>
@@ -127,7 +161,11 @@ class SampleSpace {
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void restart() {
     broken_ = false;
-    for (int64_t i = 1; i < workspace_.count(); ++i) workspace_.clear(i);
+    clear(1);
+  }
+  /// Zeroes the vectors from number `first` on, with their padding.
+  void clear(int64_t first = 0) {
+    for (int64_t i = first; i < workspace_.count(); ++i) workspace_.clear(i);
   }
 
  private:
@@ -136,13 +174,13 @@ class SampleSpace {
 
   static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
 
-  int64_t length() const { return kernel_.length(); }
+  int64_t length() const { return kernel_->length(); }
 
   const kernels::Loops<T>& loops_ = kernels::loops<T>();
-  const Kernel& kernel_;
-  const Factors* factors_;
+  const Kernel* kernel_;
+  const Factors* factors_ = nullptr;
   kernels::Workspace<T>& workspace_;
-  SampleState& state_;
+  SampleState* state_ = nullptr;
   int64_t used_ = 2;
   T b2_ = 0;
   bool broken_ = false;

@@ -15,6 +15,12 @@ SolveInfo empty_info(const at::Tensor& b) {
           at::empty({batch}, counts), at::empty({batch}, counts)};
 }
 
+/// What an iteration takes of a core for each unknown, in nanoseconds; in GMRES a product of a cycle.
+double cost_per_unknown(Method method) {
+  if (method == Method::kJacobi || method == Method::kChebyshev) return 0.1;
+  return method == Method::kGmres ? 0.8 : 0.3;
+}
+
 template <class T, class Parameters>
 SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
   const auto rhs = b.contiguous();
@@ -34,27 +40,28 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              result.info.operator_applications.mutable_data_ptr<int64_t>()};
   const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t products = request.max_iter * (request.method == Method::kGmres ? request.restart : 1);
-  at::parallel_for(0, size, grain_size(unknowns, products), [&](int64_t begin, int64_t end) {
-    solve_range(a, batch, begin, end);
-  });
+  at::parallel_for(0, size, grain_size(request.method, size, unknowns, products),
+                   [&](int64_t begin, int64_t end) { solve_range(a, batch, begin, end); });
   return result;
 }
 
 }  // namespace
 
-int64_t grain_size(int64_t unknowns, int64_t products) {
-  constexpr double nanoseconds_per_point = 0.5, worthwhile = 1e5;
-  const double sample = nanoseconds_per_point * static_cast<double>(unknowns) *
-                        static_cast<double>(std::min<int64_t>(products, 1000) + 4);
-  return std::max<int64_t>(1, static_cast<int64_t>(worthwhile / sample));
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations) {
+  constexpr double worthwhile = 1e5;
+  const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
+                      static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
+  const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
+  return at::divup(samples, threads);
 }
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel();
-  const bool has_loops = !std::holds_alternative<std::monostate>(parameters) &&
-                         request.method != Method::kGmresStokes;
-  if (!b.is_cpu() || !has_loops)
-    return solve_with_tensors(a, b, request);
+  const bool has_loops =
+      request.method == Method::kChebyshev ? std::holds_alternative<kernels::LaplacianParameters>(parameters)
+                                           : !std::holds_alternative<std::monostate>(parameters) &&
+                                                 request.method != Method::kGmresStokes;
+  if (!b.is_cpu() || !has_loops) return solve_with_tensors(a, b, request);
   return std::visit(
       [&](const auto& p) -> SolveResult {
         if constexpr (std::is_same_v<std::decay_t<decltype(p)>, std::monostate>) {

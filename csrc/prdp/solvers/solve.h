@@ -26,15 +26,17 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
 /// The same in plain tensor operations: the oracle for the CPU loops, and the way of other devices.
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
-/// Samples a thread takes at least: below some 100 µs of work, handing it over costs more than it saves.
-int64_t grain_size(int64_t unknowns, int64_t products);
+/// Samples that a thread takes, such that each has some 100 µs of work at least: below that, handing it
+/// over costs more than it saves. A cycle of GMRES counts as its products.
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations);
 
 /// u after exactly `caps` iterations of each sample, recorded by autograd where b or the tensors of
 /// `a` require it: the map whose derivative the unrolled mode takes.
 struct RecordedSolve {
   at::Tensor u, operator_applications;
 };
-RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver, const at::Tensor& caps);
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+                             const at::Tensor& caps);
 
 /// The same iteration by iteration, in plain tensor operations. Of samples with caps > 0 alone.
 class StepwiseSolve {

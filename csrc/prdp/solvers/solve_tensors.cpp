@@ -130,7 +130,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   return {u.contiguous(), info_of(states, b.options())};
 }
 
-RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver, const at::Tensor& caps) {
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+                             const at::Tensor& caps) {
   // Samples of no iterations return zero and have no derivative. They are left out: an operator that
   // was refused would send NaN backwards even from behind a mask.
   const auto index = caps.gt(0).nonzero().flatten().to(b.device());
@@ -164,7 +165,8 @@ StepwiseSolve::StepwiseSolve(const Solver& solver, const at::Tensor& b, const at
 
 int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin(), caps_.end()); }
 
-StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b, const State& before, int64_t done) {
+StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b, const State& before,
+                                         int64_t done) {
   std::vector<SampleState> states(caps_.size());
   TensorSpace space(a, a.project(b * scale_), states, /*recording=*/true);
   State after;
@@ -174,11 +176,12 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b,
     if (!before.empty()) {
       size_t next = 0;
       std::apply([&](auto&... part) { ((part = before[next++]), ...); }, state);
-      method.resume();
+      method.resume(done);
     }
     for (size_t i = 0; i < states.size(); ++i) states[i].active = done < caps_[i];
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
-    method.step();
+    if constexpr (detail::kTakesStrides<decltype(method)>) method.step(1);
+    else method.step();
     if constexpr (detail::kLeastResidual<decltype(method)>) method.residual2();
     std::apply([&](const auto&... part) { (after.push_back(part), ...); }, state);
     return 0;

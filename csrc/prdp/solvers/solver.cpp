@@ -11,7 +11,8 @@ namespace {
 template <class Enum, size_t N>
 using Names = std::array<std::pair<Enum, std::string_view>, N>;
 
-constexpr Names<Method, 6> kMethods{{{Method::kJacobi, "jacobi"},
+constexpr Names<Method, 7> kMethods{{{Method::kJacobi, "jacobi"},
+                                     {Method::kChebyshev, "chebyshev"},
                                      {Method::kSteepestDescent, "steepest_descent"},
                                      {Method::kConjugateGradient, "cg"},
                                      {Method::kGmres, "gmres"},

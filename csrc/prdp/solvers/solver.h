@@ -7,7 +7,15 @@
 
 namespace prdp {
 
-enum class Method { kJacobi, kSteepestDescent, kConjugateGradient, kGmres, kGmresStokes, kDirect };
+enum class Method {
+  kJacobi,
+  kChebyshev,
+  kSteepestDescent,
+  kConjugateGradient,
+  kGmres,
+  kGmresStokes,
+  kDirect
+};
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -30,6 +38,12 @@ struct Jacobi {
   int64_t max_iter;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kJacobi, max_iter, rtol}; }
+};
+/// Jacobi's iteration accelerated by what is known of the spectrum; for Heat and Poisson.
+struct Chebyshev {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kChebyshev, max_iter, rtol}; }
 };
 struct SteepestDescent {
   int64_t max_iter;

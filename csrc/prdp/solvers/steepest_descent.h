@@ -1,4 +1,5 @@
 #pragma once
+#include <cstdint>
 #include <tuple>
 
 namespace prdp {
@@ -16,8 +17,8 @@ class SteepestDescentMethod {
     rr_ = space_.b2();
   }
   void step() {
-    space_.apply(r_, q_);
-    alpha_ = space_.step_length(rr_, space_.dot(r_, q_), rr_, space_.dot(q_, q_));
+    const auto [rq, qq] = space_.apply_with_dots(r_, q_);
+    alpha_ = space_.step_length(rr_, rq, rr_, qq);
     rr_ = space_.descend(alpha_, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
@@ -25,7 +26,7 @@ class SteepestDescentMethod {
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, rr_); }
-  void resume() {}
+  void resume(int64_t) {}
 
   typename Space::Vector x;
 

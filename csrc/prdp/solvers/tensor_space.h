@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <vector>
 
 #include "prdp/operators/operator.h"
@@ -30,7 +31,12 @@ class TensorSpace {
   void fill_zero(Vector& v) { v = at::zeros_like(b_); }
   void copy(const Vector& from, Vector& to) { to = keep_frozen(from, to); }
   void assign(const Scalar& from, Scalar& to) { to = keep_frozen(from, to); }
-  void advance(Vector& x, const Vector& next) { x = keep_frozen(next, x); }
+  /// x takes the value of next, and next that of x.
+  void advance(Vector& x, Vector& next) {
+    const auto before = x;
+    x = keep_frozen(next, x);
+    next = before;
+  }
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
   void xpby(const Vector& x, const Scalar& beta, Vector& y) { y = keep_frozen(x + beta * y, y); }
   Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
@@ -44,20 +50,28 @@ class TensorSpace {
     count();
     out = a_.apply(preconditioned ? a_.precondition(v, false) : v);
   }
+  std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
+    apply(v, out);
+    return {dot(v, out), dot(out, out)};
+  }
   void divide_by_diagonal(const Vector& b, Vector& c) {
     diagonal_ = a_.diagonal().to(b_.options());
     c = b / diagonal_;
   }
-  template <bool WithResidual>
-  Scalar jacobi_sweep(const Vector& c, const Vector& x, Vector& next) {
-    Vector product;
-    apply(x, product);
-    const auto change = c - product / diagonal_;
-    next = x + change;
-    if constexpr (!WithResidual) return {};
+  void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
+    for (int64_t s = 0; s < n; ++s) {
+      next = swept(x, jacobi_change(c, x), next, omega ? omega + s : nullptr);
+      advance(x, next);
+    }
+  }
+  Scalar measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega) {
+    const auto change = jacobi_change(c, x);
+    next = swept(x, change, next, omega);
     const auto r = diagonal_ * change;
     return dot(r, r);
   }
+  Scalar radius2() const { return a_.jacobi_radius().square(); }
+  static constexpr bool sweeps_contract() { return false; }  // not known of the operator
   Scalar residual(const Vector& x, Vector& r) {
     Vector product;
     apply(x, product);
@@ -86,7 +100,7 @@ class TensorSpace {
     for (int64_t i = 1; i < count; ++i) sum = sum + y[i] * v[i];
     x = keep_frozen(x + (preconditioned ? a_.precondition(sum, false) : sum), x);
   }
-  bool lost_orthogonality(const Scalar&, const Scalar&) const { return true; }  // for some sample
+  bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
@@ -117,6 +131,14 @@ class TensorSpace {
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
+  }
+  static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
+    return omega ? before + *omega * (x + change - before) : x + change;
+  }
+  Vector jacobi_change(const Vector& c, const Vector& x) {
+    Vector product;
+    apply(x, product);
+    return c - product / diagonal_;
   }
   void set_active(const std::vector<bool>& active);
   void count();

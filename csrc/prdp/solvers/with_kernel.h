@@ -34,7 +34,8 @@ void with_kernel(const CsrParameters& a, const Body& body) {
 
 /// `winds`: (batch or 1, channel, nx) or (batch or 1, channel, ny, nx).
 template <class T>
-kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, double nu, double dt, bool transposed) {
+kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, double nu, double dt,
+                                               bool transposed) {
   return {winds.const_data_ptr<T>(),
           winds.size(0) == 1 ? 0 : winds.numel() / winds.size(0),
           winds.dim() > 3 ? winds.size(2) : 1,

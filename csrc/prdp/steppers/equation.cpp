@@ -79,8 +79,8 @@ Outputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_vie
   const auto [next, info] = step(equation, u, unflatten(std::move(options)...));
   return {next, info.iterations, info.residual, info.status, info.operator_applications};
 }
-using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                          at::ArrayRef<double>, int64_t)>;
+using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
+                                          at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
 at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape,
                   at::ArrayRef<double> parameters) {

@@ -28,19 +28,21 @@ constexpr const char* kVjpSchema =
     "Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
     ") -> Tensor[]";
 
-using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                            at::ArrayRef<double>, int64_t, c10::SymInt)>;
+using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
+                                            at::IntArrayRef, at::ArrayRef<double>, int64_t, c10::SymInt)>;
 using OptionalTensor = std::optional<at::Tensor>;
 using VjpSignature = WithOptions<std::vector<at::Tensor>(
     const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, at::IntArrayRef,
     at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
-Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
+Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
+                    const SolveOptions& o) {
   static const auto op = c10::Dispatcher::singleton()
                              .findSchemaOrThrow("prdp::rollout_solves", "")
                              .typed<SolvesSignature>();
-  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind), at::IntArrayRef(e.shape),
-                           at::ArrayRef<double>(e.parameters), e.picard_steps, solves);
+  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind),
+                           at::IntArrayRef(e.shape), at::ArrayRef<double>(e.parameters), e.picard_steps,
+                           solves);
 }
 
 Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
@@ -48,7 +50,8 @@ Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArray
   return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
 }
 
-void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
+void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+           const SolveOptions& options) {
   options.check(equation.kind.c_str());
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);
@@ -61,9 +64,9 @@ bool any_requires_grad(at::TensorList tensors) {
 
 /// Below autograd.
 template <class... Options>
-Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                      at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt count,
-                      Options... flat) {
+Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                      at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                      c10::SymInt count, Options... flat) {
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const auto options = unflatten(std::move(flat)...);
   check(equation, u, count, options);
@@ -87,7 +90,8 @@ template <class... Options>
 Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                     at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves,
                     Options... flat) {
-  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves, unflatten(std::move(flat)...));
+  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves,
+        unflatten(std::move(flat)...));
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, solves + 1);
   const auto of_dtype = [&](at::ScalarType dtype) {
@@ -101,8 +105,8 @@ template <class... Options>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
                                    at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind,
-                                   at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
-                                   Options... flat) {
+                                   at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                                   int64_t picard_steps, Options... flat) {
   const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
@@ -122,7 +126,8 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
 template <class... Options>
 std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
                                  const OptionalTensor&, at::IntArrayRef needed, at::TensorList tensors,
-                                 c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t, Options...) {
+                                 c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t,
+                                 Options...) {
   std::vector<at::Tensor> gradients;
   auto sizes = cotangent.sym_sizes().vec();
   sizes.erase(sizes.begin() + 1);
@@ -195,9 +200,9 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
 };
 
 template <class... Options>
-Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                        at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves,
-                        Options... flat) {
+Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                        at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                        c10::SymInt solves, Options... flat) {
   auto call = c10::make_intrusive<Call>();
   call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call->solves = std::move(solves);
@@ -214,9 +219,9 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
 }
 
 template <class... Options>
-Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                       at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt steps,
-                       Options... flat) {
+Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                       at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                       c10::SymInt steps, Options... flat) {
   const auto [states, info] = rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps,
                                       unflatten(std::move(flat)...));
   return {states, info.iterations, info.residual, info.status, info.operator_applications};
@@ -252,6 +257,8 @@ TORCH_LIBRARY_IMPL(prdp, Meta, m) {
   m.impl("rollout_solves", static_cast<SolvesSignature*>(fake_solves));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(fake_vjp));
 }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves)); }
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves));
+}
 
 }  // namespace prdp

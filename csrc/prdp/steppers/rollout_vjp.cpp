@@ -34,7 +34,8 @@ void Reports::push(const SolveInfo& info) {
 }
 
 void Reports::reverse() {
-  for (auto* list : {&iterations_, &residual_, &status_, &applications_}) std::reverse(list->begin(), list->end());
+  for (auto* list : {&iterations_, &residual_, &status_, &applications_})
+    std::reverse(list->begin(), list->end());
 }
 
 SolveInfo Reports::joined(const at::Tensor& u) const {
@@ -42,9 +43,9 @@ SolveInfo Reports::joined(const at::Tensor& u) const {
           side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong)};
 }
 
-std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
-                                      const SolveOptions& options, at::IntArrayRef needed,
-                                      decltype(linear_solve)& adjoint_solve) {
+std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept,
+                                      const Equation& equation, const SolveOptions& options,
+                                      at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
   const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
   const bool rhs_is_state = equation.kind == "heat" || equation.kind == "burgers";
   const bool flow = is_flow(equation);
@@ -58,7 +59,8 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     const FailuresOfStep here(s / picard + 1, solves / picard);
     const int64_t first = s - s % picard;
     const auto a = equation_operator(equation, at_solve(kept.solutions, s));
-    Solved solved{{}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s)};
+    Solved solved{
+        {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s)};
     if (options.backward == Backward::kUnrolled)
       solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
     std::vector<int64_t> wanted(needed.begin(), needed.end());
