@@ -204,7 +204,8 @@ def test_a_failed_adjoint_solve_says_it_too(name):
         cotangent = torch.zeros_like(states)
         cotangent[1, 3] = float("nan")
         with pytest.raises(
-            torch.linalg.LinAlgError, match="step 3 of 4: adjoint solve: 1 of 3 samples failed: sample 1 NONFINITE_INPUT"
+            torch.linalg.LinAlgError,
+            match="step 3 of 4: adjoint solve: 1 of 3 samples failed: sample 1 NONFINITE_INPUT",
         ):
             states.backward(cotangent, create_graph=create_graph)
 

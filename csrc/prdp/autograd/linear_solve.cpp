@@ -1,5 +1,6 @@
 #include "prdp/autograd/linear_solve.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
@@ -78,12 +79,23 @@ Outputs fake_kernel(const at::Tensor& b, Args... args) {
           at::empty_symint({b.sym_size(0)}, b.options()), counts(), counts()};
 }
 
+/// Whether tensors are what they seem, not fake, wrapped or watched: then the dispatcher has nothing to add
+/// to a kernel, and its way through the flat arguments is saved.
+bool is_plain(const at::Tensor& t) { return !at::isTensorSubclassLike(t); }
+
+/// The op below autograd.
+Outputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o) {
+  const at::AutoDispatchBelowADInplaceOrView below;
+  if (!is_plain(b)) return call_op(b, a, o);
+  const auto [u, info] = linear_solve_kernel(a, b, o);
+  return {u, info.iterations, info.residual, info.status, info.operator_applications};
+}
+
 class LinearSolve : public torch::autograd::Function<LinearSolve> {
  public:
   static variable_list forward(AutogradContext* ctx, const at::Tensor& b, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
-    const at::AutoDispatchBelowADInplaceOrView below;
-    const auto [u, iterations, residual, status, applications] = call_op(b, call->a, call->options);
+    const auto [u, iterations, residual, status, applications] = call_below(b, call->a, call->options);
     ctx->mark_non_differentiable({iterations, residual, status, applications});
     ctx->set_materialize_grads(false);
 
@@ -115,8 +127,10 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     if (!grads[0].defined()) return out;
     std::vector<int64_t> needed(inputs);
     for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
-    const auto found =
-        solve_vjp(grads[0], {saved[0], saved[0], saved[1], saved[2]}, a, call->options, needed);
+    auto& adjoint_solve =
+        at::GradMode::is_enabled() || !is_plain(grads[0]) ? linear_solve : linear_solve_kernel;
+    const Solved solved{saved[0], saved[0], saved[1], saved[2]};
+    const auto found = solve_vjp(grads[0], solved, a, call->options, needed, adjoint_solve);
     std::copy(found.gradients.begin(), found.gradients.end(), out.begin());
     return out;
   }
@@ -130,10 +144,7 @@ Outputs autograd_kernel(const at::Tensor& b, Args... args) {
       at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
       (b.requires_grad() || std::any_of(tensors.begin(), tensors.end(),
                                         [](const at::Tensor& t) { return t.requires_grad(); }));
-  if (!differentiable) {
-    const at::AutoDispatchBelowADInplaceOrView below;
-    return call_op(b, call->a, call->options);
-  }
+  if (!differentiable) return call_below(b, call->a, call->options);
   const auto out = LinearSolve::apply(b, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4]};
 }
