@@ -153,7 +153,7 @@ def training(found):
 
 def memory(found, titles):
     """Peak memory against K, one panel a problem."""
-    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    figure = Figure(figsize=(11.5, 3.8), layout="constrained")
     colours = ("#0072B2", "#D55E00", "#009E73", "#999999")
     for axes, case in zip(figure.subplots(1, len(titles)), titles, strict=True):
         modes = dict.fromkeys(p["mode"] for p in found)
