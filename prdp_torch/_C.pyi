@@ -98,6 +98,7 @@ class Network:
     hidden: list[int]
     blocks: int
     width: int
+    zero_output: bool
 
 class Training:
     loss: str

@@ -58,4 +58,7 @@ def make_network(scene, seed):
             made = MLP(physics.channels * math.prod(physics.shape), network.hidden)
         else:
             made = ResNet(len(physics.shape), physics.channels, network.blocks, network.width, physics.periodic)
+        if network.zero_output:
+            for parameter in list(made.parameters())[-2:]:  # weight and bias of the last layer
+                torch.nn.init.zeros_(parameter)
         return made.to(scene.dtype)

@@ -31,7 +31,8 @@ void bind_scenes(py::module_& m) {
       .def_readonly("kind", &Scene::Network::kind)
       .def_readonly("hidden", &Scene::Network::hidden)
       .def_readonly("blocks", &Scene::Network::blocks)
-      .def_readonly("width", &Scene::Network::width);
+      .def_readonly("width", &Scene::Network::width)
+      .def_readonly("zero_output", &Scene::Network::zero_output);
   py::class_<Scene::Training>(m, "Training")
       .def_readonly("loss", &Scene::Training::loss)
       .def_readonly("batch", &Scene::Training::batch)

@@ -184,6 +184,11 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   torch::manual_seed(static_cast<uint64_t>(seed));
   auto network = n.kind == "mlp" ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
                                  : AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()));
+  if (n.zero_output) {
+    const torch::NoGradGuard no_grad;
+    const auto parameters = network.ptr()->parameters();
+    for (auto last = parameters.end() - 2; last != parameters.end(); ++last) last->zero_();
+  }
   network.ptr()->to(scene.dtype);
   return network;
 }

@@ -109,6 +109,14 @@ def test_the_scenes_networks_see_beyond_the_grid_what_the_equation_sees():
     assert sum(p.numel() for p in make_network(scenes.load("heat_2d"), 0).parameters()) == 23409900
 
 
+def test_a_network_may_start_from_zero_output():
+    scene = scenes.load("burgers_2d")
+    network, u = make_network(scene, 0), torch.randn(2, 2, 64, 64)
+    assert scene.network.zero_output and (network(u) == 0).all()
+    assert all(p.abs().max() > 0 for p in list(network.parameters())[:-2])
+    assert not (make_network(scenes.load("heat_1d"), 0)(torch.randn(2, 1, 30)) == 0).any()
+
+
 @pytest.mark.parametrize("name", ["heat_1d", "burgers_1d"])
 def test_weights_depend_on_the_seed_alone(name):
     scene = scenes.load(name)

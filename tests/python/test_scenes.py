@@ -53,7 +53,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
     [
         ("rtol = 1e-5", "tol = 1e-5", "[solver]", "solver.rtol: missing; the table holds: backward, max_iter"),
         ("rtol = 1e-5", "rtol = 1e-5\nm = 3", "m = 3", "unknown name 'solver.m'; allowed: backward, max_iter, meth"),
-        ('method = "jacobi"', 'method = "x"', "method", "solver.method: unknown name 'x'; allowed: jacobi, steepest"),
+        ('method = "jacobi"', 'method = "x"', "method", "solver.method: unknown name 'x'; allowed: jacobi, cheby"),
         ("nu = 1e-3", "nu = -1.0", "nu =", "physics.nu: must be >= 0, got -1"),
         ("dt = 1.0", "dt = 0", "dt =", "physics.dt: must be > 0, got 0"),
         ("max_iter = 25", "max_iter = -1", "max_iter", "solver.max_iter: must be >= 0, got -1"),
@@ -70,6 +70,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ('"heat"', '"wave"', "equation =", "physics.equation: unknown name 'wave'; allowed: poisson, heat, burgers"),
         ('kind = "mlp"', 'kind = "cnn"', "kind", "network.kind: unknown name 'cnn'; allowed: mlp, resnet"),
         ("hidden", "blocks = 6\nhidden", "blocks", "unknown name 'network.blocks'; allowed: hidden, kind"),
+        ("hidden", "zero_output = 1\nhidden", "zero_output", "network.zero_output: expected true or false"),
         ("rtol = 1e-5", "rtol = 1e-5\nrestart = 2", "restart", "unknown name 'solver.restart'; allowed: backward"),
         ("[network]", "[networks]", "title", "network: missing; the table holds:"),
         ("[physics]", "[physics", "[physics", "Error while parsing"),
@@ -77,6 +78,12 @@ def test_the_projects_scenes_hold_the_papers_settings():
 )  # fmt: skip
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):
     assert_refused(written(tmp_path, (before, after)), where, message)
+
+
+def test_chebyshev_is_for_scenes_of_known_spectrum(tmp_path):
+    assert scenes.load(written(tmp_path, ('"jacobi"', '"chebyshev"'))).method == "chebyshev"
+    refused = written(tmp_path, ('method = "gmres"', 'method = "chebyshev"'), scene="burgers_1d")
+    assert_refused(refused, "method", "solver.method: unknown name 'chebyshev'; allowed: jacobi, steepest_descent, cg")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +108,7 @@ def test_missing_files_and_unknown_scenes():
         scenes.load("nowhere.toml")
     with pytest.raises(
         ValueError,
-        match="no scene 'heat1d'; available: burgers_1d, heat_1d, heat_2d, heat_3d, navier_stokes, poisson_1p",
+        match="no scene 'heat1d'; available: burgers_1d, burgers_2d, heat_1d, heat_2d, heat_3d, navier_stokes",
     ):
         scenes.load("heat1d")
 

@@ -45,8 +45,9 @@ Scene::Physics read_physics(TomlSection s, Task task) {
 }
 
 void read_solver(TomlSection s, Scene& scene) {
-  scene.solver.method = method_from_name(
-      s.choice("method", {"jacobi", "steepest_descent", "cg", "gmres", "direct"}));
+  std::vector<std::string> methods{"jacobi", "steepest_descent", "cg", "gmres", "direct"};
+  if (!scene.physics.periodic()) methods.insert(methods.begin() + 1, "chebyshev");  // heat and Poisson
+  scene.solver.method = method_from_name(s.choice("method", methods));
   scene.solver.max_iter = s.whole("max_iter", 0);
   scene.solver.rtol = s.at_least("rtol", 0.0);
   if (scene.solver.method == Method::kGmres) scene.solver.restart = s.whole("restart", 1);
@@ -83,6 +84,7 @@ Scene::Network read_network(TomlSection s) {
     n.blocks = s.whole("blocks", 1);
     n.width = s.whole("width", 1);
   }
+  n.zero_output = s.flag("zero_output", false);
   s.finish();
   return n;
 }

@@ -42,6 +42,7 @@ struct Scene {
     std::string kind;             // "mlp" or "resnet"
     std::vector<int64_t> hidden;  // mlp
     int64_t blocks = 0, width = 0;  // resnet
+    bool zero_output = false;       // the last layer starts at zero
   };
   struct Training {
     std::string loss;  // "nmse" or "mse"

@@ -39,6 +39,11 @@ class TomlSection {
     }
     fail(key, "unknown name '" + chosen + "'; allowed: " + list.str());
   }
+  bool flag(const char* key, bool otherwise) {
+    if (!has(key)) return otherwise;
+    if (!table_[key].is_boolean()) fail(key, "expected true or false");
+    return table_[key].value_or(otherwise);
+  }
   double number(const char* key) {
     const double x = value<double>(key, "a number");
     if (!std::isfinite(x)) fail(key, "must be finite");
