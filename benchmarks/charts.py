@@ -149,3 +149,20 @@ def training(found):
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def memory(found, titles):
+    """Peak memory against K, one panel a problem."""
+    figure = Figure(figsize=(11.5, 3.8), layout="constrained")
+    colours = ("#0072B2", "#D55E00", "#009E73", "#999999")
+    for axes, case in zip(figure.subplots(1, len(titles)), titles, strict=True):
+        modes = dict.fromkeys(p["mode"] for p in found)
+        for mode, colour in zip(modes, colours, strict=False):
+            points = [p for p in found if (p["case"], p["mode"]) == (case, mode)]
+            axes.plot([p["k"] for p in points], [p["bytes"] / 1e6 for p in points], "o-", color=colour, label=mode)
+        axes.set(xscale="log", yscale="log", xlabel="K", ylabel="MB at the peak", title=titles[case])
+        axes.set_xticks([p["k"] for p in points], [str(p["k"]) for p in points])
+        axes.minorticks_off()
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jinja2
 
-from benchmarks import charts
+from benchmarks import charts, memory
 from benchmarks.problems import PROBLEMS
 from prdp_torch import records
 
@@ -60,6 +60,23 @@ def sections(results):
             "text": "One batch of the scene: network, loss, backward and fused Adam (grey), and what the solves "
             "and their derivatives add, at K = 1 and at the converged K.",
         }  # fmt: skip
+    if "memory" in results:
+        yield {
+            "name": "memory", "title": "Memory of a gradient", "table": memory_table(results["memory"]),
+            "figure": charts.memory(results["memory"], memory.CASES),
+            "text": "Growth of the peak resident set by one solve with its gradients for the state and nu, batch "
+            f"of {memory.BATCH}, float32, each case in a process of its own.",
+        }  # fmt: skip
+
+
+def memory_table(found):
+    budgets = sorted({p["k"] for p in found})
+    rows = [["problem", "derivative", *(f"K = {k}: MB (s)" for k in budgets)]]
+    for case, mode in dict.fromkeys((p["case"], p["mode"]) for p in found):
+        of = {p["k"]: p for p in found if (p["case"], p["mode"]) == (case, mode)}
+        cells = (f"{of[k]['bytes'] / 1e6:.1f} ({of[k]['seconds']:.2g})" for k in budgets)
+        rows.append([memory.CASES[case], mode, *cells])
+    return rows
 
 
 def accuracy_table(points):

@@ -7,6 +7,7 @@ from torch import Tensor, dtype
 VERSION: str
 DEFAULT_RTOL: float
 DEFAULT_RESTART: int
+CHECKPOINT_SQRT: int
 SOLVE_STATUSES: dict[str, int]
 PRDP_DEFAULTS: dict[str, float | int | None]
 
@@ -31,6 +32,7 @@ def check_options(
     adjoint_max_iter: int | None,
     adjoint_rtol: float | None,
     on_failure: str,
+    checkpoint_every: int,
 ) -> None: ...
 def open_adjoint_log() -> int: ...
 def close_adjoint_log(log: int) -> None: ...

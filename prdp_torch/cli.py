@@ -26,7 +26,7 @@ app = typer.Typer(
 )
 console = Console(highlight=False)
 
-SUITES = ("accuracy", "size", "roofline", "change_of_k", "training")  # modules of benchmarks/
+SUITES = ("accuracy", "size", "roofline", "change_of_k", "training", "memory")  # modules of benchmarks/
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import check_options
+from prdp_torch.solvers import check_options, checkpoint_number
 
 SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
 SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
@@ -33,7 +33,8 @@ class AdjointLog:
 
 
 class SolveInfo(NamedTuple):
-    """What a solve says of itself, one value per sample: tensors of shape (batch,)."""
+    """What a solve says of itself, one value per sample: tensors of shape (batch,). Of a rollout, one value
+    per sample and step: (batch, steps)."""
 
     iterations: torch.Tensor
     """Iterations that made the returned u (int64)."""
@@ -46,18 +47,20 @@ class SolveInfo(NamedTuple):
     log: AdjointLog | None = None
 
     def __repr__(self):
-        found = Counter(SolveStatus(s).name for s in self.status.tolist())
+        found = Counter(SolveStatus(s).name for s in self.status.flatten().tolist())
         statuses = ", ".join(f"{count} {name}" for name, count in found.items())
         ranges = ", ".join(
             f"{name} {min(values):g} to {max(values):g}"
             for name in ("iterations", "residual", "operator_applications")
-            if (values := getattr(self, name).tolist())
+            if (values := getattr(self, name).flatten().tolist())
         )
         return f"SolveInfo({statuses}; {ranges})"
 
     @property
     def adjoint(self):
-        """The same of the adjoint solve, after `backward()` in implicit mode; None before."""
+        """The same of the adjoint solve, after `backward()`; None before. In unrolled mode, of the sweeps back
+        through the iterations: those, the solve's status, and NaN for a residual; the products are all that
+        the backward pass took."""
         return None if self.log is None else self.log.read()
 
 
@@ -69,6 +72,7 @@ def linear_solve(
     adjoint_max_iter=None,
     adjoint_rtol=None,
     on_failure="raise",
+    checkpoint_every=None,
 ):
     """Solve A u = b, differentiably. Returns (u, info); u has the shape of b.
 
@@ -83,6 +87,9 @@ def linear_solve(
         adjoint_max_iter, adjoint_rtol: budget of the adjoint solve; the primal's where None.
         on_failure: "raise" (torch.linalg.LinAlgError naming the samples), "warn" or "return" where a
             sample diverges, overflows, breaks down or is not finite. Reaching max_iter is no failure.
+        checkpoint_every: for "unrolled" alone: of the K iterates that the backward pass needs it keeps one
+            in so many and computes those between again; "sqrt" for ⌈√K⌉, None for all. The gradient is
+            the same to the last bit (docs/derivatives.md has the memory and the time).
 
     Raises:
         ValueError, TypeError: bad arguments, before any work.
@@ -98,7 +105,7 @@ def linear_solve(
     log = None
     if not torch.compiler.is_compiling():
         _check.dense("linear_solve", "b", b)
-        check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure)
+        check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
         log = AdjointLog()
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     u, *report = torch.ops.prdp.linear_solve(
@@ -117,5 +124,6 @@ def linear_solve(
         adjoint_rtol,
         on_failure,
         0 if log is None else log.number,
+        checkpoint_number(checkpoint_every),
     )
     return u.squeeze(0) if lone_vector else u, SolveInfo(*report, log)

@@ -92,10 +92,17 @@ class Direct(Solver):
     method: ClassVar[str] = "direct"
 
 
-def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure):
+def checkpoint_number(checkpoint_every):
+    """`checkpoint_every` as the compiled library takes it."""
+    return {None: 0, "sqrt": _C.CHECKPOINT_SQRT}.get(checkpoint_every, checkpoint_every)
+
+
+def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every):
     """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
         raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
+    if checkpoint_every not in (None, "sqrt") and _check.whole(who, "checkpoint_every", checkpoint_every) < 1:
+        raise ValueError(f"{who}: checkpoint_every must be >= 1, 'sqrt' or None, got {checkpoint_every}")
     _C.check_options(
         who,
         solver.method,
@@ -106,4 +113,5 @@ def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_fail
         _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
         _check.string(who, "on_failure", on_failure),
+        checkpoint_number(checkpoint_every),
     )

@@ -31,6 +31,7 @@ void bind_solvers(py::module_& m) {
   set_warning_sink(warn_in_python);
   m.attr("DEFAULT_RTOL") = kDefaultRtol;
   m.attr("DEFAULT_RESTART") = kDefaultRestart;
+  m.attr("CHECKPOINT_SQRT") = kCheckpointSqrt;
   py::dict statuses;
   for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
   m.attr("SOLVE_STATUSES") = statuses;
@@ -53,19 +54,23 @@ void bind_solvers(py::module_& m) {
           Solver{method_from_name(method), max_iter, rtol, restart}.check(who.c_str());
         },
         py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"));
-  m.def("check_options",
-        [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
-           std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
-           std::string on_failure) {
-          SolveOptions{{method_from_name(method), max_iter, rtol, restart},
-                       backward_from_name(backward),
-                       adjoint_max_iter,
-                       adjoint_rtol,
-                       on_failure_from_name(on_failure)}
-              .check(who.c_str());
-        },
-        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"), py::arg("backward"),
-        py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"));
+  m.def(
+      "check_options",
+      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
+         std::string backward, std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
+         std::string on_failure, int64_t checkpoint_every) {
+        SolveOptions{{method_from_name(method), max_iter, rtol, restart},
+                     backward_from_name(backward),
+                     adjoint_max_iter,
+                     adjoint_rtol,
+                     on_failure_from_name(on_failure),
+                     /*adjoint_log=*/0,
+                     checkpoint_every}
+            .check(who.c_str());
+      },
+      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
+      py::arg("backward"), py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"),
+      py::arg("checkpoint_every"));
 
   m.def("open_adjoint_log", &adjoint_log::open);
   m.def("close_adjoint_log", &adjoint_log::close, py::arg("log"));

@@ -98,6 +98,22 @@ TEST(Burgers, StepEqualsDenseSolveAndItsGradientADifferenceOfSteps) {
   EXPECT_NEAR((gradient * direction).sum().item<double>(), (slope * g).sum().item<double>(), 1e-6);
 }
 
+TEST(Burgers, RolloutEqualsItsStepsToTheLastBit) {
+  const auto nu = at::scalar_tensor(1e-2, at::kDouble).requires_grad_();
+  auto burgers = prdp::Burgers({9}, nu, 0.1, prdp::GMRES{.restart = 3, .max_iter = 2});
+  auto u = prdp_test::random_field({9}, 2).requires_grad_();
+  const auto g = prdp_test::random_field({9}, 2);
+  auto last = u;
+  for (int step = 0; step < 3; ++step) last = burgers(last);
+  const auto expected = torch::autograd::grad({last}, {u, nu}, {g});
+  const auto states = burgers.rollout(u, 3);
+  EXPECT_TRUE(at::equal(states.select(1, 3), last));
+  const auto found = torch::autograd::grad({states.select(1, 3)}, {u, nu}, {g});
+  EXPECT_TRUE(at::equal(found[0], expected[0]) && at::equal(found[1], expected[1]));
+  EXPECT_EQ(burgers.info()->iterations.sizes(), at::IntArrayRef({2, 3}));
+  EXPECT_EQ(burgers.adjoint_info()->iterations.sizes(), at::IntArrayRef({2, 3}));
+}
+
 TEST(NavierStokes, StepIsFreeOfDivergenceAndDifferentiable) {
   auto flow = prdp::NavierStokes({6, 5}, 1e-3, 0.1, prdp::Direct{}, prdp::Backward::kImplicit, 2);
   auto u = at::cat({prdp_test::random_field({6, 5}, 2), prdp_test::random_field({6, 5}, 2),

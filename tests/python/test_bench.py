@@ -77,17 +77,21 @@ def test_readings_are_taken_in_turn():
 
 
 def test_all_suites_run_and_leave_a_page(tmp_path):
+    suites = ("roofline", "training", "memory")
     done = subprocess.run(
-        [sys.executable, "-m", "prdp_torch.cli", "bench", "roofline", "training", "--quick", "--out", tmp_path],
+        [sys.executable, "-m", "prdp_torch.cli", "bench", *suites, "--quick", "--out", tmp_path],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "page.html").read_text()
-    assert "limits of this machine" in page and page.count("<figure>") == 2
+    assert "limits of this machine" in page and page.count("<figure>") == 3
     found = json.loads((tmp_path / "roofline.json").read_text())
     assert found["machine"]["threads"] == 1
     for point in found["roofline"]["points"]:
         assert 0 < point["residual"] < 1 and 0 < point["gflops"] < found["roofline"]["limits"]["gflops"]
+    peaks = {(p["case"], p["mode"]): p["bytes"] for p in json.loads((tmp_path / "memory.json").read_text())["memory"]}
+    for case in ("heat_3d", "heat_3d_chebyshev", "navier_stokes"):
+        assert 0 < 2 * peaks[case, "unrolled"] < peaks[case, "unrolled, recorded by autograd"]
 
 
 def test_an_unknown_suite_is_refused():

@@ -17,6 +17,9 @@ namespace prdp {
 /// for failed samples unless options.on_failure says otherwise.
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options);
 
+/// The same below autograd and the dispatcher, for the kernels of ops: solves, logs and reports.
+SolveResult linear_solve_kernel(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options);
+
 /// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator.
 OperatorSpec matrix(const at::Tensor& values);
 

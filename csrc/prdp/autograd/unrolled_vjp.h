@@ -1,5 +1,6 @@
 #pragma once
 #include <ATen/ATen.h>
+#include <ATen/core/grad_mode.h>
 
 #include <vector>
 
@@ -13,17 +14,47 @@ struct UnrolledSolve {
   OperatorSpec a;
   Solver solver;
   at::Tensor iterations, status;  // (batch,)
+  int64_t checkpoint_every = 0;   // as SolveOptions has it
 };
 
 /// Product of the cotangent of u with the derivative of the map (b, tensors of A) → u of exactly the
-/// iterations that ran; one tensor for each input that `needed` (b first) marks with 1. As the torch op
-/// prdp::unrolled_vjp, which recomputes the iterations: nothing but b and A is kept for it.
-std::vector<at::Tensor> unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b,
-                                     const UnrolledSolve& solve, at::IntArrayRef needed);
+/// iterations that ran: the gradients of b and of each tensor, undefined where `needed` (b first) holds 0
+/// or there is none; and the products with A and Aᵀ that it took, of each sample.
+struct UnrolledVjp {
+  std::vector<at::Tensor> gradients;
+  at::Tensor operator_applications;
+};
 
-/// The same, recorded by autograd, for second derivatives.
-std::vector<at::Tensor> unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
-                                              const UnrolledSolve& solve,
-                                              at::IntArrayRef needed);
+/// The report of it: the iterations and the status are the solve's, the residual is NaN, since no system
+/// is solved.
+SolveInfo unrolled_info(const UnrolledVjp& found, const UnrolledSolve& solve, const at::Tensor& b);
+
+/// As the torch op prdp::unrolled_vjp, which runs the iterations again: nothing but b and A is kept for
+/// it. `log`: where its report goes (adjoint_log.h).
+UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                         at::IntArrayRef needed, int64_t log);
+
+/// The same, recorded by autograd, for second derivatives; it keeps all iterates.
+UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
+                                  const UnrolledSolve& solve, at::IntArrayRef needed, int64_t log);
+
+/// The ways of the op. By hand-written sweeps in the CPU loops, where `has_sweep`: one sample at a time.
+bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
+UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                      at::IntArrayRef needed);
+/// By autograd, one iteration at a time, in plain tensor operations: everything else.
+UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                       at::IntArrayRef needed);
+
+/// Runs body() recorded by autograd: an op may run where that is switched off, inside a compiled graph
+/// for one.
+template <class Body>
+auto with_autograd(const Body& body) {
+  const auto keys = c10::impl::tls_local_dispatch_key_set();
+  const c10::impl::ForceDispatchKeyGuard guard(
+      keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
+  const at::AutoGradMode record(true);
+  return body();
+}
 
 }  // namespace prdp

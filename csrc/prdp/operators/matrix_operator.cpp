@@ -62,6 +62,7 @@ std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda,
                                                     const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
   if (matrix_.dim() == 2) return {at::matmul(lambda.mT(), u)};
+  if (matrix_.sym_size(0) == 1) return {at::matmul(lambda.mT(), u).unsqueeze(0)};
   return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
 }
 
@@ -146,7 +147,8 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda,
   const auto col = col_.expand({u.size(0), -1});
   const auto row = rows().expand({u.size(0), -1});
   const auto outer = lambda.gather(1, row) * u.gather(1, col);
-  return {at::Tensor(), at::Tensor(), values_.dim() == 1 ? outer.sum(0) : outer};
+  const bool shared = values_.dim() == 1 || values_.size(0) == 1;
+  return {at::Tensor(), at::Tensor(), shared ? outer.sum(0).view_as(values_) : outer};
 }
 
 std::vector<int64_t> CsrOperator::first_nonfinite(int64_t sample) const {

@@ -1,4 +1,6 @@
 #pragma once
+#include <cstdint>
+#include <tuple>
 
 namespace prdp {
 
@@ -17,11 +19,11 @@ class ConjugateGradientMethod {
   }
   void step() {
     const auto [pq, qq] = space_.apply_with_dots(p_, q_);
-    const auto alpha = space_.step_length(rr_, pq, pp_, qq);
-    const auto rr = space_.descend(alpha, p_, q_, x, r_);
-    const auto beta = space_.ratio(rr, rr_);
-    space_.xpby(r_, beta, p_);
-    pp_ = rr + beta * beta * pp_;  // r and p are orthogonal
+    alpha_ = space_.step_length(rr_, pq, pp_, qq);
+    const auto rr = space_.descend(alpha_, p_, q_, x, r_);
+    beta_ = space_.ratio(rr, rr_);
+    space_.xpby(r_, beta_, p_);
+    pp_ = rr + beta_ * beta_ * pp_;  // r and p are orthogonal
     rr_ = rr;
   }
   auto residual2() const { return rr_; }
@@ -32,12 +34,16 @@ class ConjugateGradientMethod {
     return rr_;
   }
 
+  /// What the next iteration starts from, beside x; resume() once it has been put back.
+  auto carried() { return std::tie(r_, p_, rr_, pp_); }
+  void resume(int64_t) {}
+
   typename Space::Vector x;
 
- private:
+ protected:
   Space& space_;
   typename Space::Vector r_, p_, q_;  // residual; search direction; A p
-  typename Space::Scalar rr_{}, pp_{};
+  typename Space::Scalar rr_{}, pp_{}, alpha_{}, beta_{};
 };
 
 }  // namespace prdp

@@ -1,4 +1,6 @@
 #pragma once
+#include <cstdint>
+#include <tuple>
 
 namespace prdp {
 
@@ -27,6 +29,10 @@ class DirectMethod {
     ready_ = true;
     return residual2_;
   }
+
+  /// What the next iteration starts from; resume() once it has been put back.
+  auto carried() { return std::tie(x); }
+  void resume(int64_t) { ready_ = false; }
 
   typename Space::Vector x;
 

@@ -1,6 +1,7 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <tuple>
 #include <vector>
 
 namespace prdp {
@@ -40,19 +41,19 @@ class GmresMethod {
     residual2();
     space_.copy(x, kept_x_);
     space_.copy(r_, kept_r_);
-    const int64_t columns = extend_basis();
-    minimise(columns);
-    space_.add_combination(y_, v_, columns, x, preconditioned_);
+    columns_ = extend_basis();
+    minimise(columns_);
+    space_.add_combination(y_, v_, columns_, x, preconditioned_);
     ready_ = false;
   }
   /// ‖b - A x‖². A cycle that made it grow was rounding errors and is taken back.
   auto residual2() {
     if (ready_) return residual2_;
     Scalar fresh = space_.residual(x, r_);
-    const Scalar grew = space_.is_larger(fresh, residual2_);
-    space_.restore(grew, kept_x_, x);
-    space_.restore(grew, kept_r_, r_);
-    space_.restore(grew, residual2_, fresh);
+    grew_ = space_.is_larger(fresh, residual2_);
+    space_.restore(grew_, kept_x_, x);
+    space_.restore(grew_, kept_r_, r_);
+    space_.restore(grew_, residual2_, fresh);
     residual2_ = fresh;
     ready_ = true;
     return residual2_;
@@ -61,9 +62,16 @@ class GmresMethod {
   /// Not zero where the last cycle's Krylov space could not be extended: it holds all that A reaches.
   const Scalar& exhausted() const { return exhausted_; }
 
+  /// What the next cycle starts from once residual2() is known; resume() once it has been put back.
+  auto carried() { return std::tie(x, scale_); }
+  void resume(int64_t) {
+    residual2_ = space_.b2() / 0;  // no cycle before to take back
+    ready_ = false;
+  }
+
   Vector x;
 
- private:
+ protected:
   Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
 
   /// v₀ = r/‖r‖ and A v_j = Σ h_ij v_i, rotated into R as they come. Returns how many columns there are.
@@ -143,15 +151,21 @@ class GmresMethod {
       space_.subtract_combination(y_.data(), products_, columns, e);
       std::vector<Scalar> change(columns);
       for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e);
-      for (int64_t j = 0; j < columns; ++j) {  // (RᵀR)⁻¹ change
-        for (int64_t i = 0; i < j; ++i) change[j] = change[j] - h(i, j) * change[i];
-        change[j] = change[j] * inverse_[j];
-      }
-      for (int64_t j = columns - 1; j >= 0; --j) {
-        for (int64_t k = j + 1; k < columns; ++k) change[j] = change[j] - h(j, k) * change[k];
-        change[j] = change[j] * inverse_[j];
-        y_[j] = y_[j] + change[j];
-      }
+      solve_normal(change);
+      for (int64_t j = 0; j < columns; ++j) y_[j] = y_[j] + change[j];
+    }
+  }
+
+  /// z ← (RᵀR)⁻¹ z
+  void solve_normal(std::vector<Scalar>& z) {
+    const auto columns = static_cast<int64_t>(z.size());
+    for (int64_t j = 0; j < columns; ++j) {
+      for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
+      z[j] = z[j] * inverse_[j];
+    }
+    for (int64_t j = columns - 1; j >= 0; --j) {
+      for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
+      z[j] = z[j] * inverse_[j];
     }
   }
 
@@ -162,9 +176,11 @@ class GmresMethod {
   std::vector<Vector> v_, products_;  // orthonormal basis; A v_j, kept while recording
   std::vector<Scalar> h_, inverse_;   // by columns, R once rotated; 1/R_jj
   std::vector<Scalar> cos_, sin_, g_, y_, again_;
-  Scalar residual2_{}, exhausted_{}, loss_{};  // loss_: of orthogonality, in units of rounding
+  Scalar residual2_{}, exhausted_{}, grew_{};
+  Scalar loss_{};   // of orthogonality, in units of rounding
   Scalar scale_{};  // largest ‖A v‖ so far: what is rounding beside it is zero
-  bool ready_ = false;  // r_ and residual2_ belong to x
+  int64_t columns_ = 0;  // of the last cycle
+  bool ready_ = false;   // r_ and residual2_ belong to x
 };
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #pragma once
 #include <cstdint>
+#include <tuple>
 #include <vector>
 
 namespace prdp {
@@ -14,7 +15,11 @@ template <class Space>
 class JacobiMethod {
  public:
   explicit JacobiMethod(Space& space, bool accelerated = false)
-      : x(space.vector()), space_(space), accelerated_(accelerated), c_(space.vector()), next_(space.vector()),
+      : x(space.vector()),
+        space_(space),
+        accelerated_(accelerated),
+        c_(space.vector()),
+        next_(space.vector()),
         r_(space.vector()) {}
 
   void start() {
@@ -44,9 +49,16 @@ class JacobiMethod {
   /// With a symmetric iteration matrix G, ‖Gr‖² = r·G²r <= ‖r‖ ‖G²r‖: the residual falls by ever less.
   bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_contract(); }
 
+  /// What the next iteration starts from; resume() once it has been put back, as after `done` iterations.
+  auto carried() { return std::tie(x, next_); }
+  void resume(int64_t done) {
+    ready_ = false;
+    done_ = done;
+  }
+
   typename Space::Vector x;
 
- private:
+ protected:
   using Scalar = typename Space::Scalar;
 
   /// ω of n iterations after the first `first`, which is at least one; null without acceleration.

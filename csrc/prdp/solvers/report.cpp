@@ -11,6 +11,8 @@ WarningSink& warning_sink() {
   return sink;
 }
 
+thread_local int64_t step_now = 0, steps_in_all = 0;  // of a rollout, while it runs
+
 /// "(0, 17)"
 std::string position(const std::vector<int64_t>& index) {
   std::ostringstream text;
@@ -33,6 +35,12 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus stat
 
 }  // namespace
 
+FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps) {
+  step_now = step;
+  steps_in_all = steps;
+}
+FailuresOfStep::~FailuresOfStep() { step_now = 0; }
+
 void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure, const char* role) {
   if (on_failure == OnFailure::kReturn) return;
@@ -45,6 +53,7 @@ void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& in
 
   constexpr size_t named = 4;
   std::ostringstream text;
+  if (step_now > 0) text << "step " << step_now << " of " << steps_in_all << ": ";
   text << role << ": " << failed.size() << " of " << batch << " samples failed";
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];

@@ -21,16 +21,6 @@ double cost_per_unknown(Method method) {
   return method == Method::kGmres ? 0.8 : 0.3;
 }
 
-/// Samples that a thread takes, such that each has some 100 µs of work at least: below that, handing it
-/// over costs more than it saves.
-int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations) {
-  constexpr double worthwhile = 1e5;
-  const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
-                      static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
-  const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
-  return at::divup(samples, threads);
-}
-
 template <class T, class Parameters>
 SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
   const auto rhs = b.contiguous();
@@ -50,13 +40,20 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              result.info.operator_applications.mutable_data_ptr<int64_t>()};
   const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t products = request.max_iter * (request.method == Method::kGmres ? request.restart : 1);
-  at::parallel_for(0, size, grain_size(request.method, size, unknowns, products), [&](int64_t begin, int64_t end) {
-    solve_range(a, batch, begin, end);
-  });
+  at::parallel_for(0, size, grain_size(request.method, size, unknowns, products),
+                   [&](int64_t begin, int64_t end) { solve_range(a, batch, begin, end); });
   return result;
 }
 
 }  // namespace
+
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations) {
+  constexpr double worthwhile = 1e5;
+  const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
+                      static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
+  const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
+  return at::divup(samples, threads);
+}
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel();

@@ -26,14 +26,50 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
 /// The same in plain tensor operations: the oracle for the CPU loops, and the way of other devices.
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
+/// Samples that a thread takes, such that each has some 100 µs of work at least: below that, handing it
+/// over costs more than it saves. A cycle of GMRES counts as its products.
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations);
+
 /// u after exactly `caps` iterations of each sample, recorded by autograd where b or the tensors of
 /// `a` require it: the map whose derivative the unrolled mode takes.
-at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver, const at::Tensor& caps);
+struct RecordedSolve {
+  at::Tensor u, operator_applications;
+};
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+                             const at::Tensor& caps);
+
+/// The same iteration by iteration, in plain tensor operations. Of samples with caps > 0 alone.
+class StepwiseSolve {
+ public:
+  /// What one iteration hands to the next, x first; empty: the start.
+  using State = std::vector<at::Tensor>;
+
+  StepwiseSolve(const Solver& solver, const at::Tensor& b, const at::Tensor& caps);
+  /// The state after iteration `done` + 1 out of the one before it. A sample past its cap stays.
+  State step(const Operator& a, const at::Tensor& b, const State& before, int64_t done);
+  /// x to u, and ū to x̄: u = P x / scale.
+  at::Tensor scaled_back(const Operator& a, const at::Tensor& x) const { return a.project(x) / scale_; }
+  int64_t iterations() const;  // of the sample that takes most
+  const std::vector<int64_t>& applications() const { return applications_; }
+
+ private:
+  Solver solver_;
+  at::Tensor scale_;
+  std::vector<int64_t> caps_, applications_;
+};
 
 /// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples, naming them with
 /// what happened. `role` is "linear_solve" or "adjoint solve".
 void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure, const char* role);
+
+/// While it lives, what is reported on this thread is said of this step, counted from 1, of a rollout.
+class FailuresOfStep {
+ public:
+  FailuresOfStep(int64_t step, int64_t steps);
+  FailuresOfStep(const FailuresOfStep&) = delete;
+  ~FailuresOfStep();
+};
 
 /// Where warnings go; torch's own by default, which prints them on stderr.
 using WarningSink = void (*)(const std::string& text);

@@ -130,18 +130,18 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   return {u.contiguous(), info_of(states, b.options())};
 }
 
-at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
-                          const at::Tensor& caps) {
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+                             const at::Tensor& caps) {
   // Samples of no iterations return zero and have no derivative. They are left out: an operator that
   // was refused would send NaN backwards even from behind a mask.
   const auto index = caps.gt(0).nonzero().flatten().to(b.device());
   if (index.numel() < b.size(0)) {
-    const auto zeros = at::zeros_like(b);
-    if (index.numel() == 0) return zeros;
+    const auto zeros = at::zeros_like(b), none = at::zeros_like(caps);
+    if (index.numel() == 0) return {zeros, none};
     if (const auto part = a.select(index)) {
-      const auto some = solve_recorded(*part, b.index_select(0, index), solver,
-                                       caps.index_select(0, index.to(caps.device())));
-      return zeros.index_copy(0, index, some);
+      const auto there = index.to(caps.device());
+      const auto some = solve_recorded(*part, b.index_select(0, index), solver, caps.index_select(0, there));
+      return {zeros.index_copy(0, index, some.u), none.index_copy(0, there, some.operator_applications)};
     }
   }
   const auto host_caps = caps.to(at::kCPU).contiguous();
@@ -149,10 +149,45 @@ at::Tensor solve_recorded(const Operator& a, const at::Tensor& b, const Solver& 
   for (size_t i = 0; i < states.size(); ++i) states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   TensorSpace space(a, a.project(rhs), states, /*recording=*/true);
-  return with_method(solver.method, solver.restart, space, [&](auto m) {
+  const auto u = with_method(solver.method, solver.restart, space, [&](auto m) {
     detail::run(space, m, states, 0.0, /*track=*/false);
     return a.project(m.x) / scale;
   });
+  return {u, info_of(states, b.options()).operator_applications.to(caps.device())};
+}
+
+StepwiseSolve::StepwiseSolve(const Solver& solver, const at::Tensor& b, const at::Tensor& caps)
+    : solver_(solver), scale_(scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool)).scale) {
+  const auto host = caps.to(at::kCPU).contiguous();
+  caps_.assign(host.const_data_ptr<int64_t>(), host.const_data_ptr<int64_t>() + host.numel());
+  applications_.resize(caps_.size());
+}
+
+int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin(), caps_.end()); }
+
+StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b, const State& before,
+                                         int64_t done) {
+  std::vector<SampleState> states(caps_.size());
+  TensorSpace space(a, a.project(b * scale_), states, /*recording=*/true);
+  State after;
+  with_method(solver_.method, solver_.restart, space, [&](auto method) {
+    method.start();
+    auto state = std::tuple_cat(std::tie(method.x), method.carried());
+    if (!before.empty()) {
+      size_t next = 0;
+      std::apply([&](auto&... part) { ((part = before[next++]), ...); }, state);
+      method.resume(done);
+    }
+    for (size_t i = 0; i < states.size(); ++i) states[i].active = done < caps_[i];
+    space.freeze_unless(states, [](const SampleState& s) { return s.active; });
+    if constexpr (detail::kTakesStrides<decltype(method)>) method.step(1);
+    else method.step();
+    if constexpr (detail::kLeastResidual<decltype(method)>) method.residual2();
+    std::apply([&](const auto&... part) { (after.push_back(part), ...); }, state);
+    return 0;
+  });
+  for (size_t i = 0; i < states.size(); ++i) applications_[i] += states[i].applications;
+  return after;
 }
 
 }  // namespace prdp

@@ -72,6 +72,10 @@ void Solver::check(const char* who) const {
 void SolveOptions::check(const char* who) const {
   solver.check(who);
   check_budget(who, "adjoint_", adjoint_max_iter.value_or(0), adjoint_rtol.value_or(0.0));
+  TORCH_CHECK_VALUE(checkpoint_every >= kCheckpointSqrt, who, ": checkpoint_every must be >= 1, got ",
+                    checkpoint_every);
+  TORCH_CHECK_VALUE(checkpoint_every == 0 || backward == Backward::kUnrolled, who,
+                    ": checkpoint_every is for backward = unrolled alone, got ", name(backward));
 }
 
 }  // namespace prdp

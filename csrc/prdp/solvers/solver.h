@@ -7,7 +7,15 @@
 
 namespace prdp {
 
-enum class Method { kJacobi, kChebyshev, kSteepestDescent, kConjugateGradient, kGmres, kGmresStokes, kDirect };
+enum class Method {
+  kJacobi,
+  kChebyshev,
+  kSteepestDescent,
+  kConjugateGradient,
+  kGmres,
+  kGmresStokes,
+  kDirect
+};
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -92,6 +100,9 @@ struct SolveInfo {
   at::Tensor operator_applications;  // products with A, all told
 };
 
+/// For checkpoint_every: ⌈√K⌉, K being the iterations that ran.
+inline constexpr int64_t kCheckpointSqrt = -1;
+
 /// Everything about a solve but the operator and b.
 struct SolveOptions {
   Solver solver;
@@ -100,8 +111,10 @@ struct SolveOptions {
   std::optional<double> adjoint_rtol{};
   OnFailure on_failure = OnFailure::kRaise;
   int64_t adjoint_log = 0;  // where the adjoint solve leaves its SolveInfo (adjoint_log.h); 0: nowhere
+  /// Unrolled mode keeps every so many iterates and runs those between again; 0: keeps all.
+  int64_t checkpoint_every = 0;
 
-  /// Raises ValueError for a budget or tolerance out of range, naming it.
+  /// Raises ValueError for a budget, tolerance or interval out of range, naming it.
   void check(const char* who) const;
 };
 

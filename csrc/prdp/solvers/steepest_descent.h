@@ -1,4 +1,6 @@
 #pragma once
+#include <cstdint>
+#include <tuple>
 
 namespace prdp {
 
@@ -16,18 +18,22 @@ class SteepestDescentMethod {
   }
   void step() {
     const auto [rq, qq] = space_.apply_with_dots(r_, q_);
-    const auto alpha = space_.step_length(rr_, rq, rr_, qq);
-    rr_ = space_.descend(alpha, r_, q_, x, r_);
+    alpha_ = space_.step_length(rr_, rq, rr_, qq);
+    rr_ = space_.descend(alpha_, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() { return rr_ = space_.residual(x, r_); }
 
+  /// What the next iteration starts from, beside x; resume() once it has been put back.
+  auto carried() { return std::tie(r_, rr_); }
+  void resume(int64_t) {}
+
   typename Space::Vector x;
 
- private:
+ protected:
   Space& space_;
   typename Space::Vector r_, q_;  // residual; A r
-  typename Space::Scalar rr_{};
+  typename Space::Scalar rr_{}, alpha_{};
 };
 
 }  // namespace prdp

@@ -4,15 +4,12 @@
 
 #include <algorithm>
 
+#include "prdp/autograd/flat_options.h"
 #include "prdp/grid/grid.h"
 
 namespace prdp {
 
 namespace {
-
-bool is_flow(const Equation& equation) {
-  return equation.kind == "burgers" || equation.kind == "navier_stokes";
-}
 
 /// A state of the equation in which nothing moves.
 at::Tensor rest(const Equation& equation) {
@@ -24,6 +21,10 @@ at::Tensor rest(const Equation& equation) {
 }
 
 }  // namespace
+
+bool is_flow(const Equation& equation) {
+  return equation.kind == "burgers" || equation.kind == "navier_stokes";
+}
 
 void Equation::check() const {
   TORCH_CHECK_VALUE(picard_steps >= 1, kind, ": picard_steps must be >= 1, got ", picard_steps);
@@ -46,6 +47,13 @@ at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u) {
   return u;
 }
 
+at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar) {
+  if (equation.kind == "poisson") return -bar;
+  if (equation.kind == "navier_stokes")
+    return at::cat({bar.narrow(1, 0, 2) / equation.parameters[0], at::zeros_like(bar.narrow(1, 2, 1))}, 1);
+  return bar;
+}
+
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
   const auto b = equation_rhs(equation, u);
   auto result = linear_solve(equation_operator(equation, u), b, options);
@@ -64,22 +72,15 @@ namespace {
 
 using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
-Outputs step_op(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
-                at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
-                c10::string_view solver, c10::SymInt max_iter, double rtol, int64_t restart,
-                c10::string_view backward,
-                std::optional<c10::SymInt> adjoint_max_iter, std::optional<double> adjoint_rtol,
-                c10::string_view on_failure, int64_t adjoint_log) {
+template <class... Options>
+Outputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                    at::ArrayRef<double> parameters, int64_t picard_steps, Options... options) {
   const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
-  const auto [next, info] = step(equation, u,
-                                 {{method_from_name(solver), std::move(max_iter), rtol, restart},
-                                  backward_from_name(backward),
-                                  std::move(adjoint_max_iter),
-                                  adjoint_rtol,
-                                  on_failure_from_name(on_failure),
-                                  adjoint_log});
+  const auto [next, info] = step(equation, u, unflatten(std::move(options)...));
   return {next, info.iterations, info.residual, info.status, info.operator_applications};
 }
+using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
+                                          at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
 at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape,
                   at::ArrayRef<double> parameters) {
@@ -95,10 +96,9 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-        "str solver, SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, "
-        "float? adjoint_rtol, str on_failure, int adjoint_log) -> (Tensor u_next, Tensor iterations, "
-        "Tensor residual, Tensor status, Tensor operator_applications)",
-        step_op);
+        PRDP_OPTIONS_SCHEMA ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
+        "Tensor operator_applications)",
+        static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
   m.def("check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "
         "int picard_steps) -> ()",

@@ -17,9 +17,14 @@ struct Equation {
   void check() const;
 };
 
+/// Whether A depends on the state.
+bool is_flow(const Equation& equation);
+
 /// The system's operator A(u) and right-hand side b(u) at the state u, both differentiable in u.
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u);
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
+/// ū for b̄: b is linear in u, and this is its transpose.
+at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar);
 
 /// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step. Over several
 /// Picard steps the info counts all iterations and holds the worst status; its residual is the last.

@@ -22,6 +22,12 @@ at::Tensor Stepper::operator()(const at::Tensor& u) {
   return next;
 }
 
+at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
+  auto [states, info] = prdp::rollout(equation_, u, steps, options_);
+  info_ = std::move(info);
+  return states;
+}
+
 void Stepper::set_max_iter(int64_t k) {
   Solver{options_.solver.method, k}.check(equation_.kind.c_str());
   options_.solver.max_iter = k;

@@ -3,7 +3,7 @@
 #include <optional>
 
 #include "prdp/autograd/linear_solve.h"
-#include "prdp/steppers/equation.h"
+#include "prdp/steppers/rollout.h"
 
 namespace prdp {
 
@@ -15,6 +15,9 @@ class Stepper {
   Stepper(Equation equation, SolveOptions options);
 
   at::Tensor operator()(const at::Tensor& u);
+  /// The states of `steps` steps, u included: (batch, steps + 1, channel, *shape); info() and
+  /// adjoint_info() then hold tensors (batch, steps). One node of autograd (rollout.h).
+  at::Tensor rollout(const at::Tensor& u, int64_t steps);
 
   OperatorSpec operator_at(const at::Tensor& u) const { return equation_operator(equation_, u); }
   at::Tensor rhs(const at::Tensor& u) const { return equation_rhs(equation_, u); }

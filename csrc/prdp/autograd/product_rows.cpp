@@ -1,0 +1,34 @@
+#include "prdp/autograd/product_rows.h"
+
+namespace prdp {
+
+namespace {
+constexpr int64_t kRows = 16;
+}
+
+ProductRows::ProductRows(std::unique_ptr<Operator> a, const at::TensorOptions& options) : a_(std::move(a)) {
+  auto shape = a_->vector_shape();
+  shape.insert(shape.begin(), kRows);
+  lambda_ = at::empty(shape, options);
+  v_ = at::empty(shape, options);
+}
+
+void ProductRows::push() {
+  if (++count_ == kRows) flush();
+}
+
+void ProductRows::flush() {
+  if (count_ == 0) return;
+  const auto products = a_->product_rule(lambda_.narrow(0, 0, count_), v_.narrow(0, 0, count_));
+  sums_.resize(products.size());
+  for (size_t i = 0; i < products.size(); ++i)
+    if (products[i].defined()) sums_[i] = sums_[i].defined() ? sums_[i] + products[i] : products[i];
+  count_ = 0;
+}
+
+std::vector<at::Tensor> ProductRows::finish() {
+  flush();
+  return std::move(sums_);
+}
+
+}  // namespace prdp

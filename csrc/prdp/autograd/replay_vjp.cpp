@@ -1,0 +1,112 @@
+#include <torch/csrc/autograd/autograd.h>
+
+#include "prdp/autograd/run_back.h"
+#include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+using State = StepwiseSolve::State;
+
+/// The whole batch as a sweep for run_back(): autograd records one iteration at a time and takes its
+/// derivative before the next.
+class Replay {
+ public:
+  /// Makes A out of the tensors that it depends on.
+  using MakeOperator = std::function<std::unique_ptr<Operator>(const std::vector<at::Tensor>&)>;
+
+  Replay(MakeOperator make, StepwiseSolve& solve, std::vector<at::Tensor> inputs, at::IntArrayRef needed,
+         const at::Tensor& cotangent)
+      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)),
+        needed_(needed) {
+    // u = P x / scale is linear in x, and its own transpose.
+    bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent));
+  }
+
+  void start() { now_ = {}, done_ = 0; }
+  void save(int64_t slot) {
+    if (static_cast<size_t>(slot) >= kept_.size()) kept_.resize(slot + 1);
+    kept_[slot] = now_;
+  }
+  void load(int64_t slot, int64_t k) { now_ = kept_[slot], done_ = k; }
+  void step() { now_ = solve_.step(*make_(tensors()), inputs_[0], now_, done_++); }
+
+  void step_back(int64_t slot, int64_t k) {
+    std::vector<at::Tensor> leaves, inputs = inputs_;
+    State before = kept_[slot];
+    for (auto& part : before) leaves.push_back(part = part.detach().requires_grad_());
+    for (size_t i = 0; i < inputs.size(); ++i)
+      if (needed_[i] || i == 0) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
+    std::vector<at::Tensor> outputs, cotangents;
+    const auto found = with_autograd([&] {
+      const auto a = make_({inputs.begin() + 1, inputs.end()});
+      const auto after = solve_.step(*a, inputs[0], before, k);
+      for (size_t i = 0; i < bars_.size(); ++i) {
+        if (!bars_[i].defined() || !after[i].requires_grad()) continue;
+        outputs.push_back(after[i]);
+        cotangents.push_back(bars_[i]);
+      }
+      return torch::autograd::grad(outputs, leaves, cotangents, false, false, /*allow_unused=*/true);
+    });
+    bars_.assign(found.begin(), found.begin() + before.size());
+    for (size_t i = 0, next = before.size(); i < inputs.size(); ++i)
+      if (needed_[i] || i == 0) add(gradients[i], found[next++]);
+  }
+
+  std::vector<at::Tensor> gradients;  // of b and the tensors of A
+
+ private:
+  static void add(at::Tensor& sum, const at::Tensor& term) {
+    if (term.defined()) sum = sum.defined() ? sum + term : term;
+  }
+  std::vector<at::Tensor> tensors() const { return {inputs_.begin() + 1, inputs_.end()}; }
+
+  MakeOperator make_;
+  StepwiseSolve& solve_;
+  std::vector<at::Tensor> inputs_;  // b and the tensors of A
+  at::IntArrayRef needed_;
+  State now_;
+  int64_t done_ = 0;
+  std::vector<State> kept_;
+  std::vector<at::Tensor> bars_;  // of the state, x first
+};
+
+}  // namespace
+
+UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                       at::IntArrayRef needed) {
+  UnrolledVjp found{std::vector<at::Tensor>(needed.size()), at::zeros({b.size(0)}, at::kLong)};
+  const auto index = solve.iterations.gt(0).nonzero().flatten();
+  if (index.numel() == 0) return found;
+
+  // Samples of no iterations are left out where the operator can be had without them.
+  const auto here = index.to(b.device());
+  const bool part = index.numel() < b.size(0) && make_operator(solve.a)->select(here);
+  const auto make = [&](const std::vector<at::Tensor>& tensors) {
+    auto spec = solve.a;
+    spec.tensors = tensors;
+    auto a = make_operator(spec);
+    return part ? a->select(here) : std::move(a);
+  };
+  std::vector<at::Tensor> inputs{part ? b.index_select(0, here) : b};
+  inputs.insert(inputs.end(), solve.a.tensors.begin(), solve.a.tensors.end());
+  const auto caps = part ? solve.iterations.index_select(0, index) : solve.iterations;
+  StepwiseSolve stepwise(solve.solver, inputs[0], caps);
+  Replay replay(make, stepwise, inputs, needed, part ? cotangent.index_select(0, here) : cotangent);
+  run_back(replay, {stepwise.iterations(), solve.checkpoint_every});
+
+  found.gradients = std::move(replay.gradients);
+  auto applications = at::tensor(at::IntArrayRef(stepwise.applications()), at::kLong);
+  if (part) {
+    found.gradients[0] = at::zeros_like(b).index_copy(0, here, found.gradients[0]);
+    applications = at::zeros({b.size(0)}, at::kLong).index_copy(0, index.cpu(), applications);
+  }
+  found.operator_applications = applications;
+  for (size_t i = 0; i < needed.size(); ++i)
+    if (!needed[i]) found.gradients[i] = at::Tensor();
+  return found;
+}
+
+}  // namespace prdp

@@ -1,0 +1,56 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "prdp/solvers/solver.h"
+
+namespace prdp {
+
+/// How K iterations are kept for their reverse: of every segment its first iterate, and of one segment
+/// at a time all.
+struct Checkpoints {
+  int64_t iterations, stride;
+
+  Checkpoints(int64_t k, int64_t every) : iterations(k), stride(std::max<int64_t>(k, 1)) {
+    if (every == kCheckpointSqrt) stride = static_cast<int64_t>(std::ceil(std::sqrt(static_cast<double>(k))));
+    else if (every > 0) stride = std::min(every, k);
+    stride = std::max<int64_t>(stride, 1);
+  }
+  int64_t segments() const { return (iterations + stride - 1) / stride; }
+  /// Of the iterates in the segment at hand and of the segments' first ones.
+  int64_t slots() const { return stride + segments(); }
+};
+
+/// Runs the iterations of a sweep forward, keeping what `plan` says, and then back, one by one: whatever
+/// is kept, the arithmetic and so the result is the same to the last bit. A sweep has start(), step(),
+/// save(slot), load(slot, k) of what k iterations have made, and step_back(slot, k): from the cotangents
+/// after iteration k, which starts from the state in the slot and has just been run again, to those
+/// before it.
+template <class Sweep>
+void run_back(Sweep& sweep, const Checkpoints& plan) {
+  const auto length = [&](int64_t segment) {
+    return std::min(plan.stride, plan.iterations - segment * plan.stride);
+  };
+  sweep.start();
+  for (int64_t segment = 0; segment < plan.segments(); ++segment) {
+    sweep.save(plan.stride + segment);
+    if (segment + 1 == plan.segments()) break;
+    for (int64_t i = 0; i < plan.stride; ++i) sweep.step();
+  }
+  for (int64_t segment = plan.segments() - 1; segment >= 0; --segment) {
+    sweep.load(plan.stride + segment, segment * plan.stride);
+    for (int64_t i = 0; i < length(segment); ++i) {
+      sweep.save(i);
+      if (i + 1 < length(segment)) sweep.step();
+    }
+    for (int64_t i = length(segment) - 1; i >= 0; --i) {
+      const int64_t k = segment * plan.stride + i;
+      sweep.load(i, k);
+      sweep.step();
+      sweep.step_back(i, k);
+    }
+  }
+}
+
+}  // namespace prdp

@@ -1,0 +1,24 @@
+#pragma once
+#include "prdp/autograd/linear_solve.h"
+
+namespace prdp {
+
+/// What a solve A u = b keeps for its derivative; implicit mode needs u where A has a derivative, the
+/// unrolled one all else, and the status both where a failed sample may have passed.
+struct Solved {
+  at::Tensor b, u, iterations, status;
+};
+
+/// The product of the cotangent ū with the derivative of (b, tensors of A) → u, as options.backward
+/// defines it: gradients of b and of each tensor of `a`, undefined where `needed` (b first) holds 0 or
+/// there is none; and the report of the adjoint solve. Where autograd records, it is differentiable, if
+/// `adjoint_solve` is.
+struct SolveVjp {
+  std::vector<at::Tensor> gradients;
+  SolveInfo info;
+};
+SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
+                   const SolveOptions& options, at::IntArrayRef needed,
+                   decltype(linear_solve)& adjoint_solve = linear_solve);
+
+}  // namespace prdp

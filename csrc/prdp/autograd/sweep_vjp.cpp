@@ -1,0 +1,117 @@
+#include <ATen/Parallel.h>
+#include <torch/csrc/autograd/autograd.h>
+
+#include "prdp/autograd/reverse_samples.h"
+#include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+/// Adds what a sample has for tensor i of A to its gradient: all of it where the samples share the
+/// tensor, else its row.
+void add_sample(at::Tensor& gradient, const at::Tensor& tensor, const at::Tensor& of_sample, int64_t sample) {
+  if (!gradient.defined()) gradient = at::zeros_like(tensor);
+  (of_sample.sizes() == tensor.sizes() ? gradient : gradient.narrow(0, sample, 1)).add_(of_sample);
+}
+
+/// ∂⟨D̄, D(g)⟩/∂g for the diagonal D of A, of the samples that took an iteration: a refused operator
+/// would send NaN even from behind zeros.
+void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagonal_bar,
+                   const UnrolledSolve& solve, at::IntArrayRef needed) {
+  const auto index = solve.iterations.gt(0).nonzero().flatten();
+  if (index.numel() == 0) return;
+  auto spec = solve.a;
+  std::vector<at::Tensor> inputs;
+  for (size_t i = 0; i < spec.tensors.size(); ++i)
+    if (needed[i + 1]) inputs.push_back(spec.tensors[i] = spec.tensors[i].detach().requires_grad_());
+  const auto bar = diagonal_bar.index_select(0, index);
+  const auto found = with_autograd([&] {
+    const auto diagonal = make_operator(spec)->select(index)->diagonal();
+    if (!diagonal.requires_grad()) return std::vector<at::Tensor>(inputs.size());
+    return torch::autograd::grad({diagonal.to(bar.scalar_type()).expand_as(bar)}, inputs, {bar}, false, false,
+                                 /*allow_unused=*/true);
+  });
+  for (size_t i = 0, next = 0; i < spec.tensors.size(); ++i) {
+    if (!needed[i + 1]) continue;
+    const auto& g = found[next++];
+    auto& sum = gradients[i + 1];
+    if (g.defined()) sum = sum.defined() ? sum + g : g;
+  }
+}
+
+template <class T, class Parameters>
+void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
+           int64_t grain) {
+  at::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
+    const at::NoGradGuard no_grad;
+    reverse_range(a, transpose, batch, begin, end);
+  });
+}
+
+}  // namespace
+
+bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
+  const auto method = solve.solver.method;
+  // Chebyshev's weights depend on A too: autograd knows how.
+  const bool written_out =
+      method != Method::kDirect && method != Method::kGmresStokes && method != Method::kChebyshev;
+  return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel());
+}
+
+UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                      at::IntArrayRef needed) {
+  const auto a = make_operator(solve.a);
+  auto transposed = solve.a;
+  transposed.transposed = !transposed.transposed;
+  const auto parameters = a->kernel(), transpose = make_operator(transposed)->kernel();
+  const auto rhs = b.contiguous(), bar = cotangent.contiguous(), iterations = solve.iterations.contiguous();
+  const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
+  const bool for_diagonal = for_a && solve.solver.method == Method::kJacobi;
+  const auto b_bar = at::empty_like(rhs), diagonal_bar = for_diagonal ? at::empty_like(rhs) : at::Tensor();
+  UnrolledVjp found{std::vector<at::Tensor>(needed.size()), at::empty_like(iterations)};
+  std::vector<std::vector<at::Tensor>> of_samples(rhs.size(0));
+
+  const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
+  const int64_t most = size == 0 ? 0 : iterations.max().item<int64_t>();
+  const int64_t products = solve.solver.method == Method::kGmres ? solve.solver.restart : 1;
+  const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most * products);
+  const auto run = [&]<class T>(T) {
+    ReverseBatch<T> batch{solve.solver.method,
+                          solve.solver.restart,
+                          solve.checkpoint_every,
+                          iterations.const_data_ptr<int64_t>(),
+                          rhs.const_data_ptr<T>(),
+                          bar.const_data_ptr<T>(),
+                          b_bar.mutable_data_ptr<T>(),
+                          for_diagonal ? diagonal_bar.mutable_data_ptr<T>() : nullptr,
+                          found.operator_applications.mutable_data_ptr<int64_t>(),
+                          {},
+                          {}};
+    if (for_a) {
+      batch.rows = [&](int64_t s) {
+        return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs.options());
+      };
+      batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };
+    }
+    std::visit(
+        [&](const auto& p) {
+          using Parameters = std::decay_t<decltype(p)>;
+          if constexpr (!std::is_same_v<Parameters, std::monostate>)
+            sweep(p, std::get<Parameters>(transpose), batch, size, grain);
+        },
+        parameters);
+  };
+  rhs.scalar_type() == at::kFloat ? run(float()) : run(double());
+
+  if (needed[0]) found.gradients[0] = b_bar;
+  for (int64_t s = 0; s < size; ++s)
+    for (size_t i = 0; i < of_samples[s].size(); ++i)
+      if (needed[i + 1] && of_samples[s][i].defined())
+        add_sample(found.gradients[i + 1], solve.a.tensors[i], of_samples[s][i], s);
+  if (for_diagonal) add_diagonals(found.gradients, diagonal_bar, solve, needed);
+  return found;
+}
+
+}  // namespace prdp

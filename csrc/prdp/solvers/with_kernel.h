@@ -1,0 +1,60 @@
+#pragma once
+#include "prdp/kernels/burgers.h"
+#include "prdp/kernels/laplacian.h"
+#include "prdp/kernels/matrix.h"
+#include "prdp/kernels/navier_stokes.h"
+#include "prdp/operators/operator.h"
+
+/// From what an operator tells the CPU loops to its kernel: with_kernel<T>(parameters, body) calls
+/// body(kernel).
+namespace prdp {
+
+template <class T, class Body>
+void with_kernel(const kernels::LaplacianParameters& a, const Body& body) {
+  switch (a.dim) {
+    case 1: return body(kernels::Laplacian<T, 1>(a));
+    case 2: return body(kernels::Laplacian<T, 2>(a));
+    case 3: return body(kernels::Laplacian<T, 3>(a));
+  }
+}
+
+template <class T, class Body>
+void with_kernel(const DenseParameters& a, const Body& body) {
+  const int64_t n = a.matrix.size(-1);
+  const int64_t sample_stride = a.matrix.dim() == 2 ? 0 : n * n;
+  body(kernels::Dense<T>(a.matrix.const_data_ptr<T>(), n, sample_stride, a.transposed));
+}
+
+template <class T, class Body>
+void with_kernel(const CsrParameters& a, const Body& body) {
+  body(kernels::Csr<T>(a.crow.const_data_ptr<int64_t>(), a.col.const_data_ptr<int64_t>(),
+                       a.values.const_data_ptr<T>(), a.crow.size(-1) - 1, a.values.size(-1),
+                       /*is_shared=*/a.values.dim() == 1, a.transposed));
+}
+
+/// `winds`: (batch or 1, channel, nx) or (batch or 1, channel, ny, nx).
+template <class T>
+kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, double nu, double dt,
+                                               bool transposed) {
+  return {winds.const_data_ptr<T>(),
+          winds.size(0) == 1 ? 0 : winds.numel() / winds.size(0),
+          winds.dim() > 3 ? winds.size(2) : 1,
+          winds.size(-1),
+          nu,
+          dt,
+          transposed};
+}
+
+template <class T, class Body>
+void with_kernel(const BurgersParameters& a, const Body& body) {
+  const auto p = upwind_parameters<T>(a.winds, a.nu, a.dt, a.transposed);
+  if (a.winds.dim() == 3) return body(kernels::Burgers<T, 1>(p));
+  body(kernels::Burgers<T, 2>(p));
+}
+
+template <class T, class Body>
+void with_kernel(const NavierStokesParameters& a, const Body& body) {
+  body(kernels::NavierStokes<T>(upwind_parameters<T>(a.velocity, a.nu, a.dt, a.transposed)));
+}
+
+}  // namespace prdp

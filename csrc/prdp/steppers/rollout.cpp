@@ -1,0 +1,264 @@
+#include "prdp/steppers/rollout.h"
+
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/custom_class.h>
+#include <torch/library.h>
+
+#include "prdp/autograd/flat_options.h"
+#include "prdp/solvers/solve.h"
+#include "prdp/steppers/rollout_vjp.h"
+
+namespace prdp {
+
+namespace {
+
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+
+// A rollout is a row of solves, picard_steps to a step: solve s takes its winds from solution s and its
+// right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
+constexpr const char* kSolvesSchema =
+    "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
+    "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> "
+    "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
+constexpr const char* kVjpSchema =
+    "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, int[] needed, "
+    "Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
+    ") -> Tensor[]";
+
+using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
+                                            at::IntArrayRef, at::ArrayRef<double>, int64_t, c10::SymInt)>;
+using OptionalTensor = std::optional<at::Tensor>;
+using VjpSignature = WithOptions<std::vector<at::Tensor>(
+    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, at::IntArrayRef,
+    at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
+
+Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
+                    const SolveOptions& o) {
+  static const auto op = c10::Dispatcher::singleton()
+                             .findSchemaOrThrow("prdp::rollout_solves", "")
+                             .typed<SolvesSignature>();
+  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind),
+                           at::IntArrayRef(e.shape), at::ArrayRef<double>(e.parameters), e.picard_steps,
+                           solves);
+}
+
+Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                     at::ArrayRef<double> parameters, int64_t picard_steps) {
+  return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
+}
+
+void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+           const SolveOptions& options) {
+  options.check(equation.kind.c_str());
+  TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
+                    solves / equation.picard_steps);
+  make_operator(equation_operator(equation, u))->check_vector(u);
+}
+
+bool any_requires_grad(at::TensorList tensors) {
+  return std::any_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) { return t.requires_grad(); });
+}
+
+/// Below autograd.
+template <class... Options>
+Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                      at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                      c10::SymInt count, Options... flat) {
+  const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
+  const auto options = unflatten(std::move(flat)...);
+  check(equation, u, count, options);
+  const int64_t solves = count.expect_int();
+  std::vector<at::Tensor> solutions{u};
+  Reports reports;
+  at::Tensor b;
+  for (int64_t s = 0; s < solves; ++s) {
+    const FailuresOfStep here(s / picard_steps + 1, solves / picard_steps);
+    const auto& last = solutions.back();
+    if (s % picard_steps == 0) b = equation_rhs(equation, last);
+    auto [next, info] = linear_solve_kernel(equation_operator(equation, last), b, options);
+    solutions.push_back(std::move(next));
+    reports.push(info);
+  }
+  auto info = reports.joined(u);
+  return {at::stack(solutions, 1), info.iterations, info.residual, info.status, info.operator_applications};
+}
+
+template <class... Options>
+Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                    at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves,
+                    Options... flat) {
+  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves,
+        unflatten(std::move(flat)...));
+  auto sizes = u.sym_sizes().vec();
+  sizes.insert(sizes.begin() + 1, solves + 1);
+  const auto of_dtype = [&](at::ScalarType dtype) {
+    return at::empty_symint({u.sym_size(0), solves}, u.options().dtype(dtype));
+  };
+  return {at::empty_symint(sizes, u.options()), of_dtype(at::kLong), of_dtype(u.scalar_type()),
+          of_dtype(at::kLong), of_dtype(at::kLong)};
+}
+
+template <class... Options>
+std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
+                                   const OptionalTensor& iterations, const OptionalTensor& status,
+                                   at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind,
+                                   at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                                   int64_t picard_steps, Options... flat) {
+  const at::NoGradGuard no_grad;
+  const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
+  const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
+                  status.value_or(at::Tensor())};
+  const auto found =
+      vjp_of_solves(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
+  std::vector<at::Tensor> gradients;
+  for (size_t i = 0; i < found.size(); ++i) {
+    if (!needed[i]) continue;
+    gradients.push_back(!found[i].defined() ? at::zeros_like(tensors[i - 1])
+                        : i == 0            ? found[i].contiguous()
+                                            : found[i]);
+  }
+  return gradients;
+}
+
+template <class... Options>
+std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
+                                 const OptionalTensor&, at::IntArrayRef needed, at::TensorList tensors,
+                                 c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t,
+                                 Options...) {
+  std::vector<at::Tensor> gradients;
+  auto sizes = cotangent.sym_sizes().vec();
+  sizes.erase(sizes.begin() + 1);
+  if (needed[0]) gradients.push_back(at::empty_symint(sizes, cotangent.options()));
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
+  return gradients;
+}
+
+/// What travels from the forward to the backward pass.
+struct Call : torch::CustomClassHolder {
+  Equation equation;
+  c10::SymInt solves;
+  SolveOptions options;
+};
+
+class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
+ public:
+  static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
+                               const c10::intrusive_ptr<Call>& call) {
+    const at::AutoDispatchBelowADInplaceOrView below;
+    const auto& options = call->options;
+    const auto [solutions, iterations, residual, status, applications] =
+        call_solves(call->equation, u, call->solves, options);
+    ctx->mark_non_differentiable({iterations, residual, status, applications});
+    ctx->set_materialize_grads(false);
+    const bool unrolled = options.backward == Backward::kUnrolled;
+    const bool a_varies = is_flow(call->equation) || any_requires_grad(tensors);
+    const bool may_have_failed = options.on_failure != OnFailure::kRaise;
+    variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
+                        unrolled || may_have_failed ? status : at::Tensor()};
+    saved.insert(saved.end(), tensors.begin(), tensors.end());
+    ctx->save_for_backward(saved);
+    call->equation.tensors.clear();  // they are among the saved ones
+    ctx->saved_data["call"] = c10::IValue::make_capsule(call);
+    return {solutions, iterations, residual, status, applications};
+  }
+
+  static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
+    const auto saved = ctx->get_saved_variables();
+    const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
+    auto equation = call->equation;
+    equation.tensors.assign(saved.begin() + 3, saved.end());
+    const size_t inputs = equation.tensors.size() + 1;
+    variable_list out(inputs + 1);  // u, the tensors, and the call, which has no gradient
+    if (!grads[0].defined()) return out;
+    std::vector<int64_t> needed(inputs);
+    for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
+
+    // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
+    if (at::GradMode::is_enabled()) {
+      const KeptSolves kept{saved[0], saved[1], saved[2]};
+      const auto found = vjp_of_solves(grads[0], kept, equation, call->options, needed, linear_solve);
+      std::copy(found.begin(), found.end(), out.begin());
+      return out;
+    }
+    const auto optional = [](const at::Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
+    static const auto op = c10::Dispatcher::singleton()
+                               .findSchemaOrThrow("prdp::rollout_vjp", "")
+                               .typed<VjpSignature>();
+    const auto found = call_with_options(
+        op, call->options, grads[0], optional(saved[0]), optional(saved[1]), optional(saved[2]),
+        at::IntArrayRef(needed), at::TensorList(equation.tensors), c10::string_view(equation.kind),
+        at::IntArrayRef(equation.shape), at::ArrayRef<double>(equation.parameters), equation.picard_steps);
+    size_t next = 0;
+    for (size_t i = 0; i < inputs; ++i)
+      if (needed[i]) out[i] = found[next++];
+    return out;
+  }
+};
+
+template <class... Options>
+Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                        at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                        c10::SymInt solves, Options... flat) {
+  auto call = c10::make_intrusive<Call>();
+  call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
+  call->solves = std::move(solves);
+  call->options = unflatten(std::move(flat)...);
+  const bool differentiable =
+      at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
+      (u.requires_grad() || any_requires_grad(tensors));
+  if (!differentiable) {
+    const at::AutoDispatchBelowADInplaceOrView below;
+    return call_solves(call->equation, u, call->solves, call->options);
+  }
+  const auto out = RolloutSolves::apply(u, tensors, call);
+  return {out[0], out[1], out[2], out[3], out[4]};
+}
+
+template <class... Options>
+Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
+                       at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
+                       c10::SymInt steps, Options... flat) {
+  const auto [states, info] = rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps,
+                                      unflatten(std::move(flat)...));
+  return {states, info.iterations, info.residual, info.status, info.operator_applications};
+}
+
+}  // namespace
+
+SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
+                    const SolveOptions& options) {
+  const int64_t picard = equation.picard_steps;
+  auto [solutions, iterations, residual, status, applications] =
+      call_solves(equation, u, steps * picard, options);
+  if (picard == 1) return {solutions, {iterations, residual, status, applications}};
+  const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
+  return {solutions.slice_symint(1, 0, std::nullopt, picard),
+          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1),
+           of_steps(status).amin(-1), of_steps(applications).sum(-1)}};
+}
+
+TORCH_LIBRARY_FRAGMENT(prdp, m) {
+  m.def(kSolvesSchema, {at::Tag::pt2_compliant_tag});
+  m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
+  m.def("rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
+        "SymInt steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor states, Tensor iterations, Tensor residual, "
+        "Tensor status, Tensor operator_applications)",
+        static_cast<SolvesSignature*>(rollout_kernel));
+}
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(solves_kernel));
+  m.impl("rollout_vjp", static_cast<VjpSignature*>(vjp_kernel));
+}
+TORCH_LIBRARY_IMPL(prdp, Meta, m) {
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(fake_solves));
+  m.impl("rollout_vjp", static_cast<VjpSignature*>(fake_vjp));
+}
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves));
+}
+
+}  // namespace prdp

@@ -1,0 +1,87 @@
+#include "prdp/steppers/rollout_vjp.h"
+
+#include <algorithm>
+
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/solve_vjp.h"
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+/// (batch,) of each solve → (batch, solves).
+at::Tensor side_by_side(const std::vector<at::Tensor>& of_solves, const at::Tensor& u, at::ScalarType dtype) {
+  if (of_solves.empty()) return at::empty({u.size(0), 0}, u.options().dtype(dtype));
+  return at::stack(of_solves, 1);
+}
+
+at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
+  return of_solves.defined() ? of_solves.select(1, s) : of_solves;
+}
+
+void add_to(at::Tensor& sum, const at::Tensor& term) {
+  if (term.defined()) sum = sum.defined() ? sum + term : term;
+}
+
+}  // namespace
+
+void Reports::push(const SolveInfo& info) {
+  iterations_.push_back(info.iterations);
+  residual_.push_back(info.residual);
+  status_.push_back(info.status);
+  applications_.push_back(info.operator_applications);
+}
+
+void Reports::reverse() {
+  for (auto* list : {&iterations_, &residual_, &status_, &applications_})
+    std::reverse(list->begin(), list->end());
+}
+
+SolveInfo Reports::joined(const at::Tensor& u) const {
+  return {side_by_side(iterations_, u, at::kLong), side_by_side(residual_, u, u.scalar_type()),
+          side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong)};
+}
+
+std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept,
+                                      const Equation& equation, const SolveOptions& options,
+                                      at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
+  const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
+  const bool rhs_is_state = equation.kind == "heat" || equation.kind == "burgers";
+  const bool flow = is_flow(equation);
+  auto each = options;
+  each.adjoint_log = 0;
+  auto bars = cotangent.unbind(1);
+  std::vector<at::Tensor> of_tensors(equation.tensors.size());
+  Reports reports;
+  at::Tensor rhs_bar;
+  for (int64_t s = solves - 1; s >= 0; --s) {
+    const FailuresOfStep here(s / picard + 1, solves / picard);
+    const int64_t first = s - s % picard;
+    const auto a = equation_operator(equation, at_solve(kept.solutions, s));
+    Solved solved{
+        {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s)};
+    if (options.backward == Backward::kUnrolled)
+      solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
+    std::vector<int64_t> wanted(needed.begin(), needed.end());
+    wanted[0] = needed[0] || first > 0;
+    if (flow) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
+    const auto [gradients, info] = solve_vjp(bars[s + 1], solved, a, each, wanted, adjoint_solve);
+    reports.push(info);
+    add_to(rhs_is_state ? bars[first] : rhs_bar, gradients[0]);
+    if (flow) add_to(bars[s], gradients[1]);
+    if (s == first && rhs_bar.defined()) {
+      add_to(bars[s], equation_rhs_transposed(equation, rhs_bar));
+      rhs_bar = at::Tensor();
+    }
+    const size_t others = gradients.size() - of_tensors.size();
+    for (size_t i = 0; i < of_tensors.size(); ++i) add_to(of_tensors[i], gradients[others + i]);
+  }
+  reports.reverse();
+  if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, reports.joined(cotangent));
+  std::vector<at::Tensor> found{needed[0] ? bars[0] : at::Tensor()};
+  found.insert(found.end(), of_tensors.begin(), of_tensors.end());
+  return found;
+}
+
+}  // namespace prdp

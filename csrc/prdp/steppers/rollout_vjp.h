@@ -1,0 +1,34 @@
+#pragma once
+#include <vector>
+
+#include "prdp/autograd/linear_solve.h"
+#include "prdp/steppers/equation.h"
+
+namespace prdp {
+
+/// SolveInfo of the solves of a rollout, one after the other.
+class Reports {
+ public:
+  void push(const SolveInfo& info);
+  void reverse();
+  /// Tensors (batch, solves); `u` tells the batch and the dtype where there are none.
+  SolveInfo joined(const at::Tensor& u) const;
+
+ private:
+  std::vector<at::Tensor> iterations_, residual_, status_, applications_;
+};
+
+/// What the solves of a rollout keep for their derivative; undefined where it is not wanted.
+struct KeptSolves {
+  at::Tensor solutions, iterations, status;  // (batch, solves (+ 1), …)
+};
+
+/// The product of the cotangent (batch, solves + 1, channel, *shape) of all solutions of a rollout
+/// (rollout.cpp) with its derivative: gradients of u and of each tensor of the equation, undefined where
+/// `needed` (u first) holds 0 or there is none. Sums run in the order in which autograd takes the steps
+/// of a chain. Where autograd records, it is differentiable, if `adjoint_solve` is.
+std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept,
+                                      const Equation& equation, const SolveOptions& options,
+                                      at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve);
+
+}  // namespace prdp

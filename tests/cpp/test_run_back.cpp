@@ -1,0 +1,51 @@
+#include <gtest/gtest.h>
+
+#include <map>
+#include <vector>
+
+#include "prdp/autograd/run_back.h"
+
+namespace {
+
+/// Iterations that count themselves: the state is their number.
+struct Counting {
+  int64_t now = 0, runs = 0;
+  std::map<int64_t, int64_t> kept;
+  std::vector<int64_t> taken_back;
+
+  void start() { now = 0; }
+  void step() { ++now, ++runs; }
+  void save(int64_t slot) { kept[slot] = now; }
+  void load(int64_t slot, int64_t k) {
+    now = kept.at(slot);
+    EXPECT_EQ(now, k);
+  }
+  void step_back(int64_t slot, int64_t k) {
+    EXPECT_EQ(kept.at(slot), k);  // what the iteration starts from
+    EXPECT_EQ(now, k + 1);        // it has been run again
+    taken_back.push_back(k);
+  }
+};
+
+TEST(RunBack, TakesEveryIterationBackOnceAndKeepsWhatItWasAsked) {
+  for (const int64_t k : {1, 2, 7, 16, 40})
+    for (const int64_t every : {int64_t{0}, int64_t{1}, int64_t{3}, int64_t{100}, prdp::kCheckpointSqrt}) {
+      const prdp::Checkpoints plan(k, every);
+      Counting sweep;
+      run_back(sweep, plan);
+      ASSERT_EQ(static_cast<int64_t>(sweep.taken_back.size()), k);
+      for (int64_t i = 0; i < k; ++i) EXPECT_EQ(sweep.taken_back[i], k - 1 - i);
+      EXPECT_LE(static_cast<int64_t>(sweep.kept.size()), plan.slots());
+      EXPECT_LT(sweep.kept.rbegin()->first, plan.slots());
+      EXPECT_LE(sweep.runs, 3 * k);
+    }
+}
+
+TEST(RunBack, SquareRootKeepsFewest) {
+  EXPECT_EQ(prdp::Checkpoints(160, prdp::kCheckpointSqrt).slots(), 13 + 13);
+  EXPECT_EQ(prdp::Checkpoints(160, 0).slots(), 160 + 1);
+  EXPECT_EQ(prdp::Checkpoints(160, 40).slots(), 40 + 4);
+  EXPECT_EQ(prdp::Checkpoints(5, 100).slots(), 5 + 1);
+}
+
+}  // namespace
