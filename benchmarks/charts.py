@@ -160,7 +160,7 @@ def memory(found, titles):
         for mode, colour in zip(modes, colours, strict=False):
             points = [p for p in found if (p["case"], p["mode"]) == (case, mode)]
             axes.plot([p["k"] for p in points], [p["bytes"] / 1e6 for p in points], "o-", color=colour, label=mode)
-        axes.set(xscale="log", yscale="log", xlabel="K", ylabel="MB at the peak", title=titles[case])
+        axes.set(xscale="log", yscale="symlog", ylim=(0, None), xlabel="K", ylabel="MB at the peak", title=titles[case])
         axes.set_xticks([p["k"] for p in points], [str(p["k"]) for p in points])
         axes.minorticks_off()
         axes.spines[["top", "right"]].set_visible(False)
