@@ -83,7 +83,7 @@ def test_scenes_are_listed(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, heat_1d"),
+        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, heat_1d"),
         (["compare", "nosuch.toml"], "prdp: scene: cannot read 'nosuch.toml'"),
         (["train", "heat_1d", "--schedule", "3"], "prdp: --schedule: expected START:STEP, two whole numbers, got '3'"),
         (["train", "heat_1d", "--prdp", "--direct"], "give one of --prdp, --constant, --schedule and --direct"),
