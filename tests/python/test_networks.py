@@ -111,7 +111,7 @@ def test_the_scenes_networks_see_beyond_the_grid_what_the_equation_sees():
 
 def test_a_network_may_start_from_zero_output():
     scene = scenes.load("burgers_2d")
-    network, u = make_network(scene, 0), torch.randn(2, 2, 64, 64)
+    network, u = make_network(scene, 0), torch.randn(2, 2, 96, 96)
     assert scene.network.zero_output and (network(u) == 0).all()
     assert all(p.abs().max() > 0 for p in list(network.parameters())[:-2])
     assert not (make_network(scenes.load("heat_1d"), 0)(torch.randn(2, 1, 30)) == 0).any()

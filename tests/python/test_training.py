@@ -73,7 +73,7 @@ SMALLER = {
         ("width = 32", "width = 8"),
         ("rate = 1e-4", "rate = 1e-3"),
     ],
-    "burgers_2d": [("shape = [64, 64]", "shape = [10, 12]"), ("train = 400", "train = 200")],
+    "burgers_2d": [("shape = [96, 96]", "shape = [10, 12]"), ("train = 400", "train = 200")],
 }
 
 
