@@ -43,7 +43,7 @@ def main():
     torch.set_num_threads(1)
     folder = records.prepare_folder(options.out)
     environment = records.environment() | {"peers": peer_versions()}
-    environment["command"] = " ".join(["prdp", "bench", *sys.argv[1:]])
+    environment["command"] = " ".join(["prdp", "bench", *options.suites, *(["--quick"] if options.quick else [])])
     results = {}
     for suite in options.suites or cli.SUITES:
         module = importlib.import_module(f"benchmarks.{suite}")
