@@ -29,6 +29,7 @@ def accuracy(title, points):
         for axes, measure in zip(panel_row, ("seconds", "products"), strict=True):
             _curves(axes, points, error, cost, measure)
             axes.set(xscale="log", yscale="log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.grid(alpha=0.3, lw=0.4)
         work = "solve" if cost == "forward" else "solve and gradient"
         panel_row[0].set(ylabel=f"{name}, worst of the batch", xlabel=f"{work}, ms for the batch")
@@ -67,9 +68,6 @@ def _legend(points):
     return handles
 
 
-CACHES = {"L1": 48 << 10, "L2": 1 << 20, "L3": 32 << 20}
-
-
 def size(series):
     """Time per unknown and iteration over the size of a sample, and over the batch."""
     figure = Figure(figsize=(11, 4.6), layout="constrained")
@@ -82,7 +80,7 @@ def size(series):
             axes.plot(x, y, marker=marks[name], color=shades[name], ms=4, lw=1.4, label=name)
         axes.set(xscale="log", yscale="log")
         axes.grid(alpha=0.3, which="both", lw=0.4)
-    for name, held in CACHES.items():  # three vectors of float32 fill the cache
+    for name, held in series["caches"].items():  # three vectors of float32 fill the cache
         left.axvline(held / 12, color="#999999", lw=0.8, ls=":")
         left.text(held / 13, 0.98, name, transform=left.get_xaxis_transform(), ha="right", va="top", color="#666666")
     left.set(xlabel="unknowns of one sample (batch 1)", ylabel="ns per unknown and product with A")

@@ -1,5 +1,7 @@
 """Time per unknown and iteration: over the size of a sample, with one sample, and over the batch."""
 
+from pathlib import Path
+
 import torch
 
 import prdp_torch as prdp
@@ -20,8 +22,8 @@ BATCH_SHAPES = {
 
 
 def run(report, quick=False):
-    """{"size": {series: points}, "batch": {series: points}}; a point's seconds are per unknown and iteration
-    (a product with A for GMRES)."""
+    """{"size": {series: points}, "batch": {series: points}, "caches": {name: bytes}}; a point's seconds are per
+    unknown and iteration (a product with A for GMRES)."""
     largest = 10**5 if quick else 10**8
     by_size, by_batch = {}, {}
     for name, shapes in SIDES.items():
@@ -31,7 +33,17 @@ def run(report, quick=False):
     for name, shape in BATCH_SHAPES.items():
         report(f"cost against batch: {name}")
         by_batch[name] = [point(name, shape, batch) for batch in BATCHES[: 5 if quick else None]]
-    return {"size": by_size, "batch": by_batch}
+    return {"size": by_size, "batch": by_batch, "caches": caches()}
+
+
+def caches():
+    """Of one core, as Linux tells them; nothing elsewhere."""
+    found = {}
+    for cache in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
+        level, kind, size = ((cache / name).read_text().strip() for name in ("level", "type", "size"))
+        if kind != "Instruction":
+            found[f"L{level}"] = int(size.removesuffix("K")) * 1024
+    return found
 
 
 def point(name, shape, batch):

@@ -92,7 +92,8 @@ class Stepper(torch.nn.Module):
         channel, *shape). The same values and gradients as by calling the stepper, to the last bit, but in
         one op with one backward pass, which saves the fixed cost of a call and of its node in every step.
         `info` and `adjoint_info` then hold tensors of shape (batch, steps); a failure says in which step,
-        counted from 1. Kept for the backward pass are the states (nothing for `Poisson`, or `Heat` with a plain nu, in implicit mode)."""
+        counted from 1. Kept for the backward pass are the states (nothing for `Poisson`, or `Heat` with a
+        plain nu, in implicit mode)."""
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
