@@ -7,7 +7,7 @@ from prdp_torch import _C, scenes
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 
-SCENES = ["heat_1d", "heat_2d", "burgers_1d", "heat_3d", "navier_stokes"]
+SCENES = ["heat_1d", "heat_2d", "burgers_1d", "burgers_2d", "heat_3d", "navier_stokes"]
 
 
 def run(report, quick=False):

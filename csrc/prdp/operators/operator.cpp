@@ -43,7 +43,9 @@ at::Tensor Operator::precondition(const at::Tensor&, bool) const {
 }
 
 at::Tensor Operator::jacobi_radius() const {
-  TORCH_CHECK_VALUE(false, "Chebyshev: the spectrum is known of Heat and Poisson operators alone; for others take CG or GMRES");
+  TORCH_CHECK_VALUE(false,
+                    "Chebyshev: the spectrum is known of Heat and Poisson operators alone; "
+                    "for others take CG or GMRES");
 }
 
 namespace {
