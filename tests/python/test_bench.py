@@ -11,11 +11,10 @@ import torch
 from helpers import dense_burgers, dense_navier_stokes
 
 import prdp_torch as prdp
+from benchmarks import measure, ours, problems
+from benchmarks.peers import stencils, torch_eager
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
-from benchmarks import measure, ours, problems  # noqa: E402
-from benchmarks.peers import stencils, torch_eager  # noqa: E402
 
 SMALL = {
     "heat_1d": lambda: problems.heat((7,), 5, batch=2),

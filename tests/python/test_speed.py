@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 import prdp_torch as prdp
+from benchmarks import measure, problems
 from prdp_torch import _C
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
-from benchmarks import measure, problems  # noqa: E402
 
 # problem, method: how many times as fast the loops are at least
 BOUNDS = {

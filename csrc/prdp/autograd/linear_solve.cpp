@@ -10,6 +10,7 @@
 #include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -102,8 +103,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     // Implicit mode keeps u alone, and that only if A has a derivative; b and the iteration counts
     // are unrolled mode's. Where a failed sample may have passed, its status says so.
     const bool unrolled = call->options.backward == Backward::kUnrolled;
-    const bool differentiates_a = std::any_of(tensors.begin(), tensors.end(),
-                                              [](const at::Tensor& t) { return t.requires_grad(); });
+    const bool differentiates_a = any_requires_grad(tensors);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
     variable_list saved{unrolled ? b : differentiates_a ? u : at::Tensor(),
                         unrolled ? iterations : at::Tensor(),
@@ -140,10 +140,8 @@ template <class... Args>
 Outputs autograd_kernel(const at::Tensor& b, Args... args) {
   const auto call = unpack(args...);
   const auto tensors = call->a.tensors;
-  const bool differentiable =
-      at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
-      (b.requires_grad() || std::any_of(tensors.begin(), tensors.end(),
-                                        [](const at::Tensor& t) { return t.requires_grad(); }));
+  const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
+                              (b.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) return call_below(b, call->a, call->options);
   const auto out = LinearSolve::apply(b, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4]};

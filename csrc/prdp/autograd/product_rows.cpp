@@ -1,5 +1,7 @@
 #include "prdp/autograd/product_rows.h"
 
+#include "prdp/operators/tensors.h"
+
 namespace prdp {
 
 namespace {
@@ -21,8 +23,7 @@ void ProductRows::flush() {
   if (count_ == 0) return;
   const auto products = a_->product_rule(lambda_.narrow(0, 0, count_), v_.narrow(0, 0, count_));
   sums_.resize(products.size());
-  for (size_t i = 0; i < products.size(); ++i)
-    if (products[i].defined()) sums_[i] = sums_[i].defined() ? sums_[i] + products[i] : products[i];
+  for (size_t i = 0; i < products.size(); ++i) add_to(sums_[i], products[i]);
   count_ = 0;
 }
 

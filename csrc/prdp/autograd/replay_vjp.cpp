@@ -2,6 +2,7 @@
 
 #include "prdp/autograd/run_back.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -52,15 +53,12 @@ class Replay {
     });
     bars_.assign(found.begin(), found.begin() + before.size());
     for (size_t i = 0, next = before.size(); i < inputs.size(); ++i)
-      if (needed_[i] || i == 0) add(gradients[i], found[next++]);
+      if (needed_[i] || i == 0) add_to(gradients[i], found[next++]);
   }
 
   std::vector<at::Tensor> gradients;  // of b and the tensors of A
 
  private:
-  static void add(at::Tensor& sum, const at::Tensor& term) {
-    if (term.defined()) sum = sum.defined() ? sum + term : term;
-  }
   std::vector<at::Tensor> tensors() const { return {inputs_.begin() + 1, inputs_.end()}; }
 
   MakeOperator make_;

@@ -4,17 +4,11 @@
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
 namespace {
-
-/// (batch,) → (batch, 1, …)
-at::Tensor per_sample(const at::Tensor& t, const at::Tensor& like) {
-  auto wide = t;
-  for (int64_t d = 1; d < like.dim(); ++d) wide = wide.unsqueeze(-1);
-  return wide;
-}
 
 /// Zeros for the refused samples, whose u is the constant zero.
 at::Tensor without_refused(const at::Tensor& cotangent, const at::Tensor& status) {

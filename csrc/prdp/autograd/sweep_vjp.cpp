@@ -3,6 +3,7 @@
 
 #include "prdp/autograd/reverse_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -33,12 +34,8 @@ void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagona
     return torch::autograd::grad({diagonal.to(bar.scalar_type()).expand_as(bar)}, inputs, {bar}, false, false,
                                  /*allow_unused=*/true);
   });
-  for (size_t i = 0, next = 0; i < spec.tensors.size(); ++i) {
-    if (!needed[i + 1]) continue;
-    const auto& g = found[next++];
-    auto& sum = gradients[i + 1];
-    if (g.defined()) sum = sum.defined() ? sum + g : g;
-  }
+  for (size_t i = 0, next = 0; i < spec.tensors.size(); ++i)
+    if (needed[i + 1]) add_to(gradients[i + 1], found[next++]);
 }
 
 template <class T, class Parameters>

@@ -8,6 +8,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/linear_solve.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -21,12 +22,6 @@ constexpr const char* kSchema =
     "(Tensor[] gradients, Tensor operator_applications)";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor>;
 
-/// (batch,) → (batch, 1, …)
-at::Tensor as_rows(at::Tensor t, const at::Tensor& like) {
-  while (t.dim() < like.dim()) t = t.unsqueeze(-1);
-  return t;
-}
-
 /// b = 0 is solved in no iterations, yet the map has a derivative there: A⁻ᵀ by the same method and
 /// budget, which for linear methods is the derivative of all max_iter iterations. Adds it to b̄.
 void add_derivative_at_zero(UnrolledVjp& found, const at::Tensor& cotangent, const UnrolledSolve& solve,
@@ -38,8 +33,8 @@ void add_derivative_at_zero(UnrolledVjp& found, const at::Tensor& cotangent, con
   a.transposed = !a.transposed;
   SolveOptions options{solve.solver, Backward::kImplicit};
   options.on_failure = OnFailure::kReturn;
-  const auto [lambda, info] = linear_solve(a, cotangent * as_rows(at_zero, cotangent), options);
-  found.gradients[0] = found.gradients[0].defined() ? found.gradients[0] + lambda : lambda;
+  const auto [lambda, info] = linear_solve(a, cotangent * per_sample(at_zero, cotangent), options);
+  add_to(found.gradients[0], lambda);
   found.operator_applications = found.operator_applications + info.operator_applications * at_zero;
 }
 

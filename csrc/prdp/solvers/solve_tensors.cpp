@@ -1,5 +1,6 @@
 #include <ATen/core/grad_mode.h>
 
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/tensor_space.h"
@@ -7,13 +8,6 @@
 namespace prdp {
 
 namespace {
-
-/// (batch,) → (batch, 1, …), to multiply a batch of vectors.
-at::Tensor per_sample(const at::Tensor& t, const at::Tensor& like) {
-  std::vector<int64_t> shape(like.dim(), 1);
-  shape[0] = like.size(0);
-  return t.reshape(shape);
-}
 
 /// Power of two per sample that brings its largest magnitude to the order of one.
 at::Tensor power_of_two_scale(const at::Tensor& magnitude) {

@@ -6,6 +6,7 @@
 #include <torch/library.h>
 
 #include "prdp/autograd/flat_options.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/rollout_vjp.h"
 
@@ -56,10 +57,6 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);
   make_operator(equation_operator(equation, u))->check_vector(u);
-}
-
-bool any_requires_grad(at::TensorList tensors) {
-  return std::any_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) { return t.requires_grad(); });
 }
 
 /// Below autograd.

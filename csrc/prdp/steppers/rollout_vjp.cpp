@@ -4,6 +4,7 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/solve_vjp.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -18,10 +19,6 @@ at::Tensor side_by_side(const std::vector<at::Tensor>& of_solves, const at::Tens
 
 at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
   return of_solves.defined() ? of_solves.select(1, s) : of_solves;
-}
-
-void add_to(at::Tensor& sum, const at::Tensor& term) {
-  if (term.defined()) sum = sum.defined() ? sum + term : term;
 }
 
 }  // namespace
