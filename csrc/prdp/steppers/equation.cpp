@@ -17,7 +17,7 @@ at::Tensor rest(const Equation& equation) {
   std::vector<int64_t> sizes{1, has_pressure ? 3 : static_cast<int64_t>(equation.shape.size())};
   // A negative extent is left for the operator to refuse.
   for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
-  return at::zeros(sizes);
+  return at::zeros({1}).expand(sizes);  // of any size in the memory of one number
 }
 
 }  // namespace
