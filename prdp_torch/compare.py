@@ -111,10 +111,6 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
     a record of the same settings and another number of intervals, which would be lost."""
     path = folder / label / f"seed_{seed}.json"
-    curves = _finished(path, scene) if resume else None
-    if curves is not None:
-        on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
-        return curves
     path.parent.mkdir(parents=True, exist_ok=True)
     versions = environment["versions"]
     checkpoint = Checkpoint(
@@ -122,6 +118,10 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     )
     if not resume:
         checkpoint.remove()
+    curves = _finished(path, scene, checkpoint) if resume else None
+    if curves is not None:
+        on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
+        return curves
     network = None if scene.task == "parameters" else make_network(scene, seed)
     curves = train(scene, refinement, seed, network, on_interval, on_data, checkpoint)
     on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
@@ -131,15 +131,19 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     return curves
 
 
-def _finished(path, scene):
-    """The curves of the record at `path` if it is of this training."""
+def _finished(path, scene, checkpoint):
+    """The curves of the record at `path` if it is of this training. ValueError if it is of another length, and no
+    checkpoint is left to go on from."""
     record = records.read(path)
     if record is None:
         return None
     intervals = record["settings"].pop("intervals")
     if record["settings"] != records.identity(scene):
         return None
-    _C.check_same_length(path, intervals, scene.training.intervals)
+    if intervals != scene.training.intervals:
+        if checkpoint.read() is None:
+            _C.refuse_finished(path, intervals, scene.training.intervals)
+        return None
     curves = record["curves"]
     curves["metric"] = [math.nan if value is None else value for value in curves["metric"]]
     return curves

@@ -115,7 +115,7 @@ void bind_scenes(py::module_& m) {
   m.def("fingerprint", &fingerprint, py::arg("content"));
   m.def("seal_record", &seal_record, py::arg("object"));
   m.def("read_record", &read_record, py::arg("path"));
-  m.def("check_same_length", &check_same_length, py::arg("record"), py::arg("intervals"), py::arg("wanted"));
+  m.def("refuse_finished", &refuse_finished, py::arg("record"), py::arg("intervals"), py::arg("wanted"));
   m.def(
       "write_whole",
       [](const std::vector<std::pair<std::filesystem::path, std::string>>& files) {

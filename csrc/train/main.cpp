@@ -69,16 +69,17 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, c
   return checkpoint;
 }
 
-/// Whether the record is of this training, whole. Throws if it is of one of other length.
-bool is_done(const fs::path& path, const prdp::Scene& scene) {
+/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on from.
+bool is_done(const fs::path& path, const prdp::Scene& scene, const prdp::Checkpoint& checkpoint) {
   const auto text = prdp::read_record(path);
   if (!text) return false;
   auto found = Json::parse(*text).value("settings", Json::object());
   const auto intervals = found.value("intervals", int64_t{0});
   found.erase("intervals");
   if (found != settings(scene)) return false;
-  prdp::check_same_length(path, intervals, scene.training.intervals);
-  return true;
+  if (intervals == scene.training.intervals) return true;
+  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, scene.training.intervals);
+  return false;
 }
 
 std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
@@ -117,8 +118,8 @@ int run(const Options& options, const std::string& command) {
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
-    if (options.resume && is_done(file, scene)) continue;
     auto checkpoint = checkpoint_of(file, options, scene, refinement.label, seed);
+    if (options.resume && is_done(file, scene, checkpoint)) continue;
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
       if (std::exchange(first, false) || done % 10 == 0)

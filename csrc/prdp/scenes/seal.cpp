@@ -36,8 +36,8 @@ std::string fingerprint(std::string_view content) {
   return digits;
 }
 
-void check_same_length(const fs::path& record, int64_t intervals, int64_t wanted) {
-  TORCH_CHECK_VALUE(intervals == wanted, "record: '", record.string(), "' is of a finished training of ", intervals,
+void refuse_finished(const fs::path& record, int64_t intervals, int64_t wanted) {
+  TORCH_CHECK_VALUE(false, "record: '", record.string(), "' is of a finished training of ", intervals,
                     " intervals, not ", wanted, "; it cannot go on: give another --out, or leave out --resume to "
                     "train afresh");
 }
@@ -63,7 +63,8 @@ std::optional<Sealed> read_sealed(const fs::path& path, const char* kind, const 
 }
 
 std::string seal_record(std::string_view object) {
-  const auto body = object.substr(0, object.find_last_not_of("} \n", object.rfind('}')) + 1);
+  auto body = object.substr(0, object.rfind('}'));
+  body = body.substr(0, body.find_last_not_of(" \n") + 1);
   std::string text(body);
   return text.append(kBefore).append(fingerprint(body)).append(kBehind);
 }

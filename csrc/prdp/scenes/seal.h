@@ -27,8 +27,9 @@ std::string seal_record(std::string_view object);
 /// one that is not as `seal_record` made it, or no regular file.
 std::optional<std::string> read_record(const std::filesystem::path& path);
 
-/// Raises ValueError for the record of a finished training of another length: it has left nothing to go on from.
-void check_same_length(const std::filesystem::path& record, int64_t intervals, int64_t wanted);
+/// Raises the ValueError for the record of a training that finished after other than the `wanted` intervals, and has
+/// left nothing to go on from.
+[[noreturn]] void refuse_finished(const std::filesystem::path& record, int64_t intervals, int64_t wanted);
 
 /// Raises the ValueError for a file that is not as it was written.
 [[noreturn]] void refuse_damaged(const std::filesystem::path& path, const char* kind, const char* remedy);
