@@ -34,6 +34,22 @@ def environment(tmp_path, monkeypatch):
     monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
 
 
+def in_process_of_its_own(trainer, *arguments, **options):
+    """Exit status and errors of a trainer."""
+    command = [*TRAINERS[trainer], *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+    return done.returncode, done.stderr
+
+
+def run(trainer, *arguments):
+    """The same; the Python trainer in this process, which has imported torch already."""
+    if trainer == "cpp":
+        return in_process_of_its_own(trainer, *arguments)
+    done = CliRunner().invoke(cli.app, ["train", *map(str, arguments)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.stderr
+
+
 def short(intervals=2):
     scene = scenes.load("heat_1d")
     scene.training.intervals = intervals
@@ -151,7 +167,7 @@ def reseal(path, state):
     path.write_bytes(mark.split(b", ")[0] + b", " + _C.fingerprint(rest).encode() + b"\n" + rest)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit")
+@pytest.mark.filterwarnings("ignore:`torch.jit", "ignore:'torch.load' received a zip file")
 def test_no_checkpoint_runs_code(tmp_path):
     process = subprocess.Popen([TRAINER, HEAT, "--out", tmp_path / "cpp"], stdout=subprocess.PIPE, text=True)
     path = tmp_path / "cpp/prdp/seed_0.checkpoint"
@@ -226,13 +242,6 @@ def test_a_finished_training_is_not_overwritten_by_a_longer_one(tmp_path, traine
 # ---- two processes, and a full disk
 
 
-def run(trainer, *arguments, **options):
-    """Exit status and errors of a trainer."""
-    command = [*TRAINERS[trainer], *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-    return done.returncode, done.stderr
-
-
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_a_folder_is_trained_into_by_one_process_at_a_time(tmp_path, trainer):
     folder = tmp_path / "prdp"
@@ -269,7 +278,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_record(tmp_path, trainer, mo
     assert run(*arguments, 1)[0] == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()}
     calm = {**os.environ, "PRDP_CHECKPOINT_SECONDS": "1000"}
-    status, errors = run(*arguments, 2, preexec_fn=no_room, env=calm)
+    status, errors = in_process_of_its_own(*arguments, 2, preexec_fn=no_room, env=calm)
     assert status == 2 and "cannot write '" in errors and "File too large" in errors and errors.count("\n") == 1
     assert {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()} == before
 
@@ -277,46 +286,41 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_record(tmp_path, trainer, mo
 # ---- errors in one line
 
 
-def both(tmp_path, *arguments):
-    """Exit status and last line of both trainers."""
-    done = CliRunner().invoke(cli.app, ["train", *map(str, arguments)])
-    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-    cpp = run("cpp", *arguments)
-    return [(done.exit_code, done.stderr), cpp]
+def both(*arguments):
+    """Exit status and errors of both trainers."""
+    return [run(trainer, *arguments) for trainer in TRAINERS]
 
 
 @pytest.mark.parametrize(
     "changes, words",
     [
         ([("train = 200", "train = 10000000000000")], "out of memory: cannot allocate 800000000"),
-        ([('title = "', 'title = "\x00')], "changed.toml:1: "),
+        ([('title = "', 'title = "\x00')], "changed.toml:4: Error while parsing string"),
     ],
 )
 def test_a_scene_that_asks_for_too_much_is_one_line_in_both_languages(tmp_path, changes, words):
     path = written(tmp_path, *changes)
-    for status, errors in both(tmp_path, path, "--out", tmp_path / "out"):
+    for status, errors in both(path, "--out", tmp_path / "out"):
         assert status == 2 and words in errors and errors.count("\n") == 1
 
 
 def test_a_reference_that_does_not_converge_is_one_line_in_both_languages(tmp_path):
-    path = written(tmp_path, ("dt = 0.2", "dt = 2e9"), ("nu = 0.01", "nu = 0"), scene="burgers_2d")
+    path = written(tmp_path, ("dt = 0.2", "dt = 2e9"), ("nu = 1e-2", "nu = 0"), scene="burgers_2d")
     path = Path(path)
     path.write_text(path.read_text().replace("shape = [96, 96]", "shape = [12, 12]"))
-    for status, errors in both(tmp_path, path, "--out", tmp_path / "out"):
+    for status, errors in both(path, "--out", tmp_path / "out"):
         assert status == 2 and "the scene's dt is too long for it" in errors and errors.count("\n") == 1
 
 
 @pytest.mark.parametrize("option", ["--constant", "--intervals", "--seeds"])
 def test_numbers_beyond_all_bounds_exit_2_in_both_languages(tmp_path, option):
-    for status, errors in both(tmp_path, HEAT, "--out", tmp_path / "out", option, 99999999999999999999):
+    for status, errors in both(HEAT, "--out", tmp_path / "out", option, 99999999999999999999):
         assert status == 2 and option in errors and "1000000000" in errors and not (tmp_path / "out").exists()
 
 
 def test_brackets_in_a_path_are_no_markup(tmp_path):
-    for (status, errors), name in zip(
-        both(tmp_path, HEAT, "--out", tmp_path / "x[/red]y", "--intervals", 1), "ab", strict=True
-    ):
-        assert status == 0, (name, errors)
+    for status, errors in both(HEAT, "--out", tmp_path / "x[/red]y", "--intervals", 1):
+        assert status == 0, errors
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "nested"])
@@ -349,6 +353,6 @@ def test_emulators_whose_data_take_long_are_cached(tmp_path):
     _C.make_dataset(scenes.load("heat_1d"))
     assert len(list((tmp_path / "cache").iterdir())) == 1
     other = Path(shutil.copy(path, tmp_path / "modes.toml"))
-    other.write_text(other.read_text().replace("modes = ", "modes = 1 # "))
+    other.write_text(other.read_text().replace("modes = ", "modes = 2 # "))
     _C.make_dataset(scenes.load(other))
     assert len(list((tmp_path / "cache").iterdir())) == 2
