@@ -75,6 +75,8 @@ def test_arguments_out_of_range(make, message):
 def test_a_step_costs_no_memory_until_it_is_taken():
     for kind in (prdp.Heat, prdp.Burgers, prdp.NavierStokes):
         assert kind((10**7, 10**7), 1e-3, 1.0, prdp.Jacobi(1)).max_iter == 1  # a field would take 400 TB
+        with pytest.raises(ValueError, match=r"\[1099511627776, 1099511627776\] has more than 2\*\*63 numbers"):
+            kind((2**40, 2**40), 1e-3, 1.0, prdp.Jacobi(1))
 
 
 def test_arguments_out_of_range_where_they_reach_the_op():

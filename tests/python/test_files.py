@@ -104,7 +104,8 @@ def test_damaged_records_and_weights_are_refused(tmp_path):
     curves = trained(scene, tmp_path)
     record, weights = (tmp_path / "prdp" / f"seed_0.{kind}" for kind in ("json", "pt"))
     refused(record, lambda: records.read(record))
-    refused(weights, lambda: records.read_weights(record, make_network(scene, 0)))
+    network = make_network(scene, 0)
+    refused(weights, lambda: records.read_weights(record, network))
     assert trained(scene, tmp_path, resume=True) == curves
 
 

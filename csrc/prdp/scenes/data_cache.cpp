@@ -25,8 +25,8 @@ std::string settings_of(const Scene& scene) {
   std::ostringstream text;
   text << std::setprecision(17) << "prdp data " << kFormat << ": " << p.equation << ", shape "
        << at::IntArrayRef(p.shape) << ", reference_shape " << at::IntArrayRef(d.reference_shape) << ", nu " << p.nu
-       << ", dt " << p.dt << ", modes " << d.modes << ", train " << d.train << ", valid " << d.valid << ", valid_steps " << d.valid_steps
-       << ", seed " << d.seed << ", " << scene.dtype;
+       << ", dt " << p.dt << ", modes " << d.modes << ", train " << d.train << ", valid " << d.valid
+       << ", valid_steps " << d.valid_steps << ", seed " << d.seed << ", " << scene.dtype;
   return text.str();
 }
 
