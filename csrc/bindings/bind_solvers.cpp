@@ -114,8 +114,8 @@ void bind_solvers(py::module_& m) {
           return make_operator(spec(kind, shape, parameters, tensors))->product_rule(lambda, v);
         },
         "∂⟨lambda, A v⟩ with respect to each tensor of A, as the solves take it; None where there is none.",
-        py::arg("lambda_"), py::arg("v"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
-        py::arg("parameters"));
+        py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"),
+        py::arg("kind"), py::arg("shape"), py::arg("parameters"));
 
   m.def("solve_with_tensors",
         [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,

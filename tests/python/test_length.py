@@ -58,7 +58,7 @@ def steppers(length, scale, nu, **options):
 
 
 SOLVERS = {
-    "gmres": lambda: prdp.GMRES(200, restart=20, rtol=1e-13),
+    "gmres": lambda: prdp.GMRES(400, restart=12, rtol=1e-11),
     "direct": lambda: prdp.Direct(),
     "stokes": lambda: prdp.GMRES(200, rtol=1e-13, preconditioner="stokes"),
 }
@@ -72,12 +72,12 @@ def test_a_scaled_domain_has_the_scaled_flow_and_gradient(solver, backward):
     for length, scale in ((1.0, 1.0), (side, side)):
         nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
         for stepper, channels, factor in steppers(length, scale, nu, solver=SOLVERS[solver](), backward=backward):
-            if solver == "stokes" and channels != 3:
-                continue
+            if channels != 3 if solver == "stokes" else channels == 3 and (solver, backward) == ("gmres", "unrolled"):
+                continue  # the iterates of GMRES on Navier-Stokes depend on the units, and so do their derivatives
             u = field(SHAPE, channels=channels)
             u = (fields.project(u) if channels == 3 else u).requires_grad_()
             u_next = stepper(factor * u)[:, :2] / factor
-            results.append((u_next, *torch.autograd.grad((u_next**2).sum(), (u, nu))))
+            results.append((u_next, *torch.autograd.grad((u_next**2).sum(), (u, nu), retain_graph=True)))
     half = len(results) // 2
     for unit, scaled in zip(results[:half], results[half:], strict=True):
         torch.testing.assert_close(scaled, unit, rtol=1e-7, atol=1e-9)
@@ -103,6 +103,18 @@ def test_the_loops_and_plain_tensors_agree_on_a_stretched_domain():
                 "return", 0,
             )  # fmt: skip
             torch.testing.assert_close(found, oracle, rtol=1e-9, atol=1e-11)
+
+
+def test_unrolled_sweeps_and_autograd_agree_on_a_stretched_domain():
+    for index in range(3):
+        results = []
+        for create_graph in (False, True):  # by the CPU loops, and by plain tensors
+            nu = torch.tensor(1e-2, dtype=torch.float64, requires_grad=True)
+            options = {"solver": prdp.GMRES(2, restart=4), "backward": "unrolled", "on_failure": "return"}
+            stepper, channels, _ = list(steppers(LENGTH, 1.0, nu, **options))[index]
+            u = field(SHAPE, channels=channels).requires_grad_()
+            results.append(torch.autograd.grad((stepper(u) ** 2).sum(), (u, nu), create_graph=create_graph))
+        torch.testing.assert_close(*results, rtol=1e-9, atol=1e-11)
 
 
 def test_steps_and_their_operators_have_the_same_length():
@@ -178,12 +190,12 @@ def test_a_number_stays_a_number():
 @pytest.mark.parametrize("nu", [1e-2, torch.tensor(1e-2), torch.nn.Parameter(torch.tensor(1e-2))], ids=type)
 def test_steppers_are_copied_and_pickled(nu):
     u = field((4, 6), channels=2)
-    burgers = prdp.Burgers((4, 6), nu, 0.1, prdp.GMRES(5), length=LENGTH)
+    burgers = prdp.Burgers((4, 6), nu, 0.1, prdp.Jacobi(5, rtol=0.0), length=LENGTH)
     burgers.rollout(u.clone().requires_grad_(), 2).sum().backward()
     for clone in (copy.deepcopy(burgers), pickle.loads(pickle.dumps(burgers))):
         assert torch.equal(clone.rollout(u, 2), burgers.rollout(u, 2))
         clone.max_iter = 2
         if isinstance(nu, torch.Tensor):
             clone.nu.data.fill_(1.0)
-        assert burgers.max_iter == 5 and float(burgers.nu) == pytest.approx(1e-2)
+        assert burgers.max_iter == 5 and torch.as_tensor(burgers.nu).item() == pytest.approx(1e-2)
         assert not torch.equal(clone(u), burgers(u))

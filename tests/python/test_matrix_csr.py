@@ -23,9 +23,9 @@ def entries(batch=None, seed=0):
 
 def dense(values):
     rows = torch.arange(N).repeat_interleave(CROW.diff())
-    return torch.zeros(*values.shape[:-1], N, N, dtype=values.dtype).index_put(
-        (..., rows, COL) if values.dim() == 1 else (torch.arange(len(values))[:, None], rows, COL), values
-    )
+    matrix = torch.zeros(*values.shape[:-1], N, N, dtype=values.dtype)
+    matrix[..., rows, COL] = values
+    return matrix
 
 
 def right_hand_side(batch=3):
