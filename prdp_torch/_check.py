@@ -40,6 +40,17 @@ def shape(who, value):
     raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {value!r}")
 
 
+def lengths(who, value, axes):
+    """The sides of the domain, one per axis; none where all are 1."""
+    if not isinstance(value, (tuple, list)):
+        sides = [real(who, "length", value)] * axes
+    else:
+        sides = [real(who, "every length", side) for side in value]
+        if len(sides) != axes:
+            raise ValueError(f"{who}: length must be one number or one per axis, {axes} here, got {value!r}")
+    return [] if all(side == 1.0 for side in sides) else sides
+
+
 def dense(who, name, value):
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{who}: {name} must be a torch tensor, got {type(value).__name__}")
