@@ -16,6 +16,7 @@ class RegisteredProducts:
         self,
         apply: Callable[[Tensor, list[Tensor]], Tensor],
         apply_transpose: Callable[[Tensor, list[Tensor]], Tensor],
+        product_rule: Callable[[Tensor, Tensor, list[Tensor]], list[Tensor]],
     ) -> None: ...
     @property
     def number(self) -> int: ...

@@ -8,6 +8,7 @@ gradients through `apply` and through `linear_solve`.
 import torch
 
 from prdp_torch import _C, _check
+from prdp_torch.batching import product_rule
 
 
 class Operator:
@@ -19,7 +20,7 @@ class Operator:
     def __init__(self, shape, parameters, tensors):
         self.shape = shape
         self.parameters = parameters
-        self.tensors = tensors
+        self.tensors = [full_precision(t) for t in tensors]
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
@@ -119,7 +120,9 @@ class Function(Operator):
                 raise TypeError(f"Function: {name} must be callable, got {function!r}")
         tensors = [_check.dense("Function", "every tensor", t) for t in tensors]
         self._products = _C.RegisteredProducts(
-            lambda v, given: matvec(v, *given), lambda v, given: transpose(v, *given)
+            lambda v, given: matvec(v, *given),
+            lambda v, given: transpose(v, *given),
+            lambda cotangent, u, given: product_rule(matvec, cotangent, u, given),
         )
         super().__init__([self._products.number], [], tensors)
 
@@ -149,6 +152,12 @@ def real_tensor(who, name, value):
     if isinstance(value, torch.Tensor):
         return value
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+
+
+def full_precision(t):
+    """float32 for float16 and bfloat16 under torch.autocast, as the solves take them there."""
+    low = t.dtype in (torch.float16, torch.bfloat16) and torch.is_autocast_enabled(t.device.type)
+    return t.float() if low else t
 
 
 def flow(who, name, winds, nu, dt):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from prdp_torch import _C, _check, operators
+from prdp_torch.batching import outlive_transforms
 from prdp_torch.solve import AdjointLog, SolveInfo
 from prdp_torch.solvers import check_options, checkpoint_number
 
@@ -84,7 +85,7 @@ class Stepper(torch.nn.Module):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
         u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options())
-        self.info = SolveInfo(*report, self._adjoint_log)
+        self.info = SolveInfo(*outlive_transforms(report), self._adjoint_log)
         return u_next
 
     def rollout(self, u, steps):
@@ -98,7 +99,7 @@ class Stepper(torch.nn.Module):
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
         states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._options())
-        self.info = SolveInfo(*report, self._adjoint_log)
+        self.info = SolveInfo(*outlive_transforms(report), self._adjoint_log)
         return states
 
     def _equation(self):

@@ -37,11 +37,13 @@ void bind_solvers(py::module_& m) {
   m.attr("SOLVE_STATUSES") = statuses;
 
   py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts")
-      .def(py::init([](Products::Product apply, Products::Product apply_transpose) {
-             auto made = RegisteredProducts::make({std::move(apply), std::move(apply_transpose)});
+      .def(py::init([](Products::Product apply, Products::Product apply_transpose,
+                       decltype(Products::product_rule) product_rule) {
+             auto made = RegisteredProducts::make(
+                 {std::move(apply), std::move(apply_transpose), std::move(product_rule)});
              return std::const_pointer_cast<RegisteredProducts>(made);
            }),
-           py::arg("apply"), py::arg("apply_transpose"))
+           py::arg("apply"), py::arg("apply_transpose"), py::arg("product_rule"))
       .def_property_readonly("number", &RegisteredProducts::number);
   m.def("check_operator",
         [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,

@@ -1,5 +1,7 @@
 #include "prdp/operators/function_operator.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
+#include <ATen/functorch/DynamicLayer.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <limits>
@@ -110,6 +112,9 @@ at::Tensor FunctionOperator::solve_transpose_directly(const at::Tensor& b) const
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  const auto& rule = registered_->products().product_rule;
+  const bool wrapped = at::areAnyTensorSubclassLike({lambda, u}) || at::areAnyTensorSubclassLike(tensors_);
+  if (rule && (wrapped || at::functorch::maybeCurrentDynamicLayer())) return rule(lambda, u, tensors_);
   // Recorded on copies of its own, or, where the derivative is itself to be differentiated, on views:
   // the partial derivative must not follow a tensor's way through u.
   const bool create_graph = at::GradMode::is_enabled();

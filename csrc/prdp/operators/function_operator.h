@@ -12,6 +12,11 @@ namespace prdp {
 struct Products {
   using Product = std::function<at::Tensor(const at::Tensor& v, const std::vector<at::Tensor>& tensors)>;
   Product apply, apply_transpose;
+  /// ∂⟨λ, A u⟩ with respect to each tensor where a transform of torch.func runs, which goes without autograd's
+  /// C++ interface; empty: there are no such transforms.
+  std::function<std::vector<at::Tensor>(const at::Tensor& lambda, const at::Tensor& u,
+                                        const std::vector<at::Tensor>& tensors)>
+      product_rule{};
 };
 
 /// Functions cannot cross torch's dispatcher, a number can: it stands for them as long as this lives.
