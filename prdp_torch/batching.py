@@ -95,10 +95,10 @@ def product_rule(matvec, cotangent, u, tensors):
 
 def outlive_transforms(tensors):
     """Tensors without the wrappers of the transforms that run, which must not leave them; the axes that are
-    mapped come first."""
-    if torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is None:
+    mapped come first. None in a compiled function, which cannot take the wrappers off."""
+    if not torch._C._are_functorch_transforms_active():
         return tensors
-    return [_unwrapped(t) for t in tensors]
+    return None if torch.compiler.is_compiling() else [_unwrapped(t) for t in tensors]
 
 
 def _unwrapped(t):

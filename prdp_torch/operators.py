@@ -136,7 +136,8 @@ class Matrix(Operator):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
             self.kind = "csr"
-            tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
+            with torch._C._DisableFuncTorch():  # torch.func does not know sparse tensors
+                tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
         elif matrix.layout == torch.strided:
             self.kind = "dense"
             tensors = [matrix]

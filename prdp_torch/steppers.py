@@ -85,7 +85,7 @@ class Stepper(torch.nn.Module):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
         u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options())
-        self.info = SolveInfo(*outlive_transforms(report), self._adjoint_log)
+        self._keep(report)
         return u_next
 
     def rollout(self, u, steps):
@@ -99,8 +99,12 @@ class Stepper(torch.nn.Module):
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
         states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._options())
-        self.info = SolveInfo(*outlive_transforms(report), self._adjoint_log)
+        self._keep(report)
         return states
+
+    def _keep(self, report):
+        report = outlive_transforms(report)
+        self.info = None if report is None else SolveInfo(*report, self._adjoint_log)
 
     def _equation(self):
         e = self.equation

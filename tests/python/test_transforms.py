@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.autograd.forward_ad as fwad
-from helpers import field, spd_matrices, statuses
+from helpers import field, spd_matrices
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 from torch.utils._pytree import tree_leaves
 
@@ -46,9 +46,10 @@ def dense_solve(solver, backward="implicit"):
 def csr_solve(solver, backward="implicit"):
     """By the op, since torch makes no sparse tensors of tensors that it transforms."""
     csr = PATTERN.double().to_sparse_csr()
+    crow, col, (row, column) = csr.crow_indices(), csr.col_indices(), PATTERN.nonzero().unbind(1)
 
     def solve(a, b):
-        tensors = [csr.crow_indices(), csr.col_indices(), a[PATTERN]]
+        tensors = [crow, col, a[row, column]]
         options = (solver.method, solver.max_iter, solver.rtol, solver.restart, backward, None, None, "raise", 0)
         return torch.ops.prdp.linear_solve(b[None], tensors, "csr", [], [], False, *options)[0][0]
 
@@ -104,14 +105,32 @@ def test_second_derivatives_equal_those_of_lapack(kind, second):
 
 
 @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
-@pytest.mark.parametrize("kind", [dense_solve, function_solve], ids=["dense", "function"])
-def test_linearize_keeps_the_solve_of_the_tangent(kind):
+def test_linearize_keeps_the_solve_of_the_tangent():
     given = matrix_and_vector()
-    ours = kind(prdp.GMRES(9, restart=4, rtol=1e-14))
-    u, linear = linearize(ours, *given)
+    u, linear = linearize(dense_solve(prdp.GMRES(9, restart=4, rtol=1e-14)), *given)
     for seed in (3, 4):
         tangents = random(4, 4, seed=seed), random(4, seed=seed + 5)
         close((u, linear(*tangents)), jvp(torch.linalg.solve, given, tangents))
+
+
+@pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
+@pytest.mark.parametrize("operator", [
+    lambda a: operators.Matrix(a.to_sparse_csr()),
+    lambda a: operators.Function(lambda v, a: v @ a.mT, lambda v, a: v @ a, (a,)),
+    lambda a: a.to_sparse_csr(),
+], ids=["csr operator", "function", "csr tensor"])  # fmt: skip
+def test_operators_from_outside_of_the_transform(operator):
+    a, b = matrix_and_vector()
+    product, b = operator(a), b[None]
+
+    def solve(b):
+        return prdp.linear_solve(product, b, prdp.GMRES(9, restart=4, rtol=1e-14))[0]
+
+    inverse = torch.linalg.inv(a)
+    for jacobian in (jacfwd(solve)(b), jacrev(solve)(b)):
+        close(jacobian.reshape(4, 4), inverse)
+    if not isinstance(product, torch.Tensor):  # torch does not trace sparse tensors
+        close(linearize(solve, b)[1](b), b @ inverse.mT)
 
 
 @matrices
@@ -189,18 +208,19 @@ def test_gradients_of_steps_equal_those_of_plain_autograd(make, channels, shape,
     take, given = taking(make, way, backward), state_and_viscosity(channels, shape)
     leaves = [g.clone().requires_grad_() for g in given]
     u = take(*leaves)
+    leaves = leaves[: 1 if make is poisson else 2]
     cotangents = random(3, *u.shape)
     if make is navier_stokes:
         cotangents[..., 2, :, :] = 0
-    by_one = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
-    plain = [torch.autograd.grad(u, leaves, c, **by_one) for c in cotangents]
+    plain = [torch.autograd.grad(u, leaves, c, retain_graph=True) for c in cotangents]
     _, pullback = vjp(take, *given)
     for cotangent, expected in zip(cotangents, plain, strict=True):
-        close(pullback(cotangent), expected)
+        close(pullback(cotangent)[: len(leaves)], expected)
     plain = [torch.stack(entries) for entries in zip(*plain, strict=True)]
-    close(vmap(pullback)(cotangents), plain)
-    close(torch.autograd.grad(u, leaves, cotangents, is_grads_batched=True, **by_one), plain)
-    close(jacfwd(take, (0, 1))(*given), jacrev(take, (0, 1))(*given), rtol=1e-8, atol=1e-10)
+    close(vmap(pullback)(cotangents)[: len(leaves)], plain)
+    close(torch.autograd.grad(u, leaves, cotangents, is_grads_batched=True), plain)
+    if backward == "implicit":
+        close(jacfwd(take, (0, 1))(*given), jacrev(take, (0, 1))(*given), rtol=1e-8, atol=1e-10)
 
 
 @ways
@@ -287,7 +307,7 @@ def test_the_implicit_tangent_is_a_solve_of_the_same_budget():
 @pytest.mark.parametrize("second", SECOND, ids=SECOND_NAMES)
 def test_second_derivatives_of_unrolled_solves_are_refused(second):
     step = prdp.Heat((4,), 1e-2, 0.1, prdp.Jacobi(3), "unrolled")
-    with pytest.raises(NotImplementedError if second is not SECOND[1] else RuntimeError, match="no second derivatives"):
+    with pytest.raises(RuntimeError, match="no second derivatives"):
         second(lambda u: step(u).pow(3).sum(), 0)(field((4,), 1))
 
 
@@ -332,6 +352,14 @@ def test_reports_outlive_the_transforms():
     assert vmap(counted)(u)[1].shape == (3, 2)
 
 
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_transforms_compile(backward):
+    step, u = heat(0.1, backward), field((5,), 3)
+    for f in (grad(lambda u: step(u).pow(3).sum()), vmap(lambda u: step(u[None])), lambda u: jvp(step, (u,), (u,))):
+        torch._dynamo.reset()
+        close(torch.compile(f, fullgraph=True, backend="aot_eager")(u), f(u), rtol=0, atol=1e-15)
+
+
 def test_a_failure_under_vmap_is_reported_per_entry():
     a = operators.Heat((4,), 1e-2, 0.1)
     b = random(3, 2, 1, 4)
@@ -348,7 +376,7 @@ def test_a_failure_under_vmap_is_reported_per_entry():
 
 
 def test_a_bad_viscosity_is_refused_under_vmap_too():
-    u = field((4,))
+    u = field((5,))
     with pytest.raises(ValueError, match="nu must be finite and >= 0"):
         vmap(lambda nu: heat(nu, "implicit")(u))(torch.tensor([0.1, -0.1], dtype=torch.float64))
 
@@ -382,7 +410,6 @@ def test_a_subclass_among_the_tensors_of_the_operator_is_noticed():
 
 def disguises():
     yield "negative bit", torch._neg_view
-    yield "negative view of an imaginary part", lambda t: torch.complex(torch.zeros_like(t), -t).conj().imag
     yield "no memory", lambda t: torch._efficientzerotensor(t.shape, dtype=t.dtype)
 
 

@@ -122,7 +122,8 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   std::vector<at::Tensor> arguments, wanted;
   for (const auto& t : tensors_) {
     const bool real = at::isFloatingType(t.scalar_type());
-    arguments.push_back(create_graph ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
+    const bool recorded = create_graph && t.requires_grad();
+    arguments.push_back(recorded ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
     if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
   }
   std::vector<at::Tensor> gradients(tensors_.size());

@@ -211,6 +211,8 @@ template <class... Options>
 Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
                         at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
                         c10::SymInt solves, Options... flat) {
+  TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
+                              "rollout_solves: has no forward mode; take the op rollout");
   auto call = c10::make_intrusive<Call>();
   call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call->solves = std::move(solves);
