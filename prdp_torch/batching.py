@@ -7,31 +7,29 @@ tensor that is mapped, such as nu, the entries are solved one after the other.
 import torch
 from torch.utils._pytree import tree_map
 
-# Per tensor of an operator, its dimensions where it has a batch axis; 0 where all samples share it. `None` in
-# their place: one per axis of the grid, and two.
+# Per tensor of an operator, how many dimensions it has where it has a batch axis: of a grid its axes and
+# two (None), of the rest as many; 0 where all samples share it.
 _DIMS = {"poisson": [], "heat": [0], "burgers": [None, 0], "navier_stokes": [None, 0], "dense": [3], "csr": [2, 2, 2]}
 
 
 @torch.library.register_vmap("prdp::linear_solve")
 def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
-    size = info.batch_size
-    b = b.movedim(in_dims[0], 0) if in_dims[0] is not None else b.expand(size, *b.shape)
-    tensors = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
+    size, op = info.batch_size, torch.ops.prdp.linear_solve
+    whole = b.expand(size, *b.shape) if in_dims[0] is None else b.movedim(in_dims[0], 0)
     mapped = [dim is not None for dim in in_dims[1]]
-    folded = _fold(tensors, mapped, kind, len(shape), size, b.shape[1])
+    in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
+    folded = _fold(in_front, mapped, kind, len(shape), size, whole.shape[1])
     if folded is None:
-        return _one_by_one(
-            torch.ops.prdp.linear_solve, size, (b, *tensors), (True, *mapped), lambda b, *t: (b, t, kind, shape, *rest)
-        )
-    results = torch.ops.prdp.linear_solve(b.flatten(0, 1), folded, kind, shape, *rest)
+        return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, *rest))
+    results = op(whole.flatten(0, 1), folded, kind, shape, *rest)
     return [t.unflatten(0, (size, -1)) for t in results], [0] * len(results)
 
 
 def _fold(tensors, mapped, kind, axes, size, batch):
     """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
-    if kind == "function":  # unknown which of its tensors have a batch axis
+    if kind not in _DIMS:  # a Function: unknown which of its tensors have a batch axis
         return None if tensors else []
-    dims = [axes + 2 if n is None else n for n in _DIMS.get(kind, [0] * len(tensors))]
+    dims = [axes + 2 if n is None else n for n in _DIMS[kind]]
     folded = []
     for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
         if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:
@@ -48,30 +46,22 @@ def _fold(tensors, mapped, kind, axes, size, batch):
     return folded
 
 
-def _one_by_one(op, size, tensors, mapped, arguments):
+def _one_by_one(op, info, in_dims, arguments):
     """The op for one entry after the other; its results with the mapped axis in front."""
-    results = []
-    for i in range(size):
-        entry = [t[i] if is_mapped else t for t, is_mapped in zip(tensors, mapped, strict=True)]
-        results.append(op(*arguments(*entry)))
+
+    def pick(argument, dim, i):
+        if isinstance(dim, (list, tuple)):
+            return [pick(*pair, i) for pair in zip(argument, dim, strict=True)]
+        return argument if dim is None else argument.select(dim, i)
+
+    results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
     stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
     return stacked, tree_map(lambda _: 0, stacked)
 
 
 def _loop(op):
-    """A batching rule that takes one entry after the other: of derivatives that sum over the batch."""
-
-    def rule(info, in_dims, *arguments):
-        def pick(argument, dim, i):
-            if isinstance(argument, (list, tuple)) and isinstance(dim, (list, tuple)):
-                return [pick(*pair, i) for pair in zip(argument, dim, strict=True)]
-            return argument if dim is None else argument.select(dim, i)
-
-        results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
-        stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
-        return stacked, tree_map(lambda _: 0, stacked)
-
-    return rule
+    """The batching rule of a derivative that sums over the batch: it cannot be folded."""
+    return lambda info, in_dims, *arguments: _one_by_one(op, info, in_dims, arguments)
 
 
 torch.library.register_vmap("prdp::unrolled_vjp", _loop(torch.ops.prdp.unrolled_vjp))
