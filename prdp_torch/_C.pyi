@@ -17,8 +17,10 @@ class RegisteredProducts:
     def __init__(
         self,
         apply: Callable[[Tensor, list[Tensor]], Tensor],
-        apply_transpose: Callable[[Tensor, list[Tensor]], Tensor] | None = ...,
-        diagonal: Callable[[list[Tensor]], Tensor] | None = ...,
+        apply_transpose: Callable[[Tensor, list[Tensor]], Tensor] | None,
+        diagonal: Callable[[list[Tensor]], Tensor] | None,
+        transpose_in_transforms: Callable[[Tensor, list[Tensor]], Tensor],
+        product_rule: Callable[[Tensor, Tensor, list[Tensor]], list[Tensor]],
     ) -> None: ...
     @property
     def number(self) -> int: ...

@@ -9,7 +9,7 @@ import warnings
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, batching
 
 
 class Operator:
@@ -21,7 +21,7 @@ class Operator:
     def __init__(self, shape, parameters, tensors):
         self.shape = shape
         self.parameters = parameters
-        self.tensors = tensors
+        self.tensors = [full_precision(t) for t in tensors]
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
@@ -146,6 +146,8 @@ class Function(Operator):
             product,
             product if symmetric else _returning_a_tensor("transpose", transpose),
             None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
+            lambda v, given: batching.transposed(matvec, v, given),
+            lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
         )
         super().__init__([self._products.number], [], tensors)
 
@@ -164,7 +166,8 @@ class Matrix(Operator):
         if matrix.layout == torch.sparse_csr:
             _warn_of_csr_gradient(matrix)
             self.kind = "csr"
-            tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
+            with torch._C._DisableFuncTorch():  # torch.func does not know sparse tensors
+                tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
         elif matrix.layout == torch.strided:
             self.kind = "dense"
             tensors = [matrix]
@@ -250,6 +253,12 @@ def real_tensor(who, name, value):
     if isinstance(value, torch.Tensor):
         return value
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+
+
+def full_precision(t):
+    """float32 for float16 and bfloat16 under torch.autocast, as the solves take them there."""
+    low = t.dtype in (torch.float16, torch.bfloat16) and torch.is_autocast_enabled(t.device.type)
+    return t.float() if low else t
 
 
 def flow(who, name, winds, nu, dt, length):

@@ -3,6 +3,7 @@
 import torch
 
 from prdp_torch import _C, _check, operators
+from prdp_torch.batching import outlive_transforms
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import check_options, checkpoint_number
 
@@ -69,7 +70,7 @@ class Stepper(torch.nn.Module):
 
     def forward(self, u):
         u_next, *report = self._solve(u, self._adjoint_log)
-        self.info = SolveInfo(*report, self._adjoint_log)
+        self._keep(report, self._adjoint_log)
         if u_next.requires_grad:
             self._last_log = self._adjoint_log
         return u_next
@@ -98,11 +99,15 @@ class Stepper(torch.nn.Module):
             report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=True)]
         else:
             report = [u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64)]
-        self.info = SolveInfo(*report, log)
+        self._keep(report, log)
         # A rollout without gradients, such as a validation, leaves the report of the last backward pass.
         if states.requires_grad:
             self._last_log = log
         return states
+
+    def _keep(self, report, log):
+        report = outlive_transforms(report)
+        self.info = None if report is None else SolveInfo(*report, log)
 
     def _solve(self, u, log):
         """One step: u_next and its report."""

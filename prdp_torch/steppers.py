@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 
 from prdp_torch import _check, operators
-from prdp_torch.solve import SolveInfo
 from prdp_torch.stepper import Stepper
 
 
@@ -63,7 +62,7 @@ class EquationStepper(Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
         u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options(self._adjoint_log.number))
-        self.info = SolveInfo(*report, self._adjoint_log)
+        self._keep(report, self._adjoint_log)
         return u_next
 
     def rollout(self, u, steps):
@@ -78,7 +77,7 @@ class EquationStepper(Stepper):
             steps = _check.whole("rollout", "steps", steps)
         options = self._options(self._adjoint_log.number)
         states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *options)
-        self.info = SolveInfo(*report, self._adjoint_log)
+        self._keep(report, self._adjoint_log)
         return states
 
     def _equation(self):

@@ -50,13 +50,14 @@ void bind_solvers(py::module_& m) {
   m.attr("SOLVE_STATUSES") = statuses;
 
   py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts")
-      .def(py::init([](Products::Product apply, Products::Product apply_transpose, Products::Diagonal diagonal) {
-             auto made = RegisteredProducts::make(
-                 {std::move(apply), std::move(apply_transpose), std::move(diagonal)});
+      .def(py::init([](Products::Product apply, Products::Product apply_transpose, Products::Diagonal diagonal,
+                       Products::Product transpose_in_transforms, Products::ProductRule product_rule) {
+             auto made = RegisteredProducts::make({std::move(apply), std::move(apply_transpose), std::move(diagonal),
+                                                   std::move(transpose_in_transforms), std::move(product_rule)});
              return std::const_pointer_cast<RegisteredProducts>(made);
            }),
-           py::arg("apply"), py::arg("apply_transpose") = Products::Product(),
-           py::arg("diagonal") = Products::Diagonal())
+           py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
+           py::arg("product_rule"))
       .def_property_readonly("number", &RegisteredProducts::number);
   m.def("check_operator",
         [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,

@@ -150,12 +150,6 @@ def test_fake_tensors_know_the_shapes():
     assert u.shape == b.shape and info.status.shape == (7,) and info.status.dtype == torch.int64
 
 
-def test_functorch_transforms_refuse_in_words():
-    heat = prdp.Heat((5,), 1e-3, 1.0, solver=prdp.Jacobi(3))
-    with pytest.raises(RuntimeError, match=r"cannot use C\+\+ torch::autograd::Function with functorch"):
-        torch.func.grad(lambda u: heat(u).sum())(field((5,)))
-
-
 def test_steppers_are_modules_without_weights_that_copy_and_pickle():
     heat = prdp.Heat((8,), 1e-3, 1.0, solver=prdp.Jacobi(3))
     assert list(heat.parameters()) == [] and heat.state_dict() == {}

@@ -21,4 +21,7 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
                    const SolveOptions& options, at::IntArrayRef needed,
                    decltype(linear_solve)& adjoint_solve = linear_solve);
 
+/// A cotangent or tangent with zeros for the refused samples, whose u is the constant zero.
+at::Tensor without_refused(const at::Tensor& derivative, const at::Tensor& status);
+
 }  // namespace prdp

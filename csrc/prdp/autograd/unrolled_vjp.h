@@ -38,6 +38,11 @@ UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const
 UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
                                   const UnrolledSolve& solve, at::IntArrayRef needed, int64_t log);
 
+/// The derivative of the same map along tangents of b and of the tensors of A, one for each 1 in `needed` (b
+/// first): as the torch op prdp::unrolled_jvp.
+at::Tensor unrolled_jvp(at::TensorList tangents, const at::Tensor& b, const UnrolledSolve& solve,
+                        at::IntArrayRef needed);
+
 /// The ways of the op. By hand-written sweeps in the CPU loops, where `has_sweep`: one sample at a time.
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,

@@ -1,6 +1,8 @@
 #include "prdp/operators/function_operator.h"
 
 #include <ATen/ExpandUtils.h>
+#include <ATen/TensorSubclassLikeUtils.h>
+#include <ATen/functorch/DynamicLayer.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <limits>
@@ -113,8 +115,15 @@ at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
 }
 
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {
-  const auto& transpose = registered_->products().apply_transpose;
-  return transpose ? product(transpose, v, tensors_, "transpose") : derivative_transposed(v);
+  const auto& [apply, transpose, diagonal, transpose_in_transforms, rule] = registered_->products();
+  if (transpose) return product(transpose, v, tensors_, "transpose");
+  if (transpose_in_transforms && in_transform(v)) return transpose_in_transforms(v, tensors_);
+  return derivative_transposed(v);
+}
+
+bool FunctionOperator::in_transform(const at::Tensor& v) const {
+  return at::functorch::maybeCurrentDynamicLayer() || at::isTensorSubclassLike(v) ||
+         at::areAnyTensorSubclassLike(tensors_);
 }
 
 at::Tensor FunctionOperator::product(const Products::Product& function, const at::Tensor& v,
@@ -187,6 +196,8 @@ at::Tensor FunctionOperator::solve_transpose_directly(const at::Tensor& b) const
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  const auto& rule = registered_->products().product_rule;
+  if (rule && (in_transform(u) || in_transform(lambda))) return rule(lambda, u, tensors_);
   // Recorded on copies of its own, or, where the derivative is itself to be differentiated, on views:
   // the partial derivative must not follow a tensor's way through u.
   const bool create_graph = at::GradMode::is_enabled();
@@ -194,7 +205,8 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   std::vector<at::Tensor> arguments, wanted;
   for (const auto& t : tensors_) {
     const bool real = at::isFloatingType(t.scalar_type());
-    arguments.push_back(create_graph ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
+    const bool recorded = create_graph && t.requires_grad();
+    arguments.push_back(recorded ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
     if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
   }
   std::vector<at::Tensor> gradients(tensors_.size());

@@ -14,9 +14,15 @@ namespace prdp {
 struct Products {
   using Product = std::function<at::Tensor(const at::Tensor& v, const std::vector<at::Tensor>& tensors)>;
   using Diagonal = std::function<at::Tensor(const std::vector<at::Tensor>& tensors)>;
+  using ProductRule = std::function<std::vector<at::Tensor>(const at::Tensor& lambda, const at::Tensor& u,
+                                                            const std::vector<at::Tensor>& tensors)>;
   Product apply;
   Product apply_transpose{};  // torch's own derivative of `apply` where not given
   Diagonal diagonal{};        // broadcastable against the vectors, differentiable; for Jacobi
+  /// The derivative of `apply`, and ∂⟨λ, A u⟩ with respect to each tensor, where a transform of torch.func runs,
+  /// which goes without autograd's C++ interface; empty: there are no such transforms.
+  Product transpose_in_transforms{};
+  ProductRule product_rule{};
 };
 
 /// Functions cannot cross torch's dispatcher, a number can: it stands for them as long as this lives.
@@ -68,6 +74,8 @@ class FunctionOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override;
 
  private:
+  /// Whether a transform of torch.func runs, or a tensor belongs to one.
+  bool in_transform(const at::Tensor& v) const;
   at::Tensor product(const Products::Product& function, const at::Tensor& v,
                      const std::vector<at::Tensor>& tensors, const char* name) const;
   at::Tensor product_without_captures(const at::Tensor& v) const;

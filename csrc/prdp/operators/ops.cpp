@@ -39,4 +39,11 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
         dense);
 }
 
+// torch.func.vmap goes through what they are made of.
+TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
+  m.impl("apply", apply);
+  m.impl("diagonal", diagonal);
+  m.impl("dense", dense);
+}
+
 }  // namespace prdp

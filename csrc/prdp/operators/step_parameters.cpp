@@ -1,5 +1,7 @@
 #include "prdp/operators/step_parameters.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
+
 #include <cmath>
 
 namespace prdp {
@@ -24,6 +26,7 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
 }
 
 void StepParameters::check_values() const {
+  if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
   const double value = nu.item<double>();
   TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ",
                     value);

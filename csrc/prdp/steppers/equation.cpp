@@ -109,4 +109,11 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
         check_equation_op);
 }
 
+// torch.func.vmap goes through what they are made of.
+TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
+  m.impl("step", static_cast<StepSignature*>(step_kernel));
+  m.impl("rhs", rhs_op);
+  m.impl("check_equation", check_equation_op);
+}
+
 }  // namespace prdp

@@ -5,7 +5,9 @@
 #include <torch/custom_class.h>
 #include <torch/library.h>
 
+#include "prdp/autograd/disguises.h"
 #include "prdp/autograd/flat_options.h"
+#include "prdp/operators/autocast.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/rollout_vjp.h"
@@ -173,26 +175,35 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     if (!grads[0].defined()) return out;
     std::vector<int64_t> needed(inputs);
     for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
+    const KeptSolves kept{saved[0], saved[1], saved[2]};
+    const auto gradients = [&](const at::Tensor& cotangent) {
+      return vjp(cotangent, kept, equation, call->options, needed);
+    };
+    const WithoutAutocast full_precision;
+    const auto found = is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], gradients)
+                                                        : gradients(grads[0]);
+    std::copy(found.begin(), found.end(), out.begin());
+    return out;
+  }
 
+ private:
+  static variable_list vjp(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
+                           const SolveOptions& options, at::IntArrayRef needed) {
     // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
-    if (at::GradMode::is_enabled()) {
-      const KeptSolves kept{saved[0], saved[1], saved[2]};
-      const auto found = vjp_of_solves(grads[0], kept, equation, call->options, needed, linear_solve);
-      std::copy(found.begin(), found.end(), out.begin());
-      return out;
-    }
+    if (at::GradMode::is_enabled() || has_tangent(cotangent))
+      return vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve);
     const auto optional = [](const at::Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
     static const auto op = c10::Dispatcher::singleton()
                                .findSchemaOrThrow("prdp::rollout_vjp", "")
                                .typed<VjpSignature>();
     const auto found = call_with_options(
-        op, call->options, grads[0], optional(saved[0]), optional(saved[1]), optional(saved[2]),
-        at::IntArrayRef(needed), at::TensorList(equation.tensors), c10::string_view(equation.kind),
+        op, options, cotangent, optional(kept.solutions), optional(kept.iterations), optional(kept.status),
+        needed, at::TensorList(equation.tensors), c10::string_view(equation.kind),
         at::IntArrayRef(equation.shape), at::ArrayRef<double>(equation.parameters), equation.picard_steps);
-    size_t next = 0;
-    for (size_t i = 0; i < inputs; ++i)
-      if (needed[i]) out[i] = found[next++];
-    return out;
+    variable_list gradients(needed.size());
+    for (size_t i = 0, next = 0; i < needed.size(); ++i)
+      if (needed[i]) gradients[i] = found[next++];
+    return gradients;
   }
 };
 
@@ -200,6 +211,8 @@ template <class... Options>
 Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
                         at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
                         c10::SymInt solves, Options... flat) {
+  TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
+                              "rollout_solves: has no forward mode; take the op rollout");
   auto call = c10::make_intrusive<Call>();
   call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call->solves = std::move(solves);
@@ -215,6 +228,21 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
   return {out[0], out[1], out[2], out[3], out[4]};
 }
 
+/// The same step by step.
+SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
+  check(equation, u, steps * equation.picard_steps, options);
+  options.adjoint_log = 0;  // it would hold the first step's alone
+  std::vector<at::Tensor> states{u};
+  Reports reports;
+  for (int64_t s = 0; s < steps; ++s) {
+    const FailuresOfStep here(s + 1, steps);
+    auto [next, info] = step(equation, states.back(), options);
+    states.push_back(std::move(next));
+    reports.push(info);
+  }
+  return {at::stack(states, 1), reports.joined(u)};
+}
+
 template <class... Options>
 Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
                        at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
@@ -228,6 +256,9 @@ Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_
 
 SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
                     const SolveOptions& options) {
+  // The one op has neither forward mode nor transforms; its steps have.
+  if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
+    return chain(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;
   auto [solutions, iterations, residual, status, applications] =
       call_solves(equation, u, steps * picard, options);
@@ -256,6 +287,10 @@ TORCH_LIBRARY_IMPL(prdp, Meta, m) {
 }
 TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
   m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves));
+}
+
+TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
+  m.impl("rollout", static_cast<SolvesSignature*>(rollout_kernel));
 }
 
 }  // namespace prdp

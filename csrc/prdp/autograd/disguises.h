@@ -1,0 +1,54 @@
+#pragma once
+#include <ATen/LegacyVmapTransforms.h>
+#include <ATen/TensorSubclassLikeUtils.h>
+#include <ATen/functorch/DynamicLayer.h>
+
+#include <algorithm>
+#include <vector>
+
+/// What a tensor can be beside plain numbers in memory.
+namespace prdp {
+
+/// Whether the memory of a tensor holds its values, and nobody watches it: then a kernel may be called
+/// directly. The dispatcher resolves what is fake, wrapped, negated by a bit, or zero without memory.
+inline bool is_plain(const at::Tensor& t) {
+  constexpr c10::DispatchKeySet lazy(
+      {c10::DispatchKey::Negative, c10::DispatchKey::Conjugate, c10::DispatchKey::ZeroTensor});
+  return !at::isTensorSubclassLike(t) && !t.key_set().has_any(lazy);
+}
+inline bool all_plain(at::TensorList tensors) { return std::all_of(tensors.begin(), tensors.end(), is_plain); }
+
+/// Whether a tensor is dual: it carries a tangent of forward mode.
+inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }
+inline bool any_tangent(at::TensorList tensors) {
+  return std::any_of(tensors.begin(), tensors.end(), has_tangent);
+}
+
+/// Whether a transform of torch.func is running.
+inline bool in_torch_func() { return at::functorch::maybeCurrentDynamicLayer().has_value(); }
+
+/// Whether a cotangent is the batch of them that autograd.grad(is_grads_batched=True) makes.
+inline bool is_batch_of_cotangents(const at::Tensor& cotangent) { return at::isBatchedTensor(cotangent); }
+
+/// Runs backward(cotangent) for one of such a batch after the other, and joins the gradients again.
+template <class Backward>
+std::vector<at::Tensor> for_each_cotangent(const at::Tensor& cotangents, const Backward& backward) {
+  const auto physical = at::MultiBatchVmapTransform::logicalToPhysical(cotangents);
+  const int64_t mapped = physical.numBatchDims();
+  const auto sizes = physical.tensor().sizes().slice(0, mapped);
+  std::vector<std::vector<at::Tensor>> found;
+  for (const auto& cotangent : physical.tensor().flatten(0, mapped - 1).unbind()) {
+    const auto gradients = backward(cotangent);
+    found.resize(gradients.size());
+    for (size_t i = 0; i < gradients.size(); ++i)
+      if (gradients[i].defined()) found[i].push_back(gradients[i]);
+  }
+  std::vector<at::Tensor> joined;
+  for (const auto& of_input : found)
+    joined.push_back(of_input.empty() ? at::Tensor()
+                                      : physical.getPhysicalToLogicalMap().apply(
+                                            at::stack(of_input).unflatten(0, sizes)));
+  return joined;
+}
+
+}  // namespace prdp

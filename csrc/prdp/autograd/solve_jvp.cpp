@@ -1,0 +1,58 @@
+#include "prdp/autograd/solve_jvp.h"
+
+#include "prdp/autograd/disguises.h"
+#include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+at::Tensor primal(const at::Tensor& t) { return has_tangent(t) ? t._fw_primal(/*level=*/0) : t; }
+
+OperatorSpec primal(OperatorSpec a) {
+  for (auto& t : a.tensors) t = primal(t);
+  return a;
+}
+
+/// ḃ - Ȧ u
+at::Tensor tangent_rhs(const at::Tensor& b, const at::Tensor& u, const OperatorSpec& a) {
+  auto rhs = b._fw_grad(/*level=*/0);
+  if (any_tangent(a.tensors)) {
+    const auto product = make_operator(a)->apply(u);
+    if (has_tangent(product)) add_to(rhs, product._fw_grad(/*level=*/0).neg());
+  }
+  return rhs.defined() ? rhs : at::zeros_like(u);
+}
+
+at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, SolveOptions options) {
+  auto rhs = tangent_rhs(b, solved.u, a);
+  if (options.on_failure != OnFailure::kRaise) rhs = without_refused(rhs, solved.status);
+  options.adjoint_log = 0;  // it is the primal solve's
+  return linear_solve(primal(a), rhs, options).u;
+}
+
+at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
+                    const SolveOptions& options) {
+  std::vector<at::Tensor> tangents;
+  std::vector<int64_t> needed;
+  const auto take = [&](const at::Tensor& t) {
+    needed.push_back(has_tangent(t));
+    if (has_tangent(t)) tangents.push_back(t._fw_grad(/*level=*/0));
+  };
+  take(b);
+  for (const auto& t : a.tensors) take(t);
+  const auto tangent = unrolled_jvp(
+      tangents, primal(b), {primal(a), options.solver, solved.iterations, solved.status}, needed);
+  return options.on_failure == OnFailure::kRaise ? tangent : without_refused(tangent, solved.status);
+}
+
+}  // namespace
+
+at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
+                     const SolveOptions& options) {
+  return options.backward == Backward::kUnrolled ? unrolled(b, solved, a, options)
+                                                 : implicit(b, solved, a, options);
+}
+
+}  // namespace prdp

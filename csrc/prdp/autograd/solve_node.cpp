@@ -1,0 +1,72 @@
+#include "prdp/autograd/solve_node.h"
+
+#include "prdp/autograd/disguises.h"
+#include "prdp/operators/autocast.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+using torch::autograd::SavedVariable;
+using torch::autograd::variable_list;
+
+SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
+    : Node(torch::autograd::collect_next_edges(b, at::TensorList(a.tensors))),
+      a_(std::move(a)),
+      options_(std::move(options)) {
+  if (a_.kind == "function") products_ = RegisteredProducts::find(a_.shape[0]);
+}
+
+void SolveNode::save(const at::Tensor& b, const Solved& solved) {
+  // Implicit mode keeps u alone, and that only if A has a derivative; b and the iteration counts
+  // are unrolled mode's. Where a failed sample may have passed, its status says so.
+  const bool unrolled = options_.backward == Backward::kUnrolled;
+  if (unrolled) {
+    b_ = SavedVariable(b, /*is_output=*/false);
+    iterations_ = SavedVariable(solved.iterations, /*is_output=*/false);
+  } else if (any_requires_grad(a_.tensors)) {
+    u_ = SavedVariable(solved.u, /*is_output=*/true);
+  }
+  if (unrolled || options_.on_failure != OnFailure::kRaise)
+    status_ = SavedVariable(solved.status, /*is_output=*/false);
+  for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
+  a_.tensors.clear();
+}
+
+void SolveNode::release_variables() {
+  const std::lock_guard lock(mutex_);
+  for (auto* saved : {&b_, &u_, &iterations_, &status_}) saved->reset_data();
+  for (auto& saved : tensors_) saved.reset_data();
+}
+
+variable_list SolveNode::apply(variable_list&& cotangents) {
+  const auto& cotangent = cotangents[0];
+  if (!cotangent.defined()) return variable_list(tensors_.size() + 1);
+  auto a = a_;
+  Solved solved;
+  {
+    const std::lock_guard lock(mutex_);
+    // The function that torch.func.vjp returns runs after its transform: the wrappers are dead by then.
+    const auto unpack = [](const SavedVariable& saved, c10::intrusive_ptr<Node> of = nullptr) {
+      return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
+    };
+    solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_)};
+    for (const auto& saved : tensors_) a.tensors.push_back(unpack(saved));
+  }
+  const WithoutAutocast full_precision;
+  const FailuresOfStep here(step_.first, step_.second);
+  if (is_batch_of_cotangents(cotangent))
+    return for_each_cotangent(cotangent, [&](const at::Tensor& one) { return gradients(one, solved, a); });
+  return gradients(cotangent, solved, a);
+}
+
+variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved,
+                                   const OperatorSpec& a) const {
+  std::vector<int64_t> needed(a.tensors.size() + 1);
+  for (size_t i = 0; i < needed.size(); ++i) needed[i] = task_should_compute_output(i);
+  const bool by_kernel = !at::GradMode::is_enabled() && is_plain(cotangent) && all_plain(a.tensors) &&
+                         !has_tangent(cotangent) && !any_tangent(a.tensors);
+  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_kernel : linear_solve)
+      .gradients;
+}
+
+}  // namespace prdp

@@ -1,0 +1,35 @@
+#pragma once
+#include <torch/csrc/autograd/function.h>
+#include <torch/csrc/autograd/saved_variable.h>
+
+#include "prdp/autograd/solve_vjp.h"
+#include "prdp/operators/function_operator.h"
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+/// The backward pass of prdp::linear_solve. A Node like those of torch's own ops, because torch.func does
+/// not take torch::autograd::Function of C++.
+class SolveNode final : public torch::autograd::Node {
+ public:
+  SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options);
+  /// To be called once u has this node for its history.
+  void save(const at::Tensor& b, const Solved& solved);
+
+  torch::autograd::variable_list apply(torch::autograd::variable_list&& cotangents) override;
+  void release_variables() override;
+  std::string name() const override { return "LinearSolve"; }
+
+ private:
+  torch::autograd::variable_list gradients(const at::Tensor& cotangent, const Solved& solved,
+                                           const OperatorSpec& a) const;
+
+  OperatorSpec a_;  // its tensors are among the saved ones
+  SolveOptions options_;
+  std::shared_ptr<const RegisteredProducts> products_;  // of a Function, kept alive
+  std::pair<int64_t, int64_t> step_ = FailuresOfStep::now();  // of a rollout, for what the backward pass reports
+  std::vector<torch::autograd::SavedVariable> tensors_;
+  torch::autograd::SavedVariable b_, u_, iterations_, status_;
+};
+
+}  // namespace prdp

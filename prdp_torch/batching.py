@@ -1,0 +1,106 @@
+"""The batching rules of the library's ops: what torch.func.vmap makes of a solve.
+
+A mapped axis is folded into the batch, as samples do not influence each other. Where all samples share a
+tensor that is mapped, such as nu, the entries are solved one after the other.
+"""
+
+import torch
+from torch.utils._pytree import tree_map
+
+# Per tensor of an operator, how many dimensions it has where it has a batch axis: of a grid its axes and
+# two (None), of the rest as many; 0 where all samples share it.
+_DIMS = {"poisson": [], "heat": [0], "burgers": [None, 0], "navier_stokes": [None, 0], "dense": [3], "csr": [2, 2, 2]}
+
+
+@torch.library.register_vmap("prdp::linear_solve")
+def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
+    size, op = info.batch_size, torch.ops.prdp.linear_solve
+    whole = b.expand(size, *b.shape) if in_dims[0] is None else b.movedim(in_dims[0], 0)
+    mapped = [dim is not None for dim in in_dims[1]]
+    in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
+    folded = _fold(in_front, mapped, kind, len(shape), size, whole.shape[1])
+    if folded is None:
+        return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, *rest))
+    results = op(whole.flatten(0, 1), folded, kind, shape, *rest)
+    return [t.unflatten(0, (size, -1)) for t in results], [0] * len(results)
+
+
+def _fold(tensors, mapped, kind, axes, size, batch):
+    """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
+    if kind not in _DIMS:  # a Function: unknown which of its tensors have a batch axis
+        return None if tensors else []
+    dims = [axes + 2 if n is None else n for n in _DIMS[kind]]
+    folded = []
+    for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
+        if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:
+            t = t.unsqueeze(int(is_mapped))  # the one sample's
+        of_samples = t.dim() - is_mapped == n and n > 0
+        if is_mapped:
+            if not of_samples or t.shape[1] != batch:
+                return None
+            folded.append(t.flatten(0, 1))
+        elif of_samples and t.shape[0] == batch:
+            folded.append(t.expand(size, *t.shape).flatten(0, 1))
+        else:
+            folded.append(t)
+    return folded
+
+
+def _one_by_one(op, info, in_dims, arguments):
+    """The op for one entry after the other; its results with the mapped axis in front."""
+
+    def pick(argument, dim, i):
+        if isinstance(dim, (list, tuple)):
+            return [pick(*pair, i) for pair in zip(argument, dim, strict=True)]
+        return argument if dim is None else argument.select(dim, i)
+
+    results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
+    stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
+    return stacked, tree_map(lambda _: 0, stacked)
+
+
+def _loop(op):
+    """The batching rule of a derivative that sums over the batch: it cannot be folded."""
+    return lambda info, in_dims, *arguments: _one_by_one(op, info, in_dims, arguments)
+
+
+torch.library.register_vmap("prdp::unrolled_vjp", _loop(torch.ops.prdp.unrolled_vjp))
+torch.library.register_vmap("prdp::unrolled_jvp", _loop(torch.ops.prdp.unrolled_jvp))
+
+
+def transposed(matvec, v, tensors):
+    """Aᵀ v by torch.func: A is linear, so its derivative is the same everywhere."""
+    _, pullback = torch.func.vjp(lambda x: matvec(x, *tensors), torch.zeros_like(v))
+    return pullback(v)[0]
+
+
+def product_rule(matvec, cotangent, u, tensors):
+    """∂⟨λ, A u⟩ with respect to each tensor of A by torch.func; zeros for those of whole numbers."""
+    real = [i for i, t in enumerate(tensors) if t.is_floating_point()]
+
+    def product(*changed):
+        given = list(tensors)
+        for i, t in zip(real, changed, strict=True):
+            given[i] = t
+        return matvec(u, *given)
+
+    _, pullback = torch.func.vjp(product, *[tensors[i] for i in real])
+    gradients = dict(zip(real, pullback(cotangent), strict=True))
+    return [gradients[i] if i in gradients else torch.zeros_like(t) for i, t in enumerate(tensors)]
+
+
+def outlive_transforms(tensors):
+    """Tensors without the wrappers of the transforms that run, which must not leave them; the axes that are
+    mapped come first. None in a compiled function, which cannot take the wrappers off."""
+    if not torch._C._are_functorch_transforms_active():
+        return tensors
+    return None if torch.compiler.is_compiling() else [_unwrapped(t) for t in tensors]
+
+
+def _unwrapped(t):
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(t):
+        dim = functorch.maybe_get_bdim(t)
+        t = functorch.get_unwrapped(t)
+        t = t.movedim(dim, 0) if dim > 0 else t
+    return t
