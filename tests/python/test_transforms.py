@@ -64,7 +64,22 @@ def function_solve(solver, backward="implicit"):
     return solve
 
 
-MATRICES = [(dense_solve, "dense"), (csr_solve, "csr"), (function_solve, "function")]
+def function_alone_solve(solver, backward="implicit"):
+    """By a matvec whose transpose is torch's own derivative, and through an ImplicitStep."""
+
+    def solve(a, b):
+        product = operators.Function(lambda v, a: v @ a.mT, tensors=(a,))
+        return prdp.ImplicitStep(product, None, solver, backward)(b[None])[0]
+
+    return solve
+
+
+MATRICES = [
+    (dense_solve, "dense"),
+    (csr_solve, "csr"),
+    (function_solve, "function"),
+    (function_alone_solve, "function_alone"),
+]
 matrices = pytest.mark.parametrize("kind", [m[0] for m in MATRICES], ids=[m[1] for m in MATRICES])
 
 

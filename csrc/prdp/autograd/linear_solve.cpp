@@ -5,10 +5,10 @@
 #include <torch/library.h>
 
 #include "prdp/autograd/adjoint_log.h"
-#include "prdp/autograd/disguises.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

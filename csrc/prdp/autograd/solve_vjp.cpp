@@ -2,7 +2,7 @@
 
 #include <ATen/core/grad_mode.h>
 
-#include "prdp/autograd/disguises.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
 

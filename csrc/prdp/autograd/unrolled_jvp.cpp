@@ -4,7 +4,7 @@
 #include <torch/csrc/autograd/functions/utils.h>
 #include <torch/library.h>
 
-#include "prdp/autograd/disguises.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/autograd/unrolled_vjp.h"
 
 namespace prdp {

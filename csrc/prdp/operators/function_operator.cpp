@@ -10,6 +10,7 @@
 #include <unordered_map>
 
 #include "prdp/operators/dense.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/operators/with_autograd.h"
 
 namespace prdp {
@@ -117,7 +118,8 @@ at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {
   const auto& [apply, transpose, diagonal, transpose_in_transforms, rule] = registered_->products();
   if (transpose) return product(transpose, v, tensors_, "transpose");
-  if (transpose_in_transforms && in_transform(v)) return transpose_in_transforms(v, tensors_);
+  const bool dual = has_tangent(v) || any_tangent(tensors_);
+  if (transpose_in_transforms && in_transform(v) && !dual) return transpose_in_transforms(v, tensors_);
   return derivative_transposed(v);
 }
 

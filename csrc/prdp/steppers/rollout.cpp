@@ -5,7 +5,7 @@
 #include <torch/custom_class.h>
 #include <torch/library.h>
 
-#include "prdp/autograd/disguises.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/tensors.h"
