@@ -29,6 +29,7 @@ std::string settings_of(const Scene& scene) {
        << at::IntArrayRef(p.shape) << ", reference_shape " << at::IntArrayRef(d.reference_shape) << ", nu " << p.nu
        << ", dt " << p.dt << ", train " << d.train << ", valid " << d.valid << ", valid_steps " << d.valid_steps
        << ", seed " << d.seed << ", " << scene.dtype;
+  if (scene.task == Scene::Task::kEmulator) text << ", modes " << d.modes;
   return text.str();
 }
 
@@ -45,7 +46,9 @@ fs::path cache_folder() {
 }
 
 std::vector<at::Tensor> tensors_of(const Dataset& d) {
-  return {d.train_start, d.train_end, d.valid_start, d.valid_end, d.train_first};
+  std::vector<at::Tensor> all{d.train_start, d.train_end, d.valid_start, d.valid_end};
+  if (d.train_first.defined()) all.push_back(d.train_first);
+  return all;
 }
 
 void write(const fs::path& path, const std::string& settings, const Dataset& data) {
@@ -56,12 +59,14 @@ void write(const fs::path& path, const std::string& settings, const Dataset& dat
 }
 
 bool fits(const Dataset& data, const Scene& scene) {
-  const auto& shape = scene.physics.shape;
   const auto holds = [&](int64_t samples, const at::Tensor& u) {
-    return u.scalar_type() == scene.dtype && u.sizes().equals({samples, 3, shape[0], shape[1]});
+    std::vector<int64_t> sizes{samples, scene.physics.channels()};
+    sizes.insert(sizes.end(), scene.physics.shape.begin(), scene.physics.shape.end());
+    return u.scalar_type() == scene.dtype && u.sizes().equals(sizes);
   };
   const int64_t train = scene.data.train, valid = scene.data.valid;
-  return holds(train, data.train_start) && holds(train, data.train_first) && holds(train, data.train_end) &&
+  const bool first = scene.task != Scene::Task::kCorrector || holds(train, data.train_first);
+  return first && holds(train, data.train_start) && holds(train, data.train_end) &&
          holds(valid, data.valid_start) && holds(valid, data.valid_end);
 }
 
@@ -74,7 +79,8 @@ Dataset read(const fs::path& path, const std::string& settings, const Scene& sce
     const auto content = torch::jit::pickle_load(bytes).toTuple();
     found = content->elements().at(0).toStringRef();
     const auto tensors = content->elements().at(1).toTensorVector();
-    data = {tensors.at(0), tensors.at(1), tensors.at(2), tensors.at(3), tensors.at(4)};
+    data = {tensors.at(0), tensors.at(1), tensors.at(2), tensors.at(3), {}};
+    if (tensors.size() > 4) data.train_first = tensors[4];
   } catch (const std::exception&) {
     TORCH_CHECK_VALUE(false, "data: '", path.string(), "' is damaged; delete it, and it is made again");
   }
