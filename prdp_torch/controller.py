@@ -20,7 +20,18 @@ class Record(NamedTuple):
 
 
 class _Attached:
-    """Hands K on to the steppers."""
+    """Hands K on to the steppers; can be copied and pickled, with the steppers."""
+
+    _native: type
+    """The compiled class."""
+
+    def __getstate__(self):
+        return {"settings": self.settings, "state": self.state_dict(), "attributes": self.__dict__}
+
+    def __setstate__(self, saved):
+        self._native.__init__(self, **saved["settings"])
+        self._load(**saved["state"])
+        self.__dict__.update(saved["attributes"])
 
     def _take(self, steppers):
         who = type(self).__name__
@@ -84,6 +95,8 @@ class PRDPController(_C.PRDPController, _Attached):
     Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
     """
 
+    _native = _C.PRDPController
+
     def __init__(self, steppers=(), **settings):
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
         self._take(steppers)
@@ -116,6 +129,8 @@ class PRDPController(_C.PRDPController, _Attached):
 class LinearSchedule(_C.LinearSchedule, _Attached):
     """The manual schedule: K = initial + increment·(calls of step), at most `maximum`; increment = 0
     is a constant K. The same interface as `PRDPController`; the metric is not looked at."""
+
+    _native = _C.LinearSchedule
 
     def __init__(self, steppers=(), *, initial, increment, maximum):
         settings = {"initial": initial, "increment": increment, "maximum": maximum}

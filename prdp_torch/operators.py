@@ -175,6 +175,11 @@ class Matrix(Operator):
             raise ValueError(f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}")
         if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
             raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
+        if self.kind == "csr" and tensors[0].shape[-1] != matrix.shape[-1] + 1:
+            raise ValueError(
+                f"linear_solve: a CSR matrix of {matrix.shape[-1]} rows needs a crow of one more, got "
+                f"{tensors[0].shape[-1]}"
+            )
         super().__init__([], [], tensors)
 
     @classmethod

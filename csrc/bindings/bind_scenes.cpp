@@ -87,15 +87,17 @@ void bind_scenes(py::module_& m) {
       .def_readonly("train_end", &Dataset::train_end)
       .def_readonly("valid_start", &Dataset::valid_start)
       .def_readonly("valid_end", &Dataset::valid_end);
-  m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress());
+  m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress(),
+        py::call_guard<py::gil_scoped_release>());
   m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
-        py::arg("on_progress") = OnProgress());
+        py::arg("on_progress") = OnProgress(), py::call_guard<py::gil_scoped_release>());
   py::class_<ParameterProblem>(m, "ParameterProblem")
       .def_readonly("modes", &ParameterProblem::modes)
       .def_readonly("start", &ParameterProblem::start)
       .def_readonly("reference", &ParameterProblem::reference)
       .def_readonly("solution", &ParameterProblem::solution);
-  m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"));
+  m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"),
+        py::call_guard<py::gil_scoped_release>());
 
   py::class_<Checkpoint>(m, "Checkpoint")
       .def(py::init<std::filesystem::path, std::string>(), py::arg("path"), py::arg("settings"))

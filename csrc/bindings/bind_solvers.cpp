@@ -1,8 +1,7 @@
-#include <pybind11/functional.h>
-
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/solving.h"
 
@@ -38,10 +37,70 @@ void warn_in_python(const std::string& text) {
   if (PyErr_WarnEx(PyExc_UserWarning, text.c_str(), 1) != 0) throw py::error_already_set();
 }
 
+/// A function of the user's in Python.
+template <class Result>
+struct PythonFunction {
+  /// Destroyed with the interpreter's lock held.
+  std::shared_ptr<py::object> function;
+
+  explicit PythonFunction(py::object f)
+      : function(new py::object(std::move(f)), [](py::object* held) {
+          const py::gil_scoped_acquire gil;
+          delete held;
+        }) {}
+  template <class... Args>
+  Result operator()(const Args&... args) const {
+    const py::gil_scoped_acquire gil;
+    return (*function)(args...).template cast<Result>();
+  }
+};
+
+template <class Function>
+Function optional_function(const std::optional<py::function>& f) {
+  return f ? Function(PythonFunction<typename Function::result_type>(*f)) : Function();
+}
+
+template <class Function>
+PyObject* python_object(const Function& f) {
+  const auto* in_python = f.template target<PythonFunction<typename Function::result_type>>();
+  return in_python ? in_python->function->ptr() : nullptr;
+}
+
+/// Tells Python's garbage collector of the functions, so that it frees one that refers to its operator, such as
+/// a method of the operator's owner. Those that a backward pass still needs are not the operator's alone.
+int visit_products(PyObject* self, visitproc visit, void* arg) {
+  Py_VISIT(Py_TYPE(self));
+  if (!py::detail::is_holder_constructed(self)) return 0;
+  const auto registered = py::cast<std::shared_ptr<RegisteredProducts>>(py::handle(self));
+  if (registered.use_count() > 2) return 0;  // the holder's and this one
+  const auto& products = registered->products();
+  for (PyObject* function :
+       {python_object(products.apply), python_object(products.apply_transpose), python_object(products.diagonal),
+        python_object(products.transpose_in_transforms), python_object(products.product_rule)})
+    Py_VISIT(function);
+  return 0;
+}
+
+void collect_products(PyHeapTypeObject* heap_type) {
+  heap_type->ht_type.tp_flags |= Py_TPFLAGS_HAVE_GC;
+  heap_type->ht_type.tp_traverse = visit_products;
+}
+
+unsigned long main_thread = 0;
+
+/// Runs the handlers of signals, which Python does on its main thread alone; Ctrl-C's raises KeyboardInterrupt.
+void check_signals() {
+  if (PyThread_get_thread_ident() != main_thread) return;
+  const py::gil_scoped_acquire gil;
+  if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+}
+
 }  // namespace
 
 void bind_solvers(py::module_& m) {
   set_warning_sink(warn_in_python);
+  main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
+  interruption::set_check(check_signals);
   m.attr("DEFAULT_RTOL") = kDefaultRtol;
   m.attr("DEFAULT_RESTART") = kDefaultRestart;
   m.attr("CHECKPOINT_SQRT") = kCheckpointSqrt;
@@ -49,11 +108,16 @@ void bind_solvers(py::module_& m) {
   for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
   m.attr("SOLVE_STATUSES") = statuses;
 
-  py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts")
-      .def(py::init([](Products::Product apply, Products::Product apply_transpose, Products::Diagonal diagonal,
-                       Products::Product transpose_in_transforms, Products::ProductRule product_rule) {
-             auto made = RegisteredProducts::make({std::move(apply), std::move(apply_transpose), std::move(diagonal),
-                                                   std::move(transpose_in_transforms), std::move(product_rule)});
+  py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts",
+                                                                      py::custom_type_setup(collect_products))
+      .def(py::init([](py::function apply, std::optional<py::function> apply_transpose,
+                       std::optional<py::function> diagonal, py::function transpose_in_transforms,
+                       py::function product_rule) {
+             auto made = RegisteredProducts::make({PythonFunction<at::Tensor>(apply),
+                                                   optional_function<Products::Product>(apply_transpose),
+                                                   optional_function<Products::Diagonal>(diagonal),
+                                                   PythonFunction<at::Tensor>(transpose_in_transforms),
+                                                   PythonFunction<std::vector<at::Tensor>>(product_rule)});
              return std::const_pointer_cast<RegisteredProducts>(made);
            }),
            py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
@@ -124,8 +188,10 @@ void bind_solvers(py::module_& m) {
            std::string solver, int64_t max_iter, double rtol, int64_t restart) {
           auto a = spec(kind, shape, parameters, tensors);
           a.transposed = transposed;
-          const auto result =
-              solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, restart});
+          const auto result = [&] {
+            const py::gil_scoped_release no_gil;
+            return solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, restart});
+          }();
           return py::make_tuple(result.u, as_tuple(result.info));
         },
         "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.",

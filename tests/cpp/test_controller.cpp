@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <limits>
 
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
@@ -124,6 +125,26 @@ TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
   EXPECT_EQ(c.max_iter(), 60);
   EXPECT_THROW(c.load_state({0}), c10::ValueError);
   EXPECT_THROW(c.load_state({61}), c10::ValueError);
+}
+
+TEST(Controllers, KStopsAtTheLargestNumber) {
+  constexpr int64_t kMost = std::numeric_limits<int64_t>::max();
+  const auto last = [](auto controller) {
+    for (int i = 0; i < 20; ++i) {
+      const int64_t before = controller.max_iter();
+      const bool raised = controller.step(1.0 + i);
+      EXPECT_EQ(raised, controller.max_iter() > before);
+    }
+    return controller.max_iter();
+  };
+  EXPECT_EQ(last(PRDPController({.delta = 2, .window = 1, .increment = kMost})), kMost);
+  EXPECT_EQ(last(PRDPController({.delta = 2, .window = 1, .initial = kMost - 1})), kMost);
+  EXPECT_EQ(last(PRDPController({.delta = 2, .window = 1, .increment = kMost, .maximum = 7})), 7);
+  EXPECT_EQ(last(PRDPController({.delta = 2, .window = 1, .growth = 1e18})), kMost);
+  EXPECT_EQ(last(PRDPController({.window = kMost})), 2);
+  EXPECT_EQ(last(PRDPController({.delta = kMost})), 1);
+  EXPECT_EQ(last(prdp::LinearSchedule(1, kMost, kMost)), kMost);
+  EXPECT_EQ(last(prdp::LinearSchedule(5, kMost, 9)), 9);
 }
 
 }  // namespace

@@ -108,7 +108,7 @@ TEST(Data, SameSeedSameDataOtherSeedOtherData) {
 TEST(Data, HeatTargetsAreExactStepsAsManyAsTheSceneSays) {
   auto scene = prdp::read_scene(scene_path("heat_1d"));
   scene.data.valid_steps = 3;
-  const auto data = prdp::make_dataset(scene);
+  const auto data = prdp::compute_dataset(scene);
   EXPECT_EQ(data.train_start.sizes(), (std::vector<int64_t>{200, 1, 30}));
   EXPECT_EQ(data.valid_end.sizes(), (std::vector<int64_t>{5, 1, 30}));
   auto exact = scene.stepper(prdp::Direct{});

@@ -1,7 +1,9 @@
 #include <gtest/gtest.h>
 
 #include "helpers.h"
+#include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 
 /// The CPU loops against the plain-tensor solver, which share only the text of the methods.
@@ -96,6 +98,42 @@ TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
   EXPECT_TRUE(result.u.isfinite().all().item<bool>());
   EXPECT_TRUE(result.u[1].eq(0.5).all().item<bool>());
   EXPECT_TRUE(result.u[3].eq(0.25).all().item<bool>());
+}
+
+TEST(Solve, AnInterruptionEndsAllThreadsAndLeavesNothingBehind) {
+  struct Interrupted {};
+  const auto a = prdp::make_operator(heat({64, 64}));
+  const auto b = at::randn({16, 1, 64, 64}, at::kDouble);
+  const prdp::SolveRequest request{Method::kConjugateGradient, 200, 1e-10, {}};
+  const auto wanted = prdp::solve(*a, b, request).u;
+  prdp::interruption::set_check([] { throw Interrupted{}; });
+  for (const auto method : {Method::kJacobi, Method::kConjugateGradient})
+    EXPECT_THROW(prdp::solve(*a, b, {method, int64_t{1} << 50, 0.0, {}}), Interrupted);
+  prdp::interruption::set_check(nullptr);
+  EXPECT_TRUE(at::equal(prdp::solve(*a, b, request).u, wanted));
+
+  // The other threads end although nobody interrupts them, and the first error comes out.
+  const auto body = [](int64_t begin, int64_t) {
+    if (begin == 0) throw Interrupted{};
+    for (;;) prdp::interruption::Watch::local().look();
+  };
+  EXPECT_THROW(prdp::interruption::parallel_for(0, 8, 1, body), Interrupted);
+}
+
+TEST(Matrix, OnlySquareOnesWithIndicesInRangeAreTaken) {
+  const auto eye = at::eye(3, at::kDouble);
+  EXPECT_NO_THROW(prdp::matrix(eye.to_sparse_csr()));
+  EXPECT_THROW(prdp::matrix(at::ones({3, 4})), c10::ValueError);
+  EXPECT_THROW(prdp::matrix(at::ones({3, 4}).to_sparse_csr()), c10::ValueError);
+  EXPECT_THROW(prdp::matrix(at::ones({3})), c10::ValueError);
+  EXPECT_THROW(prdp::matrix(eye.to_sparse()), c10::ValueError);
+  const auto b = at::ones({2, 3}, at::kDouble);
+  const prdp::SolveOptions options{prdp::CG{.max_iter = 5}};
+  EXPECT_TRUE(at::allclose(prdp::linear_solve(prdp::matrix(eye.to_sparse_csr()), b, options).u, b));
+  auto spoilt = prdp::matrix(eye.to_sparse_csr());
+  spoilt.tensors[1] = at::tensor({0, 1, 3}, at::kLong);
+  EXPECT_THROW(prdp::linear_solve(spoilt, b, options), c10::ValueError);
+  EXPECT_THROW(prdp::linear_solve(prdp::matrix(at::eye(0)), at::ones({2, 0}), options), c10::ValueError);
 }
 
 TEST(Solve, EmptyBatchIsNoTrouble) {

@@ -2,6 +2,16 @@
 
 import signal
 
+import pytest
+
 # A shell starts what it runs in the background with Ctrl-C ignored, and children inherit that: the tests
 # that interrupt a training would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def data_cache(tmp_path_factory):
+    """Data sets are made anew by the code under test, once, and not read from the user's own cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PRDP_CACHE", str(tmp_path_factory.mktemp("data")))
+        yield

@@ -1,6 +1,8 @@
 """The controller against the decisions of the published code, and its rules."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -163,3 +165,47 @@ def test_the_manual_schedule_has_the_same_interface():
     assert "max_iter=40; initial=25, increment=6" in repr(schedule)
     with pytest.raises(ValueError, match="maximum must be >= initial = 25, got 3"):
         prdp.LinearSchedule(initial=25, increment=6, maximum=3)
+
+
+@pytest.mark.parametrize("make", [copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+@pytest.mark.parametrize("kind", ["prdp", "schedule"])
+def test_a_copy_goes_on_like_the_original(kind, make):
+    heat = prdp.Heat((5,), 1e-3, 1.0, prdp.Jacobi(1))
+    if kind == "prdp":
+        original = prdp.PRDPController([heat], window=1, delta=2, increment=3, maximum=50)
+    else:
+        original = prdp.LinearSchedule([heat], initial=2, increment=3, maximum=50)
+    metrics = [1.0, 0.9, 0.9, 0.9, 0.5, 0.5, 0.5, 0.2, 0.2]
+    for metric in metrics[:5]:
+        original.step(metric)
+    twin = make(original)
+    assert type(twin) is type(original) and twin.settings == original.settings
+    assert twin.state_dict() == original.state_dict() and original.max_iter > 2
+    (stepper,) = twin.steppers
+    assert (stepper is heat) == (make is copy.copy) and stepper.max_iter == twin.max_iter
+    goes_on = [(twin.step(metric), twin.max_iter, stepper.max_iter) for metric in metrics[5:]]
+    assert goes_on == [(original.step(metric), original.max_iter, heat.max_iter) for metric in metrics[5:]]
+
+
+def test_a_copy_of_both_keeps_a_stepper_with_its_controller():
+    heat = prdp.Heat((5,), 1e-3, 1.0, prdp.Jacobi(1))
+    both = {"heat": heat, "controller": prdp.PRDPController([heat], window=1, delta=2)}
+    for twin in (copy.deepcopy(both), pickle.loads(pickle.dumps(both))):
+        assert twin["controller"].steppers[0] is twin["heat"] is not heat
+
+
+def test_k_stops_at_the_largest_number():
+    most = 2**63 - 1
+    controller = prdp.PRDPController(window=1, delta=2, increment=most)
+    schedule = prdp.LinearSchedule(initial=1, increment=most, maximum=most)
+    assert [schedule.step(), schedule.step()] == [True, False] and schedule.max_iter == most
+    assert [controller.step(1.0) for _ in range(4)] == [False, False, True, False]
+    assert controller.max_iter == most
+    steps = prdp.Burgers((8,), 1e-3, 1e-2, prdp.GMRES(1), picard_steps=4)
+    with pytest.raises(
+        ValueError, match=r"rollout: steps times picard_steps must be below 2\^63, got 2305843009213693953"
+    ):
+        steps.rollout(field((8,)), 2**61 + 1)
+    # Huge budgets are no reason to run out of numbers when work is shared between threads.
+    heat = prdp.Heat((8,), 1e-3, 1.0, prdp.GMRES(most, restart=most))
+    assert heat.converged is False and torch.isfinite(heat(field((8,)))).all() and heat.converged

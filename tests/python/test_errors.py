@@ -161,3 +161,45 @@ def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
         match=r"was built for torch 2.0.1\+cpu, but torch .* is installed; install torch 2.0.1\+cpu, or rebuild",
     ):
         _load.check_torch()
+
+
+def unsuited():
+    """Methods that an operator does not support, and the words for it."""
+    burgers = operators.Burgers(field((8,)), 1e-3, 1e-2)
+    function = operators.Function(lambda v: v, lambda v: v)
+    chebyshev = "Chebyshev: the spectrum is known of Heat and Poisson operators alone"
+    stokes = 'preconditioner "stokes" is for NavierStokes operators alone'
+    return [
+        (burgers, prdp.Chebyshev(1), chebyshev),
+        (function, prdp.Chebyshev(5), chebyshev),
+        (burgers, prdp.GMRES(3, preconditioner="stokes"), stokes),
+        (function, prdp.GMRES(3, preconditioner="stokes"), stokes),
+        (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi divides by, is not known"),
+    ]
+
+
+@pytest.mark.parametrize("max_iter", [0, 1, 5])
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+@pytest.mark.parametrize("case", range(5))
+def test_a_method_that_does_not_suit_the_operator_is_refused_whatever_b_is(case, scale, max_iter):
+    a, solver, message = unsuited()[case]
+    solver.max_iter = max_iter
+    with pytest.raises(ValueError, match=message):
+        prdp.linear_solve(a, scale * field((8,)), solver)
+
+
+def test_jacobi_is_refused_by_a_zero_on_the_diagonal_whatever_b_is():
+    matrix = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
+    for a in (matrix, matrix.to_sparse_csr()):
+        with pytest.raises(torch.linalg.LinAlgError, match=r"ZERO_DIAGONAL in row \(0\)"):
+            prdp.linear_solve(a, torch.zeros(2), prdp.Jacobi(3))
+    flow = operators.NavierStokes(field((4, 4), channels=3), 1e-3, 1e-2)
+    with pytest.raises(torch.linalg.LinAlgError, match="ZERO_DIAGONAL"):
+        prdp.linear_solve(flow, torch.zeros(2, 3, 4, 4, dtype=torch.float64), prdp.Jacobi(3))
+
+
+def test_vectors_without_unknowns_are_refused():
+    function = operators.Function(lambda v: v, lambda v: v)
+    for solver in (prdp.CG(3), prdp.Direct()):
+        with pytest.raises(ValueError, match=r"Function: every extent of a vector must be >= 1, got \[2, 0\]"):
+            prdp.linear_solve(function, torch.zeros(2, 0), solver)

@@ -3,6 +3,7 @@
 import copy
 import gc
 import pickle
+import weakref
 
 import numpy as np
 import pytest
@@ -73,6 +74,40 @@ def test_the_backward_pass_keeps_the_operator_alive():
     gc.collect()
     u.sum().backward()
     assert k.grad.abs().min() > 0 and s.grad.abs() > 0
+
+
+class Owner:
+    """Keeps an operator whose products are its own methods."""
+
+    def __init__(self):
+        self.scale = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+        self.operator = operators.Function(self.times, self.times, (self.scale,))
+
+    def times(self, v, scale):
+        return scale * v
+
+
+def test_an_operator_in_a_cycle_with_its_owner_is_freed():
+    owner = Owner()
+    alive = weakref.ref(owner)
+    u, _ = prdp.linear_solve(owner.operator, right_hand_side(), prdp.CG(3))
+    scale = owner.scale
+    del owner
+    gc.collect()
+    assert alive() is not None  # the backward pass needs it
+    u.sum().backward()
+    torch.testing.assert_close(scale.grad, -right_hand_side().sum() / 4)
+    del u
+    gc.collect()
+    assert alive() is None
+
+
+def test_an_operator_that_is_in_use_is_not_taken_for_garbage():
+    owner = Owner()
+    operator, alive = owner.operator, weakref.ref(owner)
+    del owner
+    gc.collect()
+    assert alive() is not None and torch.equal(operator.apply(torch.ones(1, 2)), torch.full((1, 2), 2.0))
 
 
 def test_a_symmetric_operator_on_fields_takes_the_same_product_twice():

@@ -70,3 +70,23 @@ u, _ = prdp.linear_solve(times, b, prdp.Direct())
 assert torch.allclose(torch.einsum("bij,bj->bi", a, u), b, rtol=1e-12, atol=1e-12)
 print("sound")
 """)
+
+
+def test_two_threads_that_read_their_reports_do_not_wait_for_each_other():
+    """The log of adjoint reports once destroyed tensors, which takes the interpreter's lock, with its own held."""
+    assert "both done" in run("""
+import threading
+def work():
+    a = torch.eye(3, dtype=torch.float64) * 2
+    for _ in range(400):
+        b = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+        u, info = prdp.linear_solve(a, b, prdp.CG(5))
+        for _ in range(3):
+            u.sum().backward(retain_graph=True)
+            assert info.adjoint.status.min() > 0
+threads = [threading.Thread(target=work, daemon=True) for _ in range(2)]
+for thread in threads: thread.start()
+for thread in threads: thread.join(60)
+assert not any(thread.is_alive() for thread in threads), "deadlock"
+print("both done")
+""")

@@ -7,6 +7,8 @@ namespace prdp::adjoint_log {
 
 namespace {
 
+/// A tensor that Python has seen takes the interpreter's lock when it is destroyed, and whoever holds that one
+/// may be waiting for this mutex: nothing is destroyed while it is held.
 struct Logs {
   std::mutex mutex;
   std::unordered_map<int64_t, std::optional<SolveInfo>> entries;
@@ -27,8 +29,9 @@ int64_t open() {
 }
 
 void close(int64_t log) {
+  decltype(Logs::entries)::node_type closed;
   const std::lock_guard lock(logs().mutex);
-  logs().entries.erase(log);
+  closed = logs().entries.extract(log);
 }
 
 std::optional<SolveInfo> read(int64_t log) {
@@ -38,9 +41,10 @@ std::optional<SolveInfo> read(int64_t log) {
 }
 
 void write(int64_t log, const SolveInfo& info) {
+  std::optional<SolveInfo> other = info;  // the new one, and then the one before it
   const std::lock_guard lock(logs().mutex);
   const auto entry = logs().entries.find(log);
-  if (entry != logs().entries.end()) entry->second = info;
+  if (entry != logs().entries.end()) entry->second.swap(other);
 }
 
 }  // namespace prdp::adjoint_log

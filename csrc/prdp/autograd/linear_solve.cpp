@@ -137,11 +137,16 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
 }
 
 OperatorSpec matrix(const at::Tensor& values) {
-  if (values.layout() == at::kSparseCsr)
-    return {"csr", {}, {}, {values.crow_indices(), values.col_indices(), values.values()}};
-  TORCH_CHECK_VALUE(values.layout() == at::kStrided,
+  const bool sparse = values.layout() == at::kSparseCsr;
+  TORCH_CHECK_VALUE(sparse || values.layout() == at::kStrided,
                     "linear_solve: A must be a dense or sparse CSR tensor, got ", values.layout());
-  return {"dense", {}, {}, {values}};
+  TORCH_CHECK_VALUE((values.dim() == 2 || values.dim() == 3) && values.sym_size(-1) == values.sym_size(-2),
+                    "linear_solve: A must have shape (n, n) or (batch, n, n), got ", values.sym_sizes());
+  if (!sparse) return {"dense", {}, {}, {values}};
+  const auto crow = values.crow_indices();
+  TORCH_CHECK_VALUE(crow.sym_size(-1) == values.sym_size(-1) + 1, "linear_solve: a CSR matrix of ",
+                    values.sym_size(-1), " rows needs a crow of one more, got ", crow.sym_size(-1));
+  return {"csr", {}, {}, {crow, values.col_indices(), values.values()}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

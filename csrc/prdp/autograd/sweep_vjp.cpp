@@ -1,9 +1,9 @@
-#include <ATen/Parallel.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include "prdp/autograd/reverse_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -41,7 +41,7 @@ void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagona
 template <class T, class Parameters>
 void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
            int64_t grain) {
-  at::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
+  interruption::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
     const at::NoGradGuard no_grad;
     reverse_range(a, transpose, batch, begin, end);
   });
@@ -72,8 +72,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
 
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t most = size == 0 ? 0 : iterations.max().item<int64_t>();
-  const int64_t products = solve.solver.method == Method::kGmres ? solve.solver.restart : 1;
-  const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most * products);
+  const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most, solve.solver.restart);
   const auto run = [&]<class T>(T) {
     ReverseBatch<T> batch{solve.solver.method,
                           solve.solver.restart,

@@ -54,6 +54,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorL
                          status,
                          checkpoint_every};
   for (const auto& t : tensors) unrolled.a.tensors.push_back(t.detach());
+  make_operator(unrolled.a)->check_parameters();
   const auto rhs = b.detach();
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
   UnrolledVjp found;

@@ -16,7 +16,7 @@ LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maxim
 
 bool LinearSchedule::step(double, bool) {
   const int64_t before = state_.max_iter;
-  state_.max_iter = std::min(maximum_, before + increment_);
+  state_.max_iter = before + std::min(increment_, maximum_ - before);
   return state_.max_iter > before;
 }
 

@@ -27,7 +27,7 @@ PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
 
 bool PRDPController::should_refine() const {
   const auto& history = state_.history;
-  if (static_cast<int64_t>(history.size()) < settings_.delta + 1) return false;
+  if (static_cast<int64_t>(history.size()) <= settings_.delta) return false;
   // As products, so that a metric of zero needs no division.
   constexpr double rounding = 1e-12;
   const double newest = history.back().smoothed;
@@ -41,7 +41,7 @@ bool PRDPController::should_refine() const {
 bool PRDPController::step(double metric, bool converged) {
   TORCH_CHECK_VALUE(std::isfinite(metric) && metric >= 0.0,
                     "PRDPController: metric must be finite and >= 0, got ", metric);
-  const double alpha = 2.0 / static_cast<double>(settings_.window + 1);
+  const double alpha = 2.0 / (static_cast<double>(settings_.window) + 1.0);
   const auto& history = state_.history;
   const double smoothed =
       history.empty() ? metric : history.back().smoothed + alpha * (metric - history.back().smoothed);
@@ -49,10 +49,11 @@ bool PRDPController::step(double metric, bool converged) {
 
   const int64_t limit = settings_.maximum.value_or(std::numeric_limits<int64_t>::max());
   if (converged || state_.max_iter >= limit || !should_refine()) return false;
-  const auto grown = static_cast<int64_t>(
-      std::ceil(settings_.growth * static_cast<double>(state_.max_iter) - 1e-9));
+  // Either sum may lie beyond the largest int64.
+  const double grown = std::ceil(settings_.growth * static_cast<double>(state_.max_iter) - 1e-9);
+  const int64_t added = std::min(settings_.increment, limit - state_.max_iter) + state_.max_iter;
   state_.checkpoint = smoothed;
-  state_.max_iter = std::min(limit, std::max(state_.max_iter + settings_.increment, grown));
+  state_.max_iter = grown >= static_cast<double>(limit) ? limit : std::max(added, static_cast<int64_t>(grown));
   state_.history.back().refined = true;
   return true;
 }

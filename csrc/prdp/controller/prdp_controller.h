@@ -13,7 +13,7 @@ struct PRDPSettings {
   int64_t window = 6;       // of the exponential mean, α = 2 / (window + 1); 1: no smoothing
   int64_t initial = 1;      // K₀
   int64_t increment = 1;    // ΔK
-  std::optional<int64_t> maximum;  // K is never raised beyond
+  std::optional<int64_t> maximum{};  // K is never raised beyond
   double growth = 1.0;      // K is raised to growth·K where that is more than K + ΔK
 };
 

@@ -2,6 +2,7 @@
 #include <Eigen/Dense>
 #include <Eigen/Sparse>
 #include <Eigen/SparseLU>
+#include <functional>
 #include <memory>
 #include <numbers>
 
@@ -141,11 +142,12 @@ class DenseFactors {
   Eigen::PartialPivLU<Matrix> lu_;
 };
 
-/// Sparse LU by Eigen.
+/// Sparse LU by Eigen, whose ordering and factorisation may not return from an empty row or column.
 template <class T>
 class CsrFactors {
  public:
-  explicit CsrFactors(const Csr<T>& a) : n_(a.unknowns()) {
+  explicit CsrFactors(const Csr<T>& a) : n_(a.unknowns()), singular_(has_empty_line(a)) {
+    if (singular_) return;
     std::vector<Eigen::Triplet<T>> entries;
     entries.reserve(a.stored());
     a.for_each_entry([&](int64_t i, int64_t j, T value) {
@@ -156,7 +158,7 @@ class CsrFactors {
     lu_.compute(m);
   }
   bool solve(const T* r, T* d) const {
-    if (lu_.info() != Eigen::Success) return false;
+    if (singular_ || lu_.info() != Eigen::Success) return false;
     using Vector = Eigen::Matrix<T, Eigen::Dynamic, 1>;
     const Vector x = lu_.solve(Eigen::Map<const Vector>(r, n_));
     std::copy(x.data(), x.data() + n_, d);
@@ -164,7 +166,15 @@ class CsrFactors {
   }
 
  private:
+  static bool has_empty_line(const Csr<T>& a) {
+    std::vector<char> row(a.unknowns()), column(a.unknowns());
+    a.for_each_entry([&](int64_t i, int64_t j, T) { row[i] = column[j] = 1; });
+    return !std::all_of(row.begin(), row.end(), std::identity{}) ||
+           !std::all_of(column.begin(), column.end(), std::identity{});
+  }
+
   int64_t n_;
+  bool singular_;
   Eigen::SparseLU<Eigen::SparseMatrix<T>> lu_;
 };
 

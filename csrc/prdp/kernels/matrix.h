@@ -67,6 +67,7 @@ class Dense : public MatrixBase<T, Dense<T>> {
   Dense sample(int64_t s) const { return {a_ + s * sample_stride_, n_, 0, transposed_}; }
   bool is_shared() const { return sample_stride_ == 0; }
   T diagonal(int64_t i) const { return a_[i * n_ + i]; }
+  int64_t stored() const { return n_ * n_; }
   T at(int64_t i, int64_t j) const { return transposed_ ? a_[j * n_ + i] : a_[i * n_ + j]; }
   bool operator_is_finite() const { return std::isfinite(largest_magnitude(a_, n_ * n_)); }
 

@@ -5,6 +5,7 @@
 #include <ATen/functorch/DynamicLayer.h>
 #include <torch/csrc/autograd/autograd.h>
 
+#include <algorithm>
 #include <limits>
 #include <mutex>
 #include <unordered_map>
@@ -104,6 +105,9 @@ FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.ten
 
 void FunctionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(b.dim() >= 2, "Function: expected (batch, ...), got ", b.sizes());
+  const auto extents = b.sizes().slice(1);
+  TORCH_CHECK_VALUE(std::find(extents.begin(), extents.end(), 0) == extents.end(),
+                    "Function: every extent of a vector must be >= 1, got ", b.sizes());
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
                    "Function: expected float32 or float64, got ", b.scalar_type());
   vectors_ = b.sizes().vec();

@@ -1,5 +1,7 @@
 #include "prdp/operators/matrix_operator.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
+
 #include "prdp/operators/dense.h"
 
 namespace prdp {
@@ -24,6 +26,26 @@ at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
   return at::matmul(matrix, v.unsqueeze(-1)).squeeze(-1);
 }
 
+void check_has_rows(const c10::SymInt& n) {
+  TORCH_CHECK_VALUE(n >= 1, "linear_solve: A must have at least one row");
+}
+
+/// Raises ValueError unless these are the compressed rows of an n × n matrix: crow (n + 1), col (nnz).
+void check_rows(const int64_t* crow, const int64_t* col, int64_t n, int64_t stored) {
+  TORCH_CHECK_VALUE(crow[0] == 0 && crow[n] == stored, "linear_solve: crow of a CSR matrix must run from 0 to the ",
+                    stored, " stored values, got ", crow[0], " to ", crow[n]);
+  for (int64_t i = 0; i < n; ++i)
+    TORCH_CHECK_VALUE(crow[i] <= crow[i + 1], "linear_solve: crow of a CSR matrix must not fall, got ", crow[i],
+                      " before ", crow[i + 1], " at index ", i);
+  // One comparison for both bounds, and no branch: the compiler makes vector code of it.
+  bool inside = true;
+  for (int64_t k = 0; k < stored; ++k) inside &= static_cast<uint64_t>(col[k]) < static_cast<uint64_t>(n);
+  if (inside) return;
+  for (int64_t k = 0; k < stored; ++k)
+    TORCH_CHECK_VALUE(col[k] >= 0 && col[k] < n, "linear_solve: a column of a CSR matrix of ", n,
+                      " rows must lie in [0, ", n, "), got ", col[k], " at index ", k);
+}
+
 at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b) {
   // A singular matrix gives a non-finite solution here, and a status there.
   return solve_dense(matrix, b.unsqueeze(-1)).squeeze(-1);
@@ -38,6 +60,7 @@ DenseOperator::DenseOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE((dim == 2 || dim == 3) && matrix_.sym_size(-1) == matrix_.sym_size(-2),
                     "linear_solve: A must have shape (n, n) or (batch, n, n), got ",
                     matrix_.sym_sizes());
+  check_has_rows(matrix_.sym_size(-1));
 }
 
 void DenseOperator::check_vector(const at::Tensor& b) const {
@@ -80,11 +103,35 @@ KernelParameters DenseOperator::kernel() const { return DenseParameters{matrix_.
 
 CsrOperator::CsrOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE(spec.tensors.size() == 3, "csr: takes three tensors, crow, col and values");
-  crow_ = spec.tensors[0].to(at::kLong);
-  col_ = spec.tensors[1].to(at::kLong);
+  const auto &crow = spec.tensors[0], &col = spec.tensors[1];
   values_ = spec.tensors[2];
   TORCH_CHECK_VALUE(values_.dim() == 1 || values_.dim() == 2,
                     "linear_solve: A must have shape (n, n) or (batch, n, n)");
+  for (const auto* index : {&crow, &col})
+    TORCH_CHECK_TYPE(index->scalar_type() == at::kInt || index->scalar_type() == at::kLong,
+                     "linear_solve: indices of a CSR matrix must be int32 or int64, got ", index->scalar_type());
+  TORCH_CHECK_VALUE(col.sym_sizes() == values_.sym_sizes(), "linear_solve: a CSR matrix needs as many columns as "
+                    "values, got ", col.sym_sizes(), " and ", values_.sym_sizes());
+  TORCH_CHECK_VALUE(crow.device() == values_.device() && col.device() == values_.device(),
+                    "linear_solve: indices and values of a CSR matrix must be on one device, got ", crow.device(),
+                    ", ", col.device(), " and ", values_.device());
+  const bool batched = values_.dim() == 2;
+  TORCH_CHECK_VALUE(crow.dim() == values_.dim() && (!batched || crow.sym_size(0) == values_.sym_size(0)),
+                    "linear_solve: crow and values of a CSR matrix must have the same batch axis, got ",
+                    crow.sym_sizes(), " and ", values_.sym_sizes());
+  check_has_rows(crow.sym_size(-1) - 1);
+  crow_ = crow.to(at::kLong);
+  col_ = col.to(at::kLong);
+}
+
+void CsrOperator::check_parameters() const {
+  // Tensors that stand for others while a graph is traced have no numbers yet: the kernel checks them.
+  if (at::isTensorSubclassLike(crow_) || at::isTensorSubclassLike(col_) || crow_.is_meta()) return;
+  const auto crow = crow_.to(at::kCPU).contiguous(), col = col_.to(at::kCPU).contiguous();
+  const int64_t matrices = values_.dim() == 2 ? values_.size(0) : 1, stored = values_.size(-1);
+  for (int64_t m = 0; m < matrices; ++m)
+    check_rows(crow.const_data_ptr<int64_t>() + m * (n() + 1), col.const_data_ptr<int64_t>() + m * stored, n(),
+               stored);
 }
 
 void CsrOperator::check_vector(const at::Tensor& b) const {

@@ -28,8 +28,12 @@ class DenseOperator final : public Operator {
 /// `values` carries a gradient. A derivative with respect to A exists on its pattern alone.
 class CsrOperator final : public Operator {
  public:
+  /// Checks types and shapes; what the indices say is left to check_parameters().
   explicit CsrOperator(const OperatorSpec& spec);
   void check_vector(const at::Tensor& b) const override;
+  /// Raises ValueError unless each crow rises from 0 to nnz and each column lies in [0, n). Torch does not
+  /// check this when a sparse tensor is made, and the CPU loops read and write where the indices say.
+  void check_parameters() const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;

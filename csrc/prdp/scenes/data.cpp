@@ -72,14 +72,23 @@ at::Tensor starts(const Scene& scene) {
   return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
 }
 
+constexpr int64_t kSamplesAtOnce = 100;  // between two reports
+
 /// The states of `steps` steps of the converged equation: (samples, steps + 1, channels, *shape).
 at::Tensor follow(const Scene& scene, at::Tensor u, int64_t steps, const OnSteps& on_steps) {
   const at::NoGradGuard no_grad;
   if (scene.task == Scene::Task::kCorrector) return follow_flow(scene, u, steps, on_steps).to(scene.dtype);
   auto reference = scene.stepper(scene.reference_solver());
-  std::vector<at::Tensor> states{u};
-  for (int64_t i = 0; i < steps; ++i) states.push_back(u = converged_step(reference, u));
-  return at::stack(states, 1).to(scene.dtype);
+  std::vector<at::Tensor> parts;
+  for (auto part : u.split(kSamplesAtOnce)) {
+    std::vector<at::Tensor> states{part};
+    for (int64_t i = 0; i < steps; ++i) {
+      states.push_back(part = converged_step(reference, part));
+      on_steps(part.size(0));
+    }
+    parts.push_back(at::stack(states, 1));
+  }
+  return at::cat(parts).to(scene.dtype);
 }
 
 /// Adds steps up towards `total`.

@@ -57,9 +57,9 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
     return hand_out_zeros(SolveStatus::kNonfiniteInput, std::numeric_limits<double>::infinity());
   if (!operator_is_finite)
     return hand_out_zeros(SolveStatus::kNonfiniteOperator, std::numeric_limits<double>::infinity());
-  if (magnitude == T(0)) return hand_out_zeros(SolveStatus::kConverged, 0.0);
   if (batch.method == Method::kJacobi && kernel.has_zero_diagonal())
     return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
+  if (magnitude == T(0)) return hand_out_zeros(SolveStatus::kConverged, 0.0);
 
   const T scale = kernels::power_of_two_scale(magnitude);
   T* scaled = space.b();

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "prdp/kernels/direct_factors.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/iterate.h"
 
 namespace prdp {
@@ -55,25 +56,29 @@ class SampleSpace {
 
   /// out = A v; returns v·out and ‖out‖².
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    ++state_->applications;
+    count(1);
     if constexpr (requires { kernel_->apply(v, out)[0]; }) return kernel_->apply(v, out);
     kernel_->apply(v, out);
     return {dot(v, out), dot(out, out)};
   }
   void apply(const T* v, Vector out, bool /*preconditioned: never, solve() sees to it*/ = false) {
-    ++state_->applications;
+    count(1);
     kernel_->apply(v, out);
   }
   void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
   /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
   /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
   void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
-    state_->applications += n;
-    if constexpr (kernels::kHasSpectrum<Kernel>) kernel_->jacobi_sweeps(c, x, next, n, omega);
-    else kernel_->jacobi_sweeps(c, x, next, n);
+    for (int64_t part; n > 0; n -= part) {
+      part = std::min(n, interruption::Watch::at_once(work()));
+      count(part);
+      if constexpr (kernels::kHasSpectrum<Kernel>) kernel_->jacobi_sweeps(c, x, next, part, omega);
+      else kernel_->jacobi_sweeps(c, x, next, part);
+      if (omega) omega += part;
+    }
   }
   Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
-    ++state_->applications;
+    count(1);
     if constexpr (kernels::kHasSpectrum<Kernel>) return kernel_->jacobi_sweep(c, x, next, omega);
     else return kernel_->jacobi_sweep(c, x, next);
   }
@@ -175,7 +180,17 @@ class SampleSpace {
   static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
 
   int64_t length() const { return kernel_->length(); }
+  /// Of a product with A.
+  int64_t work() const {
+    if constexpr (requires { kernel_->stored(); }) return kernel_->stored() + kernel_->unknowns();
+    else return kernel_->unknowns();
+  }
+  void count(int64_t products) {
+    watch_.spend(products * work());
+    state_->applications += products;
+  }
 
+  interruption::Watch& watch_ = interruption::Watch::local();
   const kernels::Loops<T>& loops_ = kernels::loops<T>();
   const Kernel* kernel_;
   const Factors* factors_ = nullptr;

@@ -1,7 +1,6 @@
 #include "prdp/solvers/solve.h"
 
-#include <ATen/Parallel.h>
-
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve_cpu.h"
 
 namespace prdp {
@@ -39,18 +38,19 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              result.info.status.mutable_data_ptr<int64_t>(),
                              result.info.operator_applications.mutable_data_ptr<int64_t>()};
   const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
-  const int64_t products = request.max_iter * (request.method == Method::kGmres ? request.restart : 1);
-  at::parallel_for(0, size, grain_size(request.method, size, unknowns, products),
-                   [&](int64_t begin, int64_t end) { solve_range(a, batch, begin, end); });
+  interruption::parallel_for(0, size, grain_size(request.method, size, unknowns, request.max_iter, request.restart),
+                             [&](int64_t begin, int64_t end) { solve_range(a, batch, begin, end); });
   return result;
 }
 
 }  // namespace
 
-int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations) {
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
+  const double products = static_cast<double>(iterations) *
+                          static_cast<double>(method == Method::kGmres ? std::min(restart, unknowns) : 1);
   const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
-                      static_cast<double>(std::min<int64_t>(iterations, 1000) + 4);
+                      (std::min(products, 1000.0) + 4.0);
   const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
   return at::divup(samples, threads);
 }

@@ -28,7 +28,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 
 /// Samples that a thread takes, such that each has some 100 µs of work at least: below that, handing it
 /// over costs more than it saves. A cycle of GMRES counts as its products.
-int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations);
+int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart);
 
 /// u after exactly `caps` iterations of each sample, recorded by autograd where b or the tensors of
 /// `a` require it: the map whose derivative the unrolled mode takes.

@@ -26,12 +26,14 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
     for (int64_t i = 0; i < batch; ++i)
       if (host.const_data_ptr<bool>()[i]) status[i] = why;
   };
+  // A method that does not suit the operator raises here, also where nothing needs to be iterated.
+  if (method == Method::kChebyshev) a.jacobi_radius();
   // The last mark holds: the order is that of the CPU loops, from the end.
+  mark(magnitude.eq(0), SolveStatus::kConverged);
   if (method == Method::kJacobi) {
     const auto zero = a.diagonal().eq(0);
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
-  mark(magnitude.eq(0), SolveStatus::kConverged);
   mark(a.norm().isfinite().logical_not(), SolveStatus::kNonfiniteOperator);
   mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
   return status;
@@ -87,6 +89,9 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const at::NoGradGuard no_grad;
   const auto magnitude = largest_magnitude(b);
   const auto status = settle_beforehand(a, request.method, magnitude);
+  const auto is_open = [](SolveStatus s) { return s == SolveStatus::kMaxIter; };
+  const bool iterates = request.max_iter > 0 && std::any_of(status.begin(), status.end(), is_open);
+  if (request.method == Method::kGmresStokes && !iterates && b.size(0) > 0) a.precondition(at::zeros_like(b), false);
   auto takes_part = at::empty({b.size(0)}, at::kBool);
   std::vector<SampleState> states(status.size());
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();

@@ -101,6 +101,7 @@ void TensorSpace::set_active(const std::vector<bool>& active) {
 }
 
 void TensorSpace::count() {
+  interruption::Watch::local().look();
   for (size_t i = 0; i < states_.size(); ++i)
     states_[i].applications += active_.empty() || active_[i];
 }

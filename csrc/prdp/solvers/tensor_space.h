@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/iterate.h"
 
 namespace prdp {

@@ -5,10 +5,13 @@
 #include <torch/custom_class.h>
 #include <torch/library.h>
 
-#include "prdp/operators/disguises.h"
+#include <limits>
+
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/autocast.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/rollout_vjp.h"
 
@@ -69,12 +72,13 @@ Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_v
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const auto options = unflatten(std::move(flat)...);
   check(equation, u, count, options);
-  const int64_t solves = count.expect_int();
+  const int64_t solves = count.expect_int(), unknowns = u.numel();
   std::vector<at::Tensor> solutions{u};
   Reports reports;
   at::Tensor b;
   for (int64_t s = 0; s < solves; ++s) {
     const FailuresOfStep here(s / picard_steps + 1, solves / picard_steps);
+    interruption::Watch::local().spend(unknowns);
     const auto& last = solutions.back();
     if (s % picard_steps == 0) b = equation_rhs(equation, last);
     auto [next, info] = linear_solve_kernel(equation_operator(equation, last), b, options);
@@ -260,6 +264,9 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
     return chain(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;
+  TORCH_CHECK_VALUE(steps.is_symbolic() || picard < 1 ||
+                        steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
+                    "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
   auto [solutions, iterations, residual, status, applications] =
       call_solves(equation, u, steps * picard, options);
   if (picard == 1) return {solutions, {iterations, residual, status, applications}};

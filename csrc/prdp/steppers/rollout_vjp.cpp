@@ -5,6 +5,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -54,6 +55,7 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
   at::Tensor rhs_bar;
   for (int64_t s = solves - 1; s >= 0; --s) {
     const FailuresOfStep here(s / picard + 1, solves / picard);
+    interruption::Watch::local().spend(cotangent.numel() / cotangent.size(1));
     const int64_t first = s - s % picard;
     const auto a = equation_operator(equation, at_solve(kept.solutions, s));
     Solved solved{

@@ -1,0 +1,71 @@
+#pragma once
+#include <ATen/Parallel.h>
+
+#include <atomic>
+#include <chrono>
+
+/// How a long computation is ended from outside: Python's Ctrl-C. The loops tell how much work they do, and
+/// every now and then a check may throw, on the thread that called; what had been computed is lost.
+namespace prdp::interruption {
+
+/// Called about ten times per second on every thread that computes; throws to end the computation. There is
+/// none until somebody sets it.
+using Check = void (*)();
+void set_check(Check check);
+
+/// Thrown on the threads that help another one whose part of the work has been given up.
+struct Stopped {};
+
+/// A thread's count of its work since it last looked whether it is to stop.
+class Watch {
+ public:
+  static Watch& local();
+
+  /// Tells of work about to be done, in multiplications. Looks up after some 100 µs of it.
+  void spend(int64_t work) {
+    left_ -= work;
+    if (left_ < 0) look();
+  }
+  /// Looks now.
+  void look();
+  /// How often work of this size may be done without looking up.
+  static int64_t at_once(int64_t work) { return work >= kAtOnce ? 1 : kAtOnce / (work > 0 ? work : 1); }
+
+  /// While it lives, this thread works on a part of something that `stop` says has been given up.
+  class Member {
+   public:
+    explicit Member(const std::atomic<bool>& stop);
+    Member(const Member&) = delete;
+    ~Member() { watch_.stop_ = before_; }
+
+   private:
+    Watch& watch_;
+    const std::atomic<bool>* before_;
+  };
+
+ private:
+  static constexpr int64_t kBudget = int64_t{1} << 18, kAtOnce = int64_t{1} << 22;
+
+  int64_t left_ = kBudget;
+  std::chrono::steady_clock::time_point next_check_{};
+  const std::atomic<bool>* stop_ = nullptr;
+  bool checking_ = false;
+};
+
+/// at::parallel_for, all of whose threads stop soon after one of them has thrown.
+template <class Body>
+void parallel_for(int64_t begin, int64_t end, int64_t grain, const Body& body) {
+  std::atomic<bool> stop = false;
+  at::parallel_for(begin, end, grain, [&](int64_t from, int64_t to) {
+    const Watch::Member member(stop);
+    try {
+      body(from, to);
+    } catch (const Stopped&) {  // the caller gets what made the others stop
+    } catch (...) {
+      stop = true;
+      throw;
+    }
+  });
+}
+
+}  // namespace prdp::interruption

@@ -1,0 +1,113 @@
+"""What users install: the C++ package, the source archive and the wheel, each made from this build."""
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+BUILD = ROOT / "build"
+CMAKE = Path(sys.executable).with_name("cmake")
+
+
+def run(*command, folder=ROOT, status=0, **environment):
+    """A command's output; its paths find neither this checkout nor anything by the environment."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        list(map(str, command)),
+        cwd=folder,
+        env={**kept, "PATH": f"{CMAKE.parent}:{kept['PATH']}", **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == status, (done.returncode, done.stdout[-2000:] + done.stderr[-4000:])
+    return done
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    prefix = tmp_path_factory.mktemp("prefix")
+    run(CMAKE, "--install", BUILD, "--component", "cpp", "--prefix", prefix)
+    return prefix
+
+
+def test_the_installed_headers_include_no_others(installed):
+    headers = {str(path.relative_to(installed / "include")) for path in installed.glob("include/**/*.h")}
+    assert "prdp/prdp.h" in headers
+    for header in headers:
+        wanted = re.findall(r'#include "(prdp/.*)"', (installed / "include" / header).read_text())
+        assert set(wanted) <= headers, header
+
+
+def test_the_examples_build_with_the_installed_package_and_run(installed, tmp_path):
+    prefixes = f"{installed};{torch.utils.cmake_prefix_path}"
+    run(
+        CMAKE, "-S", ROOT / "examples" / "cpp", "-B", tmp_path, "-G", "Ninja", f"-DCMAKE_PREFIX_PATH={prefixes}"
+    )  # fmt: skip
+    run(CMAKE, "--build", tmp_path, "--parallel", 2)
+
+    gradient = run(tmp_path / "heat_gradient", status=1)
+    residuals = [float(r) for r in re.findall(r"K = \d+: residual (\S+),", gradient.stdout)]
+    assert len(residuals) == 4 and residuals[-1] < residuals[0] < 1
+    # The error of its last line, without torch's stack trace.
+    assert gradient.stderr == "heat_gradient: Heat: expected (batch, 1, 30), got (4, 30)\n"
+
+    trained = run(tmp_path / "train_network").stdout
+    epochs = [(float(error), int(k)) for error, k in re.findall(r"error (\S+), K = (\d+)", trained)]
+    assert len(epochs) == 7 and epochs[0][1] == 1 and epochs[-1][1] > 1
+    assert epochs[-1][0] < 0.3 * epochs[0][0] and [k for _, k in epochs] == sorted(k for _, k in epochs)
+
+
+def setup(tmp_path, *commands):
+    run(
+        sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path, *commands, PRDP_BUILD_DIR=str(BUILD)
+    )  # fmt: skip
+
+
+def test_the_source_archive_can_be_built(tmp_path):
+    """It holds what git knows of these folders, and CMake, which looks for every source file, accepts it."""
+    setup(tmp_path, "sdist", "--dist-dir", tmp_path)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as opened:
+        opened.extractall(tmp_path, filter="data")
+    (source,) = (path for path in tmp_path.glob("prdp_torch-*") if path.is_dir())
+
+    def files(root):
+        names = ("cmake", "csrc", "examples", "prdp_torch")
+        found = {path.relative_to(root) for name in names for path in (root / name).rglob("*") if path.is_file()}
+        made = {".so", ".pyc"}
+        return {path for path in found if path.suffix not in made and path.name != "built_for_torch.txt"}
+
+    assert files(source) == files(ROOT) and not list(source.rglob("*.so"))
+    assert {"CMakeLists.txt", "README.md", "pyproject.toml", "setup.py"} <= {path.name for path in source.iterdir()}
+    run(CMAKE, "-S", source, "-B", tmp_path / "build", "-G", "Ninja", f"-DPython_EXECUTABLE={sys.executable}")
+
+
+def test_the_wheel_works_in_an_environment_of_its_own(tmp_path):
+    setup(tmp_path, "build", "--build-base", tmp_path / "base", "bdist_wheel", "--dist-dir", tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "fresh")
+    python = tmp_path / "fresh" / "bin" / "python"
+    run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)
+    (packages,) = (tmp_path / "fresh" / "lib").glob("python*/site-packages")
+    # Torch and the others come from here: no network. An editable installation among them is not followed.
+    (packages / "others.pth").write_text(str(Path(torch.__file__).parents[1]))
+    smoke = """
+import torch, prdp_torch as prdp
+from prdp_torch import scenes
+u = torch.randn(2, 1, 30, requires_grad=True)
+heat = prdp.Heat((30,), 1e-3, 1.0, prdp.CG(100))
+heat(u).sum().backward()
+assert heat.converged and u.grad.abs().min() > 0
+print(prdp.__file__, *map(str, scenes.available().values()))
+"""
+    found = run(python, "-c", smoke, folder=tmp_path).stdout.split()
+    assert len(found) > 5 and all(path.startswith(str(packages)) for path in found)
+    listed = run(tmp_path / "fresh" / "bin" / "prdp", "scenes", folder=tmp_path).stdout
+    assert "heat_1d" in listed and "navier_stokes" in listed
