@@ -122,8 +122,14 @@ def test_unrolled_equals_autograd_through_a_textbook_loop(method, n, batch, k, r
             u = loop(*mine, torch.zeros_like(mine[1]), int(info.iterations[i]))
             expected = grad(u, mine, g[i], allow_unused=True)
             # Of what the last iteration starts from, rounding has taken that share.
-            noise = 1e-11 if solved else 1e-11 + 1e-13 / residual
-            for found, truth in ((a_bar[i], expected[0]), (b_bar[i], expected[1]), (alone[i], expected[1])):
+            noise = 1e-10 if solved else 1e-11 + 1e-13 / residual
+            # CG solves symmetric systems, and its derivative for others is its own.
+            both_ways = (lambda x: x + x.T) if method == "cg" and solved else (lambda x: x)
+            for found, truth in (
+                (both_ways(a_bar[i]), both_ways(expected[0])),
+                (b_bar[i], expected[1]),
+                (alone[i], expected[1]),
+            ):
                 assert (found - truth).norm() <= noise * truth.norm(), (method, create_graph, info)
 
 
@@ -270,7 +276,9 @@ def test_going_on_from_the_true_residual_is_part_of_the_map(method, create_graph
             )
             assert torch.equal(checkpointed, a_bar)
         of_u = float(g.double() @ u.double())
-        assert abs(float(b_bar.detach().double() @ b.double()) - of_u) < 1.2e-5 * float(b_bar.detach().norm() * b.norm())
+        assert abs(float(b_bar.detach().double() @ b.double()) - of_u) < 1.2e-5 * float(
+            b_bar.detach().norm() * b.norm()
+        )
         assert abs(float((a_bar.detach().double() * a.double()).sum()) + of_u) < 2e-5 * abs(of_u)
     assert create_graph or found > 0
 
@@ -335,22 +343,25 @@ def test_a_small_consistent_part_is_solved():
 
 @modes
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "direct"])
-@pytest.mark.parametrize("exponent", [-80, -66, -50, 50, 66, 80])
+@pytest.mark.parametrize("exponent", [-66, -60, -50, 50, 60])
 def test_operators_far_from_the_order_of_one(method, backward, exponent):
     """A power of two in A is one in the results; a number out of range fails in words."""
-    a, b, g = (x.float() for x in (matrices(method, 5, 1, 4)[0], random(5, seed=5), random(5, seed=6)))
-    solver = METHODS[method](4, rtol=1e-3)
-    (a_bar, b_bar), u, info = gradients(a, b, solver, g, backward=backward)
-    factor = 2.0**exponent
-    fits = a_bar.double().abs().max() / factor**2 < torch.finfo(torch.float32).max
-    (found, other), v, far = gradients(a * factor, b, solver, g, backward=backward, on_failure="return")
-    assert far.iterations.tolist() == info.iterations.tolist() and torch.equal(v, u / factor)
-    if fits:
-        assert torch.equal(other, b_bar / factor)
-        if exponent < 60:  # else A-bar is subnormal
-            assert torch.equal(found, (a_bar.double() / factor**2).float())
-    else:
-        assert statuses(far.adjoint) == ["OVERFLOW"] and not found.any() and not other.any()
+    a, b, g = (x.float() for x in (matrices(method, 5, 1, 4)[0], 1e-6 * random(5, seed=5), random(5, seed=6)))
+    solver, factor = METHODS[method](3, rtol=0.0), 2.0**exponent
+    (a_bar, b_bar), u, _ = gradients(a, b, solver, g, backward=backward)
+    for size in (1.0, 2.0**20):  # of b
+        (found, other), v, info = gradients(a * factor, b * size, solver, g, backward=backward, on_failure="return")
+        expected = a_bar.double() / factor**2 * size
+        if expected.abs().max() >= torch.finfo(torch.float32).max:
+            assert statuses(info.adjoint) == ["OVERFLOW"] and not found.any() and not other.any()
+        elif statuses(info) == ["MAX_ITER"]:
+            # Squares of the products are subnormal beyond 1e-19, in the solve itself.
+            close = {"rtol": 0.0 if abs(exponent) <= 50 else 1e-3, "atol": 1e-38}
+            torch.testing.assert_close(v, u / factor * size, **close)
+            torch.testing.assert_close(other, b_bar / factor, **close)
+            torch.testing.assert_close(found, expected.float(), **close)
+        else:
+            assert statuses(info)[0] in ("OVERFLOW", "BREAKDOWN") and abs(exponent) >= 60
 
 
 @modes
@@ -390,6 +401,7 @@ def test_direct_gives_the_same_bits_in_any_company(kind):
         "burgers": lambda rows: operators.Burgers(many[rows], 1e-2, 0.2),
     }[kind]
     for k in (1, 2):
+
         def b_bar(rows, k=k):
             x = b[rows].clone().requires_grad_()
             u, _ = prdp.linear_solve(make(rows), x, prdp.Direct(k), backward="unrolled")

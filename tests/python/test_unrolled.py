@@ -157,7 +157,7 @@ def test_a_nonfinite_cotangent_of_a_rollout_is_named_with_its_step(method):
     assert torch.equal(results[1][0], cotangent[0, 0])  # of the start itself: nothing comes back from step 2
     assert [prdp.SolveStatus(int(s)).name for s in step.adjoint_info.status[0]][1] == "NONFINITE_INPUT"
     step.on_failure = "raise"
-    with pytest.raises(torch.linalg.LinAlgError, match="step 2 of 2: adjoint solve: 1 of 3 .* NONFINITE_INPUT"):
+    with pytest.raises(torch.linalg.LinAlgError, match=r"step 2 of 2: adjoint solve: 1 of 3 .* NONFINITE_INPUT"):
         torch.autograd.grad(step.rollout(x, 2), x, cotangent)
 
 
@@ -205,7 +205,7 @@ def test_the_op_behind_it_passes_opcheck():
     said = torch.tensor([4, 3]), torch.tensor([-1, 1]), torch.tensor([0.1, 0.0], dtype=torch.float64)
     for method in METHODS:
         options = (method, 4, 1e-5, 3, "unrolled", None, None, "raise", 0, 2)
-        args = (b, b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
+        args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
         assert set(opcheck(torch.ops.prdp.unrolled_vjp.default, args).values()) == {"SUCCESS"}
 
 

@@ -100,15 +100,14 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     ctx->mark_non_differentiable({iterations, residual, status, applications});
     ctx->set_materialize_grads(false);
 
-    // Implicit mode keeps u alone, and that only if A has a derivative; unrolled mode keeps b, u and what the
+    // Implicit mode keeps u alone, and that only if A has a derivative; unrolled mode keeps b and what the
     // solve said. Where a failed sample may have passed, its status says so.
     const bool unrolled = call->options.backward == Backward::kUnrolled;
     const bool differentiates_a = any_requires_grad(tensors);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
     const at::Tensor none;
-    variable_list saved{unrolled ? b : none, unrolled || differentiates_a ? u : none,
-                        unrolled ? iterations : none, unrolled || may_have_failed ? status : none,
-                        unrolled ? residual : none};
+    variable_list saved{unrolled ? b : differentiates_a ? u : none, unrolled ? iterations : none,
+                        unrolled || may_have_failed ? status : none, unrolled ? residual : none};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(std::move(saved));
 
@@ -122,7 +121,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     const auto saved = ctx->get_saved_variables();
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
     auto a = call->a;
-    a.tensors.assign(saved.begin() + 5, saved.end());
+    a.tensors.assign(saved.begin() + 4, saved.end());
     const size_t inputs = a.tensors.size() + 1;
     variable_list out(inputs + 1);  // b, the tensors, and the call, which has no gradient
     if (!grads[0].defined()) return out;
@@ -130,7 +129,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
     auto& adjoint_solve =
         at::GradMode::is_enabled() || !is_plain(grads[0]) ? linear_solve : linear_solve_kernel;
-    const Solved solved{saved[0], saved[1], saved[2], saved[3], saved[4]};
+    const Solved solved{saved[0], saved[0], saved[1], saved[2], saved[3]};
     const auto found = solve_vjp(grads[0], solved, a, call->options, needed, adjoint_solve);
     std::copy(found.gradients.begin(), found.gradients.end(), out.begin());
     return out;

@@ -1,10 +1,10 @@
 #pragma once
 #include <functional>
 
+#include "prdp/autograd/near_one.h"
 #include "prdp/autograd/product_rows.h"
 #include "prdp/autograd/run_back.h"
 #include "prdp/autograd/sweeps.h"
-#include "prdp/solvers/near_one.h"
 #include "prdp/solvers/sample_space.h"
 #include "prdp/solvers/with_kernel.h"
 

@@ -4,7 +4,7 @@
 namespace prdp {
 
 /// What a solve A u = b keeps for its derivative; implicit mode needs u where A has a derivative, the
-/// unrolled one everything, and the status both where a failed sample may have passed.
+/// unrolled one all else, and the status both where a failed sample may have passed.
 struct Solved {
   at::Tensor b, u, iterations, status, residual;
 };

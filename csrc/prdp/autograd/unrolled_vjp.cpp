@@ -17,14 +17,14 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor u, Tensor iterations, Tensor status, Tensor residual, "
+    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
     "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
     PRDP_OPTIONS_SCHEMA ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
     "Tensor operator_applications)";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 using Signature =
     WithOptions<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                        const at::Tensor&, const at::Tensor&, at::IntArrayRef, at::TensorList,
+                        const at::Tensor&, at::IntArrayRef, at::TensorList,
                         c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool)>;
 
 /// Residuals up to so many units of rounding are rounding.
@@ -50,27 +50,50 @@ std::vector<double> growth(const at::Tensor& u, const at::Tensor& b) {
   return to_host<double>(u_norm / b_norm * (u_largest / b_largest), b.size(0));
 }
 
-/// The samples whose residual is no more than the rounding errors of computing it, and less than √ε. Jacobi
-/// and Chebyshev that have run all their iterations are left out: these are smooth, solved or not.
-Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver) {
+/// The samples whose residual is no more than the rounding errors of computing it, and less than √ε; of those
+/// that may be, u is asked for.
+template <class MakeU>
+Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_u) {
   const int64_t batch = solved.b.size(0);
   const bool single = solved.b.scalar_type() == at::kFloat;
   const double epsilon = single ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
   const auto residual = to_host<double>(solved.residual, batch);
   const auto status = to_host<int64_t>(solved.status, batch);
-  const auto iterations = to_host<int64_t>(solved.iterations, batch);
-  const bool smooth = solver.method == Method::kJacobi || solver.method == Method::kChebyshev;
   Rows rows(batch, false), near(batch, false);
   for (int64_t i = 0; i < batch; ++i) {
     const auto s = static_cast<SolveStatus>(status[i]);
-    if (is_refused(s) || (smooth && iterations[i] == solver.max_iter.expect_int())) continue;
+    if (is_refused(s)) continue;
     rows[i] = s == SolveStatus::kConvergedBreakdown || residual[i] == 0.0;
     near[i] = !rows[i] && residual[i] <= std::sqrt(epsilon);
   }
   if (!any(near)) return rows;
-  const auto norm = to_host<double>(a.norm(), batch), u_over_b = growth(solved.u, solved.b);
+  const auto norm = to_host<double>(a.norm(), batch), u_over_b = growth(make_u(), solved.b);
   for (int64_t i = 0; i < batch; ++i)
     rows[i] = rows[i] || (near[i] && residual[i] <= kRoundings * epsilon / 2 * (norm[i] * u_over_b[i] + 1.0));
+  return rows;
+}
+
+/// The samples that were solved to rounding, but those whose iterations are smooth there: all of Jacobi's and
+/// Chebyshev's up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
+template <class MakeU>
+Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeU& make_u) {
+  auto rows = within_rounding(a, solved, make_u);
+  if (!any(rows)) return rows;
+  const auto batch = static_cast<int64_t>(rows.size());
+  const auto iterations = to_host<int64_t>(solved.iterations, batch);
+  const auto leave_out = [&](int64_t count, const Rows& kept) {
+    for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != count || kept[i]);
+  };
+  const Rows none(batch, false);
+  if (solver.method == Method::kJacobi || solver.method == Method::kChebyshev)
+    leave_out(solver.max_iter.expect_int(), none);
+  const int64_t unknowns = solved.b.numel() / batch;
+  if (solver.method == Method::kConjugateGradient &&
+      std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
+    const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart});
+    const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
+    leave_out(unknowns, within_rounding(a, before, [&] { return one_less.u; }));
+  }
   return rows;
 }
 
@@ -80,10 +103,19 @@ using OfIterations = UnrolledVjp (*)(const at::Tensor& cotangent, const at::Tens
 
 SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
                         const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
-                        decltype(linear_solve)& adjoint_solve) {
+                        decltype(linear_solve)& any_solve) {
   const int64_t batch = solved.b.size(0);
   const auto a = make_operator(spec);
-  const auto exact = solved_to_rounding(*a, solved, options.solver), sound = finite_rows(cotangent);
+  at::Tensor u;  // again, as it is not kept
+  const auto make_u = [&] {
+    auto silent = options;
+    silent.on_failure = OnFailure::kReturn;
+    silent.adjoint_log = 0;
+    if (!u.defined()) u = any_solve(spec, solved.b, silent).u;
+    return u;
+  };
+  const auto exact = solved_to_rounding(*a, solved, options.solver, make_u), sound = finite_rows(cotangent);
+  const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   const auto bar = only(cotangent, sound);
   const auto counts = to_host<int64_t>(solved.iterations, batch), status = to_host<int64_t>(solved.status, batch);
 
@@ -120,7 +152,8 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
            applications[i]);
     const auto some = both(rows, exact);
     if (any(some)) {
-      const auto found = implicit_vjp(only(bar, some), solved.u, spec, implicit, needed, adjoint_solve);
+      const auto for_products = for_a ? make_u() : at::Tensor();
+      const auto found = implicit_vjp(only(bar, some), for_products, spec, implicit, needed, any_solve);
       for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
       const auto iterations = to_host<int64_t>(found.info.iterations, batch);
       const auto residual = to_host<double>(found.info.residual, batch);
@@ -193,14 +226,14 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
 }
 
 template <class... Options>
-Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::Tensor& u,
+Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
                    const at::Tensor& iterations, const at::Tensor& status, const at::Tensor& residual,
                    at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                    at::ArrayRef<double> parameters, bool transposed, Options... flat) {
   const at::NoGradGuard no_grad;
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
-  const auto found = vjp_of_samples(cotangent, {b.detach(), u.detach(), iterations, status, residual}, a,
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual}, a,
                                     unflatten(std::move(flat)...), needed, run_iterations_back,
                                     linear_solve_kernel);
   std::vector<at::Tensor> gradients;
@@ -212,8 +245,8 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
 
 template <class... Options>
 Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&,
-                    const at::Tensor&, const at::Tensor&, at::IntArrayRef needed, at::TensorList tensors,
-                    c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool, Options...) {
+                    const at::Tensor&, at::IntArrayRef needed, at::TensorList tensors, c10::string_view,
+                    at::IntArrayRef, at::ArrayRef<double>, bool, Options...) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -231,7 +264,7 @@ SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const O
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
   const auto [gradients, iterations, residual, status, applications] = call_with_options(
-      op, options, cotangent, solved.b, solved.u, solved.iterations, solved.status, solved.residual, needed,
+      op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
       at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
       at::ArrayRef<double>(a.parameters), a.transposed);
   SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, residual, status, applications}};

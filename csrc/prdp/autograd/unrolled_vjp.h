@@ -11,7 +11,7 @@ namespace prdp {
 /// Product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran, as
 /// the torch op prdp::unrolled_vjp, which runs the iterations again. Each sample goes its way:
 ///   its cotangent is not finite, or its gradient would not be   fails in words: NONFINITE_INPUT, OVERFLOW
-///   solved to rounding (Jacobi, Chebyshev: and before max_iter) the implicit derivative, to rounding too:
+///   solved to rounding, where iterations are not smooth         the implicit derivative, to rounding too:
 ///     what its last iterations did, or left out for want of a residual, is no derivative of u
 ///   else                                                        the derivative of exactly its iterations
 /// The report has the adjoint solve's numbers for those of implicit derivative; for the last the solve's own

@@ -71,6 +71,7 @@ class Dense : public MatrixBase<T, Dense<T>> {
   T at(int64_t i, int64_t j) const { return transposed_ ? a_[j * n_ + i] : a_[i * n_ + j]; }
   /// Of the largest entry; NaN or Inf if one is not finite.
   T magnitude() const { return largest_magnitude(a_, n_ * n_); }
+  bool operator_is_finite() const { return std::isfinite(magnitude()); }
   /// factor · this one, its entries in `memory`.
   Dense scaled(T factor, std::vector<T>& memory) const {
     memory.resize(static_cast<size_t>(n_ * n_));
@@ -125,6 +126,7 @@ class Csr : public MatrixBase<T, Csr<T>> {
   bool is_shared() const { return is_shared_; }
   /// As Dense has them.
   T magnitude() const { return largest_magnitude(values_, stored_); }
+  bool operator_is_finite() const { return std::isfinite(magnitude()); }
   Csr scaled(T factor, std::vector<T>& memory) const {
     memory.resize(static_cast<size_t>(stored_));
     std::transform(values_, values_ + stored_, memory.begin(), [factor](T a) { return factor * a; });

@@ -5,7 +5,6 @@
 
 #include "prdp/kernels/direct_factors.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/near_one.h"
 #include "prdp/solvers/sample_space.h"
 
 /// The CPU's way through a batch: sample after sample, each to its end.
@@ -30,9 +29,9 @@ struct SampleBatch {
 };
 
 /// Solves sample `s`. b is scaled by a power of two to the order of one, so that no square over- or
-/// underflows and solve(2^k b) = 2^k solve(b) holds to the last bit; so is A, `factor` of which is the kernel.
+/// underflows and solve(2^k b) = 2^k solve(b) holds to the last bit.
 template <class Kernel, class Iteration, class T>
-void solve_sample(const Kernel& kernel, T factor, bool operator_is_finite, SampleSpace<Kernel>& space, Iteration& method,
+void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Kernel>& space, Iteration& method,
                   const SampleBatch<T>& batch, int64_t s) {
   const int64_t n = kernel.unknowns();
   const T* b = batch.b + s * n;
@@ -78,12 +77,9 @@ void solve_sample(const Kernel& kernel, T factor, bool operator_is_finite, Sampl
   state.b2 = space.b2();
   iterate(space, method, states, batch.rtol, batch.guarded);
   if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(method.x);
-  kernel.store(method.x, factor / scale, u);
+  kernel.store(method.x, T(1) / scale, u);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
-  // u leaves the range of the dtype only when scaled back.
-  const T size = kernels::largest_magnitude(u, n);
-  const bool vanished = factor != T(1) && size < std::numeric_limits<T>::min() && state.iterations > 0;
-  if (batch.guarded && (!std::isfinite(size) || vanished)) {
+  if (batch.guarded && !kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
     hand_out_zeros(SolveStatus::kOverflow, 1.0);
   } else {
     finish(state.status, state.iterations, std::sqrt(state.residual2 / state.b2));
@@ -100,14 +96,12 @@ void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t be
   workspace.prepare(2 + vectors_of(batch.method, restart), kernel.length(), kernel.halo());
   SampleSpace<Kernel> space(kernel, workspace);
   with_method(batch.method, restart, space, [&](auto method) {
-    const auto solve = [&](const Kernel& given, int64_t from, int64_t to) {
-      const NearOne<Kernel> near(given);
-      const Kernel& a = *near;
-      const bool finite = near.is_finite();
+    const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
+      const bool finite = a.operator_is_finite();
       std::optional<typename SampleSpace<Kernel>::Factors> factors;
       if (batch.method == Method::kDirect && finite) factors.emplace(a);
       space.set_operator(a, factors ? &*factors : nullptr);
-      for (int64_t s = from; s < to; ++s) solve_sample(a, near.factor(), finite, space, method, batch, s);
+      for (int64_t s = from; s < to; ++s) solve_sample(a, finite, space, method, batch, s);
     };
     if (kernel.is_shared()) return solve(kernel, begin, end);
     for (int64_t s = begin; s < end; ++s) solve(kernel.sample(s), s, s + 1);

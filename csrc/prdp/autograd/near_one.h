@@ -19,12 +19,9 @@ class NearOne {
     if constexpr (requires { given.scaled(T(1), memory_); }) {
       constexpr int far = 24;
       const T magnitude = given.magnitude();
-      is_finite_ = std::isfinite(magnitude);
-      if (!is_finite_ || magnitude == T(0) || std::abs(std::ilogb(magnitude)) <= far) return;
+      if (!std::isfinite(magnitude) || magnitude == T(0) || std::abs(std::ilogb(magnitude)) <= far) return;
       factor_ = kernels::power_of_two_scale(magnitude);
       scaled_.emplace(given.scaled(factor_, memory_));
-    } else {
-      is_finite_ = given.operator_is_finite();
     }
   }
   NearOne(const NearOne&) = delete;
@@ -32,12 +29,10 @@ class NearOne {
   const Kernel& operator*() const { return scaled_ ? *scaled_ : given_; }
   /// *this = factor · the operator given.
   T factor() const { return factor_; }
-  bool is_finite() const { return is_finite_; }
 
  private:
   const Kernel& given_;
   T factor_ = 1;
-  bool is_finite_ = true;
   std::vector<T> memory_;
   std::optional<Kernel> scaled_;
 };
