@@ -240,7 +240,9 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);
   const auto& info = found.info;
-  return {gradients, info.iterations, info.residual, info.status, info.operator_applications};
+  // -1 crosses the op for no residual: torch's checks of ops compare outputs, and NaN equals nothing.
+  const auto residual_or_not = info.residual.masked_fill(info.residual.isnan(), -1.0);
+  return {gradients, info.iterations, residual_or_not, info.status, info.operator_applications};
 }
 
 template <class... Options>
@@ -267,7 +269,8 @@ SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const O
       op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
       at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
       at::ArrayRef<double>(a.parameters), a.transposed);
-  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, residual, status, applications}};
+  const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
+  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications}};
   for (size_t i = 0, next = 0; i < needed.size(); ++i)
     if (needed[i]) found.gradients[i] = gradients[next++];
   return found;
