@@ -60,8 +60,9 @@ def test_matrices_and_the_other_ops_pass_opcheck():
         (torch.ops.prdp.rhs, (b, "poisson", [5], [])),
         (
             torch.ops.prdp.unrolled_vjp,
-            (b.detach(), b.detach(), [nu.detach()], [1, 1], "heat", [5], [1.0], False, "cg", 4, 1e-5, 3,
-             torch.tensor([4, 4]), torch.tensor([-1, -1])),
+            (b.detach(), b.detach(), torch.tensor([4, 4]), torch.tensor([-1, -1]),
+             torch.full((2,), 0.1, dtype=torch.float64), [1, 1], [nu.detach()], "heat", [5], [1.0], False, "cg",
+             4, 1e-5, 3, "unrolled", None, None, "raise", 0),
         ),
     ]  # fmt: skip
     for op, args in calls:

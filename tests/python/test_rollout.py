@@ -229,7 +229,7 @@ def test_refused_samples_carry_no_gradient():
 def test_the_ops_pass_opcheck(backward):
     options = ("gmres", 3, 1e-5, 3, backward, None, None, "return", 0)
     nu = torch.tensor(1e-2, dtype=torch.float64, requires_grad=True)
-    counts = torch.full((2, 4), 3), torch.full((2, 4), -1)
+    said = torch.full((2, 4), 3), torch.full((2, 4), -1), torch.full((2, 4), 0.1, dtype=torch.float64)
     for kind, shape, channels in (("heat", [5], 1), ("burgers", [3, 4], 2), ("navier_stokes", [3, 4], 3)):
         u, states = field(shape, channels=channels), torch.randn(2, 5, channels, *shape, dtype=torch.float64)
         equation = ([nu], kind, shape, [0.1], 2)
@@ -237,7 +237,7 @@ def test_the_ops_pass_opcheck(backward):
             (torch.ops.prdp.rollout_solves, (u.requires_grad_(), *equation, 4, *options)),
             (torch.ops.prdp.rollout, (u, *equation, 2, *options)),
             (torch.ops.prdp.rollout_vjp,
-             (states, states, *counts, [1, 1], [nu.detach()], *equation[1:], *options)),
+             (states, states, *said, [1, 1], [nu.detach()], *equation[1:], *options)),
         ):  # fmt: skip
             assert set(opcheck(op.default, args).values()) == {"SUCCESS"}
 

@@ -143,17 +143,24 @@ def test_samples_keep_to_themselves(method):
         assert torch.equal(torch.autograd.grad(u, (x, own), g[i : i + 1])[0], together[i : i + 1])
 
 
-def test_a_nonfinite_cotangent_stays_with_its_sample():
-    b, nu = field((12,), 3), torch.tensor(2e-3, dtype=torch.float64, requires_grad=True)
-    for method in ("steepest_descent", "cg", "gmres"):
-        results = []
-        for bad in (False, True):
-            x = b.clone().requires_grad_()
-            u, _ = prdp.linear_solve(operators.Heat((12,), nu, 1.0), x, METHODS[method](4), backward="unrolled")
-            g = torch.ones_like(u)
-            g[0, 0, 5] = float("nan") if bad else 1.0
-            results.append(torch.autograd.grad(u, x, g)[0])
-        assert torch.equal(results[0][1:], results[1][1:]) and not results[1][0].isfinite().all()
+@pytest.mark.parametrize("method", METHODS)
+def test_a_nonfinite_cotangent_of_a_rollout_is_named_with_its_step(method):
+    u, g = field((12,), 3), field((12,), 3, 7, channels=3).unsqueeze(2)
+    g[0, 1] = 0.0
+    results = []
+    for bad in (False, True):
+        step = prdp.Heat((12,), 2e-3, 1.0, METHODS[method](4), "unrolled", on_failure="return" if bad else "raise")
+        x = u.clone().requires_grad_()
+        cotangent = g.clone()
+        cotangent[0, 2, 0, 5] = float("nan") if bad else 1.0
+        states = step.rollout(x, 2)
+        results.append(torch.autograd.grad(states, x, cotangent)[0])
+    assert torch.equal(results[0][1:], results[1][1:])
+    assert torch.equal(results[1][0], cotangent[0, 0])  # of the start itself: nothing comes back from step 2
+    assert [prdp.SolveStatus(int(s)).name for s in step.adjoint_info.status[0]][1] == "NONFINITE_INPUT"
+    step.on_failure = "raise"
+    with pytest.raises(torch.linalg.LinAlgError, match=r"step 2 of 2: adjoint solve: 1 of 3 .* NONFINITE_INPUT"):
+        torch.autograd.grad(step.rollout(x, 2), x, cotangent)
 
 
 def test_powers_of_two_pass_through_exactly():
@@ -196,9 +203,11 @@ def test_a_compiled_step_with_checkpoints_gives_the_eager_gradients():
 
 def test_the_op_behind_it_passes_opcheck():
     b, nu = field((5,)), torch.tensor(1e-3, dtype=torch.float64)
-    counts = torch.tensor([4, 3]), torch.tensor([-1, -1])
+    # One to be taken back, one that is solved: its derivative is a solve.
+    said = torch.tensor([4, 3]), torch.tensor([-1, 1]), torch.tensor([0.1, 0.0], dtype=torch.float64)
     for method in METHODS:
-        args = (b, b, [nu], [1, 1], "heat", [5], [1.0], False, method, 4, 1e-5, 3, *counts, 2, 0)
+        options = (method, 4, 1e-5, 3, "unrolled", None, None, "raise", 0, 2)
+        args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
         assert set(opcheck(torch.ops.prdp.unrolled_vjp.default, args).values()) == {"SUCCESS"}
 
 

@@ -94,7 +94,7 @@ Outputs autograd_kernel(const at::Tensor& b, Args... args) {
   const auto node = reverse ? c10::make_intrusive<SolveNode>(b, a, options) : nullptr;
   const auto out = call_below(b, a, options);
   const auto& [u, iterations, residual, status, applications] = out;
-  const Solved solved{b, u, iterations, status};
+  const Solved solved{b, u, iterations, status, residual};
   if (reverse) torch::autograd::set_history(u, node);
   if (forward) u._set_fw_grad(solve_jvp(b, solved, a, options), /*level=*/0, /*is_inplace_op=*/false);
   if (reverse) node->save(b, solved);

@@ -1,6 +1,7 @@
 #pragma once
 #include <functional>
 
+#include "prdp/autograd/near_one.h"
 #include "prdp/autograd/product_rows.h"
 #include "prdp/autograd/run_back.h"
 #include "prdp/autograd/sweeps.h"
@@ -15,6 +16,7 @@ namespace prdp {
 template <class T>
 struct ReverseBatch {
   Method method;
+  double rtol;
   int64_t restart;
   int64_t checkpoint_every;
   const int64_t* iterations;
@@ -82,6 +84,8 @@ class SweepSpace : public SampleSpace<Kernel> {
     gradient_.rows->push();
   }
 
+  std::vector<T> copy_of(const T* v) const { return {v, v + a_.length()}; }
+
   T* slot(int64_t slot, int64_t v) { return kept_.vector(slot, v); }
   T& slot_scalar(int64_t slot, int64_t s) { return kept_.scalar(slot, s); }
 
@@ -95,7 +99,7 @@ class SweepSpace : public SampleSpace<Kernel> {
 
 /// Vectors that a sweep needs beside its method's, x̄ included.
 inline int64_t sweep_vectors_of(Method method, int64_t restart) {
-  return method == Method::kGmres ? restart + 6 : 5;
+  return method == Method::kGmres ? restart + 6 : 6;
 }
 
 /// Runs the sweep of `method` with x̄ in the vector `x_bar`; returns where b̄ is.
@@ -109,15 +113,18 @@ T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpo
   };
   switch (batch.method) {
     case Method::kJacobi: return run(JacobiSweep<Space>(space, x_bar));
-    case Method::kSteepestDescent: return run(SteepestDescentSweep<Space>(space, x_bar));
-    case Method::kConjugateGradient: return run(ConjugateGradientSweep<Space>(space, x_bar));
+    case Method::kSteepestDescent:
+      return run(SteepestDescentSweep<Space>(space, x_bar, {batch.rtol, plan.iterations}));
+    case Method::kConjugateGradient:
+      return run(ConjugateGradientSweep<Space>(space, x_bar, {batch.rtol, plan.iterations}));
     default: return run(GmresSweep<Space>(space, x_bar, batch.restart));
   }
 }
 
 template <class Kernel, class T>
-void reverse_sample(const Kernel& a, const Kernel& transpose, kernels::Workspace<T>& workspace,
+void reverse_sample(const NearOne<Kernel>& near, const Kernel& transpose, kernels::Workspace<T>& workspace,
                     KeptIterates<T>& kept, const ReverseBatch<T>& batch, int64_t s) {
+  const Kernel& a = *near;
   const int64_t n = a.unknowns();
   const T* b = batch.b + s * n;
   const T* cotangent = batch.cotangent + s * n;
@@ -127,7 +134,9 @@ void reverse_sample(const Kernel& a, const Kernel& transpose, kernels::Workspace
   const auto bar_scale = kernels::power_of_two_scale(kernels::largest_magnitude(cotangent, n));
   std::optional<ProductRows> rows;
   if (batch.rows) rows.emplace(batch.rows(s));
-  SweepSpace<Kernel> space(a, transpose, workspace, state, kept, {rows ? &*rows : nullptr, bar_scale, scale});
+  // With A' = factor A and b' = scale b, u = factor/scale u'.
+  const T lambda_scale = bar_scale / near.factor(), v_scale = scale / near.factor();
+  SweepSpace<Kernel> space(a, transpose, workspace, state, kept, {rows ? &*rows : nullptr, lambda_scale, v_scale});
   a.load(b, scale, space.b());
   space.project(space.b());
   space.begin(state);
@@ -137,10 +146,10 @@ void reverse_sample(const Kernel& a, const Kernel& transpose, kernels::Workspace
   T* diagonal_bar = nullptr;
   T* result = run_sweep(space, x_bar, batch, {batch.iterations[s], batch.checkpoint_every}, &diagonal_bar);
   space.project(result);
-  a.store(result, T(1) / bar_scale, b_bar);
+  a.store(result, T(1) / lambda_scale, b_bar);
   if (batch.diagonal_bar) {
-    a.store(diagonal_bar, T(1) / bar_scale, batch.diagonal_bar + s * n);
-    for (int64_t i = 0; i < n; ++i) batch.diagonal_bar[s * n + i] /= scale;
+    a.store(diagonal_bar, T(1) / lambda_scale, batch.diagonal_bar + s * n);
+    for (int64_t i = 0; i < n; ++i) batch.diagonal_bar[s * n + i] /= v_scale;
   }
   batch.applications[s] = state.applications;
   if (rows) batch.take_gradients(s, rows->finish());
@@ -155,6 +164,14 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
   const int64_t most = begin < end ? *std::max_element(batch.iterations + begin, batch.iterations + end) : 0;
   KeptIterates<T> kept(Checkpoints(most, batch.checkpoint_every).slots(),
                        batch.method == Method::kConjugateGradient ? 2 : 1, a.length(), a.halo());
+  const auto reverse = [&](const NearOne<Kernel>& near, const NearOne<Kernel>& transposed, int64_t s) {
+    reverse_sample(near, *transposed, workspace, kept, batch, s);
+  };
+  std::optional<NearOne<Kernel>> shared, shared_transpose;
+  if (a.is_shared()) {
+    shared.emplace(a);
+    shared_transpose.emplace(transpose);
+  }
   for (int64_t s = begin; s < end; ++s) {
     // Zeros for the cotangents, and nothing left of a sample before that was not finite.
     workspace.prepare(2 + vectors_of(batch.method, restart) + sweep_vectors_of(batch.method, restart),
@@ -163,10 +180,11 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
       std::fill_n(batch.b_bar + s * n, n, T(0));
       if (batch.diagonal_bar) std::fill_n(batch.diagonal_bar + s * n, n, T(0));
       batch.applications[s] = 0;
-    } else if (a.is_shared()) {
-      reverse_sample(a, transpose, workspace, kept, batch, s);
+    } else if (shared) {
+      reverse(*shared, *shared_transpose, s);
     } else {
-      reverse_sample(a.sample(s), transpose.sample(s), workspace, kept, batch, s);
+      const Kernel own = a.sample(s), own_transpose = transpose.sample(s);
+      reverse(NearOne<Kernel>(own), NearOne<Kernel>(own_transpose), s);
     }
   }
 }

@@ -42,8 +42,9 @@ at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpe
   };
   take(b);
   for (const auto& t : a.tensors) take(t);
-  const auto tangent = unrolled_jvp(
-      tangents, primal(b), {primal(a), options.solver, solved.iterations, solved.status}, needed);
+  auto plain = solved;
+  plain.b = primal(b);
+  const auto tangent = unrolled_jvp(tangents, plain, primal(a), options, needed);
   return options.on_failure == OnFailure::kRaise ? tangent : without_refused(tangent, solved.status);
 }
 

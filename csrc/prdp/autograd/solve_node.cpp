@@ -17,12 +17,13 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
-  // Implicit mode keeps u alone, and that only if A has a derivative; b and the iteration counts
-  // are unrolled mode's. Where a failed sample may have passed, its status says so.
+  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve
+  // said are unrolled mode's. Where a failed sample may have passed, its status says so.
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);
     iterations_ = SavedVariable(solved.iterations, /*is_output=*/false);
+    residual_ = SavedVariable(solved.residual, /*is_output=*/false);
   } else if (any_requires_grad(a_.tensors)) {
     u_ = SavedVariable(solved.u, /*is_output=*/true);
   }
@@ -34,7 +35,7 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
 
 void SolveNode::release_variables() {
   const std::lock_guard lock(mutex_);
-  for (auto* saved : {&b_, &u_, &iterations_, &status_}) saved->reset_data();
+  for (auto* saved : {&b_, &u_, &iterations_, &status_, &residual_}) saved->reset_data();
   for (auto& saved : tensors_) saved.reset_data();
 }
 
@@ -49,7 +50,8 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
     const auto unpack = [](const SavedVariable& saved, c10::intrusive_ptr<Node> of = nullptr) {
       return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
     };
-    solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_)};
+    solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_),
+              unpack(residual_)};
     for (const auto& saved : tensors_) a.tensors.push_back(unpack(saved));
   }
   const WithoutAutocast full_precision;

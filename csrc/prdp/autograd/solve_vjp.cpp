@@ -1,9 +1,12 @@
 #include "prdp/autograd/solve_vjp.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
-#include "prdp/operators/disguises.h"
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/rows.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/disguises.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -22,10 +25,23 @@ at::Tensor without_refused(const at::Tensor& derivative, const at::Tensor& statu
 
 namespace {
 
-/// Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Again differentiable: the solve is the same op.
-SolveVjp implicit(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
-                  const SolveOptions& options, at::IntArrayRef needed,
-                  decltype(linear_solve)& adjoint_solve) {
+/// The report where ḡ of the samples that are not in `rows` left the range of the dtype.
+void report_overflow(SolveInfo& info, const Rows& rows, const Operator& a, const at::Tensor& cotangent,
+                     const SolveOptions& options) {
+  info.status = info.status.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true);
+  auto* status = info.status.mutable_data_ptr<int64_t>();
+  for (size_t i = 0; i < rows.size(); ++i)
+    if (!rows[i] && !is_failure(static_cast<SolveStatus>(status[i])))
+      status[i] = static_cast<int64_t>(SolveStatus::kOverflow);
+  if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
+  report_failures(a, cotangent, info, options.on_failure, "adjoint solve");
+}
+
+}  // namespace
+
+SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
+                      const SolveOptions& options, at::IntArrayRef needed,
+                      decltype(linear_solve)& adjoint_solve) {
   auto transpose = a;
   transpose.transposed = !a.transposed;
   auto o = options;
@@ -36,15 +52,34 @@ SolveVjp implicit(const at::Tensor& cotangent, const at::Tensor& u, const Operat
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;
   if (!u.defined()) return found;
-  const auto products = make_operator(a)->product_rule(lambda, u);
-  for (size_t i = 0; i < products.size(); ++i)
-    if (needed[i + 1] && products[i].defined()) found.gradients[i + 1] = products[i].neg();
+  const auto op = make_operator(a);
+  const auto of_tensors = [&](const at::Tensor& of_lambda) {
+    auto products = op->product_rule(of_lambda, u);
+    for (size_t i = 0; i < products.size(); ++i)
+      products[i] = needed[i + 1] && products[i].defined() ? products[i].neg() : at::Tensor();
+    return products;
+  };
+  std::vector<at::Tensor> products;
+  if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
+    products = of_tensors(lambda);
+  } else {
+    Rows rows(cotangent.size(0), true);
+    products = finite_sum(rows, [&](const Rows& some) { return of_tensors(only(lambda, some)); });
+    if (!all(rows)) {
+      if (needed[0]) found.gradients[0] = only(lambda, rows);
+      report_overflow(found.info, rows, *op, cotangent, options);
+    }
+  }
+  std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
   return found;
 }
 
-SolveVjp unrolled(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
-                  const SolveOptions& options, at::IntArrayRef needed) {
-  const UnrolledSolve solve{a, options.solver, solved.iterations, solved.status, options.checkpoint_every};
+SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
+                   const SolveOptions& options, at::IntArrayRef needed,
+                   decltype(linear_solve)& adjoint_solve) {
+  if (options.on_failure != OnFailure::kRaise) cotangent = without_refused(cotangent, solved.status);
+  if (options.backward == Backward::kImplicit)
+    return implicit_vjp(cotangent, solved.u, a, options, needed, adjoint_solve);
   // With create_graph=True the derivative is itself recorded; else it is one op, as a compiled graph and
   // torch.func need it.
   bool recorded = at::GradMode::is_enabled() && !in_torch_func() && !has_tangent(cotangent) &&
@@ -52,19 +87,7 @@ SolveVjp unrolled(const at::Tensor& cotangent, const Solved& solved, const Opera
   for (size_t i = 0; i < needed.size(); ++i)  // not where they did so in a transform that has ended
     if (needed[i]) recorded = recorded && (i == 0 ? solved.b : a.tensors[i - 1]).requires_grad();
   const auto vjp = recorded ? unrolled_vjp_recorded : unrolled_vjp;
-  auto found = vjp(cotangent, solved.b, solve, needed, options.adjoint_log);
-  const auto info = unrolled_info(found, solve, cotangent);
-  return {std::move(found.gradients), info};
-}
-
-}  // namespace
-
-SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
-                   const SolveOptions& options, at::IntArrayRef needed,
-                   decltype(linear_solve)& adjoint_solve) {
-  if (options.on_failure != OnFailure::kRaise) cotangent = without_refused(cotangent, solved.status);
-  if (options.backward == Backward::kUnrolled) return unrolled(cotangent, solved, a, options, needed);
-  return implicit(cotangent, solved.u, a, options, needed, adjoint_solve);
+  return vjp(cotangent, solved, a, options, needed);
 }
 
 }  // namespace prdp

@@ -6,7 +6,7 @@ namespace prdp {
 /// What a solve A u = b keeps for its derivative; implicit mode needs u where A has a derivative, the
 /// unrolled one all else, and the status both where a failed sample may have passed.
 struct Solved {
-  at::Tensor b, u, iterations, status;
+  at::Tensor b, u, iterations, status, residual;
 };
 
 /// The product of the cotangent ū with the derivative of (b, tensors of A) → u, as options.backward
@@ -23,5 +23,10 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
 
 /// A cotangent or tangent with zeros for the refused samples, whose u is the constant zero.
 at::Tensor without_refused(const at::Tensor& derivative, const at::Tensor& status);
+/// The implicit one: Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Without u, b̄ alone. A sample whose share of ḡ
+/// leaves the range of the dtype fails: OVERFLOW, and zeros.
+SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
+                      const SolveOptions& options, at::IntArrayRef needed,
+                      decltype(linear_solve)& adjoint_solve);
 
 }  // namespace prdp

@@ -75,6 +75,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
   const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most, solve.solver.restart);
   const auto run = [&]<class T>(T) {
     ReverseBatch<T> batch{solve.solver.method,
+                          solve.solver.rtol,
                           solve.solver.restart,
                           solve.checkpoint_every,
                           iterations.const_data_ptr<int64_t>(),

@@ -1,6 +1,8 @@
 #pragma once
 #include <type_traits>
+#include <vector>
 
+#include "prdp/solvers/iterate.h"
 #include "prdp/solvers/methods.h"
 
 /// The reverse of one iteration of each method, written out, for one sample in padded memory. A sweep is
@@ -58,6 +60,90 @@ class SweepBase : public Method {
   void get(Scalar& part, int64_t slot, int64_t, int64_t s) { part = sweep_space_.slot_scalar(slot, s); }
 };
 
+/// A sweep of a method with a residual of its own. Where this claimed convergence and the true one did not,
+/// the solve went on from the true one, and so do its iterations here: on the first time through, which has
+/// x, they keep what they found for the times after it.
+template <class Method, class Space>
+class RecursiveSweep : public SweepBase<Method, Space> {
+  using Base = SweepBase<Method, Space>;
+
+ public:
+  using Vector = typename Space::Vector;
+  using Scalar = typename Space::Scalar;
+
+  /// The method's rtol, and the iterations that it ran.
+  struct Run {
+    double rtol;
+    int64_t iterations;
+  };
+  RecursiveSweep(Space& space, Vector x_bar, Run run)
+      : Base(space, x_bar), r_bar_(space.vector()), b_bar_(space.vector()), t_(space.vector()), run_(run),
+        b2_(space.b2()) {}
+
+  void start() {
+    Method::start();
+    done_ = 0;
+  }
+  void load(int64_t slot, int64_t k) {
+    Base::load(slot, k);
+    done_ = k;
+  }
+  void step() {
+    Method::step();
+    ++done_;
+    if (done_ > furthest_) claim();
+    else if (const auto* known = correction()) put_back(*known);
+    furthest_ = std::max(furthest_, done_);
+  }
+
+ protected:
+  /// From the cotangent of the residual, all of it in r_bar, to those of x and b: r = P (b - A x). False
+  /// where the iteration just run kept its own residual.
+  bool correct_back(Scalar norm2_bar) {
+    const auto* known = correction();
+    if (!known) return false;
+    auto& s = this->sweep_space_;
+    s.axpy(2 * norm2_bar, known->residual.data(), r_bar_);
+    s.project(r_bar_);
+    s.axpy(1, r_bar_, b_bar_);
+    s.apply_transpose(r_bar_, t_);
+    s.axpy(-1, t_, this->x_bar_);
+    s.differentiate(-1, r_bar_, known->x.data());
+    s.fill_zero(r_bar_);
+    return true;
+  }
+
+  Vector r_bar_, b_bar_, t_;
+
+ private:
+  struct Correction {
+    int64_t done;
+    Scalar norm2;
+    std::vector<Scalar> x, residual;
+  };
+  void claim() {
+    const bool claims = run_.rtol > 0.0 && detail::is_within(this->rr_, run_.rtol, b2_);
+    if (!claims || done_ == run_.iterations) return;
+    this->recompute_residual();
+    auto& s = this->sweep_space_;
+    corrections_.push_back({done_, this->rr_, s.copy_of(this->x), s.copy_of(this->r_)});
+  }
+  const Correction* correction() const {
+    for (const auto& known : corrections_)
+      if (known.done == done_) return &known;
+    return nullptr;
+  }
+  void put_back(const Correction& known) {
+    this->sweep_space_.copy(known.residual.data(), this->r_);
+    this->go_on_from(known.norm2);
+  }
+
+  Run run_;
+  double b2_;
+  int64_t done_ = 0, furthest_ = 0;  // iterations behind the state at hand; and ever
+  std::vector<Correction> corrections_;
+};
+
 /// One iteration at a time, and x alone: the iterate before it is Chebyshev's.
 template <class Space>
 class SingleJacobi : public JacobiMethod<Space> {
@@ -99,16 +185,17 @@ class JacobiSweep : public SweepBase<SingleJacobi<Space>, Space> {
 
 /// q = A r, α = r·r / r·q, x' = x + α r, r' = r - α q
 template <class Space>
-class SteepestDescentSweep : public SweepBase<SteepestDescentMethod<Space>, Space> {
-  using Base = SweepBase<SteepestDescentMethod<Space>, Space>;
+class SteepestDescentSweep : public RecursiveSweep<SteepestDescentMethod<Space>, Space> {
+  using Base = RecursiveSweep<SteepestDescentMethod<Space>, Space>;
   using Vector = typename Space::Vector;
-  using Base::sweep_space_, Base::x_bar_, Base::q_, Base::alpha_;
+  using Base::sweep_space_, Base::x_bar_, Base::r_bar_, Base::b_bar_, Base::t_, Base::q_, Base::alpha_;
 
  public:
-  SteepestDescentSweep(Space& space, Vector x_bar)
-      : Base(space, x_bar), r_bar_(space.vector()), q_bar_(space.vector()), t_(space.vector()) {}
+  SteepestDescentSweep(Space& space, Vector x_bar, typename Base::Run run)
+      : Base(space, x_bar, run), q_bar_(space.vector()) {}
 
   void step_back(int64_t slot, int64_t) {
+    this->correct_back(0);
     if (alpha_ == 0) return;  // it took no step
     auto& s = sweep_space_;
     const auto* r = this->kept(slot, 0);
@@ -125,31 +212,39 @@ class SteepestDescentSweep : public SweepBase<SteepestDescentMethod<Space>, Spac
     s.axpy(1, t_, r_bar_);
     s.differentiate(1, q_bar_, r);
   }
-  Vector finish() { return r_bar_; }  // r₀ = b
+  /// r₀ = b
+  Vector finish() {
+    sweep_space_.axpy(1, r_bar_, b_bar_);
+    return b_bar_;
+  }
 
  private:
-  Vector r_bar_, q_bar_, t_;
+  Vector q_bar_;
 };
 
 /// q = A p, α = r·r / p·q, x' = x + α p, r' = r - α q, β = r'·r' / r·r, p' = r' + β p
 template <class Space>
-class ConjugateGradientSweep : public SweepBase<ConjugateGradientMethod<Space>, Space> {
-  using Base = SweepBase<ConjugateGradientMethod<Space>, Space>;
+class ConjugateGradientSweep : public RecursiveSweep<ConjugateGradientMethod<Space>, Space> {
+  using Base = RecursiveSweep<ConjugateGradientMethod<Space>, Space>;
   using Vector = typename Space::Vector;
   using Scalar = typename Space::Scalar;
-  using Base::sweep_space_, Base::x_bar_, Base::r_, Base::q_, Base::alpha_, Base::beta_;
+  using Base::sweep_space_, Base::x_bar_, Base::r_bar_, Base::b_bar_, Base::t_;
+  using Base::r_, Base::q_, Base::alpha_, Base::beta_;
 
  public:
-  ConjugateGradientSweep(Space& space, Vector x_bar)
-      : Base(space, x_bar), r_bar_(space.vector()), p_bar_(space.vector()), q_bar_(space.vector()),
-        t_(space.vector()) {}
+  ConjugateGradientSweep(Space& space, Vector x_bar, typename Base::Run run)
+      : Base(space, x_bar, run), p_bar_(space.vector()), q_bar_(space.vector()) {}
 
   void step_back(int64_t slot, int64_t) {
     auto& s = sweep_space_;
     const auto* p = this->kept(slot, 1);
     const auto rr = this->kept_scalar(slot, 0);
-    // p' and β; where β or α is 0 the iteration ended there.
     s.axpy(1, p_bar_, r_bar_);
+    if (this->correct_back(rr_bar_)) {  // p = r there
+      s.fill_zero(p_bar_);
+      rr_bar_ = 0;
+    }
+    // p' and β; where β or α is 0 the iteration ended there.
     const auto next_rr_bar = beta_ == 0 ? rr_bar_ : rr_bar_ + s.dot(p_bar_, p) / rr;
     rr_bar_ = beta_ == 0 ? Scalar(0) : -beta_ * (s.dot(p_bar_, p) / rr);
     s.axpy(2 * next_rr_bar, r_, r_bar_);
@@ -169,13 +264,13 @@ class ConjugateGradientSweep : public SweepBase<ConjugateGradientMethod<Space>, 
   }
   /// r₀ = p₀ = b, and r₀·r₀
   Vector finish() {
-    sweep_space_.axpy(1, p_bar_, r_bar_);
-    sweep_space_.axpy(2 * rr_bar_, sweep_space_.b(), r_bar_);
-    return r_bar_;
+    for (const auto* share : {r_bar_, p_bar_}) sweep_space_.axpy(1, share, b_bar_);
+    sweep_space_.axpy(2 * rr_bar_, sweep_space_.b(), b_bar_);
+    return b_bar_;
   }
 
  private:
-  Vector r_bar_, p_bar_, q_bar_, t_;
+  Vector p_bar_, q_bar_;
   Scalar rr_bar_ = 0;
 };
 

@@ -4,34 +4,37 @@
 #include <torch/csrc/autograd/functions/utils.h>
 #include <torch/library.h>
 
-#include "prdp/operators/disguises.h"
+#include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/operators/disguises.h"
 
 namespace prdp {
 
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor[] tensors, int[] needed, str kind, int[] shape, "
-    "float[] parameters, bool transposed, str solver, SymInt max_iter, float rtol, int restart, "
-    "Tensor iterations, Tensor status) -> Tensor";
+    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] needed, "
+    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, " PRDP_OPTIONS_SCHEMA ") -> Tensor";
+using Signature =
+    WithOptions<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                           const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef,
+                           at::ArrayRef<double>, bool)>;
 
 /// The product with the cotangent is linear in it; the transpose of that is the product with the tangents.
-at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, at::TensorList tensors,
-                      at::IntArrayRef needed, c10::string_view kind, at::IntArrayRef shape,
-                      at::ArrayRef<double> parameters, bool transposed, c10::string_view solver,
-                      c10::SymInt max_iter, double rtol, int64_t restart, const at::Tensor& iterations,
-                      const at::Tensor& status) {
-  UnrolledSolve solve{{std::string(kind), shape.vec(), parameters.vec(), {}, transposed},
-                      {method_from_name(solver), max_iter, rtol, restart},
-                      iterations,
-                      status};
+template <class... Options>
+at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Tensor& iterations,
+                      const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed,
+                      at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                      at::ArrayRef<double> parameters, bool transposed, Options... flat) {
+  OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
+  auto options = unflatten(std::move(flat)...);
+  options.adjoint_log = 0;
   return with_autograd([&] {
     const auto leaf = [](const at::Tensor& t, bool wanted) { return t.detach().requires_grad_(wanted); };
-    const auto rhs = leaf(b, needed[0]);
-    for (size_t i = 0; i < tensors.size(); ++i) solve.a.tensors.push_back(leaf(tensors[i], needed[i + 1]));
+    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual};
+    for (size_t i = 0; i < tensors.size(); ++i) a.tensors.push_back(leaf(tensors[i], needed[i + 1]));
     const auto cotangent = at::ones_like(b).requires_grad_();  // any: the map is linear
-    const auto found = unrolled_vjp_recorded(cotangent, rhs, solve, needed, /*log=*/0);
+    const auto found = unrolled_vjp_recorded(cotangent, solved, a, options, needed);
     std::vector<at::Tensor> gradients, along;
     for (size_t i = 0, next = 0; i < needed.size(); ++i) {
       if (!needed[i]) continue;
@@ -47,9 +50,10 @@ at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, at::TensorLi
   });
 }
 
-at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, at::TensorList, at::IntArrayRef, c10::string_view,
-                       at::IntArrayRef, at::ArrayRef<double>, bool, c10::string_view, c10::SymInt, double,
-                       int64_t, const at::Tensor&, const at::Tensor&) {
+template <class... Options>
+at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                       at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
+                       bool, Options...) {
   return at::empty_symint(b.sym_sizes(), b.options());
 }
 
@@ -83,20 +87,18 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
 
 }  // namespace
 
-at::Tensor unrolled_jvp(at::TensorList tangents, const at::Tensor& b, const UnrolledSolve& solve,
-                        at::IntArrayRef needed) {
-  static const auto op = c10::Dispatcher::singleton()
-                             .findSchemaOrThrow("prdp::unrolled_jvp", "")
-                             .typed<decltype(jvp_kernel)>();
-  const auto& a = solve.a;
-  return op.call(tangents, b, a.tensors, needed, a.kind, a.shape, a.parameters, a.transposed,
-                 name(solve.solver.method), solve.solver.max_iter, solve.solver.rtol, solve.solver.restart,
-                 solve.iterations, solve.status);
+at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
+                        const SolveOptions& options, at::IntArrayRef needed) {
+  static const auto op =
+      c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
+  return call_with_options(op, options, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
+                           at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
+                           at::ArrayRef<double>(a.parameters), a.transposed);
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("unrolled_jvp", jvp_kernel); }
-TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_jvp", fake_kernel); }
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("unrolled_jvp", static_cast<Signature*>(jvp_kernel)); }
+TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_jvp", static_cast<Signature*>(fake_kernel)); }
 TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
   for (const char* op : {"unrolled_vjp", "unrolled_jvp"})
     m.impl(op, torch::CppFunction::makeFromBoxedFunction<&refuse_second_derivatives>());

@@ -7,7 +7,8 @@
 #include <limits>
 
 #include "prdp/autograd/adjoint_log.h"
-#include "prdp/autograd/linear_solve.h"
+#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/rows.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 
@@ -16,112 +17,198 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor[] tensors, int[] needed, str kind, "
-    "int[] shape, float[] parameters, bool transposed, str solver, SymInt max_iter, float rtol, int restart, "
-    "Tensor iterations, Tensor status, int checkpoint_every=0, int adjoint_log=0) -> "
-    "(Tensor[] gradients, Tensor operator_applications)";
-using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor>;
+    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
+    "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
+    PRDP_OPTIONS_SCHEMA ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
+    "Tensor operator_applications)";
+using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+using Signature =
+    WithOptions<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                        const at::Tensor&, at::IntArrayRef, at::TensorList,
+                        c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool)>;
 
-/// b = 0 is solved in no iterations, yet the map has a derivative there: A⁻ᵀ by the same method and
-/// budget, which for linear methods is the derivative of all max_iter iterations. Adds it to b̄.
-void add_derivative_at_zero(UnrolledVjp& found, const at::Tensor& cotangent, const UnrolledSolve& solve,
-                            at::IntArrayRef needed) {
-  const auto at_zero = solve.iterations.eq(0).logical_and(
-      solve.status.eq(static_cast<int64_t>(SolveStatus::kConverged)));
-  if (!needed[0] || !at_zero.any().item<bool>()) return;
-  auto a = solve.a;
-  a.transposed = !a.transposed;
-  SolveOptions options{solve.solver, Backward::kImplicit};
-  options.on_failure = OnFailure::kReturn;
-  const auto [lambda, info] = linear_solve(a, cotangent * per_sample(at_zero, cotangent), options);
-  add_to(found.gradients[0], lambda);
-  found.operator_applications = found.operator_applications + info.operator_applications * at_zero;
+/// Residuals up to so many units of rounding are rounding.
+constexpr double kRoundings = 8.0;
+
+/// One number per sample, on the host.
+template <class T>
+std::vector<T> to_host(const at::Tensor& t, int64_t batch) {
+  const auto flat =
+      t.detach().to(at::kCPU, c10::CppTypeToScalarType<T>::value).reshape({-1}).expand({batch}).contiguous();
+  return {flat.template const_data_ptr<T>(), flat.template const_data_ptr<T>() + batch};
 }
 
-void log_sweeps(const UnrolledVjp& found, const UnrolledSolve& solve, const at::Tensor& b, int64_t log) {
-  if (log != 0) adjoint_log::write(log, unrolled_info(found, solve, b));
+/// ‖u‖/‖b‖ of each sample, whatever their order of magnitude.
+std::vector<double> growth(const at::Tensor& u, const at::Tensor& b) {
+  const auto norm = [](const at::Tensor& t) {
+    const auto rows = t.detach().to(at::kDouble).flatten(1);
+    const auto largest = rows.abs().amax(1, /*keepdim=*/true);
+    return std::pair((rows / largest).norm(2, 1), largest.squeeze(1));
+  };
+  const auto [u_norm, u_largest] = norm(u);
+  const auto [b_norm, b_largest] = norm(b);
+  return to_host<double>(u_norm / b_norm * (u_largest / b_largest), b.size(0));
 }
 
-Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, at::TensorList tensors,
-                   at::IntArrayRef needed, c10::string_view kind, at::IntArrayRef shape,
-                   at::ArrayRef<double> parameters, bool transposed, c10::string_view solver,
-                   c10::SymInt max_iter, double rtol, int64_t restart, const at::Tensor& iterations,
-                   const at::Tensor& status, int64_t checkpoint_every, int64_t log) {
-  const at::NoGradGuard no_grad;
-  UnrolledSolve unrolled{{std::string(kind), shape.vec(), parameters.vec(), {}, transposed},
-                         {method_from_name(solver), max_iter, rtol, restart},
-                         iterations,
-                         status,
-                         checkpoint_every};
-  for (const auto& t : tensors) unrolled.a.tensors.push_back(t.detach());
-  make_operator(unrolled.a)->check_parameters();
-  const auto rhs = b.detach();
-  const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
-  UnrolledVjp found;
-  const auto method = unrolled.solver.method;
-  if ((method == Method::kJacobi || method == Method::kChebyshev) && for_b_alone) {
-    // K sweeps from zero are u = p(I - D⁻¹A) D⁻¹ b with a polynomial p; transposed, that is K sweeps with Aᵀ.
-    auto transpose = unrolled.a;
-    transpose.transposed = !transposed;
-    const SolveRequest request{method, 0, 0.0, restart, iterations};
-    const auto [b_bar, info] = prdp::solve(*make_operator(transpose), cotangent, request);
-    found = {std::vector<at::Tensor>(needed.size()), info.operator_applications};
-    found.gradients[0] = b_bar;
-  } else if (has_sweep(*make_operator(unrolled.a), unrolled, rhs)) {
-    found = sweep_vjp(cotangent, rhs, unrolled, needed);
-  } else {
-    found = replay_vjp(cotangent, rhs, unrolled, needed);
+/// The samples whose residual is no more than the rounding errors of computing it, and less than √ε; of those
+/// that may be, u is asked for.
+template <class MakeU>
+Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_u) {
+  const int64_t batch = solved.b.size(0);
+  const bool single = solved.b.scalar_type() == at::kFloat;
+  const double epsilon = single ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
+  const auto residual = to_host<double>(solved.residual, batch);
+  const auto status = to_host<int64_t>(solved.status, batch);
+  Rows rows(batch, false), near(batch, false);
+  for (int64_t i = 0; i < batch; ++i) {
+    const auto s = static_cast<SolveStatus>(status[i]);
+    if (is_refused(s)) continue;
+    rows[i] = s == SolveStatus::kConvergedBreakdown || residual[i] == 0.0;
+    near[i] = !rows[i] && residual[i] <= std::sqrt(epsilon);
   }
-  found.operator_applications = found.operator_applications.to(b.device());
-  add_derivative_at_zero(found, cotangent, unrolled, needed);
-  log_sweeps(found, unrolled, rhs, log);
+  if (!any(near)) return rows;
+  const auto norm = to_host<double>(a.norm(), batch), u_over_b = growth(make_u(), solved.b);
+  for (int64_t i = 0; i < batch; ++i)
+    rows[i] = rows[i] || (near[i] && residual[i] <= kRoundings * epsilon / 2 * (norm[i] * u_over_b[i] + 1.0));
+  return rows;
+}
 
-  std::vector<at::Tensor> gradients;
-  for (size_t i = 0; i < needed.size(); ++i) {
-    if (!needed[i]) continue;
-    const auto& g = found.gradients[i];
-    gradients.push_back(g.defined() ? g : at::zeros_like(i == 0 ? rhs : tensors[i - 1]));
+/// The samples that were solved to rounding, but those whose iterations are smooth there: all of Jacobi's and
+/// Chebyshev's up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
+template <class MakeU>
+Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeU& make_u) {
+  auto rows = within_rounding(a, solved, make_u);
+  if (!any(rows)) return rows;
+  const auto batch = static_cast<int64_t>(rows.size());
+  const auto iterations = to_host<int64_t>(solved.iterations, batch);
+  const auto leave_out = [&](int64_t count, const Rows& kept) {
+    for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != count || kept[i]);
+  };
+  const Rows none(batch, false);
+  if (solver.method == Method::kJacobi || solver.method == Method::kChebyshev)
+    leave_out(solver.max_iter.expect_int(), none);
+  const int64_t unknowns = solved.b.numel() / batch;
+  if (solver.method == Method::kConjugateGradient &&
+      std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
+    const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart});
+    const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
+    leave_out(unknowns, within_rounding(a, before, [&] { return one_less.u; }));
   }
-  return {gradients, found.operator_applications};
+  return rows;
 }
 
-Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, at::TensorList tensors, at::IntArrayRef needed,
-                    c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool, c10::string_view,
-                    c10::SymInt, double, int64_t, const at::Tensor& iterations, const at::Tensor&, int64_t,
-                    int64_t) {
-  std::vector<at::Tensor> gradients;
-  if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
-  for (size_t i = 0; i < tensors.size(); ++i)
-    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
-  return {gradients, at::empty_symint(iterations.sym_sizes(), iterations.options())};
-}
+/// Takes the derivative of each sample in its way (unrolled_vjp.h); `of_iterations` is that of the last.
+using OfIterations = UnrolledVjp (*)(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                                     at::IntArrayRef needed);
 
-}  // namespace
+SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
+                        const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
+                        decltype(linear_solve)& any_solve) {
+  const int64_t batch = solved.b.size(0);
+  const auto a = make_operator(spec);
+  at::Tensor u;  // again, as it is not kept
+  const auto make_u = [&] {
+    auto silent = options;
+    silent.on_failure = OnFailure::kReturn;
+    silent.adjoint_log = 0;
+    if (!u.defined()) u = any_solve(spec, solved.b, silent).u;
+    return u;
+  };
+  const auto exact = solved_to_rounding(*a, solved, options.solver, make_u), sound = finite_rows(cotangent);
+  const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
+  const auto bar = only(cotangent, sound);
+  const auto counts = to_host<int64_t>(solved.iterations, batch), status = to_host<int64_t>(solved.status, batch);
 
-SolveInfo unrolled_info(const UnrolledVjp& found, const UnrolledSolve& solve, const at::Tensor& b) {
-  const auto none = at::full_symint({b.sym_size(0)}, std::numeric_limits<double>::quiet_NaN(), b.options());
-  return {solve.iterations, none, solve.status, found.operator_applications};
-}
+  auto implicit = options;
+  implicit.backward = Backward::kImplicit;
+  implicit.checkpoint_every = implicit.adjoint_log = 0;
+  implicit.adjoint_rtol = std::min(options.adjoint_rtol.value_or(options.solver.rtol),
+                                   solved.b.scalar_type() == at::kFloat
+                                       ? static_cast<double>(std::numeric_limits<float>::epsilon())
+                                       : std::numeric_limits<double>::epsilon());
 
-UnrolledVjp unrolled_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
-                         at::IntArrayRef needed, int64_t log) {
-  static const auto op = c10::Dispatcher::singleton()
-                             .findSchemaOrThrow("prdp::unrolled_vjp", "")
-                             .typed<decltype(vjp_kernel)>();
-  const auto& a = solve.a;
-  const auto [gradients, applications] =
-      op.call(cotangent, b, a.tensors, needed, a.kind, a.shape, a.parameters, a.transposed,
-              name(solve.solver.method), solve.solver.max_iter, solve.solver.rtol, solve.solver.restart,
-              solve.iterations, solve.status, solve.checkpoint_every, log);
-  UnrolledVjp found{std::vector<at::Tensor>(needed.size()), applications};
-  for (size_t i = 0, next = 0; i < needed.size(); ++i)
-    if (needed[i]) found.gradients[i] = gradients[next++];
+  SolveInfo info{at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble), at::empty({batch}, at::kLong),
+                 at::empty({batch}, at::kLong)};
+  const auto says = [&](int64_t i, int64_t iterations, double residual, SolveStatus why, int64_t applications) {
+    info.iterations.mutable_data_ptr<int64_t>()[i] = iterations;
+    info.residual.mutable_data_ptr<double>()[i] = residual;
+    info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(why);
+    info.operator_applications.mutable_data_ptr<int64_t>()[i] = applications;
+  };
+  const auto share = [&](const Rows& rows) {
+    std::vector<at::Tensor> sum(needed.size());
+    auto caps = at::zeros({batch}, at::kLong);
+    for (int64_t i = 0; i < batch; ++i)
+      if (rows[i] && !exact[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
+    std::vector<int64_t> applications(batch, 0);
+    if (caps.any().item<bool>()) {
+      auto found = of_iterations(bar, solved.b, {spec, options.solver, caps.to(solved.iterations.device()),
+                                                 options.checkpoint_every}, needed);
+      sum = std::move(found.gradients);
+      applications = to_host<int64_t>(found.operator_applications, batch);
+    }
+    for (int64_t i = 0; i < batch; ++i)
+      says(i, counts[i], std::numeric_limits<double>::quiet_NaN(), static_cast<SolveStatus>(status[i]),
+           applications[i]);
+    const auto some = both(rows, exact);
+    if (any(some)) {
+      const auto for_products = for_a ? make_u() : at::Tensor();
+      const auto found = implicit_vjp(only(bar, some), for_products, spec, implicit, needed, any_solve);
+      for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
+      const auto iterations = to_host<int64_t>(found.info.iterations, batch);
+      const auto residual = to_host<double>(found.info.residual, batch);
+      const auto statuses = to_host<int64_t>(found.info.status, batch);
+      const auto products = to_host<int64_t>(found.info.operator_applications, batch);
+      for (int64_t i = 0; i < batch; ++i)
+        if (some[i]) says(i, iterations[i], residual[i], static_cast<SolveStatus>(statuses[i]), products[i]);
+    }
+    return sum;
+  };
+  auto rows = sound;
+  SolveVjp found{finite_sum(rows, share), {}};
+  for (size_t i = 0; i < needed.size(); ++i)
+    if (needed[i] && !found.gradients[i].defined())
+      found.gradients[i] = i == 0 ? only(cotangent, Rows(batch, false)) : at::zeros_like(spec.tensors[i - 1]);
+
+  auto failures = info;
+  failures.status = at::full({batch}, static_cast<int64_t>(SolveStatus::kConverged), at::kLong);
+  for (int64_t i = 0; i < batch; ++i) {
+    if (rows[i]) continue;
+    if (sound[i]) says(i, 0, 1.0, SolveStatus::kOverflow, 0);
+    else says(i, 0, std::numeric_limits<double>::infinity(), SolveStatus::kNonfiniteInput, 0);
+    failures.status.mutable_data_ptr<int64_t>()[i] = info.status.const_data_ptr<int64_t>()[i];
+  }
+  info.residual = info.residual.to(solved.b.scalar_type());
+  if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
+  report_failures(*a, cotangent, failures, options.on_failure, "adjoint solve");
+  const auto device = solved.b.device();
+  found.info = {info.iterations.to(device), info.residual.to(device), info.status.to(device),
+                info.operator_applications.to(device)};
   return found;
 }
 
-UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor& b,
-                                  const UnrolledSolve& solve, at::IntArrayRef needed, int64_t log) {
-  const at::AutoGradMode record(true);
+/// The iterations, run again and taken back.
+UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                                at::IntArrayRef needed) {
+  const auto method = solve.solver.method;
+  const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
+  if ((method == Method::kJacobi || method == Method::kChebyshev) && for_b_alone) {
+    // K sweeps from zero are u = p(I - D⁻¹A) D⁻¹ b with a polynomial p; transposed, that is K sweeps with Aᵀ.
+    auto transpose = solve.a;
+    transpose.transposed = !transpose.transposed;
+    const SolveRequest request{method, 0, 0.0, solve.solver.restart, solve.iterations, /*guarded=*/false};
+    const auto [b_bar, info] = prdp::solve(*make_operator(transpose), cotangent, request);
+    UnrolledVjp found{std::vector<at::Tensor>(needed.size()), info.operator_applications};
+    found.gradients[0] = b_bar;
+    return found;
+  }
+  if (has_sweep(*make_operator(solve.a), solve, b)) return sweep_vjp(cotangent, b, solve, needed);
+  return replay_vjp(cotangent, b, solve, needed);
+}
+
+/// The iterations, recorded all at once, and their derivative, recorded too.
+UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+                              at::IntArrayRef needed) {
   // Partial derivatives: b and the tensors may be one tensor, or depend on each other further back.
   const auto rhs = at::alias(b);
   auto a = solve.a;
@@ -131,19 +218,75 @@ UnrolledVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const at::Tensor&
   std::vector<at::Tensor> inputs;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) inputs.push_back(i == 0 ? rhs : a.tensors[i - 1]);
-  if (u.requires_grad()) {  // not where no sample took an iteration
-    const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
-                                                 /*create_graph=*/true, /*allow_unused=*/true);
-    for (size_t i = 0, next = 0; i < needed.size(); ++i)
-      if (needed[i]) found.gradients[i] = gradients[next++];
-  }
-  add_derivative_at_zero(found, cotangent, solve, needed);
-  log_sweeps(found, solve, b, log);
+  const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
+                                               /*create_graph=*/true, /*allow_unused=*/true);
+  for (size_t i = 0, next = 0; i < needed.size(); ++i)
+    if (needed[i]) found.gradients[i] = gradients[next++];
   return found;
 }
 
+template <class... Options>
+Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
+                   const at::Tensor& iterations, const at::Tensor& status, const at::Tensor& residual,
+                   at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                   at::ArrayRef<double> parameters, bool transposed, Options... flat) {
+  const at::NoGradGuard no_grad;
+  OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
+  for (const auto& t : tensors) a.tensors.push_back(t.detach());
+  make_operator(a)->check_parameters();
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual}, a,
+                                    unflatten(std::move(flat)...), needed, run_iterations_back,
+                                    linear_solve_kernel);
+  std::vector<at::Tensor> gradients;
+  for (size_t i = 0; i < needed.size(); ++i)
+    if (needed[i]) gradients.push_back(found.gradients[i]);
+  const auto& info = found.info;
+  // -1 crosses the op for no residual: torch's checks of ops compare outputs, and NaN equals nothing.
+  const auto residual_or_not = info.residual.masked_fill(info.residual.isnan(), -1.0);
+  return {gradients, info.iterations, residual_or_not, info.status, info.operator_applications};
+}
+
+template <class... Options>
+Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&,
+                    const at::Tensor&, at::IntArrayRef needed, at::TensorList tensors, c10::string_view,
+                    at::IntArrayRef, at::ArrayRef<double>, bool, Options...) {
+  std::vector<at::Tensor> gradients;
+  if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
+  const auto of_dtype = [&](at::ScalarType dtype) {
+    return at::empty_symint({b.sym_size(0)}, b.options().dtype(dtype));
+  };
+  return {gradients, of_dtype(at::kLong), of_dtype(b.scalar_type()), of_dtype(at::kLong), of_dtype(at::kLong)};
+}
+
+}  // namespace
+
+SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
+                      const SolveOptions& options, at::IntArrayRef needed) {
+  static const auto op =
+      c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
+  const auto [gradients, iterations, residual, status, applications] = call_with_options(
+      op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
+      at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
+      at::ArrayRef<double>(a.parameters), a.transposed);
+  const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
+  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications}};
+  for (size_t i = 0, next = 0; i < needed.size(); ++i)
+    if (needed[i]) found.gradients[i] = gradients[next++];
+  return found;
+}
+
+SolveVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
+                               const SolveOptions& options, at::IntArrayRef needed) {
+  const at::AutoGradMode record(true);
+  return vjp_of_samples(cotangent, solved, a, options, needed, record_iterations, linear_solve);
+}
+
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("unrolled_vjp", vjp_kernel); }
-TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_vjp", fake_kernel); }
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
+  m.impl("unrolled_vjp", static_cast<Signature*>(vjp_kernel));
+}
+TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_vjp", static_cast<Signature*>(fake_kernel)); }
 
 }  // namespace prdp

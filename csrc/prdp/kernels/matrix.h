@@ -1,6 +1,7 @@
 #pragma once
 #include <algorithm>
 #include <utility>
+#include <vector>
 
 #include "prdp/kernels/vector.h"
 
@@ -69,7 +70,15 @@ class Dense : public MatrixBase<T, Dense<T>> {
   T diagonal(int64_t i) const { return a_[i * n_ + i]; }
   int64_t stored() const { return n_ * n_; }
   T at(int64_t i, int64_t j) const { return transposed_ ? a_[j * n_ + i] : a_[i * n_ + j]; }
-  bool operator_is_finite() const { return std::isfinite(largest_magnitude(a_, n_ * n_)); }
+  /// Of the largest entry; NaN or Inf if one is not finite.
+  T magnitude() const { return largest_magnitude(a_, n_ * n_); }
+  bool operator_is_finite() const { return std::isfinite(magnitude()); }
+  /// factor · this one, its entries in `memory`.
+  Dense scaled(T factor, std::vector<T>& memory) const {
+    memory.resize(static_cast<size_t>(n_ * n_));
+    std::transform(a_, a_ + n_ * n_, memory.begin(), [factor](T a) { return factor * a; });
+    return {memory.data(), n_, 0, transposed_};
+  }
 
   void apply(const T* v, T* out) const {
     if (!transposed_) {
@@ -116,7 +125,14 @@ class Csr : public MatrixBase<T, Csr<T>> {
             transposed_};
   }
   bool is_shared() const { return is_shared_; }
-  bool operator_is_finite() const { return std::isfinite(largest_magnitude(values_, stored_)); }
+  /// As Dense has them.
+  T magnitude() const { return largest_magnitude(values_, stored_); }
+  bool operator_is_finite() const { return std::isfinite(magnitude()); }
+  Csr scaled(T factor, std::vector<T>& memory) const {
+    memory.resize(static_cast<size_t>(stored_));
+    std::transform(values_, values_ + stored_, memory.begin(), [factor](T a) { return factor * a; });
+    return {crow_, col_, memory.data(), n_, stored_, true, transposed_};
+  }
   T diagonal(int64_t i) const { return diagonal_[i]; }
   void apply(const T* v, T* out) const {
     std::fill(out, out + n_, T(0));

@@ -8,6 +8,8 @@ namespace prdp {
 template <class Space>
 class ConjugateGradientMethod {
  public:
+  static constexpr bool kHasRecursiveResidual = true;
+
   explicit ConjugateGradientMethod(Space& space)
       : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()) {}
 
@@ -28,9 +30,7 @@ class ConjugateGradientMethod {
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
-    rr_ = space_.residual(x, r_);
-    space_.copy(r_, p_);  // and start anew along the true residual
-    space_.assign(rr_, pp_);
+    go_on_from(space_.residual(x, r_));
     return rr_;
   }
 
@@ -41,6 +41,13 @@ class ConjugateGradientMethod {
   typename Space::Vector x;
 
  protected:
+  /// Starts anew along the true residual, which is in r.
+  void go_on_from(const typename Space::Scalar& rr) {
+    rr_ = rr;
+    space_.copy(r_, p_);
+    space_.assign(rr_, pp_);
+  }
+
   Space& space_;
   typename Space::Vector r_, p_, q_;  // residual; search direction; A p
   typename Space::Scalar rr_{}, pp_{}, alpha_{}, beta_{};

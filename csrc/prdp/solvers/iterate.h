@@ -65,6 +65,13 @@ inline constexpr bool kLeastResidual = requires(const Method& m) { m.exhausted()
 template <class Method>
 inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n); };
 
+/// Methods that update their residual by a recursion, and go on from the true one once it is recomputed.
+template <class Method>
+inline constexpr bool kHasRecursiveResidual = requires { Method::kHasRecursiveResidual; };
+
+/// Whether a residual asks to be confirmed by the true one.
+inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
+
 /// The iterates have run away: the last one is of no use.
 inline bool lost(const SampleState& s) {
   return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
@@ -80,7 +87,7 @@ inline bool parted_ways(const SampleState& s, double rtol) {
 inline void judge(SampleState& s, double rtol) {
   if (!std::isfinite(s.residual2)) return s.stop(SolveStatus::kOverflow);
   if (s.residual2 > kDivergenceBound * kDivergenceBound * s.b2) return s.stop(SolveStatus::kDiverged);
-  if (s.residual2 <= rtol * rtol * s.b2) s.stop(SolveStatus::kConverged);
+  if (is_within(s.residual2, rtol, s.b2)) s.stop(SolveStatus::kConverged);
 }
 
 /// A method of least residuals that no longer moves: a breakdown where its space is exhausted, and
@@ -249,21 +256,24 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
 }  // namespace detail
 
 /// Solves every sample that `states` holds active, from zero; the result is method.x. A sample that
-/// overflows or diverges is run again for as many iterations as gave its smallest residual.
+/// overflows or diverges is run again for as many iterations as gave its smallest residual, unless the
+/// iterations are wanted as they come.
 template <class Space, class Method>
-void iterate(Space& space, Method& method, typename Space::States& states, double rtol) {
+void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   using namespace detail;
   const bool track = rtol > 0.0;
   const auto caps = space.map(states, [](const SampleState& s) { return s.cap; });
   run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
+  if (!guarded) return;
   const auto again = space.map(states, [&](const SampleState& s) {
     return lost(s) || (!track && s.status == SolveStatus::kBreakdown);
   });
   if (std::find(again.begin(), again.end(), true) == again.end()) return;
 
   // The cold path. Where no residual was looked at, a watched pass finds the best iterate, or the
-  // iteration that broke down; then that iterate is remade. The other samples keep what they have.
+  // iteration that broke down; then that iterate is remade, by the same steps: a method that went on from
+  // its true residual does so again. The other samples keep what they have.
   const auto first = states;
   const auto kept = method.x;
   if (!track) {
@@ -277,7 +287,7 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
     states[i].restart(again[i] ? wanted : 0);
   }
   space.restart();
-  run(space, method, states, 0.0, /*track=*/false);
+  run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
   for (size_t i = 0; i < states.size(); ++i) {
     if (again[i]) states[i].status = first[i].status;

@@ -19,6 +19,7 @@ struct SampleBatch {
   double rtol;
   int64_t restart;
   const int64_t* caps;
+  bool guarded;
   const T* b;
   T* u;
   int64_t* iterations;
@@ -69,16 +70,16 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
     const T whole = std::sqrt(norm2(scaled));
     consistent = kernel.inconsistency(scaled) <= consistency_bound<T>(batch.rtol) * whole;
     kernel.project(scaled);
-    if (norm2(scaled) <= std::numeric_limits<T>::epsilon() * whole)
+    if (std::sqrt(norm2(scaled)) <= std::numeric_limits<T>::epsilon() * whole)
       return hand_out_zeros(SolveStatus::kInconsistent, 1.0);
   }
   space.begin(state);
   state.b2 = space.b2();
-  iterate(space, method, states, batch.rtol);
+  iterate(space, method, states, batch.rtol, batch.guarded);
   if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(method.x);
   kernel.store(method.x, T(1) / scale, u);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
-  if (!kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
+  if (batch.guarded && !kernels::all_finite(u, n)) {  // u leaves the range of the dtype only when scaled back
     hand_out_zeros(SolveStatus::kOverflow, 1.0);
   } else {
     finish(state.status, state.iterations, std::sqrt(state.residual2 / state.b2));

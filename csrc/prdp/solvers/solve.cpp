@@ -31,6 +31,7 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              request.rtol,
                              request.restart,
                              caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
+                             request.guarded,
                              rhs.const_data_ptr<T>(),
                              result.u.mutable_data_ptr<T>(),
                              result.info.iterations.mutable_data_ptr<int64_t>(),

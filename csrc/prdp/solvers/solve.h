@@ -10,13 +10,15 @@ struct SolveResult {
   SolveInfo info;
 };
 
-/// A solve without derivatives. `caps` (int64, (batch,)) gives each sample its own max_iter.
+/// A solve without derivatives. `caps` (int64, (batch,)) gives each sample its own max_iter. Not guarded, u
+/// is what the iterations make of b, however large: no better iterate and no zeros in its place.
 struct SolveRequest {
   Method method;
   int64_t max_iter;
   double rtol;
   int64_t restart;
   std::optional<at::Tensor> caps{};
+  bool guarded = true;
 };
 
 /// A u = b by the CPU loops, or by plain tensor operations where there are none for the operator or
@@ -30,8 +32,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 /// over costs more than it saves. A cycle of GMRES counts as its products.
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart);
 
-/// u after exactly `caps` iterations of each sample, recorded by autograd where b or the tensors of
-/// `a` require it: the map whose derivative the unrolled mode takes.
+/// u after exactly `caps` iterations of each sample, as `solver` took them on the way to its rtol, recorded
+/// by autograd where b or the tensors of `a` require it: the map whose derivative the unrolled mode takes.
 struct RecordedSolve {
   at::Tensor u, operator_applications;
 };

@@ -83,6 +83,29 @@ std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& proje
   return std::vector<bool>(rows, rows + found.numel());
 }
 
+/// One more iteration of the samples whose cap is beyond the `done` that they have taken, as iterate() takes
+/// it: a method whose own residual claimed convergence before, in vain, goes on from the true one.
+template <class M>
+void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& states, double rtol, int64_t done) {
+  const auto wanted = [&](const SampleState& s) { return done < s.cap; };
+  if constexpr (detail::kHasRecursiveResidual<M>) {
+    const auto residual2 = space.lanes(method.residual2());
+    for (size_t i = 0; i < states.size(); ++i) {
+      auto& s = states[i];
+      s.claims = rtol > 0.0 && done > 0 && wanted(s) && detail::is_within(residual2[i], rtol, s.b2);
+    }
+    const auto claims = [](const SampleState& s) { return s.claims; };
+    if (std::any_of(states.begin(), states.end(), claims)) {
+      space.freeze_unless(states, claims);
+      method.recompute_residual();
+    }
+  }
+  space.freeze_unless(states, wanted);
+  if constexpr (detail::kTakesStrides<M>) method.step(1);
+  else method.step();
+  if constexpr (detail::kLeastResidual<M>) method.residual2();
+}
+
 }  // namespace
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
@@ -111,12 +134,13 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
 
   auto u = with_method(request.method, request.restart, space, [&](auto method) {
-    iterate(space, method, states, request.rtol);
+    iterate(space, method, states, request.rtol, request.guarded);
     return a.project(method.x);
   });
   for (size_t i = 0; i < states.size(); ++i)
     if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
   u = at::where(per_sample(takes_part.to(b.device()), b), u / scale, at::zeros_like(b));
+  if (!request.guarded) return {u.contiguous(), info_of(states, b.options())};
   const auto finite = u.isfinite().flatten(1).all(1);
   u = at::where(per_sample(finite, b), u, at::zeros_like(u));
   const auto finite_rows = finite.to(at::kCPU);
@@ -144,12 +168,19 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solve
     }
   }
   const auto host_caps = caps.to(at::kCPU).contiguous();
+  const int64_t most = *std::max_element(host_caps.const_data_ptr<int64_t>(),
+                                         host_caps.const_data_ptr<int64_t>() + host_caps.numel());
   std::vector<SampleState> states(b.size(0));
-  for (size_t i = 0; i < states.size(); ++i) states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   TensorSpace space(a, a.project(rhs), states, /*recording=*/true);
+  const auto b2 = space.lanes(space.b2());
+  for (size_t i = 0; i < states.size(); ++i) {
+    states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
+    states[i].b2 = b2[i];
+  }
   const auto u = with_method(solver.method, solver.restart, space, [&](auto m) {
-    detail::run(space, m, states, 0.0, /*track=*/false);
+    m.start();
+    for (int64_t done = 0; done < most; ++done) iterate_again(space, m, states, solver.rtol, done);
     return a.project(m.x) / scale;
   });
   return {u, info_of(states, b.options()).operator_applications.to(caps.device())};
@@ -168,6 +199,11 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b,
                                          int64_t done) {
   std::vector<SampleState> states(caps_.size());
   TensorSpace space(a, a.project(b * scale_), states, /*recording=*/true);
+  const auto b2 = space.lanes(space.b2());
+  for (size_t i = 0; i < states.size(); ++i) {
+    states[i].cap = caps_[i];
+    states[i].b2 = b2[i];
+  }
   State after;
   with_method(solver_.method, solver_.restart, space, [&](auto method) {
     method.start();
@@ -177,11 +213,7 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b,
       std::apply([&](auto&... part) { ((part = before[next++]), ...); }, state);
       method.resume(done);
     }
-    for (size_t i = 0; i < states.size(); ++i) states[i].active = done < caps_[i];
-    space.freeze_unless(states, [](const SampleState& s) { return s.active; });
-    if constexpr (detail::kTakesStrides<decltype(method)>) method.step(1);
-    else method.step();
-    if constexpr (detail::kLeastResidual<decltype(method)>) method.residual2();
+    iterate_again(space, method, states, solver_.rtol, done);
     std::apply([&](const auto&... part) { (after.push_back(part), ...); }, state);
     return 0;
   });

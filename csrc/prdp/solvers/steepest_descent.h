@@ -8,6 +8,8 @@ namespace prdp {
 template <class Space>
 class SteepestDescentMethod {
  public:
+  static constexpr bool kHasRecursiveResidual = true;
+
   explicit SteepestDescentMethod(Space& space)
       : x(space.vector()), space_(space), r_(space.vector()), q_(space.vector()) {}
 
@@ -22,7 +24,11 @@ class SteepestDescentMethod {
     rr_ = space_.descend(alpha_, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
-  auto recompute_residual() { return rr_ = space_.residual(x, r_); }
+  auto recompute_residual() {
+    go_on_from(space_.residual(x, r_));
+    return rr_;
+  }
+
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, rr_); }
@@ -31,6 +37,9 @@ class SteepestDescentMethod {
   typename Space::Vector x;
 
  protected:
+  /// From the true residual, which is in r.
+  void go_on_from(const typename Space::Scalar& rr) { rr_ = rr; }
+
   Space& space_;
   typename Space::Vector r_, q_;  // residual; A r
   typename Space::Scalar rr_{}, alpha_{};

@@ -30,15 +30,16 @@ constexpr const char* kSolvesSchema =
     "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> "
     "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 constexpr const char* kVjpSchema =
-    "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, int[] needed, "
-    "Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
+    "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
+    "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
     ") -> Tensor[]";
 
 using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
                                             at::IntArrayRef, at::ArrayRef<double>, int64_t, c10::SymInt)>;
 using OptionalTensor = std::optional<at::Tensor>;
 using VjpSignature = WithOptions<std::vector<at::Tensor>(
-    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, at::IntArrayRef,
+    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
+    const OptionalTensor&, at::IntArrayRef,
     at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
 Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
@@ -107,13 +108,13 @@ Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_vie
 template <class... Options>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
-                                   at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind,
+                                   const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind,
                                    at::IntArrayRef shape, at::ArrayRef<double> parameters,
                                    int64_t picard_steps, Options... flat) {
   const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
-                  status.value_or(at::Tensor())};
+                  status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
   const auto found =
       vjp_of_solves(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
@@ -128,7 +129,8 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
 
 template <class... Options>
 std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
-                                 const OptionalTensor&, at::IntArrayRef needed, at::TensorList tensors,
+                                 const OptionalTensor&, const OptionalTensor&, at::IntArrayRef needed,
+                                 at::TensorList tensors,
                                  c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t,
                                  Options...) {
   std::vector<at::Tensor> gradients;
@@ -161,7 +163,8 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     const bool a_varies = is_flow(call->equation) || any_requires_grad(tensors);
     const bool may_have_failed = options.on_failure != OnFailure::kRaise;
     variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
-                        unrolled || may_have_failed ? status : at::Tensor()};
+                        unrolled || may_have_failed ? status : at::Tensor(),
+                        unrolled ? residual : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(saved);
     call->equation.tensors.clear();  // they are among the saved ones
@@ -173,13 +176,13 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     const auto saved = ctx->get_saved_variables();
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
     auto equation = call->equation;
-    equation.tensors.assign(saved.begin() + 3, saved.end());
+    equation.tensors.assign(saved.begin() + 4, saved.end());
     const size_t inputs = equation.tensors.size() + 1;
     variable_list out(inputs + 1);  // u, the tensors, and the call, which has no gradient
     if (!grads[0].defined()) return out;
     std::vector<int64_t> needed(inputs);
     for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
-    const KeptSolves kept{saved[0], saved[1], saved[2]};
+    const KeptSolves kept{saved[0], saved[1], saved[2], saved[3]};
     const auto gradients = [&](const at::Tensor& cotangent) {
       return vjp(cotangent, kept, equation, call->options, needed);
     };
@@ -202,7 +205,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
                                .typed<VjpSignature>();
     const auto found = call_with_options(
         op, options, cotangent, optional(kept.solutions), optional(kept.iterations), optional(kept.status),
-        needed, at::TensorList(equation.tensors), c10::string_view(equation.kind),
+        optional(kept.residual), needed, at::TensorList(equation.tensors), c10::string_view(equation.kind),
         at::IntArrayRef(equation.shape), at::ArrayRef<double>(equation.parameters), equation.picard_steps);
     variable_list gradients(needed.size());
     for (size_t i = 0, next = 0; i < needed.size(); ++i)

@@ -59,7 +59,8 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     const int64_t first = s - s % picard;
     const auto a = equation_operator(equation, at_solve(kept.solutions, s));
     Solved solved{
-        {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s)};
+        {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s),
+        at_solve(kept.residual, s)};
     if (options.backward == Backward::kUnrolled)
       solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
     std::vector<int64_t> wanted(needed.begin(), needed.end());

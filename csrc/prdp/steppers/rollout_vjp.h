@@ -20,7 +20,7 @@ class Reports {
 
 /// What the solves of a rollout keep for their derivative; undefined where it is not wanted.
 struct KeptSolves {
-  at::Tensor solutions, iterations, status;  // (batch, solves (+ 1), …)
+  at::Tensor solutions, iterations, status, residual;  // (batch, solves (+ 1), …)
 };
 
 /// The product of the cotangent (batch, solves + 1, channel, *shape) of all solutions of a rollout

@@ -1,0 +1,48 @@
+#include "prdp/autograd/rows.h"
+
+#include <algorithm>
+
+#include "prdp/kernels/vector.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+/// Calls body(values, count) with the tensor's numbers on the host, as float or double.
+template <class Body>
+auto with_numbers(const at::Tensor& t, const Body& body) {
+  auto host = t.detach().to(at::kCPU).contiguous();
+  if (host.scalar_type() == at::kFloat) return body(host.const_data_ptr<float>(), host.numel());
+  host = host.to(at::kDouble);
+  return body(host.const_data_ptr<double>(), host.numel());
+}
+
+}  // namespace
+
+at::Tensor only(const at::Tensor& t, const Rows& rows) {
+  if (all(rows)) return t;
+  auto others = at::empty({static_cast<int64_t>(rows.size())}, at::kBool);
+  for (size_t i = 0; i < rows.size(); ++i) others.mutable_data_ptr<bool>()[i] = !rows[i];
+  return t.masked_fill(per_sample(others.to(t.device()), t), 0.0);
+}
+
+Rows finite_rows(const at::Tensor& t) {
+  return with_numbers(t, [&](const auto* values, int64_t count) {
+    Rows rows(t.size(0));
+    const int64_t each = count / std::max<int64_t>(t.size(0), 1);
+    for (size_t i = 0; i < rows.size(); ++i)
+      rows[i] = std::isfinite(kernels::largest_magnitude(values + static_cast<int64_t>(i) * each, each));
+    return rows;
+  });
+}
+
+bool all_finite(const std::vector<at::Tensor>& tensors) {
+  return std::all_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) {
+    return !t.defined() || with_numbers(t, [](const auto* values, int64_t count) {
+      return std::isfinite(kernels::largest_magnitude(values, count));
+    });
+  });
+}
+
+}  // namespace prdp
