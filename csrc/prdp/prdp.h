@@ -4,4 +4,5 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/stepper.h"
