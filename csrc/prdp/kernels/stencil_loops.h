@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/kernels/registers.h"
+#include "prdp/kernels/vector_loops.h"
 
 /// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and for the same reason
 /// all of internal linkage.
@@ -113,11 +113,16 @@ void for_each_register(const OffsetStencil<T>& a, const T* v, T* out, Body& shar
         from[k] = v + (plane * a.ny + line) * a.row + o[2];
       }
       T* const row = out + at;
-      for (int64_t i = 0; i < a.row; i += kWidth<T>) {
-        Register<T> sum = {};
-        for (int64_t k = 0; k < a.count; ++k) sum += load(w + k * a.row + i) * load(from[k] + i);
-        store(row + i, sum);
-      }
+      // Several sums at once, as each waits for its last addition.
+      for_each_block<4>(0, a.row / kWidth<T>, [&](int64_t first, auto size) {
+        Register<T> sums[size.value] = {};
+        for (int64_t k = 0; k < a.count; ++k)
+          for (int c = 0; c < size.value; ++c) {
+            const int64_t i = (first + c) * kWidth<T>;
+            sums[c] += load(w + k * a.row + i) * load(from[k] + i);
+          }
+        for (int c = 0; c < size.value; ++c) store(row + (first + c) * kWidth<T>, sums[c]);
+      });
       for (int64_t e = 0; e < a.wrap_count; ++e) {
         const auto& wrap = a.wraps[e];
         row[wrap.to] += wrap_values[e] * from[wrap.coefficient][wrap.from];

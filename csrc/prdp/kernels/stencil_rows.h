@@ -38,21 +38,21 @@ class StencilRows {
 
   void close() {
     for (int64_t r = 0; r < rows(); ++r) {
-      T* to = coupled(r);
+      T* const to = coupled(r);
       for (size_t e = 0; e < pattern_->wraps.size(); ++e)
         to[e] = coefficient(r, pattern_->wraps[e].coefficient)[pattern_->wraps[e].to];
       if (pattern_->nearest && coupled_) {
         to[0] = coefficient(r, 1)[0];
         to[kLanes<T> + (nx_ - 1) % kLanes<T>] = coefficient(r, 2)[nx_ - 1];
       }
-      for (int64_t k = 0; k < count_; ++k) {
-        const int64_t x = pattern_->offsets[k].along[2];
-        T* const row = coefficient(r, k);
-        std::fill(row, row + std::max<int64_t>(-x, 0), T(0));
-        std::fill(row + std::min(nx_, nx_ - x), row + nx_, T(0));
+      if (row_ > nx_) std::fill(coefficient(r, 0) + nx_, coefficient(r, 0) + row_, T(1));
+    }
+    for (int64_t k = 0; k < count_; ++k) {
+      const int64_t x = pattern_->offsets[k].along[2];
+      for (int64_t r = 0; r < rows() && x != 0; ++r) {
+        for (int64_t i = 0; i < -x; ++i) coefficient(r, k)[i] = T(0);
+        for (int64_t i = nx_ - x; i < nx_; ++i) coefficient(r, k)[i] = T(0);
       }
-      T* const centre = coefficient(r, 0);
-      std::fill(centre + nx_, centre + row_, T(1));
     }
   }
 
@@ -104,12 +104,12 @@ class StencilRows {
         const auto& o = pattern_->offsets[k].along;
         const int64_t z = neighbour(r / ny, o[0], nz, periodic[0]), y = neighbour(r % ny, o[1], ny, periodic[1]);
         if (z < 0 || y < 0) continue;
-        for (int64_t i = 0; i < nx; ++i) {
-          const int64_t x = neighbour(i, o[2], nx, periodic[2]);
-          if (x < 0) continue;
-          const T value = x == i + o[2] ? coefficient(r, k)[i] : wrapped(r, k, i);
-          body(r * nx + i, (z * ny + y) * nx + x, value);
-        }
+        const int64_t begin = std::max<int64_t>(-o[2], 0), end = std::min(nx, nx - o[2]);
+        const int64_t at = r * nx, there = (z * ny + y) * nx;
+        for (int64_t i = begin; i < end; ++i) body(at + i, there + i + o[2], coefficient(r, k)[i]);
+        if (!periodic[2]) continue;
+        for (int64_t i = 0; i < begin; ++i) body(at + i, there + i + o[2] + nx, wrapped(r, k, i));
+        for (int64_t i = end; i < nx; ++i) body(at + i, there + i + o[2] - nx, wrapped(r, k, i));
       }
   }
 
