@@ -28,15 +28,15 @@ CASES = [((n,), NEAREST[1], b) for n in (1, 2, 3, 7, 17, 33) for b in ("zero", "
 CASES += [((n,), FAR_1D, b) for n in (1, 2, 3, 4, 5, 18) for b in ("zero", "periodic")]
 CASES += [
     (shape, offsets, b)
-    for shape in ((1, 1), (2, 3), (3, 2), (5, 17), (16, 4))
+    for shape in ((1, 1), (3, 2), (5, 17))
     for offsets in (NEAREST[2], NINE, FAR_2D, ONE_SIDED)
-    for b in ("zero", "periodic", ("zero", "periodic"), ("periodic", "zero"))
+    for b in ("zero", "periodic", ("periodic", "zero"))
 ]
 CASES += [
     (shape, offsets, b)
-    for shape in ((1, 2, 3), (3, 1, 2), (3, 4, 5))
+    for shape in ((1, 2, 3), (3, 4, 5))
     for offsets in (NEAREST[3], FAR_3D)
-    for b in ("zero", "periodic", ("periodic", "zero", "zero"), ("zero", "periodic", "periodic"))
+    for b in ("zero", "periodic", ("zero", "periodic", "periodic"))
 ]
 cases = pytest.mark.parametrize("shape, offsets, boundary", CASES)
 
