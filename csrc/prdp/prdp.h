@@ -5,4 +5,5 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/stepper.h"

@@ -32,7 +32,7 @@ struct Curves {
   std::vector<int64_t> budget;      // K times the solves, the paper's count
   std::vector<double> iterations, operator_applications;  // per sample of a batch, summed over updates
   std::vector<double> seconds;
-  std::string diverged;  // where and why a training was lost; the metric is NaN from there on
+  std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
 };
 
 /// Calls f(name, values) for each of them that has an entry for every interval or update.

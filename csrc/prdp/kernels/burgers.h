@@ -21,7 +21,8 @@ Stencil<T> burgers(const UpwindParameters<T>& parameters, int64_t dim) {
       scratch[p.nx + 1] = w[0];
       return {scratch, scratch + 1, scratch + 2};
     };
-    return upwind_rows<T>(pattern, {1.0, p.dt, p.nu * p.dt, p.transposed}, winds);
+    const UpwindTerms terms{1.0, p.dt, p.nu * p.dt, p.transposed, p.length_y, p.length_x};
+    return upwind_rows<T>(pattern, terms, winds);
   };
   return {pattern->grid, dim, parameters.is_shared(), assemble};
 }

@@ -18,11 +18,11 @@ class NavierStokes : public FieldRows<T> {
 
  public:
   explicit NavierStokes(const UpwindParameters<T>& p)
-      : Base(3, p.ny, p.nx), parameters_(p), inverse_dx_(inverse_spacing(p.nx, p.transposed)),
-        inverse_dy_(inverse_spacing(p.ny, p.transposed)) {
+      : Base(3, p.ny, p.nx), parameters_(p), inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
+        inverse_dy_(inverse_spacing(p.ny, p.length_y, p.transposed)) {
     if (!is_shared() || !p.is_finite(2)) return;
     const auto pattern = p.pattern(2);
-    const UpwindTerms terms{1.0 / p.dt, 1.0, p.nu, p.transposed};
+    const UpwindTerms terms{1.0 / p.dt, 1.0, p.nu, p.transposed, p.length_y, p.length_x};
     const auto u1 = [&p](int64_t j) { return p.winds + (j + p.ny) % p.ny * p.nx; };
     const auto u2 = [&](int64_t j) { return u1(j) + p.ny * p.nx; };
     const auto at_point = [](const T* wind) { return WindRow<T>{wind, wind, wind}; };
@@ -96,8 +96,9 @@ class NavierStokes : public FieldRows<T> {
   int64_t ny() const { return parameters_.ny; }
 
   /// Along an axis of one point all differences vanish.
-  static T inverse_spacing(int64_t n, bool transposed) {
-    return n == 1 ? T(0) : static_cast<T>(transposed ? -n : n);
+  static T inverse_spacing(int64_t n, double length, bool transposed) {
+    const double inverse = static_cast<double>(n) / length;
+    return n == 1 ? T(0) : static_cast<T>(transposed ? -inverse : inverse);
   }
   /// From sums over two rows to means over four points.
   const T* finish_mean(T* sum) const {

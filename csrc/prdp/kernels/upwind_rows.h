@@ -6,7 +6,7 @@
 namespace prdp::kernels {
 
 /// An operator that depends on a velocity field, as plain arrays: the winds (batch, channel, ny, nx) on
-/// a periodic grid of the unit domain; ny = 1 in one dimension.
+/// a periodic grid; ny = 1 in one dimension.
 template <class T>
 struct UpwindParameters {
   const T* winds;
@@ -14,6 +14,7 @@ struct UpwindParameters {
   int64_t ny, nx;
   double nu, dt;
   bool transposed;
+  double length_y = 1.0, length_x = 1.0;  // of the domain
 
   bool is_shared() const { return sample_stride == 0; }
   UpwindParameters sample(int64_t s) const {
@@ -43,6 +44,7 @@ struct WindRow {
 struct UpwindTerms {
   double shift, advection, diffusion;
   bool transposed;
+  double length_y = 1.0, length_x = 1.0;
 };
 
 /// Its coefficients on a periodic grid: upwind differences Γ = Σ diag(max(w⁻, 0)) B + diag(min(w⁺, 0)) F and
@@ -56,26 +58,27 @@ StencilRows<T> upwind_rows(std::shared_ptr<const StencilPattern> pattern, const 
   const int64_t ny = a.grid().shape[1], nx = a.grid().shape[2];
   std::vector<T> scratch(3 * nx + 2);
   T *const lower = scratch.data(), *const upper = lower + nx, *const winds_memory = upper + nx;
+  const double inverse_dx = static_cast<double>(nx) / terms.length_x;
+  const double inverse_dy = static_cast<double>(ny) / terms.length_y;
   for (int64_t j = 0; j < ny; ++j) {
-    const auto couple = [&](int axis, int64_t n, T* below, T* above) {
+    const auto couple = [&](int axis, double per_cell, T* below, T* above) {
       const WindRow<T> w = winds(axis, j, winds_memory);
-      const double inverse_dx = static_cast<double>(n);
-      loops.upwind_row(static_cast<T>(terms.advection * inverse_dx),
-                       static_cast<T>(terms.diffusion * inverse_dx * inverse_dx), w.before, w.here, w.after,
+      loops.upwind_row(static_cast<T>(terms.advection * per_cell),
+                       static_cast<T>(terms.diffusion * per_cell * per_cell), w.before, w.here, w.after,
                        below, above, a.coefficient(j, 0), nx);
     };
     std::fill_n(a.coefficient(j, 0), nx, static_cast<T>(terms.shift));
     // What couples a point to its neighbour belongs to the neighbour in the transpose.
-    if (nx > 1 && !terms.transposed) couple(0, nx, a.coefficient(j, 1), a.coefficient(j, 2));
+    if (nx > 1 && !terms.transposed) couple(0, inverse_dx, a.coefficient(j, 1), a.coefficient(j, 2));
     if (nx > 1 && terms.transposed) {
-      couple(0, nx, lower, upper);
+      couple(0, inverse_dx, lower, upper);
       std::rotate_copy(upper, upper + nx - 1, upper + nx, a.coefficient(j, 1));
       std::rotate_copy(lower, lower + 1, lower + nx, a.coefficient(j, 2));
     }
     if (ny == 1) continue;
     const int64_t below = j > 0 ? j - 1 : ny - 1, above = j + 1 < ny ? j + 1 : 0;
-    if (terms.transposed) couple(1, ny, a.coefficient(below, 4), a.coefficient(above, 3));
-    else couple(1, ny, a.coefficient(j, 3), a.coefficient(j, 4));
+    if (terms.transposed) couple(1, inverse_dy, a.coefficient(below, 4), a.coefficient(above, 3));
+    else couple(1, inverse_dy, a.coefficient(j, 3), a.coefficient(j, 4));
   }
   a.close();
   return a;

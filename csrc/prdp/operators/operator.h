@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <memory>
 #include <string>
 #include <variant>
@@ -15,7 +16,7 @@ namespace prdp {
 struct OperatorSpec {
   std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr"
   std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
-  std::vector<double> parameters;    // plain numbers that carry no gradient, such as dt
+  std::vector<double> parameters;    // plain numbers without gradient, such as dt and the lengths
   std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
   bool transposed = false;
 };
@@ -39,6 +40,7 @@ struct BurgersParameters {
   at::Tensor winds;
   double nu, dt;
   bool transposed = false;
+  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
 /// The velocity (batch or 1, 2 or more, Ny, Nx), contiguous, about which the Navier–Stokes equations
@@ -47,6 +49,7 @@ struct NavierStokesParameters {
   at::Tensor velocity;
   double nu, dt;
   bool transposed = false;
+  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
 /// The coefficients (batch or 1, k, *shape), contiguous, of a stencil with k offsets on each of the channels.
