@@ -4,5 +4,6 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/stepper.h"

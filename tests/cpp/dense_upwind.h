@@ -4,7 +4,7 @@
 #include <random>
 #include <vector>
 
-#include "prdp/kernels/upwind_stencil.h"
+#include "prdp/kernels/upwind_rows.h"
 
 /// The upwind operators as dense matrices, made from their definitions in plain loops.
 namespace prdp_test {

@@ -1,8 +1,9 @@
 #include <gtest/gtest.h>
 
-#include "dense_upwind.h"
 #include "helpers.h"
-#include "prdp/kernels/upwind_factors.h"
+#include "kernel_harness.h"
+#include "prdp/kernels/burgers.h"
+#include "prdp/kernels/navier_stokes_factors.h"
 #include "prdp/solvers/solve_cpu.h"
 
 /// The kernels of the upwind operators against dense matrices made from their definitions.
@@ -14,120 +15,20 @@ using namespace prdp_test;
 const std::vector<Shape> kLines{{1, 1}, {1, 2}, {1, 3}, {1, 7}, {1, 16}, {1, 17}, {1, 33}};
 const std::vector<Shape> kPlanes{{1, 1}, {2, 2}, {1, 4}, {4, 1}, {2, 16}, {3, 5}, {17, 9}, {5, 16}};
 
-/// A kernel's operations on plain vectors, in padded memory as the solvers use it.
-template <class Kernel>
-class Harness {
- public:
-  using T = typename Kernel::Scalar;
-
-  explicit Harness(const Kernel& kernel) : kernel_(kernel) {
-    workspace_.prepare(3, kernel.length(), kernel.halo());
-  }
-  T* vector(int64_t index) { return workspace_.vector(index); }
-  void load(const std::vector<T>& v, int64_t index) { kernel_.load(v.data(), T(1), vector(index)); }
-  std::vector<T> store(int64_t index) {
-    std::vector<T> values(kernel_.unknowns());
-    kernel_.store(vector(index), T(1), values.data());
-    return values;
-  }
-  std::vector<T> apply(const std::vector<T>& v) {
-    load(v, 0);
-    kernel_.apply(vector(0), vector(1));
-    return store(1);
-  }
-  /// Nothing but the unknowns is other than zero.
-  void expect_clean_padding(int64_t index) {
-    const Vector inside = as_vector(store(index));
-    double all = 0;
-    for (int64_t i = -kernel_.halo(); i < kernel_.length() + kernel_.halo(); ++i)
-      all += vector(index)[i] != T(0);
-    EXPECT_EQ(static_cast<double>((inside.array() != 0).count()), all);
-  }
-
- private:
-  const Kernel& kernel_;
-  Workspace<T> workspace_;
-};
-
-template <class T>
-constexpr double kTolerance = sizeof(T) == 4 ? 1e-6 : 1e-14;
-
-template <class Kernel>
-void expect_matrix(const Kernel& kernel, const Matrix& a) {
-  using T = typename Kernel::Scalar;
-  ASSERT_EQ(kernel.unknowns(), a.rows());
-  Harness<Kernel> harness(kernel);
-  const auto v = random_values<T>(kernel.unknowns(), 11);
-  const double norm = a.cwiseAbs().rowwise().sum().maxCoeff();
-  EXPECT_LT((as_vector(harness.apply(v)) - a * as_vector(v)).cwiseAbs().maxCoeff(), 8 * kTolerance<T> * norm);
-  harness.expect_clean_padding(1);
-  EXPECT_NEAR(kernel.norm(), norm, 8 * kTolerance<T> * norm);
-  EXPECT_EQ(kernel.has_zero_diagonal(), (a.diagonal().array() == 0.0).any());
-
-  Matrix entries = Matrix::Zero(a.rows(), a.cols());
-  const int64_t block = std::is_same_v<Kernel, Burgers<T, 2>> ? a.rows() / 2 : a.rows();
-  kernel.for_each_entry([&](int64_t i, int64_t j, T value) { entries(i, j) += static_cast<double>(value); });
-  EXPECT_LT((entries - a).topLeftCorner(block, block).cwiseAbs().maxCoeff(), 8 * kTolerance<T> * norm);
-}
-
-template <class Kernel>
-void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
-  using T = typename Kernel::Scalar;
-  Harness<Kernel> harness(kernel);
-  const auto b = random_values<T>(kernel.unknowns(), 2), x = random_values<T>(kernel.unknowns(), 3);
-  harness.load(b, 2);
-  kernel.divide_by_diagonal(harness.vector(2), harness.vector(0));
-  harness.load(x, 1);
-  const T squared =
-      kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2));
-  const Vector residual = as_vector(b) - a * as_vector(x);
-  const Vector next = as_vector(x) + residual.cwiseQuotient(a.diagonal());
-  const double scale = 30 * kTolerance<T>;
-  EXPECT_LT((as_vector(harness.store(2)) - next).norm(), scale * (1 + next.norm()));
-  EXPECT_NEAR(static_cast<double>(squared), residual.squaredNorm(), scale * a.squaredNorm());
-  harness.expect_clean_padding(0);
-  harness.expect_clean_padding(2);
-}
-
-/// `expected`: what the factors must give for the right-hand side of as many random values.
-template <class Kernel>
-void expect_solution(const Kernel& kernel, const std::function<Vector(const Vector&)>& expected) {
-  using T = typename Kernel::Scalar;
-  const typename FactorsOf<Kernel>::Type factors(kernel);
-  Harness<Kernel> harness(kernel);
-  for (const unsigned seed : {21u, 22u}) {
-    const auto r = random_values<T>(kernel.unknowns(), seed);
-    harness.load(r, 0);
-    ASSERT_TRUE(factors.solve(harness.vector(0), harness.vector(1)));
-    const Vector x = expected(as_vector(r));
-    EXPECT_LT((as_vector(harness.store(1)) - x).norm(), 1e3 * kTolerance<T> * (1 + x.norm()));
-    harness.expect_clean_padding(1);
-  }
-}
-
-template <class Kernel, class T = typename Kernel::Scalar>
-void expect_adjoint(const Kernel& a, const Kernel& transpose) {
-  Harness<Kernel> forward(a), backward(transpose);
-  const auto x = random_values<T>(a.unknowns(), 7), y = random_values<T>(a.unknowns(), 8);
-  const Vector ax = as_vector(forward.apply(x)), aty = as_vector(backward.apply(y));
-  const double scale = ax.norm() * as_vector(y).norm() + aty.norm() * as_vector(x).norm();
-  EXPECT_NEAR(ax.dot(as_vector(y)), aty.dot(as_vector(x)), 4 * kTolerance<T> * scale);
-}
-
 template <class T, int Dim>
 void expect_burgers(Shape shape) {
   SCOPED_TRACE(testing::Message() << shape.ny << " x " << shape.nx << ", " << sizeof(T) << " bytes");
   const auto flow = random_flow<T>(shape);
   const Matrix a = dense_burgers<T, Dim>(flow);
   for (const bool transposed : {false, true}) {
-    const Burgers<T, Dim> kernel(flow.parameters(transposed));
+    const auto kernel = burgers<T>(flow.parameters(transposed), Dim);
     const Matrix applied = transposed ? Matrix(a.transpose()) : a;
     expect_matrix(kernel, applied);
     expect_jacobi_sweep(kernel, applied);
     const auto lu = applied.partialPivLu();
     expect_solution(kernel, [&](const Vector& r) -> Vector { return lu.solve(r); });
   }
-  expect_adjoint(Burgers<T, Dim>(flow.parameters(false)), Burgers<T, Dim>(flow.parameters(true)));
+  expect_adjoint(burgers<T>(flow.parameters(false), Dim), burgers<T>(flow.parameters(true), Dim));
 }
 
 template <class T>
@@ -203,11 +104,11 @@ TEST(UpwindKernels, WindsThatAreNotFiniteAreSeen) {
   for (const double bad : {std::nan(""), -HUGE_VAL}) {
     auto flow = random_flow<double>({3, 5});
     flow.values[29] = bad;
-    const Burgers<double, 2> burgers(flow.parameters(false));
+    const auto step = burgers<double>(flow.parameters(false), 2);
     const NavierStokes<double> flow_kernel(flow.parameters(true));
-    EXPECT_FALSE(burgers.operator_is_finite());
+    EXPECT_FALSE(step.operator_is_finite());
     EXPECT_FALSE(flow_kernel.operator_is_finite());
-    EXPECT_FALSE(std::isfinite(burgers.norm()));
+    EXPECT_FALSE(std::isfinite(step.norm()));
     EXPECT_FALSE(std::isfinite(flow_kernel.norm()));
   }
 }
@@ -232,10 +133,10 @@ TEST(UpwindKernels, ABatchIsSolvedWithItsOwnOrWithSharedWinds) {
       const auto b = prdp_test::random_field({3, 3, 5}, 2).squeeze(1).to(at::kFloat).contiguous();
       const auto flat = b.narrow(1, 0, 2).contiguous();
       const auto pairs = w.narrow(1, 0, 2).contiguous();
-      const prdp::BurgersParameters burgers{pairs, kNu, kDt, transposed};
+      const prdp::BurgersParameters advection{pairs, kNu, kDt, transposed};
       const prdp::NavierStokesParameters flow{w, kNu, kDt, transposed};
-      const auto direct = solve_batch<float>(burgers, flat, prdp::Method::kDirect);
-      const auto jacobi = solve_batch<float>(burgers, flat, prdp::Method::kJacobi);
+      const auto direct = solve_batch<float>(advection, flat, prdp::Method::kDirect);
+      const auto jacobi = solve_batch<float>(advection, flat, prdp::Method::kJacobi);
       const auto step = solve_batch<float>(flow, b, prdp::Method::kDirect);
       EXPECT_LT((direct - jacobi).abs().max().item<float>(), 1e-4);
       for (int64_t s = 0; s < 2; ++s) {

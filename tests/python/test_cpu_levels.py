@@ -9,6 +9,15 @@ import torch
 from helpers import SOLVERS, field
 
 import prdp_torch as prdp
+from prdp_torch import operators
+
+STENCILS = [
+    ((33,), [(0,), (-1,), (1,)]),
+    ((17,), [(0,), (-2,), (1,), (2,)]),
+    ((5, 18), [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]),
+    ((6, 30), [(0, 0), (2, -1), (-1, 2), (0, 1)]),
+    ((3, 4, 17), [(0, 0, 0), (0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)]),
+]
 
 SOLVE_ALL = """
 import sys; sys.path.insert(0, {folder!r})
@@ -27,6 +36,13 @@ def solve_all():
             for solver in [*SOLVERS, prdp.Chebyshev]:
                 u = prdp.Heat(shape, 1e-3, 1.0, solver=solver(7, rtol=0.0))(field(shape, dtype=dtype))
                 results[str((dtype, shape, solver.__name__))] = u
+        for shape, offsets in STENCILS:
+            c = field(shape, dtype=dtype, channels=len(offsets))
+            c[:, 0] = c.abs().sum(1) + 1
+            a = operators.Stencil(c, offsets, "periodic")
+            for solver in (prdp.Jacobi(7, rtol=0.0), prdp.GMRES(2, rtol=0.0, restart=4)):
+                u = prdp.linear_solve(a, field(shape, dtype=dtype, channels=2), solver)[0]
+                results[str((dtype, shape, len(offsets), solver.method))] = u
         m = torch.eye(19, dtype=dtype) * 3 + 0.1
         results[f"{dtype} matrix"] = prdp.linear_solve(m, field((19,), dtype=dtype)[:, 0], prdp.Jacobi(7))[0]
     return results

@@ -41,6 +41,32 @@ print(len(solvers), "solvers")
 """)
 
 
+def test_threads_do_not_change_a_bit_of_a_stencil_or_its_gradients():
+    assert "24 cases" in run("""
+solvers = [prdp.Jacobi(30, rtol=0), prdp.CG(30, rtol=0), prdp.GMRES(6, rtol=0, restart=5)]
+nearest, far = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], [(0, 0), (0, -2), (1, 1), (-1, 0), (2, 0)]
+cases = 0
+for solver in solvers:
+    for backward in ("implicit", "unrolled"):
+        for offsets in (nearest, far):
+            for batch in (1, 24):
+                c, b, g = torch.rand(batch, 5, 48, 33), torch.randn(24, 2, 48, 33), torch.randn(24, 2, 48, 33)
+                c[:, 0] += 5
+                results = []
+                for count in (1, 2, 3):
+                    leaves = [t.clone().requires_grad_() for t in (c, b)]
+                    def both():
+                        a = prdp.operators.Stencil(leaves[0], offsets, "periodic")
+                        u, _ = prdp.linear_solve(a, leaves[1], solver, backward=backward)
+                        return u.detach(), *torch.autograd.grad(u, leaves, g)
+                    results.append(with_threads(count, both)[0])
+                for other in results[1:]:
+                    assert all(map(torch.equal, other, results[0])), (solver, backward, offsets, batch)
+                cases += 1
+print(cases, "cases")
+""")
+
+
 def test_two_threads_share_a_batch():
     """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
     one, two = map(

@@ -8,11 +8,11 @@ namespace {
 constexpr int64_t kRows = 16;
 }
 
-ProductRows::ProductRows(std::unique_ptr<Operator> a, const at::TensorOptions& options) : a_(std::move(a)) {
-  auto shape = a_->vector_shape();
-  shape.insert(shape.begin(), kRows);
-  lambda_ = at::empty(shape, options);
-  v_ = at::empty(shape, options);
+ProductRows::ProductRows(std::unique_ptr<Operator> a, const at::Tensor& like) : a_(std::move(a)) {
+  auto shape = like.sizes().vec();
+  shape[0] = kRows;
+  lambda_ = at::empty(shape, like.options());
+  v_ = at::empty(shape, like.options());
 }
 
 void ProductRows::push() {

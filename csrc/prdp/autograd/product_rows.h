@@ -9,8 +9,8 @@ namespace prdp {
 /// at once whatever else happens: the sum does not depend on how the pairs come about.
 class ProductRows {
  public:
-  /// `a` is the operator of the sample, vectors are of `options`.
-  ProductRows(std::unique_ptr<Operator> a, const at::TensorOptions& options);
+  /// `a` is the operator of the sample, vectors are of the kind of `like`, a batch of them.
+  ProductRows(std::unique_ptr<Operator> a, const at::Tensor& like);
 
   /// Where the next pair is to be written, contiguous; push() takes it.
   template <class T>

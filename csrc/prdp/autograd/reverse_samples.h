@@ -206,6 +206,9 @@ void reverse_range(const BurgersParameters& a, const BurgersParameters& transpos
 template <class T>
 void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters& transpose,
                    const ReverseBatch<T>& batch, int64_t begin, int64_t end);
+template <class T>
+void reverse_range(const StencilParameters& a, const StencilParameters& transpose,
+                   const ReverseBatch<T>& batch, int64_t begin, int64_t end);
 
 namespace detail {
 

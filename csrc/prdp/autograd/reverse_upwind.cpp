@@ -1,13 +1,7 @@
 #include "prdp/autograd/reverse_samples.h"
-#include "prdp/kernels/upwind_factors.h"
+#include "prdp/kernels/navier_stokes_factors.h"
 
 namespace prdp {
-
-template <class T>
-void reverse_range(const BurgersParameters& a, const BurgersParameters& transpose,
-                   const ReverseBatch<T>& batch, int64_t begin, int64_t end) {
-  detail::reverse_range(a, transpose, batch, begin, end);
-}
 
 template <class T>
 void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters& transpose,
@@ -15,10 +9,6 @@ void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters
   detail::reverse_range(a, transpose, batch, begin, end);
 }
 
-template void reverse_range(const BurgersParameters&, const BurgersParameters&, const ReverseBatch<float>&,
-                            int64_t, int64_t);
-template void reverse_range(const BurgersParameters&, const BurgersParameters&, const ReverseBatch<double>&,
-                            int64_t, int64_t);
 template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&,
                             const ReverseBatch<float>&, int64_t, int64_t);
 template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&,

@@ -54,7 +54,7 @@ bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& 
   // Chebyshev's weights depend on A too: autograd knows how.
   const bool written_out =
       method != Method::kDirect && method != Method::kGmresStokes && method != Method::kChebyshev;
-  return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel());
+  return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -62,7 +62,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
   const auto a = make_operator(solve.a);
   auto transposed = solve.a;
   transposed.transposed = !transposed.transposed;
-  const auto parameters = a->kernel(), transpose = make_operator(transposed)->kernel();
+  const auto parameters = a->kernel(b), transpose = make_operator(transposed)->kernel(b);
   const auto rhs = b.contiguous(), bar = cotangent.contiguous(), iterations = solve.iterations.contiguous();
   const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   const bool for_diagonal = for_a && solve.solver.method == Method::kJacobi;
@@ -88,7 +88,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
                           {}};
     if (for_a) {
       batch.rows = [&](int64_t s) {
-        return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs.options());
+        return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs);
       };
       batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };
     }

@@ -1,20 +1,16 @@
 #pragma once
-#include <limits>
-#include <optional>
-
-#include "prdp/kernels/upwind_stencil.h"
+#include "prdp/kernels/stencil.h"
+#include "prdp/kernels/upwind_rows.h"
 
 namespace prdp::kernels {
 
-/// I + dt Γ(w) - ν dt L on each channel of one sample, with the winds averaged to the faces. It knows
-/// its coefficients where all samples share the winds, else those of sample(s) do.
-template <class T, int Dim>
-class Burgers : public PeriodicBase<T, Dim, Burgers<T, Dim>> {
-  using Base = PeriodicBase<T, Dim, Burgers<T, Dim>>;
-
- public:
-  explicit Burgers(const UpwindParameters<T>& p) : Base(p) {
-    if (!this->is_shared()) return;
+/// I + dt Γ(w) - ν dt L on each of the `dim` channels, with the winds averaged to the faces.
+template <class T>
+Stencil<T> burgers(const UpwindParameters<T>& parameters, int64_t dim) {
+  const auto pattern = parameters.pattern(dim);
+  const auto assemble = [parameters, pattern, dim](int64_t s) -> std::optional<StencilRows<T>> {
+    const auto p = parameters.sample(s);
+    if (!p.is_finite(dim)) return std::nullopt;
     const auto wind = [&p](int64_t channel, int64_t j) { return p.winds + (channel * p.ny + j) * p.nx; };
     const auto winds = [&](int axis, int64_t j, T* scratch) -> WindRow<T> {
       if (axis == 1)
@@ -25,31 +21,10 @@ class Burgers : public PeriodicBase<T, Dim, Burgers<T, Dim>> {
       scratch[p.nx + 1] = w[0];
       return {scratch, scratch + 1, scratch + 2};
     };
-    const typename Stencil::Terms terms{1.0, p.dt, p.nu * p.dt, p.transposed, p.length_y, p.length_x};
-    stencil_.emplace(p.ny, p.nx, terms, winds);
-  }
-
-  Burgers sample(int64_t s) const { return Burgers(this->parameters_.sample(s)); }
-  double norm() const {
-    return this->finite_ ? stencil_->norm() : std::numeric_limits<double>::quiet_NaN();
-  }
-  bool has_zero_diagonal() const { return false; }  // 1 and more
-  const T* diagonal(int64_t r) const { return stencil_->diagonal(r % this->ny()); }
-
-  /// out = A v
-  void apply(const T* v, T* out) const {
-    for (int64_t at = 0; at < this->length(); at += this->field())
-      this->loops_.apply_periodic[Dim - 1](stencil_->stencil(), v + at, out + at);
-  }
-  /// Calls body(row, column, value) for the entries of the block that all channels share.
-  template <class Body>
-  void for_each_entry(const Body& body) const {
-    stencil_->for_each_entry(body);
-  }
-
- private:
-  using Stencil = UpwindStencil<T, Dim>;
-  std::optional<Stencil> stencil_;
-};
+    const UpwindTerms terms{1.0, p.dt, p.nu * p.dt, p.transposed, p.length_y, p.length_x};
+    return upwind_rows<T>(pattern, terms, winds);
+  };
+  return {pattern->grid, dim, parameters.is_shared(), assemble};
+}
 
 }  // namespace prdp::kernels

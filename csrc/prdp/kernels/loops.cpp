@@ -2,7 +2,7 @@
 // internal linkage, and nothing of the standard library is instantiated: no code for one processor can
 // be linked in the place of another's.
 #include "prdp/kernels/laplacian_loops.h"
-#include "prdp/kernels/periodic_loops.h"
+#include "prdp/kernels/stencil_loops.h"
 #include "prdp/kernels/vector_loops.h"
 
 namespace prdp::kernels {
@@ -25,7 +25,10 @@ constexpr Loops<T> table(const char* level) {
           {sweeps<1, T>, sweeps<2, T>, sweeps<3, T>},
           {sweep_and_measure<1, T>, sweep_and_measure<2, T>, sweep_and_measure<3, T>},
           upwind_row<T>,
-          {apply_periodic<1, T>, apply_periodic<2, T>},
+          {apply_neighbours<1, T>, apply_neighbours<2, T>, apply_neighbours<3, T>},
+          apply_offsets<T>,
+          {sweep_neighbours<1, T>, sweep_neighbours<2, T>, sweep_neighbours<3, T>},
+          sweep_offsets<T>,
           apply_staggered<T>};
 }
 

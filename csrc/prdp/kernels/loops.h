@@ -2,6 +2,8 @@
 #include <cstdint>
 #include <string_view>
 
+#include "prdp/kernels/stencil_pattern.h"
+
 /// The inner loops of all kernels. Their one source, loops.cpp, is compiled for several instruction
 /// sets, and the best one that the processor has is chosen when they are first used.
 namespace prdp::kernels {
@@ -21,23 +23,42 @@ struct PaddedStencil {
   const T* weights;
 };
 
-/// One field on a periodic grid in padded rows, with coefficients of their own at every point. Each row
-/// of the grid has a row of each of them in turn: centre, x lower, x upper (, y lower, y upper), with
-/// zeros in the padding. Those that couple the two ends of a row are kept apart as its two wraps, lower
-/// and upper, with zeros in their places: what lies next to a row in memory is never used.
+/// One field on a grid (nz, ny, nx) in padded rows, coupled to its nearest neighbours by coefficients of
+/// their own at every point. Each row of the grid has a row of each of them in turn: centre, x lower, x
+/// upper (, y lower, y upper (, z lower, z upper)). What leaves a row lies in its `ends`, with zeros in its
+/// place: two times kLanes values, which the row's last value multiplies at the row's first kLanes points,
+/// and its first value at the last kLanes; null where nothing does. Beyond the first and the last row, and
+/// plane, comes the one from the other end, with coefficients of zero where the axis is not periodic.
+/// The padding holds zeros but for the centre's, which may be divided by.
 template <class T>
-struct PeriodicStencil {
-  int64_t ny, nx, row;
+struct NeighbourStencil {
+  int64_t nz, ny, nx, row;
   const T* coefficients;
-  const T* wraps;
+  const T* ends;
 };
 
-/// [[C1, 0, G1], [0, C2, G2], [D1, D2, 0]] on three such fields, two velocities and the pressure, with
+/// The same with neighbours at any offsets, the first being the point itself. What leaves a row has its
+/// value in `wrap_values`, as many for each row as there are `wraps`.
+template <class T>
+struct OffsetStencil {
+  int64_t nz, ny, nx, row;
+  int64_t count;
+  const Offset* offsets;
+  const T* coefficients;
+  int64_t wrap_count;
+  const StencilWrap* wraps;
+  const T* wrap_values;
+};
+
+/// Offsets of at most two cells in three dimensions.
+inline constexpr int64_t kMostOffsets = 125;
+
+/// [[C1, 0, G1], [0, C2, G2], [D1, D2, 0]] on three fields, two velocities and the pressure, with
 /// backward differences G and forward differences D. The weights are rows of 1/dx, of 1/dx but for the
 /// first point, of 1/dx but for the last point, and of 1/dy; all negative in the transpose.
 template <class T>
 struct StaggeredStencil {
-  PeriodicStencil<T> velocity[2];
+  NeighbourStencil<T> velocity[2];
   const T* weights;
 };
 
@@ -78,8 +99,12 @@ struct Loops {
   /// either side. Sets lower and upper, adds to centre; any n.
   void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower,
                      T* upper, T* centre, int64_t n);
-  /// out = A v; by the number of dimensions less one.
-  void (*apply_periodic[2])(const PeriodicStencil<T>& a, const T* v, T* out);
+  /// By the number of dimensions less one. out = A v; dots += {v·out, ‖out‖²} unless it is null.
+  void (*apply_neighbours[3])(const NeighbourStencil<T>& a, const T* v, T* out, T* dots);
+  void (*apply_offsets)(const OffsetStencil<T>& a, const T* v, T* out, T* dots);
+  /// A Jacobi sweep y = x + c - D⁻¹A x; *squares += ‖D(y - x)‖² unless it is null.
+  void (*sweep_neighbours[3])(const NeighbourStencil<T>& a, const T* c, const T* x, T* y, T* squares);
+  void (*sweep_offsets)(const OffsetStencil<T>& a, const T* c, const T* x, T* y, T* squares);
   void (*apply_staggered)(const StaggeredStencil<T>& a, const T* v, T* out);
 };
 

@@ -2,7 +2,8 @@
 #include <limits>
 #include <optional>
 
-#include "prdp/kernels/upwind_stencil.h"
+#include "prdp/kernels/field_rows.h"
+#include "prdp/kernels/upwind_rows.h"
 
 namespace prdp::kernels {
 
@@ -11,48 +12,51 @@ namespace prdp::kernels {
 /// pressure is in the null space of A and Aᵀ. It knows its coefficients where all samples share the
 /// velocity, else those of sample(s) do.
 template <class T>
-class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
-  using Base = PeriodicBase<T, 3, NavierStokes<T>>;
-  using Base::field, Base::nx, Base::ny, Base::row_, Base::loops_;
+class NavierStokes : public FieldRows<T> {
+  using Base = FieldRows<T>;
+  using Base::field, Base::row_, Base::loops_;
 
  public:
   explicit NavierStokes(const UpwindParameters<T>& p)
-      : Base(p), inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
+      : Base(3, p.ny, p.nx), parameters_(p), inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
         inverse_dy_(inverse_spacing(p.ny, p.length_y, p.transposed)) {
-    if (!this->is_shared()) return;
-    const typename Stencil::Terms terms{1.0 / p.dt, 1.0, p.nu, p.transposed, p.length_y, p.length_x};
+    if (!is_shared() || !p.is_finite(2)) return;
+    const auto pattern = p.pattern(2);
+    const UpwindTerms terms{1.0 / p.dt, 1.0, p.nu, p.transposed, p.length_y, p.length_x};
     const auto u1 = [&p](int64_t j) { return p.winds + (j + p.ny) % p.ny * p.nx; };
     const auto u2 = [&](int64_t j) { return u1(j) + p.ny * p.nx; };
     const auto at_point = [](const T* wind) { return WindRow<T>{wind, wind, wind}; };
-    velocity_[0].emplace(p.ny, p.nx, terms, [&](int axis, int64_t j, T* mean) {
+    velocity_[0].emplace(upwind_rows<T>(pattern, terms, [&](int axis, int64_t j, T* mean) {
       if (axis == 0) return at_point(u1(j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i + 1] = u2(j)[i] + u2(j + 1)[i];
       mean[0] = mean[p.nx];
       return at_point(finish_mean(mean));
-    });
-    velocity_[1].emplace(p.ny, p.nx, terms, [&](int axis, int64_t j, T* mean) {
+    }));
+    velocity_[1].emplace(upwind_rows<T>(pattern, terms, [&](int axis, int64_t j, T* mean) {
       if (axis == 1) return at_point(u2(j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i] = u1(j - 1)[i] + u1(j)[i];
       mean[p.nx] = mean[0];
       return at_point(finish_mean(mean));
-    });
+    }));
     make_weights();
   }
 
-  NavierStokes sample(int64_t s) const { return NavierStokes(this->parameters_.sample(s)); }
+  bool is_shared() const { return parameters_.is_shared(); }
+  bool operator_is_finite() const { return !is_shared() || velocity_[0].has_value(); }
+  NavierStokes sample(int64_t s) const { return NavierStokes(parameters_.sample(s)); }
   double norm() const {
-    if (!this->finite_) return std::numeric_limits<double>::quiet_NaN();
+    if (!velocity_[0]) return std::numeric_limits<double>::quiet_NaN();
     const double x = std::abs(inverse_dx_), y = std::abs(inverse_dy_);
     return std::max({velocity_[0]->norm() + 2 * x, velocity_[1]->norm() + 2 * y, 2 * (x + y)});
   }
-  bool has_zero_diagonal() const { return true; }  // the pressure's
-  const T* diagonal(int64_t r) const {
-    return r < 2 * ny() ? velocity_[r / ny()]->diagonal(r % ny()) : weight(kZero);
-  }
+  bool has_zero_diagonal() const { return true; }  // the pressure's: what divides by it is never called
+  void divide_by_diagonal(const T*, T*) const {}
+  void jacobi_sweeps(const T*, T*&, T*&, int64_t) const {}
+  T jacobi_sweep(const T*, const T*, T*) const { return T(0); }
 
   /// out = A v
   void apply(const T* v, T* out) const {
-    loops_.apply_staggered({{velocity_[0]->stencil(), velocity_[1]->stencil()}, weights_.data()}, v, out);
+    loops_.apply_staggered({{velocity_[0]->neighbours(), velocity_[1]->neighbours()}, weights_.data()}, v, out);
   }
   /// Takes the mean off the pressure.
   void project(T* v) const {
@@ -86,8 +90,10 @@ class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
   }
 
  private:
-  using Stencil = UpwindStencil<T, 2>;
-  enum Weight { kX, kXLower, kXUpper, kY, kOne, kZero, kWeights };  // the first four: StaggeredStencil
+  enum Weight { kX, kXLower, kXUpper, kY, kOne, kWeights };  // the first four: StaggeredStencil
+
+  int64_t nx() const { return parameters_.nx; }
+  int64_t ny() const { return parameters_.ny; }
 
   /// Along an axis of one point all differences vanish.
   static T inverse_spacing(int64_t n, double length, bool transposed) {
@@ -121,8 +127,9 @@ class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
     return static_cast<T>(sum / static_cast<double>(ny() * nx()));
   }
 
+  UpwindParameters<T> parameters_;
   T inverse_dx_, inverse_dy_;  // negative in the transpose
-  std::optional<Stencil> velocity_[2];
+  std::optional<StencilRows<T>> velocity_[2];
   std::vector<T> weights_;  // rows of the padded length
 };
 

@@ -30,19 +30,14 @@ std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda,
   return {as_winds(std::move(channels)), nu.to(step_.nu.options())};
 }
 
-at::Tensor BurgersOperator::matrix() const {
-  // Unit vectors as the channels of one field: row j of the product is column j of the matrix.
-  auto shape = vector_shape();
-  shape[0] = grid_.unknowns();
-  const auto units = at::eye(shape[0], winds_.options()).view(shape).unsqueeze(0);
-  return apply(units).flatten(2).mT();
+at::Tensor BurgersOperator::solve_directly(const at::Tensor& b) const {
+  return solve_channels(channel_matrix(*this, winds_.options()), b);
+}
+at::Tensor BurgersOperator::solve_transpose_directly(const at::Tensor& b) const {
+  return solve_channels(channel_matrix(*this, winds_.options()).mT(), b);
 }
 
-at::Tensor BurgersOperator::solve_rows(const at::Tensor& matrix, const at::Tensor& b) const {
-  return solve_dense(matrix, b.flatten(2).mT()).mT().reshape_as(b);
-}
-
-KernelParameters BurgersOperator::kernel() const {
+KernelParameters BurgersOperator::kernel(const at::Tensor&) const {
   BurgersParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
   for (int64_t d = 0; d < grid_.dim(); ++d) k.length[2 - grid_.dim() + d] = grid_.length(d);
   return k;

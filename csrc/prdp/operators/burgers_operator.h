@@ -19,20 +19,15 @@ class BurgersOperator final : public FlowOperator {
   at::Tensor apply_transpose(const at::Tensor& v) const override { return block().apply_transpose(v); }
   at::Tensor diagonal() const override { return block().diagonal(); }
   at::Tensor norm() const override { return largest(block().row_norms()); }
-  at::Tensor solve_directly(const at::Tensor& b) const override { return solve_rows(matrix(), b); }
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
-    return solve_rows(matrix().mT(), b);
-  }
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
-  KernelParameters kernel() const override;
+  KernelParameters kernel(const at::Tensor& b) const override;
 
  private:
   /// The block of one channel, made when first wanted: the CPU loops never ask for it.
   const AdvectionDiffusion& block() const;
-  /// The same as (batch or 1, n, n).
-  at::Tensor matrix() const;
-  at::Tensor solve_rows(const at::Tensor& matrix, const at::Tensor& b) const;
 
   mutable std::optional<AdvectionDiffusion> made_;
 };

@@ -30,7 +30,7 @@ std::vector<int64_t> LaplacianOperator::vector_shape() const {
   return shape;
 }
 
-KernelParameters LaplacianOperator::kernel() const {
+KernelParameters LaplacianOperator::kernel(const at::Tensor&) const {
   const auto [alpha, beta] = coefficients();
   kernels::LaplacianParameters k;
   k.dim = grid_.dim();

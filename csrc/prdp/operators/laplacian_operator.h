@@ -16,7 +16,7 @@ class LaplacianOperator : public Operator {
   at::Tensor norm() const override;
   at::Tensor jacobi_radius() const override;
   std::vector<int64_t> vector_shape() const override;
-  KernelParameters kernel() const override;
+  KernelParameters kernel(const at::Tensor& b) const override;
 
  protected:
   explicit LaplacianOperator(Grid grid) : grid_(std::move(grid)) {}

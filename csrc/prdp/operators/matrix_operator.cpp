@@ -99,7 +99,7 @@ std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
   return chosen;
 }
 
-KernelParameters DenseOperator::kernel() const { return DenseParameters{matrix_.contiguous()}; }
+KernelParameters DenseOperator::kernel(const at::Tensor&) const { return DenseParameters{matrix_.contiguous()}; }
 
 CsrOperator::CsrOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE(spec.tensors.size() == 3, "csr: takes three tensors, crow, col and values");
@@ -215,7 +215,7 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
   return chosen;
 }
 
-KernelParameters CsrOperator::kernel() const {
+KernelParameters CsrOperator::kernel(const at::Tensor&) const {
   return CsrParameters{crow_.contiguous(), col_.contiguous(), values_.contiguous()};
 }
 

@@ -109,7 +109,7 @@ at::Tensor NavierStokesOperator::precondition(const at::Tensor& v, bool transpos
   return (*stokes_)(v, transposed);
 }
 
-KernelParameters NavierStokesOperator::kernel() const {
+KernelParameters NavierStokesOperator::kernel(const at::Tensor&) const {
   NavierStokesParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
   k.length = {grid_.length(kY), grid_.length(kX)};
   return k;

@@ -37,7 +37,7 @@ class NavierStokesOperator final : public FlowOperator {
   }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
-  KernelParameters kernel() const override;
+  KernelParameters kernel(const at::Tensor& b) const override;
   /// The same step without winds.
   at::Tensor precondition(const at::Tensor& v, bool transposed) const override;
 

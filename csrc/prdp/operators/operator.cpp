@@ -7,6 +7,7 @@
 #include "prdp/operators/laplacian_operator.h"
 #include "prdp/operators/matrix_operator.h"
 #include "prdp/operators/navier_stokes_operator.h"
+#include "prdp/operators/stencil_operator.h"
 
 namespace prdp {
 
@@ -82,12 +83,13 @@ class Transposed final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override {
     return a_->first_nonfinite(sample);
   }
-  KernelParameters kernel() const override {
-    auto k = a_->kernel();
+  KernelParameters kernel(const at::Tensor& b) const override {
+    auto k = a_->kernel(b);
     if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;
     if (auto* csr = std::get_if<CsrParameters>(&k)) csr->transposed = true;
     if (auto* burgers = std::get_if<BurgersParameters>(&k)) burgers->transposed = true;
     if (auto* flow = std::get_if<NavierStokesParameters>(&k)) flow->transposed = true;
+    if (auto* stencil = std::get_if<StencilParameters>(&k)) stencil->transposed = true;
     return k;
   }
 
@@ -100,11 +102,12 @@ std::unique_ptr<Operator> make_untransposed(const OperatorSpec& spec) {
   if (spec.kind == "poisson") return std::make_unique<PoissonOperator>(spec);
   if (spec.kind == "burgers") return std::make_unique<BurgersOperator>(spec);
   if (spec.kind == "navier_stokes") return std::make_unique<NavierStokesOperator>(spec);
+  if (spec.kind == "stencil") return std::make_unique<StencilOperator>(spec);
   if (spec.kind == "dense") return std::make_unique<DenseOperator>(spec);
   if (spec.kind == "function") return std::make_unique<FunctionOperator>(spec);
   if (spec.kind == "csr") return std::make_unique<CsrOperator>(spec);
   TORCH_CHECK_VALUE(false, "operator: unknown kind '", spec.kind,
-                    "'; allowed: heat, poisson, burgers, navier_stokes, dense, csr, function");
+                    "'; allowed: heat, poisson, burgers, navier_stokes, stencil, dense, csr, function");
 }
 
 }  // namespace

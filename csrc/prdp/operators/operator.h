@@ -8,12 +8,13 @@
 #include <vector>
 
 #include "prdp/kernels/laplacian_parameters.h"
+#include "prdp/kernels/stencil_pattern.h"
 
 namespace prdp {
 
 /// The flat description of an operator, as it crosses torch's dispatcher: numbers and tensors only.
 struct OperatorSpec {
-  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "dense", "csr"
+  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr"
   std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
   std::vector<double> parameters;    // plain numbers without gradient, such as dt and the lengths
   std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
@@ -51,9 +52,18 @@ struct NavierStokesParameters {
   std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
+/// The coefficients (batch or 1, k, *shape), contiguous, of a stencil with k offsets on each of the channels.
+struct StencilParameters {
+  at::Tensor coefficients;
+  kernels::StencilGrid grid;
+  std::vector<kernels::Offset> offsets;
+  int64_t channels;
+  bool transposed = false;
+};
+
 /// What the CPU loops need to know of an operator; monostate: it has plain tensor operations only.
-using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters,
-                                      CsrParameters, BurgersParameters, NavierStokesParameters>;
+using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters, CsrParameters,
+                                      BurgersParameters, NavierStokesParameters, StencilParameters>;
 
 /// A linear operator A(g) on batches of fields. Immutable; knows nothing of solvers.
 /// Vectors are batched: (batch, channel, *shape) for stencils, (batch, n) for matrices.
@@ -90,10 +100,11 @@ class Operator {
   /// The operator of the samples `index` (int64) alone, differentiable in the same tensors; null where
   /// that is not known.
   virtual std::unique_ptr<Operator> select(const at::Tensor& index) const = 0;
-  /// Shape of one vector without its batch axis.
+  /// Shape of one vector without its batch axis; with one channel where A takes any number.
   virtual std::vector<int64_t> vector_shape() const = 0;
 
-  virtual KernelParameters kernel() const { return std::monostate{}; }
+  /// For vectors of b's shape.
+  virtual KernelParameters kernel(const at::Tensor& /*b*/) const { return std::monostate{}; }
 
   /// A as a matrix (n, n), or (batch, n, n) where A differs between the samples.
   at::Tensor dense(const at::TensorOptions& options) const;

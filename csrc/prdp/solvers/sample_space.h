@@ -58,6 +58,7 @@ class SampleSpace {
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
     count(1);
     if constexpr (requires { kernel_->apply(v, out)[0]; }) return kernel_->apply(v, out);
+    if constexpr (requires { kernel_->apply_with_dots(v, out); }) return kernel_->apply_with_dots(v, out);
     kernel_->apply(v, out);
     return {dot(v, out), dot(out, out)};
   }

@@ -57,7 +57,7 @@ int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t ite
 }
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
-  const auto parameters = a.kernel();
+  const auto parameters = a.kernel(b);
   const bool has_loops =
       request.method == Method::kChebyshev ? std::holds_alternative<kernels::LaplacianParameters>(parameters)
                                            : !std::holds_alternative<std::monostate>(parameters) &&

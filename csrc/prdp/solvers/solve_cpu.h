@@ -17,5 +17,7 @@ template <class T>
 void solve_range(const BurgersParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>
 void solve_range(const NavierStokesParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
+template <class T>
+void solve_range(const StencilParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 
 }  // namespace prdp

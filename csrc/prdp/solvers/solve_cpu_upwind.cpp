@@ -1,21 +1,14 @@
-#include "prdp/kernels/upwind_factors.h"
+#include "prdp/kernels/navier_stokes_factors.h"
 #include "prdp/solvers/solve_cpu.h"
 #include "prdp/solvers/with_kernel.h"
 
 namespace prdp {
 
 template <class T>
-void solve_range(const BurgersParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
-  with_kernel<T>(a, [&](const auto& kernel) { solve_samples(kernel, batch, begin, end); });
-}
-
-template <class T>
 void solve_range(const NavierStokesParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
   with_kernel<T>(a, [&](const auto& kernel) { solve_samples(kernel, batch, begin, end); });
 }
 
-template void solve_range(const BurgersParameters&, const SampleBatch<float>&, int64_t, int64_t);
-template void solve_range(const BurgersParameters&, const SampleBatch<double>&, int64_t, int64_t);
 template void solve_range(const NavierStokesParameters&, const SampleBatch<float>&, int64_t, int64_t);
 template void solve_range(const NavierStokesParameters&, const SampleBatch<double>&, int64_t, int64_t);
 

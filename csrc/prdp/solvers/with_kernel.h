@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/kernels/burgers.h"
+#include "prdp/kernels/given_stencil.h"
 #include "prdp/kernels/laplacian.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/kernels/navier_stokes.h"
@@ -48,9 +49,20 @@ kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, const Pa
 
 template <class T, class Body>
 void with_kernel(const BurgersParameters& a, const Body& body) {
-  const auto p = upwind_parameters<T>(a.winds, a);
-  if (a.winds.dim() == 3) return body(kernels::Burgers<T, 1>(p));
-  body(kernels::Burgers<T, 2>(p));
+  body(kernels::burgers(upwind_parameters<T>(a.winds, a), a.winds.dim() - 2));
+}
+
+template <class T, class Body>
+void with_kernel(const StencilParameters& a, const Body& body) {
+  auto offsets = a.offsets;
+  if (a.transposed)
+    for (auto& offset : offsets)
+      for (auto& cells : offset.along) cells = -cells;
+  const int64_t batch = a.coefficients.size(0);
+  const kernels::GivenStencil<T> given{a.coefficients.const_data_ptr<T>(),
+                                       batch == 1 ? 0 : a.coefficients.numel() / batch,
+                                       std::make_shared<kernels::StencilPattern>(a.grid, offsets), a.transposed};
+  body(kernels::given_stencil(given, a.channels));
 }
 
 template <class T, class Body>

@@ -1,0 +1,143 @@
+#pragma once
+#include "prdp/kernels/direct_factors.h"
+#include "prdp/kernels/stencil.h"
+
+/// The exact methods of stencils. All factorise and solve in double, whatever T is.
+namespace prdp::kernels {
+
+/// Thomas' algorithm for all unknowns of a line but the last one, which may be coupled to both ends:
+/// [[M, e], [f, c]] with M tridiagonal is solved by x_n = (r_n - f·M⁻¹r)/(c - f·M⁻¹e). There is no
+/// pivoting: only a matrix that is diagonally dominant by rows or by columns goes without (Higham, Accuracy
+/// and Stability of Numerical Algorithms, 2002, theorem 9.9).
+class CyclicThomas {
+ public:
+  template <class T>
+  explicit CyclicThomas(const StencilRows<T>& a)
+      : n_(a.grid().shape[2]), lower_(n_), inverse_pivot_(n_), upper_(n_), column_(n_) {
+    const int64_t last = n_ - 1;
+    double corner = 0;
+    std::vector<double> pivot(n_), border(n_);
+    // Where n is 2 or 3, entries coincide and add up.
+    a.for_each_entry([&](int64_t i, int64_t j, T value) {
+      double& entry = i == last ? (j == last ? corner : border[j])
+                      : j == last ? column_[i] : j < i ? lower_[i] : j > i ? upper_[i] : pivot[i];
+      entry += static_cast<double>(value);
+    });
+    is_dominant_ = is_dominant(pivot, border, corner, 8.0 * std::numeric_limits<T>::epsilon());
+    if (!is_dominant_) return;
+    for (int64_t i = 0; i < last; ++i) {
+      if (i > 0) pivot[i] -= lower_[i] * inverse_pivot_[i - 1] * upper_[i - 1];
+      inverse_pivot_[i] = 1.0 / pivot[i];
+    }
+    border_first_ = last > 0 ? border[0] : 0.0;
+    border_last_ = last > 1 ? border[last - 1] : 0.0;
+    solve_tridiagonal(column_.data());
+    inverse_corner_ = 1.0 / (corner - border_product(column_.data()));
+  }
+  bool is_dominant() const { return is_dominant_; }
+  /// v ← A⁻¹ v
+  void solve(double* v) const {
+    solve_tridiagonal(v);
+    const double x = (v[n_ - 1] - border_product(v)) * inverse_corner_;
+    for (int64_t i = 0; i + 1 < n_; ++i) v[i] -= column_[i] * x;
+    v[n_ - 1] = x;
+  }
+
+ private:
+  /// Whether what lies beside the diagonal weighs no more than it in any row, or in any column; `slack` is
+  /// what rounding may hide.
+  bool is_dominant(const std::vector<double>& pivot, const std::vector<double>& border, double corner,
+                   double slack) const {
+    const int64_t last = n_ - 1;
+    double last_row = 0, last_column = 0;
+    bool by_rows = true, by_columns = true;
+    for (int64_t i = 0; i < last; ++i) {
+      const double bound = std::abs(pivot[i]) * (1.0 + slack), above = i > 0 ? upper_[i - 1] : 0.0;
+      by_rows = by_rows && std::abs(lower_[i]) + std::abs(upper_[i]) + std::abs(column_[i]) <= bound;
+      by_columns = by_columns && std::abs(above) + std::abs(lower_[i + 1]) + std::abs(border[i]) <= bound;
+      last_row += std::abs(border[i]);
+      last_column += std::abs(column_[i]);
+    }
+    const double bound = std::abs(corner) * (1.0 + slack);
+    return (by_rows && last_row <= bound) || (by_columns && last_column <= bound);
+  }
+
+  /// v ← M⁻¹ v; leaves the last one alone.
+  void solve_tridiagonal(double* v) const {
+    for (int64_t i = 0; i + 1 < n_; ++i)
+      v[i] = (v[i] - (i > 0 ? lower_[i] * v[i - 1] : 0.0)) * inverse_pivot_[i];
+    for (int64_t i = n_ - 3; i >= 0; --i) v[i] -= inverse_pivot_[i] * upper_[i] * v[i + 1];
+  }
+  double border_product(const double* v) const {
+    return n_ == 1 ? 0.0 : border_first_ * v[0] + (n_ > 2 ? border_last_ * v[n_ - 2] : 0.0);
+  }
+
+  int64_t n_;
+  bool is_dominant_;
+  std::vector<double> lower_, inverse_pivot_, upper_, column_;  // column_: M⁻¹e
+  double border_first_, border_last_, inverse_corner_;
+};
+
+/// Sparse LU by Eigen in double.
+class DoubleSparseLU {
+ public:
+  using Vector = Eigen::VectorXd;
+
+  /// The first n rows and columns of the kernel's matrix.
+  template <class Kernel>
+  DoubleSparseLU(const Kernel& kernel, int64_t n) {
+    std::vector<Eigen::Triplet<double>> entries;
+    kernel.for_each_entry([&](int64_t i, int64_t j, auto value) {
+      if (i < n && j < n)
+        entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<double>(value));
+    });
+    Eigen::SparseMatrix<double> m(n, n);
+    m.setFromTriplets(entries.begin(), entries.end());
+    lu_.compute(m);
+  }
+  bool is_regular() const { return lu_.info() == Eigen::Success; }
+  template <class Rhs>
+  Vector solve(const Rhs& rhs) const {
+    return lu_.solve(rhs);
+  }
+
+ private:
+  Eigen::SparseLU<Eigen::SparseMatrix<double>> lu_;
+};
+
+/// One factorisation for all channels.
+template <class T>
+class StencilFactors {
+ public:
+  explicit StencilFactors(const Stencil<T>& kernel) : kernel_(kernel), values_(kernel.unknowns()) {
+    const auto& a = kernel.coefficients();
+    if (a.pattern().nearest && a.rows() == 1) thomas_.emplace(a);
+    if (!thomas_ || !thomas_->is_dominant()) lu_.emplace(a, kernel.unknowns() / kernel.channels());
+  }
+  bool solve(const T* r, T* d) const {
+    if (lu_ && !lu_->is_regular()) return false;
+    kernel_.store(r, T(1), values_.data());
+    const int64_t n = static_cast<int64_t>(values_.size()), points = n / kernel_.channels();
+    for (int64_t at = 0; at < n; at += points) {
+      Eigen::VectorXd x = values_.segment(at, points).template cast<double>();
+      if (lu_) x = lu_->solve(x);
+      else thomas_->solve(x.data());
+      values_.segment(at, points) = x.template cast<T>();
+    }
+    kernel_.load(values_.data(), T(1), d);
+    return all_finite(values_.data(), n);
+  }
+
+ private:
+  const Stencil<T>& kernel_;
+  mutable Eigen::Matrix<T, Eigen::Dynamic, 1> values_;  // one object a thread
+  std::optional<CyclicThomas> thomas_;
+  std::optional<DoubleSparseLU> lu_;
+};
+
+template <class T>
+struct FactorsOf<Stencil<T>> {
+  using Type = StencilFactors<T>;
+};
+
+}  // namespace prdp::kernels

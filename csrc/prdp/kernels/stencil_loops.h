@@ -1,0 +1,232 @@
+#pragma once
+#include "prdp/kernels/vector_loops.h"
+
+/// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and for the same reason
+/// all of internal linkage.
+namespace prdp::kernels {
+
+namespace {
+
+template <class T>
+void upwind_row(T advection, T diffusion, const T* before, const T* here, const T* after,
+                T* __restrict lower, T* __restrict upper, T* __restrict centre, int64_t n) {
+  const T half = advection / 2;
+  for (int64_t i = 0; i < n; ++i) {
+    const T sum_before = before[i] + here[i], sum_after = here[i] + after[i];
+    const T backward = half * (sum_before > T(0) ? sum_before : T(0));
+    const T forward = half * (sum_after < T(0) ? sum_after : T(0));
+    lower[i] = -backward - diffusion;
+    upper[i] = forward - diffusion;
+    centre[i] += backward - forward + 2 * diffusion;
+  }
+}
+
+/// Number i of n rows, or planes, round the ends; -n <= i < 2n.
+inline int64_t round(int64_t i, int64_t n) { return i < 0 ? i + n : i < n ? i : i - n; }
+
+/// Goes along a row register by register, with the ones before and after for the neighbours. What these
+/// hold beyond the ends of the row meets weights of zero.
+template <class T>
+struct Line {
+  const T* v;
+  Register<T> before = {}, here = {}, after;
+
+  explicit Line(const T* row) : v(row), after(load(row)) {}
+  void step_to(int64_t i) {
+    before = here;
+    here = after;
+    after = load(v + i + kWidth<T>);
+  }
+  Register<T> left() const { return lanes_from<T, kWidth<T> - 1>(before, here); }
+  Register<T> right() const { return lanes_from<T, 1>(here, after); }
+};
+
+/// Row j of plane z of a field with what lies around it; its coefficients in A.
+template <int Dim, class T>
+struct NeighbourRow {
+  const NeighbourStencil<T>& a;
+  int64_t row, last;  // its padded length; where its last register starts
+  const T *w, *ends, *below, *above, *back, *front;
+  Line<T> line;
+
+  NeighbourRow(const NeighbourStencil<T>& stencil, int64_t z, int64_t j, const T* field)
+      : a(stencil), row(a.row), last((a.nx - 1) / kWidth<T> * kWidth<T>),
+        w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
+        ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
+        below(field + (z * a.ny + round(j - 1, a.ny)) * row), above(field + (z * a.ny + round(j + 1, a.ny)) * row),
+        back(field + (round(z - 1, a.nz) * a.ny + j) * row), front(field + (round(z + 1, a.nz) * a.ny + j) * row),
+        line(field + (z * a.ny + j) * row) {}
+
+  /// A v at register i, but for the ends.
+  Register<T> product(int64_t i) {
+    line.step_to(i);
+    Register<T> sum = load(w + i) * line.here;
+    sum += load(w + row + i) * line.left();
+    sum += load(w + 2 * row + i) * line.right();
+    if constexpr (Dim > 1) {
+      sum += load(w + 3 * row + i) * load(below + i);
+      sum += load(w + 4 * row + i) * load(above + i);
+    }
+    if constexpr (Dim > 2) {
+      sum += load(w + 5 * row + i) * load(back + i);
+      sum += load(w + 6 * row + i) * load(front + i);
+    }
+    return sum;
+  }
+  Register<T> with_ends(int64_t i, Register<T> sum) const {
+    if (!ends) return sum;
+    if (i == 0) sum += load(ends) * line.v[a.nx - 1];
+    if (i == last) sum += load(ends + kLanes<T> + last % kLanes<T>) * line.v[0];
+    return sum;
+  }
+};
+
+/// Calls body.finish(i, v, A v, diagonal) for every register i of a field v. What it takes of `out` is
+/// whatever body keeps there.
+template <int Dim, class T, class Body>
+void for_each_register(const NeighbourStencil<T>& a, const T* v, T*, Body& shared) {
+  Body body = shared;  // a copy, which no store can change for all the compiler knows
+  int64_t at = 0;
+  for (int64_t z = 0; z < a.nz; ++z)
+    for (int64_t j = 0; j < a.ny; ++j, at += a.row) {
+      NeighbourRow<Dim, T> u(a, z, j, v);
+      for (int64_t i = 0; i < a.row; i += kWidth<T>) {
+        const Register<T> sum = u.product(i);
+        body.finish(at + i, u.line.here, u.with_ends(i, sum), u.w + i);
+      }
+    }
+  shared = body;
+}
+
+/// The same, with A v in `out` on the way.
+template <class T, class Body>
+void for_each_register(const OffsetStencil<T>& a, const T* v, T* out, Body& shared) {
+  Body body = shared;
+  const T* from[kMostOffsets];
+  const T *w = a.coefficients, *wrap_values = a.wrap_values;
+  int64_t at = 0;
+  for (int64_t z = 0; z < a.nz; ++z)
+    for (int64_t j = 0; j < a.ny; ++j, at += a.row, w += a.count * a.row, wrap_values += a.wrap_count) {
+      for (int64_t k = 0; k < a.count; ++k) {
+        const auto& o = a.offsets[k].along;
+        const int64_t plane = round(z + o[0], a.nz), line = round(j + o[1], a.ny);
+        from[k] = v + (plane * a.ny + line) * a.row + o[2];
+      }
+      T* const row = out + at;
+      // Several sums at once, as each waits for its last addition.
+      for_each_block<4>(0, a.row / kWidth<T>, [&](int64_t first, auto size) {
+        Register<T> sums[size.value] = {};
+        for (int64_t k = 0; k < a.count; ++k)
+          for (int c = 0; c < size.value; ++c) {
+            const int64_t i = (first + c) * kWidth<T>;
+            sums[c] += load(w + k * a.row + i) * load(from[k] + i);
+          }
+        for (int c = 0; c < size.value; ++c) store(row + (first + c) * kWidth<T>, sums[c]);
+      });
+      for (int64_t e = 0; e < a.wrap_count; ++e) {
+        const auto& wrap = a.wraps[e];
+        row[wrap.to] += wrap_values[e] * from[wrap.coefficient][wrap.from];
+      }
+      for (int64_t i = 0; i < a.row; i += kWidth<T>)
+        body.finish(at + i, load(v + at + i), load(row + i), w + i);
+    }
+  shared = body;
+}
+
+/// out = A v and, if Dots, the parts of v·out and ‖out‖².
+template <bool Dots, class T>
+struct StencilProduct {
+  T* out;
+  Register<T> v_out = {}, out_out = {};
+
+  void finish(int64_t i, const Register<T>& v, const Register<T>& av, const T*) {
+    store(out + i, av);
+    if constexpr (!Dots) return;
+    v_out += v * av;
+    out_out += av * av;
+  }
+};
+
+/// y = x + c - D⁻¹A x and, if Measure, the parts of ‖D(y - x)‖².
+template <bool Measure, class T>
+struct StencilSweep {
+  const T* c;
+  T* y;
+  Register<T> squares = {};
+
+  void finish(int64_t i, const Register<T>& x, const Register<T>& ax, const T* diagonal) {
+    const Register<T> d = load(diagonal), change = load(c + i) - ax / d;
+    store<T>(y + i, x + change);
+    if constexpr (!Measure) return;
+    const Register<T> r = d * change;
+    squares += r * r;
+  }
+};
+
+template <class Traversal, class T>
+void stencil_product(const Traversal& for_each, T* out, T* dots) {
+  if (!dots) {
+    StencilProduct<false, T> body{out};
+    return for_each(body);
+  }
+  StencilProduct<true, T> body{out};
+  for_each(body);
+  dots[0] += sum_lanes<T>(body.v_out);
+  dots[1] += sum_lanes<T>(body.out_out);
+}
+template <class Traversal, class T>
+void stencil_sweep(const Traversal& for_each, const T* c, T* y, T* squares) {
+  if (!squares) {
+    StencilSweep<false, T> body{c, y};
+    return for_each(body);
+  }
+  StencilSweep<true, T> body{c, y};
+  for_each(body);
+  *squares += sum_lanes<T>(body.squares);
+}
+
+template <int Dim, class T>
+void apply_neighbours(const NeighbourStencil<T>& a, const T* v, T* out, T* dots) {
+  stencil_product([&](auto& body) { for_each_register<Dim>(a, v, out, body); }, out, dots);
+}
+template <class T>
+void apply_offsets(const OffsetStencil<T>& a, const T* v, T* out, T* dots) {
+  stencil_product([&](auto& body) { for_each_register(a, v, out, body); }, out, dots);
+}
+template <int Dim, class T>
+void sweep_neighbours(const NeighbourStencil<T>& a, const T* c, const T* x, T* y, T* squares) {
+  stencil_sweep([&](auto& body) { for_each_register<Dim>(a, x, y, body); }, c, y, squares);
+}
+template <class T>
+void sweep_offsets(const OffsetStencil<T>& a, const T* c, const T* x, T* y, T* squares) {
+  stencil_sweep([&](auto& body) { for_each_register(a, x, y, body); }, c, y, squares);
+}
+
+template <class T>
+void apply_staggered(const StaggeredStencil<T>& a, const T* v, T* out) {
+  const auto& grid = a.velocity[0];
+  const int64_t row = grid.row, field = grid.ny * row, last = grid.nx - 1;
+  const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
+  T *out1 = out, *out2 = out + field, *divergence = out + 2 * field;
+  for (int64_t j = 0; j < grid.ny; ++j, out1 += row, out2 += row, divergence += row) {
+    NeighbourRow<2, T> u1(a.velocity[0], 0, j, v), u2(a.velocity[1], 0, j, v + field);
+    Line<T> p(v + 2 * field + j * row);
+    const T* p_below = v + 2 * field + round(j - 1, grid.ny) * row;
+    for (int64_t i = 0; i < row; i += kWidth<T>) {
+      p.step_to(i);
+      Register<T> c1 = u1.product(i), c2 = u2.product(i);
+      c1 = c1 + load(x + i) * p.here - load(x_lower + i) * p.left();
+      c2 = c2 + load(y + i) * (p.here - load(p_below + i));
+      store<T>(out1 + i, u1.with_ends(i, c1));
+      store<T>(out2 + i, u2.with_ends(i, c2));
+      store<T>(divergence + i, load(x_upper + i) * u1.line.right() - load(x + i) * u1.line.here +
+                                   load(y + i) * (load(u2.above + i) - u2.line.here));
+    }
+    out1[0] -= x[0] * p.v[last];
+    divergence[last] += x[0] * u1.line.v[0];
+  }
+}
+
+}  // namespace
+
+}  // namespace prdp::kernels

@@ -1,0 +1,141 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <memory>
+
+#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/vector.h"
+
+namespace prdp::kernels {
+
+/// The coefficients of a stencil on one field as the loops take them. Whoever assembles them fills the rows
+/// as if each were closed in itself, then calls close(): what leaves a row goes where the loops expect it.
+template <class T>
+class StencilRows {
+ public:
+  /// All zero; `pattern` says which neighbours there are.
+  explicit StencilRows(std::shared_ptr<const StencilPattern> pattern)
+      : pattern_(std::move(pattern)), nx_(pattern_->grid.shape[2]), row_(round_up_to_lanes<T>(nx_)),
+        count_(static_cast<int64_t>(pattern_->offsets.size())),
+        coupled_(!pattern_->grid.periodic[2]   ? 0
+                 : pattern_->nearest           ? 2 * kLanes<T>
+                                               : static_cast<int64_t>(pattern_->wraps.size())),
+        memory_(rows() * (count_ * row_ + coupled_) + kLanes<T>, T(0)) {
+    const auto address = reinterpret_cast<std::uintptr_t>(memory_.data());
+    coefficients_ = reinterpret_cast<T*>((address + 63) / 64 * 64);
+  }
+  StencilRows(StencilRows&&) = default;  // a copy would lie at another alignment
+  StencilRows& operator=(StencilRows&&) = default;
+
+  const StencilPattern& pattern() const { return *pattern_; }
+  const StencilGrid& grid() const { return pattern_->grid; }
+  int64_t rows() const { return grid().shape[0] * grid().shape[1]; }
+  /// From a coefficient at a point to the same one in the next row.
+  int64_t stride() const { return count_ * row_; }
+  /// Coefficient k of row r.
+  T* coefficient(int64_t r, int64_t k) { return coefficients_ + (r * count_ + k) * row_; }
+  const T* coefficient(int64_t r, int64_t k) const { return coefficients_ + (r * count_ + k) * row_; }
+
+  void close() {
+    for (int64_t r = 0; r < rows(); ++r) {
+      T* const to = coupled(r);
+      for (size_t e = 0; e < pattern_->wraps.size(); ++e)
+        to[e] = coefficient(r, pattern_->wraps[e].coefficient)[pattern_->wraps[e].to];
+      if (pattern_->nearest && coupled_) {
+        to[0] = coefficient(r, 1)[0];
+        to[kLanes<T> + (nx_ - 1) % kLanes<T>] = coefficient(r, 2)[nx_ - 1];
+      }
+      if (row_ > nx_) std::fill(coefficient(r, 0) + nx_, coefficient(r, 0) + row_, T(1));
+    }
+    for (int64_t k = 0; k < count_; ++k) {
+      const int64_t x = pattern_->offsets[k].along[2];
+      for (int64_t r = 0; r < rows() && x != 0; ++r) {
+        for (int64_t i = 0; i < -x; ++i) coefficient(r, k)[i] = T(0);
+        for (int64_t i = nx_ - x; i < nx_; ++i) coefficient(r, k)[i] = T(0);
+      }
+    }
+  }
+
+  /// out = A v; dots += {v·out, ‖out‖²} unless it is null.
+  void apply(const T* v, T* out, T* dots) const {
+    const auto& loops = kernels::loops<T>();
+    if (pattern_->nearest) loops.apply_neighbours[grid().dim - 1](neighbours(), v, out, dots);
+    else loops.apply_offsets(offsets(), v, out, dots);
+  }
+  /// A Jacobi sweep y = x + c - D⁻¹A x; *squares += ‖D(y - x)‖² unless it is null.
+  void sweep(const T* c, const T* x, T* y, T* squares) const {
+    const auto& loops = kernels::loops<T>();
+    if (pattern_->nearest) loops.sweep_neighbours[grid().dim - 1](neighbours(), c, x, y, squares);
+    else loops.sweep_offsets(offsets(), c, x, y, squares);
+  }
+  /// The same for the loops of operators that hold several stencils of nearest neighbours.
+  NeighbourStencil<T> neighbours() const {
+    const auto& n = grid().shape;
+    return {n[0], n[1], nx_, row_, coefficients_, coupled_ ? coupled(0) : nullptr};
+  }
+
+  /// max_i Σ_j |A_ij|
+  double norm() const {
+    std::vector<T> sums(nx_);
+    T largest = 0;
+    for (int64_t r = 0; r < rows(); ++r) {
+      std::fill(sums.begin(), sums.end(), T(0));
+      for (int64_t k = 0; k < count_; ++k) {
+        const T* row = coefficient(r, k);
+        for (int64_t i = 0; i < nx_; ++i) sums[i] += std::abs(row[i]);
+      }
+      for (size_t e = 0; e < pattern_->wraps.size(); ++e) sums[pattern_->wraps[e].to] += std::abs(coupled(r)[e]);
+      if (pattern_->nearest && coupled_) {
+        sums[0] += std::abs(coupled(r)[0]);
+        sums[nx_ - 1] += std::abs(coupled(r)[kLanes<T> + (nx_ - 1) % kLanes<T>]);
+      }
+      largest = std::max(largest, largest_magnitude(sums.data(), nx_));
+    }
+    return static_cast<double>(largest);
+  }
+  /// Calls body(row, column, value) for the entries of the matrix; where nearest neighbours coincide they
+  /// come one by one.
+  template <class Body>
+  void for_each_entry(const Body& body) const {
+    const auto& [nz, ny, nx] = grid().shape;
+    const auto& periodic = grid().periodic;
+    for (int64_t r = 0; r < rows(); ++r)
+      for (int64_t k = 0; k < count_; ++k) {
+        const auto& o = pattern_->offsets[k].along;
+        const int64_t z = neighbour(r / ny, o[0], nz, periodic[0]), y = neighbour(r % ny, o[1], ny, periodic[1]);
+        if (z < 0 || y < 0) continue;
+        const int64_t begin = std::max<int64_t>(-o[2], 0), end = std::min(nx, nx - o[2]);
+        const int64_t at = r * nx, there = (z * ny + y) * nx;
+        for (int64_t i = begin; i < end; ++i) body(at + i, there + i + o[2], coefficient(r, k)[i]);
+        if (!periodic[2]) continue;
+        for (int64_t i = 0; i < begin; ++i) body(at + i, there + i + o[2] + nx, wrapped(r, k, i));
+        for (int64_t i = end; i < nx; ++i) body(at + i, there + i + o[2] - nx, wrapped(r, k, i));
+      }
+  }
+
+ private:
+  const T* coupled(int64_t r) const { return coefficients_ + rows() * stride() + r * coupled_; }
+  T* coupled(int64_t r) { return coefficients_ + rows() * stride() + r * coupled_; }
+  OffsetStencil<T> offsets() const {
+    const auto& n = grid().shape;
+    return {n[0], n[1], nx_, row_, count_, pattern_->offsets.data(), coefficients_, coupled_,
+            pattern_->wraps.data(), coupled(0)};
+  }
+
+  /// What couples point i to the one at offset x along its own row, which leaves the row.
+  T wrapped(int64_t r, int64_t k, int64_t i) const {
+    if (pattern_->nearest) return coupled(r)[k == 1 ? 0 : kLanes<T> + i % kLanes<T>];
+    const auto& wraps = pattern_->wraps;
+    size_t e = 0;
+    while (wraps[e].coefficient != k || wraps[e].to != i) ++e;
+    return coupled(r)[e];
+  }
+
+  std::shared_ptr<const StencilPattern> pattern_;
+  int64_t nx_, row_, count_;
+  int64_t coupled_;  // values for what leaves a row
+  std::vector<T> memory_;
+  T* coefficients_;  // aligned, within memory_, with those values behind them
+};
+
+}  // namespace prdp::kernels

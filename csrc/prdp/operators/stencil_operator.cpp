@@ -1,0 +1,222 @@
+#include "prdp/operators/stencil_operator.h"
+
+#include <ATen/Parallel.h>
+#include <ATen/TensorSubclassLikeUtils.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/kernels/stencil_products.h"
+#include "prdp/operators/dense.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+constexpr int64_t kFarthest = 2;
+
+/// "(0, -1)", or "(3,)" for one number.
+std::string as_tuple(at::ArrayRef<int64_t> values) {
+  std::ostringstream text;
+  for (size_t i = 0; i < values.size(); ++i) text << (i ? ", " : "(") << values[i];
+  text << (values.size() == 1 ? ",)" : ")");
+  return text.str();
+}
+
+at::ArrayRef<int64_t> entries(const kernels::Offset& offset, int64_t dim) {
+  return {offset.along + 3 - dim, static_cast<size_t>(dim)};
+}
+
+/// The product rule by loops: products (batch or 1, k, *shape) from λ and u (batch, channel, *shape).
+template <class T>
+void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& lambda, const at::Tensor& u,
+                      const at::Tensor& products) {
+  const int64_t samples = lambda.size(0), channels = lambda.size(1), given = products.size(1);
+  const int64_t points = products.numel() / (products.size(0) * given);
+  const int64_t share = products.size(0) == 1 ? samples : 1;  // samples that add up to one product
+  const auto *l = lambda.const_data_ptr<T>(), *v = u.const_data_ptr<T>();
+  auto* out = products.mutable_data_ptr<T>();
+  constexpr int64_t worthwhile = 1 << 18;  // multiplications for a thread
+  const int64_t grain = std::max<int64_t>(1, worthwhile / std::max<int64_t>(1, share * channels * points));
+  at::parallel_for(0, products.size(0) * given, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t p = begin; p < end; ++p) {
+      const int64_t place = pattern.places[p % given], first = p / given * channels;
+      for (int64_t field = first; place >= 0 && field < first + share * channels; ++field)
+        kernels::add_products(pattern.grid, pattern.offsets[place], l + field * points, v + field * points,
+                              out + p * points);
+    }
+  });
+}
+
+}  // namespace
+
+OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vector<int64_t>>& offsets,
+                     const std::vector<Boundary>& boundary) {
+  TORCH_CHECK_VALUE(coefficients.dim() >= 3 && coefficients.dim() <= 5,
+                    "Stencil: coefficients must have shape (batch or 1, k, *shape) with 1 to 3 axes in shape, got ",
+                    coefficients.sizes());
+  const auto dim = static_cast<size_t>(coefficients.dim() - 2);
+  TORCH_CHECK_VALUE(boundary.size() == 1 || boundary.size() == dim, "Stencil: boundary must be one for all axes or ",
+                    dim, ", one for each, got ", boundary.size());
+  OperatorSpec spec{"stencil", coefficients.sizes().slice(2).vec(), {}, {coefficients}};
+  for (size_t d = 0; d < dim; ++d)
+    spec.parameters.push_back(boundary[boundary.size() == 1 ? 0 : d] == Boundary::kPeriodic);
+  for (const auto& offset : offsets) {
+    TORCH_CHECK_VALUE(offset.size() == dim, "Stencil: every offset must have ", dim,
+                      " entries, one for each axis of shape, got ", as_tuple(offset));
+    spec.parameters.insert(spec.parameters.end(), offset.begin(), offset.end());
+  }
+  StencilOperator{spec};  // checks the rest
+  return spec;
+}
+
+StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1}, {false, false, false}} {
+  TORCH_CHECK_VALUE(spec.tensors.size() == 1, "Stencil: takes one tensor, the coefficients");
+  coefficients_ = spec.tensors[0];
+  grid_.dim = static_cast<int64_t>(spec.shape.size());
+  const auto sizes = coefficients_.sym_sizes();
+  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && coefficients_.dim() == dim() + 2,
+                    "Stencil: coefficients must have shape (batch or 1, k, *shape) with 1 to 3 axes in shape, got ",
+                    sizes);
+  TORCH_CHECK_TYPE(coefficients_.scalar_type() == at::kFloat || coefficients_.scalar_type() == at::kDouble,
+                   "Stencil: coefficients must be float32 or float64, got ", coefficients_.scalar_type());
+  const auto& p = spec.parameters;
+  const auto axes = static_cast<size_t>(dim());
+  TORCH_CHECK_VALUE(p.size() >= axes && p.size() % axes == 0, "Stencil: every offset must have ", dim(), " entries");
+  for (size_t d = 0; d < axes; ++d) {
+    TORCH_CHECK_VALUE(spec.shape[d] >= 1 && sizes[d + 2] == spec.shape[d],
+                      "Stencil: coefficients must have shape (batch or 1, k, ", at::IntArrayRef(spec.shape),
+                      ") with every extent >= 1, got ", sizes);
+    grid_.shape[3 - axes + d] = spec.shape[d];
+    grid_.periodic[3 - axes + d] = p[d] != 0.0;
+  }
+  for (size_t at = axes; at < p.size(); at += axes) {
+    kernels::Offset offset{{0, 0, 0}};
+    for (size_t d = 0; d < axes; ++d) offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
+    for (const int64_t cells : offset.along)
+      TORCH_CHECK_VALUE(std::abs(cells) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
+                        " cells along each axis, got ", as_tuple(entries(offset, dim())));
+    TORCH_CHECK_VALUE(std::find(offsets_.begin(), offsets_.end(), offset) == offsets_.end(), "Stencil: the offset ",
+                      as_tuple(entries(offset, dim())), " is there twice; add up its coefficients");
+    offsets_.push_back(offset);
+  }
+  TORCH_CHECK_VALUE(!offsets_.empty(), "Stencil: there must be at least one offset");
+  TORCH_CHECK_VALUE(sizes[1] == count(), "Stencil: ", count(), " offsets need coefficients of shape (batch or 1, ",
+                    count(), ", *shape), got ", sizes);
+}
+
+void StencilOperator::check_vector(const at::Tensor& b) const {
+  const auto sizes = b.sym_sizes();
+  bool fits = b.dim() == dim() + 2;
+  for (int64_t d = 0; fits && d < dim(); ++d) fits = sizes[d + 2] == extent(d);
+  if (!fits) {
+    std::ostringstream expected;
+    for (int64_t d = 0; d < dim(); ++d) expected << ", " << extent(d);
+    TORCH_CHECK_VALUE(false, "Stencil: expected (batch, channel", expected.str(), "), got ", sizes);
+  }
+  TORCH_CHECK_VALUE(coefficients_.sym_size(0) == 1 || coefficients_.sym_size(0) == sizes[0],
+                    "Stencil: the coefficients hold ", coefficients_.sym_size(0), " samples, the vector holds ",
+                    sizes[0]);
+  TORCH_CHECK_TYPE(b.scalar_type() == coefficients_.scalar_type(), "Stencil: the coefficients are ",
+                   coefficients_.scalar_type(), " but the vector is ", b.scalar_type());
+  TORCH_CHECK_VALUE(b.device() == coefficients_.device(), "Stencil: the coefficients are on ",
+                    coefficients_.device(), " but the vector is on ", b.device());
+}
+
+at::Tensor StencilOperator::shifted(const at::Tensor& t, const kernels::Offset& offset, bool back) const {
+  auto moved = t;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const int64_t cells = (back ? -1 : 1) * offset.along[3 - dim() + axis], n = extent(axis);
+    const int64_t d = t.dim() - dim() + axis;
+    if (cells == 0) continue;
+    if (grid_.periodic[3 - dim() + axis]) {
+      moved = at::roll(moved, -cells, d);
+      continue;
+    }
+    const int64_t kept = std::max<int64_t>(n - std::abs(cells), 0);
+    std::vector<int64_t> pad(2 * (t.dim() - d), 0);
+    pad[pad.size() - 2] = cells < 0 ? n - kept : 0;
+    pad[pad.size() - 1] = cells > 0 ? n - kept : 0;
+    moved = at::constant_pad_nd(moved.narrow(d, cells > 0 ? n - kept : 0, kept), pad);
+  }
+  return moved;
+}
+
+at::Tensor StencilOperator::apply(const at::Tensor& v) const {
+  at::Tensor sum;
+  for (int64_t k = 0; k < count(); ++k) add_to(sum, coefficient(k) * shifted(v, offsets_[k]));
+  return sum;
+}
+
+at::Tensor StencilOperator::apply_transpose(const at::Tensor& v) const {
+  at::Tensor sum;
+  for (int64_t k = 0; k < count(); ++k) add_to(sum, shifted(coefficient(k) * v, offsets_[k], /*back=*/true));
+  return sum;
+}
+
+at::Tensor StencilOperator::diagonal() const {
+  const kernels::StencilPattern pattern(grid_, offsets_);
+  at::Tensor sum;
+  for (int64_t k = 0; k < count(); ++k)
+    if (pattern.places[k] == 0) add_to(sum, coefficient(k));
+  return sum.defined() ? sum : at::zeros_like(coefficient(0));
+}
+
+at::Tensor StencilOperator::norm() const {
+  const kernels::StencilPattern pattern(grid_, offsets_);
+  const auto inside = at::ones(coefficients_.sizes().slice(2), coefficients_.options());
+  std::vector<at::Tensor> entries(pattern.offsets.size());
+  auto rows = coefficients_.mul(0).sum(1);  // NaN where a coefficient is not finite
+  for (int64_t k = 0; k < count(); ++k)
+    if (const int64_t place = pattern.places[k]; place >= 0)
+      add_to(entries[place], coefficient(k).squeeze(1) * shifted(inside, offsets_[k]));
+  for (const auto& entry : entries)
+    if (entry.defined()) rows = rows + entry.abs();
+  const auto norms = rows.flatten(1).amax(1);
+  return norms.size(0) == 1 ? norms.squeeze(0) : norms;
+}
+
+at::Tensor StencilOperator::solve_directly(const at::Tensor& b) const {
+  return solve_channels(channel_matrix(*this, coefficients_.options()), b);
+}
+at::Tensor StencilOperator::solve_transpose_directly(const at::Tensor& b) const {
+  return solve_channels(channel_matrix(*this, coefficients_.options()).mT(), b);
+}
+
+std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  const bool plain = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);
+  if (!at::GradMode::is_enabled() && plain && lambda.is_cpu()) {
+    const auto all = at::zeros(coefficients_.sizes(), coefficients_.options());
+    const kernels::StencilPattern pattern(grid_, offsets_);
+    const auto add = lambda.scalar_type() == at::kFloat ? add_all_products<float> : add_all_products<double>;
+    add(pattern, lambda.contiguous(), u.contiguous(), all);
+    return {all};
+  }
+  std::vector<at::Tensor> products;
+  for (const auto& offset : offsets_) products.push_back((lambda * shifted(u, offset)).sum(1));
+  const auto all = at::stack(products, 1);
+  return {coefficients_.sym_size(0) == 1 ? all.sum(0, /*keepdim=*/true) : all};
+}
+
+std::vector<int64_t> StencilOperator::first_nonfinite(int64_t sample) const {
+  return first_true(nonfinite(coefficients_.select(0, coefficients_.size(0) == 1 ? 0 : sample)));
+}
+
+std::unique_ptr<Operator> StencilOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<StencilOperator>(*this);
+  if (coefficients_.size(0) > 1) chosen->coefficients_ = coefficients_.index_select(0, index);
+  return chosen;
+}
+
+std::vector<int64_t> StencilOperator::vector_shape() const {
+  std::vector<int64_t> shape{1};
+  for (int64_t d = 0; d < dim(); ++d) shape.push_back(extent(d));
+  return shape;
+}
+
+KernelParameters StencilOperator::kernel(const at::Tensor& b) const {
+  return StencilParameters{coefficients_.detach().contiguous(), grid_, offsets_, b.size(1)};
+}
+
+}  // namespace prdp

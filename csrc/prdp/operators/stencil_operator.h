@@ -1,0 +1,49 @@
+#pragma once
+#include "prdp/grid/grid.h"
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// (A v)[i] = Σ_k coefficients[k, i] · v[i + offsets[k]] on a grid of one to three axes, the same for every
+/// channel of v (batch, channel, *shape), for linear_solve.
+///
+/// coefficients: (batch or 1, k, *shape), float32 or float64; they get gradients. offsets: k distinct ones,
+/// one entry of at most two cells for each axis. boundary: v is zero outside (Boundary::kDirichlet) or
+/// periodic; one for all axes or one for each. Raises ValueError for what does not fit together.
+OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vector<int64_t>>& offsets,
+                     const std::vector<Boundary>& boundary = {Boundary::kDirichlet});
+
+/// Kind "stencil": shape, parameters (for each axis whether it is periodic, then the offsets one after the
+/// other), tensors (coefficients).
+class StencilOperator final : public Operator {
+ public:
+  explicit StencilOperator(const OperatorSpec& spec);
+
+  void check_vector(const at::Tensor& b) const override;
+  at::Tensor apply(const at::Tensor& v) const override;
+  at::Tensor apply_transpose(const at::Tensor& v) const override;
+  at::Tensor diagonal() const override;
+  at::Tensor norm() const override;
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+  std::vector<int64_t> vector_shape() const override;
+  KernelParameters kernel(const at::Tensor& b) const override;
+
+ private:
+  int64_t dim() const { return grid_.dim; }
+  int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
+  int64_t extent(int64_t axis) const { return grid_.shape[3 - dim() + axis]; }
+  /// Coefficient k, (batch or 1, 1, *shape).
+  at::Tensor coefficient(int64_t k) const { return coefficients_.narrow(1, k, 1); }
+  /// t[i + offset], or t[i - offset], for the last dim() axes of t.
+  at::Tensor shifted(const at::Tensor& t, const kernels::Offset& offset, bool back = false) const;
+
+  kernels::StencilGrid grid_;
+  std::vector<kernels::Offset> offsets_;
+  at::Tensor coefficients_;
+};
+
+}  // namespace prdp
