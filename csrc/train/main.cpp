@@ -25,7 +25,7 @@ struct Interrupted {};
 struct Options {
   std::string scene, out, schedule, backward;
   int64_t seeds = 1, constant = -1, intervals = 0;
-  bool direct = false, resume = false;
+  bool direct = false, automatic = false, resume = false;
 };
 
 /// What a record must agree on to be of the same training.
@@ -43,6 +43,7 @@ Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, co
   Json curves;
   prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
   if (!c.diverged.empty()) curves["diverged"] = c.diverged;
+  if (!c.warning.empty()) curves["warning"] = c.warning;
   return {{"label", label},
           {"seed", seed},
           {"settings", settings(scene)},
@@ -75,6 +76,7 @@ bool is_done(const fs::path& path, const prdp::Scene& scene) {
 prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
   if (options.constant >= 0) return prdp::train::constant(options.constant);
   if (options.direct) return prdp::train::direct();
+  if (options.automatic) return prdp::train::automatic();
   if (options.schedule.empty()) return prdp::train::prdp(scene);
   long long start = 0, step = 0;
   char rest = 0;
@@ -114,6 +116,8 @@ int run(const Options& options, const std::string& command) {
     checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
+      if (!curves.warning.empty())
+        std::fprintf(stderr, "prdp_train: warning: seed %ld, %s\n", seed, curves.warning.c_str());
     } else {
       ++diverged;
       std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, curves.diverged.c_str());
@@ -133,12 +137,14 @@ int main(int argc, char** argv) {
   auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
   auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
   auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
+  auto* a = app.add_flag("--auto", options.automatic, "a tolerance tied to the error, with nothing to choose");
   app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
   app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
-  k->excludes(s)->excludes(d);
-  s->excludes(d);
+  k->excludes(s)->excludes(d)->excludes(a);
+  s->excludes(d)->excludes(a);
+  d->excludes(a);
   CLI11_PARSE(app, argc, argv);
   std::signal(SIGINT, [](int) { interrupted = 1; });
   std::string command;

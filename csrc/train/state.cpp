@@ -1,5 +1,7 @@
 #include "state.h"
 
+#include <cmath>
+#include <optional>
 #include <sstream>
 
 namespace prdp::train {
@@ -22,7 +24,10 @@ void save(OutputArchive& archive, const Curves& curves, const Controller& contro
   const auto& state = controller.state();
   std::vector<double> metric, smoothed;
   std::vector<int64_t> max_iter, refined;
+  std::vector<double> error, residual;  // NaN where not known
   for (const auto& record : state.history) {
+    error.push_back(record.error.value_or(NAN));
+    residual.push_back(record.residual.value_or(NAN));
     metric.push_back(record.metric);
     smoothed.push_back(record.smoothed);
     max_iter.push_back(record.max_iter);
@@ -34,6 +39,8 @@ void save(OutputArchive& archive, const Curves& curves, const Controller& contro
   archive.write("history_smoothed", c10::IValue(smoothed));
   archive.write("history_max_iter", c10::IValue(max_iter));
   archive.write("history_refined", c10::IValue(refined));
+  archive.write("history_error", c10::IValue(error));
+  archive.write("history_residual", c10::IValue(residual));
 }
 
 void load(InputArchive& archive, Curves& curves, Controller& controller) {
@@ -46,8 +53,12 @@ void load(InputArchive& archive, Curves& curves, Controller& controller) {
   const auto smoothed = read<std::vector<double>>(archive, "history_smoothed");
   const auto max_iter = read<std::vector<int64_t>>(archive, "history_max_iter");
   const auto refined = read<std::vector<int64_t>>(archive, "history_refined");
+  const auto error = read<std::vector<double>>(archive, "history_error");
+  const auto residual = read<std::vector<double>>(archive, "history_residual");
+  const auto known = [](double x) { return std::isnan(x) ? std::optional<double>() : x; };
   for (size_t i = 0; i < metric.size(); ++i)
-    state.history.push_back({metric[i], smoothed[i], max_iter[i], refined[i] != 0});
+    state.history.push_back(
+        {metric[i], smoothed[i], max_iter[i], refined[i] != 0, known(error[i]), known(residual[i])});
   controller.load_state(std::move(state));
 }
 
