@@ -122,7 +122,8 @@ def _short(scene, entry):
 
 
 def _verdict(scene, base, entry):
-    """How far a row comes and what it saves. Nothing is said of savings where the error is worse."""
+    """How far a row comes and what it saves. Nothing is said of savings where the error is worse or the controller
+    warns."""
     name, against = _short(scene, entry), _short(scene, base)
     if scene.compare.target is not None:
         reach = f"an error of {scene.compare.target:g}"
@@ -134,7 +135,9 @@ def _verdict(scene, base, entry):
         return f"{name} {ending}, {against} after {base['intervals']:.0f}, {_savings(entry)}."
     spread = f" ± {base['metric_std']:.1e}" if base["metric_std"] else ""
     ending = f"{name} ends at an error of {entry['metric']:.2e}, {against} at {base['metric']:.2e}{spread}"
-    return f"{ending}: {_savings(entry)}." if entry["as_good"] else f"{ending}: it fails."
+    if not entry["as_good"]:
+        return f"{ending}: it fails."
+    return f"{ending}; its controller warns." if entry["warning"] else f"{ending}: {_savings(entry)}."
 
 
 def _savings(entry):

@@ -12,8 +12,8 @@ namespace {
 
 /// Below it, solves are as good as converged.
 constexpr double kSmallResidual = 1e-4;
-/// The residual makes up the error from this share on. Measured: at most .14 in trainings that end as well
-/// as with converged solves, at least .34 in those that do not (docs/refinement.md).
+/// The residual may make up the error from this share on. Measured: up to .24 trainings end as well as with
+/// converged solves, from .26 on most do not (docs/refinement.md).
 constexpr double kShareOfError = 0.25;
 /// Too large for whatever the metric may be.
 constexpr double kLargeResidual = 0.1;
@@ -32,7 +32,7 @@ std::optional<std::string> Controller::warning() const {
   if (last.error) {
     // The residual is relative to a state that holds the error as well.
     if (residual <= kShareOfError * *last.error / (1.0 + *last.error)) return {};
-    text << "too far off for an error of " << *last.error << ": what is trained has taken up the solver's error";
+    text << "too far off for an error of " << *last.error << ": what is trained may have taken up the solver's error";
   } else {
     if (residual <= kLargeResidual || !stalled()) return {};
     text << "and the metric no longer falls: what is trained may have taken up the solver's error";
