@@ -1,5 +1,6 @@
 # make demo   set everything up, then compare PRDP with constant K on the 1D heat equation
 # make test   set everything up, then run all C++ and Python tests
+# make docs   build the documentation as a site, site/index.html
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -8,7 +9,7 @@ STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
 
-.PHONY: demo test bench-peers clean
+.PHONY: demo test docs bench-peers clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -28,6 +29,16 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	.venv-peers/bin/python -m prdp_torch.cli bench
+
+# An environment of its own: it reads the sources and needs neither torch nor a build.
+docs: $(STAMPS)/docs
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict --quiet
+	@echo "prdp: the documentation is site/index.html"
+
+$(STAMPS)/docs: docs/requirements.txt
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check -r docs/requirements.txt
+	@mkdir -p $(STAMPS) && touch $@
 
 $(STAMPS)/peers: benchmarks/requirements-peers.txt $(STAMPS)/python
 	$(PYTHON) -m venv .venv-peers
@@ -59,4 +70,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-peers .stamps build runs prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-docs .venv-peers .stamps build runs site prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info

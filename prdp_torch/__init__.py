@@ -12,9 +12,12 @@ _load.check_torch()
 
 from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
+from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
+from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
 from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent  # noqa: E402
-from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson, Stepper  # noqa: E402
+from prdp_torch.stepper import Stepper  # noqa: E402
+from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson  # noqa: E402
 
 __version__ = _C.VERSION
 
@@ -25,6 +28,7 @@ __all__ = [
     "Chebyshev",
     "Direct",
     "Heat",
+    "ImplicitStep",
     "Jacobi",
     "LinearSchedule",
     "NavierStokes",
@@ -35,6 +39,7 @@ __all__ = [
     "SteepestDescent",
     "Stepper",
     "ToleranceController",
+    "check_operator",
     "fields",
     "linear_solve",
     "operators",

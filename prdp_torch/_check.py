@@ -1,5 +1,6 @@
 """Types of arguments in words; the compiled library checks their ranges. Each returns the argument as
-the plain type it stands for, or raises TypeError."""
+the plain type it stands for, or raises TypeError, or ValueError for a number that
+this type cannot hold."""
 
 import numbers
 
@@ -8,13 +9,18 @@ import torch
 
 def whole(who, name, value):
     if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        if abs(value) >= 2**63:
+            raise ValueError(f"{who}: {name} must be less than 2**63, got {value}")
         return int(value)
     raise TypeError(f"{who}: {name} must be a whole number, got {value!r}")
 
 
 def real(who, name, value):
     if isinstance(value, numbers.Real) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError(f"{who}: {name} must be less than 2**1024, got a number of more digits") from None
     raise TypeError(f"{who}: {name} must be a real number, got {value!r}")
 
 
@@ -32,6 +38,17 @@ def shape(who, value):
     if isinstance(value, (tuple, list)):
         return [whole(who, "every extent of shape", n) for n in value]
     raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {value!r}")
+
+
+def lengths(who, value, axes):
+    """The sides of the domain, one per axis; none where all are 1."""
+    if not isinstance(value, (tuple, list)):
+        sides = [real(who, "length", value)] * axes
+    else:
+        sides = [real(who, "every length", side) for side in value]
+        if len(sides) != axes:
+            raise ValueError(f"{who}: length must be one number or one per axis, {axes} here, got {value!r}")
+    return [] if all(side == 1.0 for side in sides) else sides
 
 
 def dense(who, name, value):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import pickle
 
 import torch
 
@@ -17,7 +18,7 @@ class Checkpoint(_C.Checkpoint):
     """
 
     def __init__(self, path, **settings):
-        super().__init__(str(path), json.dumps({"trainer": "Python", **settings}))
+        super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
     def save(self, state):
         """Replace the file by this state: tensors, state_dicts and plain values. ValueError if it cannot be written."""
@@ -28,4 +29,9 @@ class Checkpoint(_C.Checkpoint):
     def load(self):
         """The state last saved, None where there is none of these settings. ValueError for a damaged file."""
         content = self.read()
-        return None if content is None else torch.load(io.BytesIO(content), weights_only=True)
+        if content is None:
+            return None
+        try:
+            return torch.load(io.BytesIO(content), weights_only=True)  # tensors and plain values; no code is run
+        except (RuntimeError, EOFError, pickle.UnpicklingError):
+            self.refuse()

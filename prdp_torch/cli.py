@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from prdp_torch import _C, records, report, trajectories
 from prdp_torch import compare as comparison
-from prdp_torch import records, report, trajectories
 from prdp_torch import scenes as scene_files
 from prdp_torch.training import Refinement
 
@@ -24,15 +24,16 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Train through PDE solves that stop early, and see what it saves.",
 )
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False, emoji=False)  # paths and titles are printed as they are
 
 SUITES = ("accuracy", "size", "roofline", "change_of_k", "training", "memory")  # modules of benchmarks/
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
-Seeds = Annotated[int | None, typer.Option(min=1, help="How many seeds, counted from 0.")]
+COUNT = {"min": 1, "max": _C.MOST_COUNTED}
+Seeds = Annotated[int | None, typer.Option(**COUNT, help="How many seeds, counted from 0.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
-Intervals = Annotated[int | None, typer.Option(min=1, help="Epochs (or updates) in place of the scene's.")]
+Intervals = Annotated[int | None, typer.Option(**COUNT, help="Epochs (or updates) in place of the scene's.")]
 
 
 def out(default):
@@ -52,8 +53,11 @@ def command(function):
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output has left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        except (ValueError, OSError) as error:
-            print(f"prdp: {error}", file=sys.stderr)
+        except (typer.Exit, typer.Abort):  # RuntimeErrors, too
+            raise
+        except (ValueError, TypeError, OSError, RuntimeError, OverflowError, MemoryError) as error:
+            words = "std::bad_alloc" if isinstance(error, MemoryError) else str(error)
+            print(f"prdp: {_C.sentence(words)}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return app.command(name=function.__name__)(guarded)
@@ -72,7 +76,7 @@ def train(
     scene: SceneName,
     auto: Annotated[bool, typer.Option("--auto", help="A tolerance tied to the error; nothing to choose.")] = False,
     prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings; the default.")] = False,
-    constant: Annotated[int | None, typer.Option(min=1, metavar="K", help="Constant K.")] = None,
+    constant: Annotated[int | None, typer.Option(**COUNT, metavar="K", help="Constant K.")] = None,
     schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
     direct: Annotated[bool, typer.Option("--direct", help="The exact solver.")] = False,
     seeds: Seeds = None,
@@ -106,7 +110,7 @@ def train(
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment()
     diverged, warnings = {}, {}
-    with _progress() as progress:
+    with records.alone_in([folder / refinement.label]), _progress() as progress:
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
@@ -203,20 +207,21 @@ def _load(scene, backward, intervals):
 
 def _schedule(text):
     parts = text.split(":")
-    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        raise ValueError(f"--schedule: expected START:STEP, two whole numbers, got '{text}'")
+    most = _C.MOST_COUNTED
+    if len(parts) != 2 or not all(part.isdecimal() and len(part) < 20 and int(part) <= most for part in parts):
+        raise ValueError(f"--schedule: expected START:STEP, two whole numbers up to {most}, got '{text}'")
     return int(parts[0]), int(parts[1])
 
 
 def _progress():
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     return Progress(*columns, console=console)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prdp_torch import records
+from prdp_torch import _C, records
 from prdp_torch.checkpoint import Checkpoint
 from prdp_torch.networks import make_network
 from prdp_torch.training import Refinement, train
@@ -23,7 +23,12 @@ class Row:
     curves: list = field(default_factory=list)
 
     def stack(self, name):
-        return np.array([c[name] for c in self.curves], dtype=float)
+        """(seeds, entries) of a curve. Where that of a lost training ends, its metric is NaN, K stays and nothing more
+        is counted."""
+        longest = max(len(c[name]) for c in self.curves)
+        rest = {"metric": lambda values: math.nan, "max_iter": lambda values: values[-1]}.get(name, lambda values: 0)
+        padded = [[*c[name], *[rest(c[name])] * (longest - len(c[name]))] for c in self.curves]
+        return np.array(padded, dtype=float)
 
     def final(self):
         """Metric at the end, one value a seed."""
@@ -94,53 +99,65 @@ def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
     report = progress or (lambda *event: None)
     environment = records.environment()
     rows = rows_of(scene)
-    for row in rows:
-        for seed in range(seeds):
-            row.curves.append(
-                run_one(
-                    scene,
-                    row.label,
-                    row.refinement,
-                    seed,
-                    folder,
-                    environment,
-                    resume,
-                    lambda done, metric, k, row=row, seed=seed: report(row, seed, done),
-                    on_data,
+    with records.alone_in([folder / row.label for row in rows]):
+        for row in rows:
+            for seed in range(seeds):
+                row.curves.append(
+                    run_one(
+                        scene,
+                        row.label,
+                        row.refinement,
+                        seed,
+                        folder,
+                        environment,
+                        resume,
+                        lambda done, metric, k, row=row, seed=seed: report(row, seed, done),
+                        on_data,
+                    )
                 )
-            )
     return rows
 
 
 def run_one(scene, label, refinement, seed, folder, environment, resume, on_interval, on_data=None):
     """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
-    the curves of a finished record of the same settings, or the training goes on from its checkpoint."""
+    the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
+    a record of the same settings and another number of intervals, which would be lost."""
     path = folder / label / f"seed_{seed}.json"
-    if resume and path.exists():
-        record = records.read(path)
-        if record["settings"] == records.settings(scene):
-            curves = record["curves"]
-            curves["metric"] = [math.nan if value is None else value for value in curves["metric"]]
-            on_interval(len(curves["seconds"]), curves["metric"][-1], curves["max_iter"][-1])
-            return curves
     path.parent.mkdir(parents=True, exist_ok=True)
     versions = environment["versions"]
     checkpoint = Checkpoint(
-        path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.settings(scene), versions=versions
+        path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.identity(scene), versions=versions
     )
     if not resume:
         checkpoint.remove()
+    curves = _finished(path, scene, checkpoint) if resume else None
+    if curves is not None:
+        on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
+        return curves
     network = None if scene.task == "parameters" else make_network(scene, seed)
     curves = train(scene, refinement, seed, network, on_interval, on_data, checkpoint)
     on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
-    if network is not None:
-        path.unlink(missing_ok=True)  # a record vouches for the weights beside it
-        records.write_weights(path.with_suffix(".pt"), network)
-    records.write(
-        path,
-        {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves},
-    )
+    record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
+    records.write_training(path, record, network)
     checkpoint.remove()
+    return curves
+
+
+def _finished(path, scene, checkpoint):
+    """The curves of the record at `path` if it is of this training. ValueError if it is of another length, and no
+    checkpoint is left to go on from."""
+    record = records.read(path)
+    if record is None:
+        return None
+    intervals = record["settings"].pop("intervals")
+    if record["settings"] != records.identity(scene):
+        return None
+    if intervals != scene.training.intervals:
+        if checkpoint.read() is None:
+            _C.refuse_finished(path, intervals, scene.training.intervals)
+        return None
+    curves = record["curves"]
+    curves["metric"] = [math.nan if value is None else value for value in curves["metric"]]
     return curves
 
 

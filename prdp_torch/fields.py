@@ -10,7 +10,8 @@ import math
 import torch
 
 from prdp_torch import _check
-from prdp_torch.steppers import Stepper
+from prdp_torch.stepper import Stepper
+from prdp_torch.steppers import EquationStepper
 
 _Y, _X = -2, -1
 
@@ -54,7 +55,7 @@ def rollout(stepper, u, steps):
     """The states u, stepper(u), stepper(stepper(u)), …, `steps` steps on, the start included:
     (batch, steps + 1, channel, *shape). `stepper` is any callable; one of this library takes them in one
     op, by `Stepper.rollout`."""
-    if isinstance(stepper, Stepper) and type(stepper).forward is Stepper.forward:
+    if isinstance(stepper, Stepper) and type(stepper).forward in (Stepper.forward, EquationStepper.forward):
         return stepper.rollout(u, steps)
     if _check.whole("rollout", "steps", steps) < 0:
         raise ValueError(f"rollout: steps must be >= 0, got {steps}")

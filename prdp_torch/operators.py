@@ -5,6 +5,8 @@ otherwise, and (batch, n) for matrices. The tensors that an operator is made of 
 gradients through `apply` and through `linear_solve`.
 """
 
+import warnings
+
 import torch
 
 from prdp_torch import _C, _check
@@ -45,45 +47,51 @@ class Operator:
 
 
 class Poisson(Operator):
-    """The Laplacian with homogeneous Dirichlet boundaries on `shape` unknowns of the unit domain,
-    dx = 1/(N + 1): Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Negative definite."""
+    """The Laplacian with homogeneous Dirichlet boundaries on `shape` unknowns, dx = length/(N + 1):
+    Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Negative definite.
+
+    length: the side of the domain, one number or one per axis in the order of `shape`.
+    """
 
     kind = "poisson"
 
-    def __init__(self, shape):
-        super().__init__(_check.shape("Poisson", shape), [], [])
+    def __init__(self, shape, length=1.0):
+        shape = _check.shape("Poisson", shape)
+        super().__init__(shape, _check.lengths("Poisson", length, len(shape)), [])
 
 
 class Heat(Operator):
     """One implicit Euler step of the heat equation, I - nu dt L with the Laplacian L of `Poisson`.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0."""
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`."""
 
     kind = "heat"
 
-    def __init__(self, shape, nu, dt):
-        super().__init__(_check.shape("Heat", shape), [_check.real("Heat", "dt", dt)], [real_tensor("Heat", "nu", nu)])
+    def __init__(self, shape, nu, dt, length=1.0):
+        shape = _check.shape("Heat", shape)
+        parameters = [_check.real("Heat", "dt", dt), *_check.lengths("Heat", length, len(shape))]
+        super().__init__(shape, parameters, [real_tensor("Heat", "nu", nu)])
 
 
 class Burgers(Operator):
-    """One implicit Euler step of Burgers' equation on a periodic grid of the unit domain, dx = 1/N,
+    """One implicit Euler step of Burgers' equation on a periodic grid, dx = length/N,
     linearised about `winds`: I + dt Γ - nu dt L on each velocity channel, with first-order upwind
     advection Γ = Σ_d max(w⁻, 0) B_d + min(w⁺, 0) F_d by the winds w∓ averaged to the faces of a cell
     (paper, appendix C.5). Row sums are 1 and off-diagonal entries <= 0.
 
     winds: (batch, 1, N) or (batch, 2, Ny, Nx), with batch 1 for all samples alike; channel 0 is the
         velocity along x, the last axis, channel 1 along y. float32 or float64, as the vectors.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0.
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`.
     """
 
     kind = "burgers"
 
-    def __init__(self, winds, nu, dt):
-        super().__init__(*flow("Burgers", "winds", winds, nu, dt))
+    def __init__(self, winds, nu, dt, length=1.0):
+        super().__init__(*flow("Burgers", "winds", winds, nu, dt, length))
 
 
 class NavierStokes(Operator):
     """One implicit Euler step of the incompressible Navier-Stokes equations on a periodic staggered grid
-    (Ny, Nx) of the unit square, dx = 1/N, linearised about `velocity`. Vectors are (batch, 3, Ny, Nx),
+    (Ny, Nx), dx = length/N, linearised about `velocity`. Vectors are (batch, 3, Ny, Nx),
     the channels u₁ along x on the left face of a cell, u₂ along y on its lower face, p in its centre:
 
         A = [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]],    C_k = I/dt + Γ_k - nu L
@@ -93,45 +101,68 @@ class NavierStokes(Operator):
     vector, constant pressure.
 
     velocity: (batch or 1, 2 or 3, Ny, Nx); a third channel, the pressure, has no influence.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0.
+    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`.
     """
 
     kind = "navier_stokes"
 
-    def __init__(self, velocity, nu, dt):
-        super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt))
+    def __init__(self, velocity, nu, dt, length=1.0):
+        super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt, length))
 
 
 class Function(Operator):
-    """An operator of your own, by its products `matvec(v, *tensors)` = A v and `transpose(v, *tensors)` =
-    Aᵀ v on batches of vectors (batch, ...), each of the shape and dtype of v. Made of torch operations,
-    they differentiate themselves; samples may differ through `tensors` alone, which get gradients.
+    """An operator of your own, by its product `matvec(v, *tensors)` = A v on batches of vectors (batch, ...).
 
-    For a symmetric A give the same function twice. `Jacobi` needs a diagonal and refuses; `Direct` probes
-    A with unit vectors, for small systems. Not under `torch.compile`.
+    Args:
+        matvec: made of torch operations; returns a new tensor of the shape and dtype of v, and is linear in
+            v. Samples may differ through `tensors` alone.
+        transpose: the same for Aᵀ v; torch's own derivative of matvec where None.
+        tensors: what A is made of, a tuple of tensors or a single one; they get gradients. A tensor that
+            requires grad and reaches matvec in another way is refused.
+        diagonal: `diagonal(*tensors)`, the diagonal of A in a shape that broadcasts against the vectors;
+            `Jacobi` needs it.
+        symmetric: A = Aᵀ, so that matvec serves for both.
+
+    `Direct` probes A with unit vectors, for small systems. `prdp.check_operator` compares all of these with
+    each other. Not under `torch.compile`.
     """
 
     kind = "function"
 
-    def __init__(self, matvec, transpose, tensors=()):
-        for name, function in (("matvec", matvec), ("transpose", transpose)):
-            if not callable(function):
+    def __init__(self, matvec, transpose=None, tensors=(), diagonal=None, symmetric=False):
+        for name, function in (("matvec", matvec), ("transpose", transpose), ("diagonal", diagonal)):
+            if not callable(function) and (name == "matvec" or function is not None):
                 raise TypeError(f"Function: {name} must be callable, got {function!r}")
+        if symmetric and transpose is not None:
+            raise ValueError("Function: with symmetric=True matvec is its own transpose; give only one of the two")
+        if isinstance(tensors, torch.Tensor):
+            tensors = (tensors,)
+        if not isinstance(tensors, (tuple, list)):
+            raise TypeError(f"Function: tensors must be a tuple of tensors, got {tensors!r}")
         tensors = [_check.dense("Function", "every tensor", t) for t in tensors]
+        self._made_of = matvec, transpose, diagonal, symmetric
+        product = _returning_a_tensor("matvec", matvec)
         self._products = _C.RegisteredProducts(
-            lambda v, given: matvec(v, *given), lambda v, given: transpose(v, *given)
+            product,
+            product if symmetric else _returning_a_tensor("transpose", transpose),
+            None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
         )
         super().__init__([self._products.number], [], tensors)
+
+    def __reduce__(self):
+        matvec, transpose, diagonal, symmetric = self._made_of
+        return Function, (matvec, transpose, tuple(self.tensors), diagonal, symmetric)
 
 
 class Matrix(Operator):
     """A tensor (n, n) or (batch, n, n), dense or sparse CSR. Gradients of a sparse one live on its
-    pattern."""
+    pattern; `Matrix.csr` takes them to its values without torch's dense detour."""
 
     def __init__(self, matrix):
         if not isinstance(matrix, torch.Tensor):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
+            _warn_of_csr_gradient(matrix)
             self.kind = "csr"
             tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
         elif matrix.layout == torch.strided:
@@ -143,6 +174,76 @@ class Matrix(Operator):
             raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
         super().__init__([], [], tensors)
 
+    @classmethod
+    def csr(cls, crow, col, values, size):
+        """A sparse matrix by its compressed rows, as `torch.sparse_csr_tensor` takes them.
+
+        Args:
+            crow: (n + 1,) whole numbers, where each row starts in col and values.
+            col: (nnz,) whole numbers, the column of each stored entry.
+            values: (nnz,), or (batch, nnz) for a matrix per sample on one pattern; float32 or float64. The
+                gradient arrives here, in this shape.
+            size: (n, n) or n; (batch, n, n) with values (batch, nnz).
+
+        Raises TypeError or ValueError where the shapes do not fit each other.
+        """
+        for name, tensor in (("crow", crow), ("col", col)):
+            if _check.dense("Matrix.csr", name, tensor).dtype not in (torch.int32, torch.int64):
+                raise TypeError(f"Matrix.csr: {name} must hold whole numbers (int32 or int64), got {tensor.dtype}")
+        if _check.dense("Matrix.csr", "values", values).dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"Matrix.csr: values must be float32 or float64, got {values.dtype}")
+        if not isinstance(size, (tuple, list)):
+            size = (_check.whole("Matrix.csr", "size", size),) * 2
+        size = tuple(_check.whole("Matrix.csr", "every extent of size", n) for n in size)
+        n, batch = size[-1], values.shape[:-1]
+        if values.dim() not in (1, 2) or len(size) not in (2, 3) or size[-2] != n or size[:-2] not in ((), batch):
+            raise ValueError(
+                "Matrix.csr: size must be (n, n), or (batch, n, n) with values of shape (batch, nnz), "
+                f"got {size} with values of shape {tuple(values.shape)}"
+            )
+        for name, tensor, length in (("crow", crow, n + 1), ("col", col, values.shape[-1])):
+            if tensor.shape not in ((length,), (*batch, length)):
+                raise ValueError(f"Matrix.csr: {name} must have shape ({length},), got {tuple(tensor.shape)}")
+        made = cls.__new__(cls)
+        made.kind = "csr"
+        pattern = [index.expand(*batch, -1) for index in (crow, col)]
+        Operator.__init__(made, [], [], [*pattern, values])
+        return made
+
+
+_warned_of_csr_gradient = False
+
+
+def _warn_of_csr_gradient(matrix):
+    global _warned_of_csr_gradient
+    if matrix.requires_grad and torch.is_grad_enabled() and not _warned_of_csr_gradient:
+        _warned_of_csr_gradient = True
+        warnings.warn(
+            "linear_solve: the gradient of a sparse CSR tensor passes through torch, which may make it dense; "
+            "operators.Matrix.csr(crow, col, values, size) takes it to the values directly",
+            stacklevel=4,
+        )
+
+
+def as_operator(who, name, value):
+    """An operator as it is, a tensor as a `Matrix`; TypeError for all else."""
+    if isinstance(value, Operator):
+        return value
+    if isinstance(value, torch.Tensor):
+        return Matrix(value)
+    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}")
+
+
+def _tensor(name, value):
+    if isinstance(value, torch.Tensor):
+        return value
+    raise TypeError(f"Function: {name} must return a torch tensor, got {type(value).__name__}")
+
+
+def _returning_a_tensor(name, function):
+    """A product as the compiled library calls it."""
+    return None if function is None else lambda v, given: _tensor(name, function(v, *given))
+
 
 def real_tensor(who, name, value):
     """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
@@ -151,8 +252,9 @@ def real_tensor(who, name, value):
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
 
 
-def flow(who, name, winds, nu, dt):
+def flow(who, name, winds, nu, dt, length):
     """Shape, parameters and tensors of a flow linearised about winds (batch, channel, *shape)."""
     if _check.dense(who, name, winds).dim() < 3:
         raise ValueError(f"{who}: {name} must have shape (batch, channel, *shape), got {tuple(winds.shape)}")
-    return list(winds.shape[2:]), [_check.real(who, "dt", dt)], [winds, real_tensor(who, "nu", nu)]
+    parameters = [_check.real(who, "dt", dt), *_check.lengths(who, length, winds.dim() - 2)]
+    return list(winds.shape[2:]), parameters, [winds, real_tensor(who, "nu", nu)]

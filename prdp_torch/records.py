@@ -1,9 +1,10 @@
 """Records: what a training was, what it cost and what it reached, as JSON."""
 
+import contextlib
+import io
 import json
 import math
 import os
-import pickle
 import platform
 import subprocess
 import sys
@@ -47,50 +48,77 @@ def _commit():
     return answer.stdout.strip()
 
 
+def identity(scene):
+    """What a training must agree on to be the same one, however many intervals it goes on for."""
+    return {"scene": scene.name, "text": scene.text, "backward": scene.backward}
+
+
 def settings(scene):
-    """What a record must agree on to be of the same training: the scene as it ran."""
-    return {
-        "scene": scene.name,
-        "text": scene.text,
-        "backward": scene.backward,
-        "intervals": scene.training.intervals,
-    }
+    """The scene as it ran."""
+    return {**identity(scene), "intervals": scene.training.intervals}
+
+
+@contextlib.contextmanager
+def alone_in(folders):
+    """Make the folders, and keep other processes from training into them meanwhile. ValueError if one does."""
+    locks = []
+    try:
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            locks.append(_C.FolderLock(folder))
+        yield
+    finally:
+        for lock in locks:
+            lock.release()
 
 
 def write(path, content):
-    """Write JSON (or text) whole or not at all: beside its place, then moved there. NaN is null."""
-    path = Path(path)
-    text = content if isinstance(content, str) else json.dumps(_null_for_nan(content), indent=1, allow_nan=False)
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text + "\n")
-    unfinished.replace(path)
+    """Write JSON (or text) whole or not at all. NaN is null. ValueError if it cannot be written."""
+    text = content if isinstance(content, str) else _json(content)
+    _C.write_whole([(path, (text + "\n").encode())])
 
 
-def write_weights(path, network):
-    """Write the network's `state_dict` whole or not at all."""
-    unfinished = path.with_name(path.name + ".part")
-    torch.save(network.state_dict(), unfinished)
-    unfinished.replace(path)
-
-
-def read_weights(path, network):
-    """Load what `write_weights` wrote into a network of the same make. ValueError if the file does not fit."""
-    try:
-        network.load_state_dict(torch.load(path, weights_only=True))
-    except (RuntimeError, EOFError, pickle.UnpicklingError):
-        raise ValueError(
-            f"weights: '{path}' is damaged or of another network; delete it, and its pictures are left out"
-        ) from None
-    return network
+def write_training(path, record, network=None):
+    """Write the record of a training, and the `state_dict` of its network (if it has one) beside it: both, each whole,
+    or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier record is
+    then still there, with its weights."""
+    weights = []
+    if network is not None:
+        content = io.BytesIO()
+        torch.save(network.state_dict(), content)
+        weights = [(weights_of(path), content.getvalue())]
+        record = {**record, "weights": _C.fingerprint(content.getvalue())}
+    _C.write_whole([*weights, (path, _C.seal_record(_json(record)).encode())])
 
 
 def read(path):
-    """A record. ValueError, naming it, for a damaged one."""
-    try:
-        return json.loads(Path(path).read_text())
-    except ValueError:
-        message = f"record: '{path}' is damaged; delete it, and its training is run again"
-        raise ValueError(message) from None
+    """A record, None where there is none. ValueError, naming it, for one that is damaged."""
+    text = _C.read_record(path)
+    return None if text is None else json.loads(text)
+
+
+def weights_of(path):
+    """Where the weights of a record lie."""
+    return path.with_suffix(".pt")
+
+
+def read_weights(path, network):
+    """Load the weights that belong to the record at `path` into a network of the same make. None if the record or its
+    weights are not there, ValueError if the weights are not those of the record."""
+    record, weights = read(path), weights_of(path)
+    if record is None or not weights.exists():
+        return None
+    content = weights.read_bytes()
+    if record.get("weights") != _C.fingerprint(content):
+        raise ValueError(
+            f"weights: '{weights}' is damaged or not of the record beside it; delete it, and its pictures are left out"
+        )
+    network.load_state_dict(torch.load(io.BytesIO(content), weights_only=True))
+    return network
+
+
+def _json(content):
+    return json.dumps(_null_for_nan(content), indent=1, allow_nan=False)
 
 
 def _null_for_nan(content):

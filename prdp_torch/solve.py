@@ -32,6 +32,17 @@ class AdjointLog:
         return AdjointLog, ()
 
 
+class AdjointLogs(list):
+    """The logs of a row of steps, one each; read as (batch, steps)."""
+
+    def __init__(self, steps=0):
+        super().__init__(AdjointLog() for _ in range(steps))
+
+    def read(self):
+        entry = _C.join_adjoint_logs([log.number for log in self])
+        return None if entry is None else SolveInfo(*entry)
+
+
 class SolveInfo(NamedTuple):
     """What a solve says of itself, one value per sample: tensors of shape (batch,). Of a rollout, one value
     per sample and step: (batch, steps)."""
@@ -44,7 +55,7 @@ class SolveInfo(NamedTuple):
     """Why it stopped: `SolveStatus(int(info.status[0])).name` (int64)."""
     operator_applications: torch.Tensor
     """Products with A, all told (int64)."""
-    log: AdjointLog | None = None
+    log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self):
         found = Counter(SolveStatus(s).name for s in self.status.flatten().tolist())

@@ -1,91 +1,68 @@
-"""Steppers: one time step, or one elliptic solve, as an `nn.Module` without weights."""
+"""Steppers of built-in equations: one time step, or one elliptic solve, as an `nn.Module`."""
 
 from dataclasses import dataclass
 
 import torch
 
-from prdp_torch import _C, _check, operators
-from prdp_torch.solve import AdjointLog, SolveInfo
-from prdp_torch.solvers import check_options, checkpoint_number
+from prdp_torch import _check, operators
+from prdp_torch.solve import SolveInfo
+from prdp_torch.stepper import Stepper
 
 
 @dataclass
 class Equation:
-    """A discretised equation as the compiled library takes it."""
+    """A discretised equation as the compiled library takes it, but for its tensors."""
 
     kind: str
     shape: list
     parameters: list
-    tensors: list
     picard_steps: int = 1
 
-    def __post_init__(self):
-        torch.ops.prdp.check_equation(self.tensors, self.kind, self.shape, self.parameters, self.picard_steps)
 
-    @classmethod
-    def implicit_step(cls, who, kind, shape, nu, dt, picard_steps=1):
-        """One implicit Euler step with diffusion; types in words."""
-        return cls(
-            kind,
-            _check.shape(who, shape),
-            [_check.real(who, "dt", dt)],
-            [operators.real_tensor(who, "nu", nu)],
-            _check.whole(who, "picard_steps", picard_steps),
-        )
+class EquationStepper(Stepper):
+    """A stepper whose equation the compiled library knows, so that a rollout is one op.
 
-
-class Stepper(torch.nn.Module):
-    """u → u_next, both (batch, channel, *shape) in float32 or float64 and of any strides, by a linear
-    solve A(u) u_next = b(u) that starts from zero. Derivatives as `linear_solve` describes them.
-
-    Args of every stepper beside its physics:
-        shape: grid of unknowns in the unit domain, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
-        backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
-
-    Attributes:
-        max_iter: K, the solver's budget; set it at any time, by hand or by a controller. A change
-            costs nothing, under `torch.compile` neither.
-        rtol, adjoint_rtol: the tolerances; set them at any time as well. Under `torch.compile` every new value
-            compiles once more, up to `torch._dynamo.config.recompile_limit` of them.
-        info: `SolveInfo` of the last forward or rollout; None before the first.
-        adjoint_info: `SolveInfo` of the last adjoint solve, or rollout of them; None before the first
-            backward.
-
-    Raises ValueError or TypeError for arguments out of range, before any work.
+    nu is a Parameter of the module where it was given as one, a buffer where it was given as a tensor, and
+    a plain number else.
     """
 
-    def __init__(
-        self,
-        equation,
-        solver,
-        backward="implicit",
-        adjoint_max_iter=None,
-        adjoint_rtol=None,
-        on_failure="raise",
-        checkpoint_every=None,
-    ):
-        super().__init__()
+    def __init__(self, shape, solver, backward, length, nu_and_dt=None, picard_steps=1, **options):
+        super().__init__(solver, backward, **options)
         who = type(self).__name__
-        check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
-        self.equation = equation
-        self.method = solver.method
-        self.rtol = float(solver.rtol)
-        self.restart = solver.restart
-        self.backward = backward
-        self.adjoint_max_iter = adjoint_max_iter
-        self.adjoint_rtol = adjoint_rtol
-        self.on_failure = on_failure
-        self.checkpoint_every = checkpoint_every
-        # A tensor, because torch.compile takes a module's plain numbers for constants.
-        self._max_iter = torch.tensor(solver.max_iter)
-        self._adjoint_log = AdjointLog()
-        self.info = None
+        self._refuse_own_system()
+        shape = _check.shape(who, shape)
+        self.length = length
+        parameters = _check.lengths(who, length, len(shape))
+        if nu_and_dt is not None:
+            nu, dt = nu_and_dt
+            self._keep_nu(nu)
+            parameters.insert(0, _check.real(who, "dt", dt))
+        self.equation = Equation(self.kind, shape, parameters, _check.whole(who, "picard_steps", picard_steps))
+        torch.ops.prdp.check_equation(*self._equation())
+
+    def _keep_nu(self, nu):
+        if isinstance(nu, torch.nn.Parameter):
+            self.nu = nu
+        elif isinstance(nu, torch.Tensor):
+            self.register_buffer("nu", nu)
+        else:
+            self.nu = _check.real(type(self).__name__, "nu", nu)
+        self._number = None, None  # nu as a number, and as the tensor that the library takes
+
+    def _refuse_own_system(self):
+        """forward calls the compiled library, not operator(u) and rhs(u) of a subclass."""
+        base = next(c for c in type(self).__mro__ if c.__module__ == __name__)
+        for name in ("operator", "rhs"):
+            if getattr(type(self), name) is not getattr(base, name) and type(self).forward is EquationStepper.forward:
+                raise TypeError(
+                    f"{type(self).__name__}: the steps of {base.__name__} do not call {name}(u) of a subclass; "
+                    f"build your own with ImplicitStep(operator, rhs, solver)"
+                )
 
     def forward(self, u):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
-        u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options())
+        u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options(self._adjoint_log.number))
         self.info = SolveInfo(*report, self._adjoint_log)
         return u_next
 
@@ -99,122 +76,112 @@ class Stepper(torch.nn.Module):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-        states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._options())
+        options = self._options(self._adjoint_log.number)
+        states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *options)
         self.info = SolveInfo(*report, self._adjoint_log)
         return states
 
     def _equation(self):
         e = self.equation
-        return e.tensors, e.kind, e.shape, e.parameters, e.picard_steps
+        return self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps
 
-    def _options(self):
-        return (
-            self.method,
-            self._max_iter.item(),
-            self.rtol,
-            self.restart,
-            self.backward,
-            self.adjoint_max_iter,
-            self.adjoint_rtol,
-            self.on_failure,
-            self._adjoint_log.number,
-            checkpoint_number(self.checkpoint_every),
-        )
-
-    @property
-    def max_iter(self):
-        return int(self._max_iter)
-
-    @max_iter.setter
-    def max_iter(self, k):
-        who = type(self).__name__
-        _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol, self.restart)
-        self._max_iter.fill_(k)
-
-    @property
-    def adjoint_info(self):
-        return self._adjoint_log.read()
-
-    @property
-    def converged(self):
-        """Whether all samples of the last forward met rtol, and of the last adjoint solve if any."""
-        reports = [report for report in (self.info, self.adjoint_info) if report is not None]
-        return self.info is not None and all(bool((report.status > 0).all()) for report in reports)
+    def _tensors(self):
+        """What the operator is made of beside the state: nu as it is now."""
+        nu = self.nu
+        if isinstance(nu, torch.Tensor):
+            return [nu]
+        number, tensor = self._number
+        if nu != number:
+            tensor = operators.real_tensor(type(self).__name__, "nu", nu)
+            self._number = nu, tensor
+        return [tensor]
 
     def rhs(self, u):
         """b(u), the right-hand side of the step from u."""
         return torch.ops.prdp.rhs(u, self.equation.kind, self.equation.shape, self.equation.parameters)
 
     def extra_repr(self):
-        e = self.equation
-        return (
-            f"shape={tuple(e.shape)}, solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, "
-            f"backward={self.backward}"
-        )
+        length = "" if self.length == 1.0 else f"length={self.length}, "
+        return f"shape={tuple(self.equation.shape)}, {length}{super().extra_repr()}"
 
 
-class Poisson(Stepper):
-    """Δu = -p with u = 0 on the boundary of the unit domain; maps p to u. `shape` unknowns,
-    dx = 1/(N + 1), second-order differences (paper, appendix C.1)."""
+class Poisson(EquationStepper):
+    """Δu = -p with u = 0 on the boundary; maps p to u. Second-order differences (paper, appendix C.1).
 
-    def __init__(self, shape, solver, backward="implicit", **options):
-        super().__init__(Equation("poisson", _check.shape("Poisson", shape), [], []), solver, backward, **options)
-
-    def operator(self, u=None):
-        """A(u) as an operator; here the same for every u."""
-        return operators.Poisson(self.equation.shape)
-
-
-class Heat(Stepper):
-    """One implicit Euler step of u_t = nu Δu with u = 0 on the boundary of the unit domain:
-    (I - nu dt L) u_next = u, `shape` unknowns, dx = 1/(N + 1) (paper, appendix C.2 to C.4).
-
-    nu >= 0 (length²/time, the domain's side being 1), a number or a 0-dimensional tensor, which then
-    gets a gradient; dt > 0 (time). Only nu dt/dx² matters: Jacobi's iteration count grows with it.
+    shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+    length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
     """
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", **options):
-        super().__init__(Equation.implicit_step("Heat", "heat", shape, nu, dt), solver, backward, **options)
+    kind = "poisson"
+
+    def __init__(self, shape, solver, backward="implicit", length=1.0, **options):
+        super().__init__(shape, solver, backward, length, **options)
+
+    def _tensors(self):
+        return []
+
+    def operator(self, u=None):
+        """A(u) as an operator; here the same for every u."""
+        return operators.Poisson(self.equation.shape, self.length)
+
+
+class Heat(EquationStepper):
+    """One implicit Euler step of u_t = nu Δu with u = 0 on the boundary: (I - nu dt L) u_next = u (paper,
+    appendix C.2 to C.4).
+
+    nu: >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient; a Parameter is
+        the module's (in `parameters()`), another tensor a buffer of it.
+    dt: > 0 (time). Only nu dt/dx² matters: Jacobi's iteration count grows with it.
+    shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+    length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
+    """
+
+    kind = "heat"
+
+    def __init__(self, shape, nu, dt, solver, backward="implicit", length=1.0, **options):
+        super().__init__(shape, solver, backward, length, (nu, dt), **options)
 
     def operator(self, u=None):
         """A(u) as an operator; here the same for every u."""
         e = self.equation
-        return operators.Heat(e.shape, e.tensors[0], e.parameters[0])
+        return operators.Heat(e.shape, self.nu, e.parameters[0], self.length)
 
 
-class Burgers(Stepper):
-    """One implicit Euler step of u_t + (u·∇)u = nu Δu on a periodic grid of the unit domain, dx = 1/N:
+class Burgers(EquationStepper):
+    """One implicit Euler step of u_t + (u·∇)u = nu Δu on a periodic grid, dx = length/N:
     (I + dt Γ(u) - nu dt L) u_next = u, first-order upwind, linearised about the state u (paper, appendix
     C.5). shape (N,) with u of (batch, 1, N), or (Ny, Nx) with u of (batch, 2, Ny, Nx): channel 0 is the
     velocity along x, the last axis, channel 1 along y.
 
-    nu >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient; dt > 0.
+    nu, dt, length: as in `Heat`.
     picard_steps: solves a step, each linearised about the solution of the one before; `info` then counts
     all their iterations and holds the worst status and the last residual.
     """
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, **options):
-        equation = Equation.implicit_step("Burgers", "burgers", shape, nu, dt, picard_steps)
-        super().__init__(equation, solver, backward, **options)
+    kind = "burgers"
+
+    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, length=1.0, **options):
+        super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
 
     def operator(self, u):
         """A(u) as an operator: the winds are u."""
-        return operators.Burgers(u, self.equation.tensors[0], self.equation.parameters[0])
+        return operators.Burgers(u, self.nu, self.equation.parameters[0], self.length)
 
 
-class NavierStokes(Stepper):
+class NavierStokes(EquationStepper):
     """One implicit Euler step of u_t + (u·∇)u + ∇p = nu Δu with ∇·u = 0 on a periodic staggered grid
-    (Ny, Nx) of the unit square, dx = 1/N, linearised about the state (paper, appendix C.6). The state is
+    (Ny, Nx), dx = length/N, linearised about the state (paper, appendix C.6). The state is
     (batch, 3, Ny, Nx): u₁ along x on the left face of a cell, u₂ along y on its lower face, p of mean
     zero in its centre; the step does not depend on its pressure. `operators.NavierStokes` is A(u).
 
-    nu, dt, picard_steps: as in `Burgers`.
+    nu, dt, length: as in `Heat`; picard_steps: as in `Burgers`.
     """
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, **options):
-        equation = Equation.implicit_step("NavierStokes", "navier_stokes", shape, nu, dt, picard_steps)
-        super().__init__(equation, solver, backward, **options)
+    kind = "navier_stokes"
+
+    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, length=1.0, **options):
+        super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
 
     def operator(self, u):
         """A(u) as an operator: the winds are the velocity of u."""
-        return operators.NavierStokes(u, self.equation.tensors[0], self.equation.parameters[0])
+        return operators.NavierStokes(u, self.nu, self.equation.parameters[0], self.length)

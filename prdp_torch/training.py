@@ -66,8 +66,8 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
     the solves, of which an update of the task "corrector" has two; iterations and operator applications
     are per sample of a batch, summed over the solves, the applications over the adjoint solves as well, whose
     own are "adjoint_applications". "warning" is there where the controller ends with one.
-    A training whose loss or metric is no longer finite stops there: "diverged" says where and why, the
-    metric is NaN from then on, and nothing more is counted.
+    A training whose loss or metric is no longer finite stops there: "diverged" says where and why, and the
+    curves end with the interval that was lost, with a metric of NaN and no costs.
 
     Args:
         scene: from `prdp_torch.scenes.load`.
@@ -78,7 +78,9 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
             checkpoint is gone on from.
         on_data: called while data are made that are not on disk yet, with (steps of a sample done, all of them).
         checkpoint: a `prdp_torch.checkpoint.Checkpoint` to go on from where it has a state, bit for bit on
-            the same machine with as many threads, and to keep the training in whenever it is due.
+            the same machine with as many threads, and to keep the training in whenever it is due. It holds torch's
+            global random state as well, for a network with dropout. ValueError for a state that does not fit the
+            scene and the network, or has more intervals than the scene.
     """
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
@@ -141,12 +143,19 @@ class _Run:
 
     def _keep(self, task):
         controller = self.controller.state_dict()
-        self.checkpoint.save({"task": task.state(), "controller": controller, "curves": self.curves})
+        state = {"task": task.state(), "controller": controller, "curves": self.curves}
+        self.checkpoint.save({**state, "random": torch.get_rng_state()})
 
     def _restore(self, task, saved):
-        task.load(saved["task"])
-        self.controller.load_state_dict(saved["controller"])
-        self.curves = saved["curves"]
+        try:
+            task.load(saved["task"])
+            self.controller.load_state_dict(saved["controller"])
+            torch.set_rng_state(saved["random"])
+            self.curves = saved["curves"]
+            done = self._done()
+        except (RuntimeError, KeyError, TypeError, ValueError):
+            self.checkpoint.refuse()
+        self.checkpoint.check_length(done, self.intervals)
 
     def _run_interval(self, task, number):
         k, rtol = self.controller.max_iter, self.steppers[0].rtol
@@ -165,9 +174,11 @@ class _Run:
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
 
     def give_up(self, why):
+        """The curves end with the interval that was lost."""
         self.curves["diverged"] = why
-        self.curves["metric"] += [math.nan] * (self.intervals + 1 - len(self.curves["metric"]))
-        while len(self.curves["seconds"]) < self.intervals:
+        lost = max(1, len(self.curves["metric"]))
+        self.curves["metric"] += [math.nan] * (lost + 1 - len(self.curves["metric"]))
+        if self._done() < lost:
             self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0.0)
 
     def _append(self, *costs):

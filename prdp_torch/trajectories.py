@@ -66,12 +66,12 @@ def field(scene, states):
 
 def _networks(scene, row, folder):
     """The networks of the seeds that did not diverge and whose weights are there."""
-    paths = [(seed, folder / row.label / f"seed_{seed}.pt") for seed in range(len(row.curves))]
-    return [
-        records.read_weights(path, make_network(scene, seed))
-        for seed, path in paths
-        if path.exists() and "diverged" not in row.curves[seed]
+    networks = [
+        records.read_weights(folder / row.label / f"seed_{seed}.json", make_network(scene, seed))
+        for seed in range(len(row.curves))
+        if "diverged" not in row.curves[seed]
     ]
+    return [network for network in networks if network is not None]
 
 
 def _follow(scene, title, kind, networks, reference):

@@ -1,11 +1,15 @@
 #include <pybind11/functional.h>
+#include <pybind11/stl/filesystem.h>
 
 #include "bindings.h"
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/checkpoint.h"
 #include "prdp/scenes/data.h"
+#include "prdp/scenes/files.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"
+#include "prdp/scenes/seal.h"
+#include "prdp/scenes/sentence.h"
 
 namespace py = pybind11;
 using namespace prdp;
@@ -94,15 +98,35 @@ void bind_scenes(py::module_& m) {
   m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"));
 
   py::class_<Checkpoint>(m, "Checkpoint")
-      .def(py::init<std::string, std::string>(), py::arg("path"), py::arg("settings"))
+      .def(py::init<std::filesystem::path, std::string>(), py::arg("path"), py::arg("settings"))
       .def("due", &Checkpoint::due)
-      .def("write", [](Checkpoint& c, const py::bytes& state) { c.write(state); }, py::arg("state"))
+      .def("write", [](Checkpoint& c, std::string state) { c.write(std::move(state)); }, py::arg("state"))
       .def("read",
            [](const Checkpoint& c) {
              const auto state = c.read();
              return state ? std::optional<py::bytes>(*state) : std::nullopt;
            })
+      .def("refuse", &Checkpoint::refuse)
+      .def("check_length", &Checkpoint::check_length, py::arg("done"), py::arg("intervals"))
       .def("remove", &Checkpoint::remove);
+
+  m.attr("MOST_COUNTED") = kMostCounted;
+  m.def("sentence", &sentence, py::arg("what"));
+  m.def("fingerprint", &fingerprint, py::arg("content"));
+  m.def("seal_record", &seal_record, py::arg("object"));
+  m.def("read_record", &read_record, py::arg("path"));
+  m.def("refuse_finished", &refuse_finished, py::arg("record"), py::arg("intervals"), py::arg("wanted"));
+  m.def(
+      "write_whole",
+      [](const std::vector<std::pair<std::filesystem::path, std::string>>& files) {
+        std::vector<NewFile> all;
+        for (const auto& [path, content] : files) all.push_back({path, content});
+        write_whole(all);
+      },
+      py::arg("files"));
+  py::class_<FolderLock>(m, "FolderLock")
+      .def(py::init<const std::filesystem::path&>(), py::arg("folder"))
+      .def("release", &FolderLock::release);
 
   m.def("loss", &loss, py::arg("kind"), py::arg("u"), py::arg("reference"));
   m.def("normalised_mse", &normalised_mse, py::arg("u"), py::arg("reference"));

@@ -4,6 +4,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/steppers/solving.h"
 
 namespace py = pybind11;
 using namespace prdp;
@@ -18,6 +19,18 @@ OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<doub
                   std::vector<at::Tensor> tensors) {
   return {std::move(kind), std::move(shape), std::move(parameters), std::move(tensors)};
 }
+
+/// FailuresOfStep for Python's `with`.
+class StepOfRollout {
+ public:
+  StepOfRollout(int64_t step, int64_t steps) : step_(step), steps_(steps) {}
+  void enter() { here_.emplace(step_, steps_); }
+  void exit() { here_.reset(); }
+
+ private:
+  int64_t step_, steps_;
+  std::optional<FailuresOfStep> here_;
+};
 
 /// Python's warnings module; a filter may turn the warning into an exception.
 void warn_in_python(const std::string& text) {
@@ -37,11 +50,13 @@ void bind_solvers(py::module_& m) {
   m.attr("SOLVE_STATUSES") = statuses;
 
   py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts")
-      .def(py::init([](Products::Product apply, Products::Product apply_transpose) {
-             auto made = RegisteredProducts::make({std::move(apply), std::move(apply_transpose)});
+      .def(py::init([](Products::Product apply, Products::Product apply_transpose, Products::Diagonal diagonal) {
+             auto made = RegisteredProducts::make(
+                 {std::move(apply), std::move(apply_transpose), std::move(diagonal)});
              return std::const_pointer_cast<RegisteredProducts>(made);
            }),
-           py::arg("apply"), py::arg("apply_transpose"))
+           py::arg("apply"), py::arg("apply_transpose") = Products::Product(),
+           py::arg("diagonal") = Products::Diagonal())
       .def_property_readonly("number", &RegisteredProducts::number);
   m.def("check_operator",
         [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
@@ -81,6 +96,26 @@ void bind_solvers(py::module_& m) {
           return as_tuple(*info);
         },
         py::arg("log"));
+
+  m.def("join_adjoint_logs",
+        [](const std::vector<int64_t>& logs) -> std::optional<py::tuple> {
+          const auto info = join_adjoint_logs(logs);
+          if (!info) return std::nullopt;
+          return as_tuple(*info);
+        },
+        py::arg("logs"));
+  py::class_<StepOfRollout>(m, "StepOfRollout")
+      .def(py::init<int64_t, int64_t>(), py::arg("step"), py::arg("steps"))
+      .def("__enter__", &StepOfRollout::enter)
+      .def("__exit__", [](StepOfRollout& self, const py::args&) { self.exit(); });
+  m.def("product_rule",
+        [](const at::Tensor& lambda, const at::Tensor& v, std::vector<at::Tensor> tensors, std::string kind,
+           std::vector<int64_t> shape, std::vector<double> parameters) {
+          return make_operator(spec(kind, shape, parameters, tensors))->product_rule(lambda, v);
+        },
+        "∂⟨lambda, A v⟩ with respect to each tensor of A, as the solves take it; None where there is none.",
+        py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"),
+        py::arg("kind"), py::arg("shape"), py::arg("parameters"));
 
   m.def("solve_with_tensors",
         [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,

@@ -6,4 +6,5 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/stepper.h"

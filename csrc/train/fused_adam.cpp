@@ -39,4 +39,38 @@ torch::Tensor FusedAdam::step(LossClosure closure) {
   return loss;
 }
 
+namespace {
+
+std::string name_of(size_t parameter, const char* part) {
+  return "optimiser." + std::to_string(parameter) + "." + part;
+}
+
+}  // namespace
+
+void FusedAdam::save(TensorMap& tensors) const {
+  const auto& parameters = param_groups()[0].params();
+  for (size_t i = 0; i < parameters.size(); ++i) {
+    const auto found = state_.find(parameters[i].unsafeGetTensorImpl());
+    if (found == state_.end()) continue;  // it had no gradient yet
+    const auto& state = static_cast<const torch::optim::AdamParamState&>(*found->second);
+    tensors[name_of(i, "step")] = at::tensor({state.step()}, at::kLong);
+    tensors[name_of(i, "mean")] = state.exp_avg();
+    tensors[name_of(i, "square")] = state.exp_avg_sq();
+  }
+}
+
+void FusedAdam::load(const TensorMap& tensors) {
+  const auto& parameters = param_groups()[0].params();
+  for (size_t i = 0; i < parameters.size(); ++i) {
+    if (!tensors.contains(name_of(i, "step"))) continue;
+    const auto dtype = parameters[i].scalar_type();
+    const auto sizes = parameters[i].sizes();
+    auto state = std::make_unique<torch::optim::AdamParamState>();
+    state->step(entry(tensors, name_of(i, "step"), at::kLong, {1}).item<int64_t>());
+    state->exp_avg(entry(tensors, name_of(i, "mean"), dtype, sizes).contiguous());
+    state->exp_avg_sq(entry(tensors, name_of(i, "square"), dtype, sizes).contiguous());
+    state_[parameters[i].unsafeGetTensorImpl()] = std::move(state);
+  }
+}
+
 }  // namespace prdp::train

@@ -1,6 +1,8 @@
 #pragma once
 #include <torch/optim/adam.h>
 
+#include "prdp/scenes/tensor_map.h"
+
 namespace prdp::train {
 
 /// torch's Adam with the state it has, updated by the fused kernel that `torch.optim.Adam(fused=True)` calls
@@ -10,6 +12,11 @@ class FusedAdam : public torch::optim::Adam {
  public:
   using Adam::Adam;
   torch::Tensor step(LossClosure closure = nullptr) override;
+
+  /// Steps and moments of the first group's parameters, by their order. Loading raises ValueError for tensors that
+  /// do not fit.
+  void save(TensorMap& tensors) const;
+  void load(const TensorMap& tensors);
 };
 
 }  // namespace prdp::train

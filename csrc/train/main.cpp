@@ -3,15 +3,18 @@
 #include <torch/version.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
+#include <charconv>
 #include <csignal>
 #include <cstdio>
 #include <filesystem>
-#include <fstream>
 #include <nlohmann/json.hpp>
 #include <thread>
 #include <utility>
 
 #include "prdp/scenes/files.h"
+#include "prdp/scenes/seal.h"
+#include "prdp/scenes/sentence.h"
 #include "training.h"
 
 namespace {
@@ -28,25 +31,29 @@ struct Options {
   bool direct = false, automatic = false, resume = false;
 };
 
-/// What a record must agree on to be of the same training.
+/// What a record or a checkpoint must agree on to be of the same training, which may go on for more intervals.
 Json settings(const prdp::Scene& scene) {
-  return {{"scene", scene.name},
-          {"text", scene.text},
-          {"backward", prdp::name(scene.backward)},
-          {"intervals", scene.training.intervals}};
+  return {{"scene", scene.name}, {"text", scene.text}, {"backward", prdp::name(scene.backward)}};
+}
+
+/// The bytes of paths and arguments need not be text.
+std::string text_of(const Json& json, int indent = -1) {
+  return json.dump(indent, ' ', /*ensure_ascii=*/false, Json::error_handler_t::replace);
 }
 
 Json versions() { return {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}; }
 
 Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, const std::string& command,
             const prdp::train::Curves& c) {
+  auto all = settings(scene);
+  all["intervals"] = scene.training.intervals;
   Json curves;
   prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
   if (!c.diverged.empty()) curves["diverged"] = c.diverged;
   if (!c.warning.empty()) curves["warning"] = c.warning;
   return {{"label", label},
           {"seed", seed},
-          {"settings", settings(scene)},
+          {"settings", all},
           {"versions", versions()},
           {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
           {"command", command},
@@ -58,19 +65,34 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, c
                                const std::string& label, int64_t seed) {
   const Json all{{"trainer", "C++"}, {"label", label}, {"seed", seed}, {"settings", settings(scene)},
                  {"versions", versions()}};
-  prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), all.dump());
+  prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), text_of(all));
   if (!options.resume) checkpoint.remove();
   return checkpoint;
 }
 
-bool is_done(const fs::path& path, const prdp::Scene& scene) {
-  std::ifstream file(path);
-  if (!file) return false;
-  const auto record = Json::parse(file, nullptr, /*allow_exceptions=*/false);
-  if (!record.is_object())
-    throw std::runtime_error("record: '" + path.string() +
-                             "' is damaged; delete it, and its training is run again");
-  return record.value("settings", Json()) == settings(scene);
+/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on from.
+bool is_done(const fs::path& path, const prdp::Scene& scene, const prdp::Checkpoint& checkpoint) {
+  const auto text = prdp::read_record(path);
+  if (!text) return false;
+  auto found = Json::parse(*text).value("settings", Json::object());
+  const auto intervals = found.value("intervals", int64_t{0});
+  found.erase("intervals");
+  if (found != settings(scene)) return false;
+  if (intervals == scene.training.intervals) return true;
+  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, scene.training.intervals);
+  return false;
+}
+
+std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
+  const char *begin = text.data(), *end = begin + text.size();
+  std::pair<int64_t, int64_t> schedule{};
+  const auto start = std::from_chars(begin, end, schedule.first);
+  const auto step = std::from_chars(std::min(start.ptr + 1, end), end, schedule.second);
+  if (start.ec != std::errc() || step.ec != std::errc() || *start.ptr != ':' || step.ptr != end ||
+      std::max(schedule.first, schedule.second) > prdp::kMostCounted)
+    throw std::runtime_error("--schedule: expected START:STEP, two whole numbers up to " +
+                             std::to_string(prdp::kMostCounted) + ", got '" + text + "'");
+  return schedule;
 }
 
 prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
@@ -78,10 +100,7 @@ prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene&
   if (options.direct) return prdp::train::direct();
   if (options.automatic) return prdp::train::automatic();
   if (options.schedule.empty()) return prdp::train::prdp(scene);
-  long long start = 0, step = 0;
-  char rest = 0;
-  if (std::sscanf(options.schedule.c_str(), "%lld:%lld%c", &start, &step, &rest) != 2)
-    throw std::runtime_error("--schedule: expected START:STEP, two whole numbers, got '" + options.schedule + "'");
+  const auto [start, step] = parse_schedule(options.schedule);
   return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
 }
 
@@ -95,13 +114,14 @@ int run(const Options& options, const std::string& command) {
   std::error_code error;
   fs::create_directories(folder, error);
   if (error) throw std::runtime_error("--out: cannot write to '" + folder.string() + "': " + error.message());
+  const prdp::FolderLock lock(folder);
 
   std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
-    if (options.resume && is_done(file, scene)) continue;
     auto checkpoint = checkpoint_of(file, options, scene, refinement.label, seed);
+    if (options.resume && is_done(file, scene, checkpoint)) continue;
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
       if (std::exchange(first, false) || done % 10 == 0)
@@ -112,7 +132,8 @@ int run(const Options& options, const std::string& command) {
       std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
     const auto curves = prdp::train::train(scene, refinement, seed, on_interval, checkpoint, on_data);
-    prdp::write_whole(file, record(scene, refinement.label, seed, command, curves).dump(1) + '\n');
+    const auto text = prdp::seal_record(text_of(record(scene, refinement.label, seed, command, curves), 1));
+    prdp::write_whole({{file, text}});
     checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
@@ -131,7 +152,7 @@ int run(const Options& options, const std::string& command) {
 int main(int argc, char** argv) {
   CLI::App app("Train a scene through differentiable physics that stops early, in C++.");
   Options options;
-  const auto positive = CLI::Range(int64_t{1}, int64_t{1000000});
+  const auto positive = CLI::Range(int64_t{1}, prdp::kMostCounted);
   app.add_option("scene", options.scene, "scene file (.toml)")->required();
   app.add_option("--seeds", options.seeds, "how many seeds, from 0")->check(positive);
   auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
@@ -145,7 +166,11 @@ int main(int argc, char** argv) {
   k->excludes(s)->excludes(d)->excludes(a);
   s->excludes(d)->excludes(a);
   d->excludes(a);
-  CLI11_PARSE(app, argc, argv);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& error) {
+    return app.exit(error) == 0 ? 0 : 2;
+  }
   std::signal(SIGINT, [](int) { interrupted = 1; });
   std::string command;
   for (int i = 0; i < argc; ++i) command += (i ? " " : "") + std::string(argv[i]);
@@ -157,9 +182,9 @@ int main(int argc, char** argv) {
                          "last checkpoint\n");
     return 130;
   } catch (const c10::Error& error) {
-    std::fprintf(stderr, "prdp_train: %s\n", error.what_without_backtrace());
+    std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what_without_backtrace()).c_str());
   } catch (const std::exception& error) {
-    std::fprintf(stderr, "prdp_train: %s\n", error.what());
+    std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what()).c_str());
   }
   return 2;
 }

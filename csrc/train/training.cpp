@@ -69,13 +69,13 @@ struct Costs {
 
 /// What a task supplies: the updates of one interval, numbered from `update` and each reporting its loss;
 /// the metric; the relative error of what is trained, as far as a user knows it, given the metric; and all
-/// that the updates change, to and from an archive.
+/// that the updates change, to and from tensors.
 struct Task {
   std::function<void(int64_t update, const std::function<void(double)>& on_update)> updates;
   std::function<double()> metric;
   std::function<double(double metric)> error;
-  std::function<void(OutputArchive&)> save;
-  std::function<void(InputArchive&)> load;
+  std::function<void(TensorMap&)> save;
+  std::function<void(const TensorMap&)> load;
 };
 
 /// What the tasks share: the intervals, their costs, and when a training is lost.
@@ -123,16 +123,21 @@ class Run {
   int64_t done() const { return static_cast<int64_t>(curves_.seconds.size()); }
 
   void keep(const Task& task) {
-    OutputArchive archive;
-    task.save(archive);
-    save(archive, curves_, *controller_);
-    checkpoint_.write(bytes_of(archive));
+    TensorMap tensors;
+    task.save(tensors);
+    save(tensors, curves_, *controller_);
+    checkpoint_.write(pack(tensors));
   }
 
   void restore(const Task& task) {
-    auto archive = archive_of(*saved_);
-    task.load(archive);
-    load(archive, curves_, *controller_);
+    try {
+      const auto tensors = unpack(*saved_);
+      task.load(tensors);
+      load(tensors, curves_, *controller_);
+    } catch (const c10::Error&) {
+      checkpoint_.refuse();
+    }
+    checkpoint_.check_length(done(), intervals_);
     take_budget();
   }
 
@@ -185,12 +190,14 @@ class Run {
         throw Diverged{interval + ": the solver was given NaN or Inf"};
   }
 
+  /// The curves end with the interval that was lost.
   void give_up(const std::string& why) {
     curves_.diverged = why;
     curves_.warning.clear();
-    curves_.metric.resize(intervals_ + 1, std::numeric_limits<double>::quiet_NaN());
-    const Costs none{.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol};
-    while (static_cast<int64_t>(curves_.seconds.size()) < intervals_) append(none);
+    const auto lost = std::max<size_t>(1, curves_.metric.size());
+    curves_.metric.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
+    if (curves_.seconds.size() < lost)
+      append({.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol});
   }
 
   int64_t intervals_;
@@ -284,8 +291,8 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
     return objective.metric();
   };
   auto& module = *network.ptr();
-  const auto save_all = [&](OutputArchive& archive) { save(archive, module, optimiser, generator); };
-  const auto load_all = [&](InputArchive& archive) { load(archive, module, optimiser, generator); };
+  const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
+  const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
   // The metric is a mean of squares relative to the reference.
   const auto error = [](double squared) { return std::sqrt(squared); };
   return run.go({updates, metric, error, save_all, load_all}, on_interval);
@@ -309,8 +316,10 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
     on_update(error.item<double>());
   };
   const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
-  const auto save_theta = [&](OutputArchive& archive) { archive.write("theta", theta); };
-  const auto load_theta = [&](InputArchive& archive) { archive.read("theta", theta); };
+  const auto save_theta = [&](TensorMap& tensors) { tensors["theta"] = theta; };
+  const auto load_theta = [&](const TensorMap& tensors) {
+    theta.detach().copy_(entry(tensors, "theta", theta.scalar_type(), theta.sizes()));
+  };
   return run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
 }
 

@@ -37,7 +37,7 @@ struct Curves {
   std::vector<double> iterations, operator_applications, adjoint_applications;
   std::vector<double> rtol;  // of the forward solves
   std::vector<double> seconds;
-  std::string diverged;  // where and why a training was lost; the metric is NaN from there on
+  std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
   std::string warning;   // what the controller says in the end
 };
 

@@ -5,7 +5,6 @@ import json
 import subprocess
 import sys
 import time
-import warnings
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM
 
@@ -73,12 +72,10 @@ def stop(process, checkpoint, signal):
 
 def seconds_in(trainer, checkpoint):
     """Of the intervals that it holds."""
-    state = io.BytesIO(checkpoint.read_bytes().split(b"\n", 2)[2])  # behind two lines of text
+    state = torch.load(io.BytesIO(checkpoint.read_bytes().split(b"\n", 2)[2]), weights_only=True)  # behind two lines
     if trainer == "python":
-        return torch.load(state, weights_only=True)["curves"]["seconds"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return torch.jit.load(state).seconds
+        return state["curves"]["seconds"]
+    return state[state.index("seconds") + 1].tolist()  # names and tensors by turns
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
@@ -115,7 +112,9 @@ def test_a_damaged_checkpoint_is_one_line_and_harms_nothing(tmp_path, trainer):
     arguments = (trainer, scene_of("emulator", tmp_path), tmp_path / "here", "--intervals", 2)
     status, errors = run(*arguments, "--resume")
     assert status == 2 and checkpoint.read_text() == "nothing of the kind\n"
-    assert errors.endswith(f"checkpoint: '{checkpoint}' is damaged; delete it, and its training starts afresh\n")
+    assert errors.endswith(
+        f"checkpoint: '{checkpoint}' is damaged or of another version; delete it, and its training starts afresh\n"
+    )
     assert errors.count("\n") == 1
     status, errors = run(*arguments)
     assert status == 0 and (checkpoint.parent / "seed_0.json").exists() and not checkpoint.exists(), errors
@@ -124,8 +123,11 @@ def test_a_damaged_checkpoint_is_one_line_and_harms_nothing(tmp_path, trainer):
 def test_a_checkpoint_of_other_settings_is_not_gone_on_from_in_cpp(tmp_path):
     scene, out = scene_of("emulator", tmp_path), tmp_path / "killed"
     stop(start("cpp", scene, out, "--intervals", 1000), out / "prdp/seed_0.checkpoint", SIGKILL)
-    assert run("cpp", scene, out, "--intervals", 3, "--resume")[0] == 0
-    assert run("cpp", scene, tmp_path / "alone", "--intervals", 3)[0] == 0
+    status, errors = run("cpp", scene, out, "--intervals", 1, "--resume")
+    assert status == 2 and "intervals, more than the 1 asked for" in errors
+    other = ("--intervals", 3, "--backward", "unrolled")
+    assert run("cpp", scene, out, *other, "--resume")[0] == 0
+    assert run("cpp", scene, tmp_path / "alone", *other)[0] == 0
     there, here = (json.loads((tmp_path / run / "prdp/seed_0.json").read_text()) for run in ("killed", "alone"))
     assert without_seconds(there["curves"]) == without_seconds(here["curves"])
 
@@ -206,8 +208,10 @@ def test_only_resume_with_the_same_settings_goes_on(tmp_path):
         (folder / "prdp/seed_0.json").unlink(missing_ok=True)
         return reports[0]
 
-    assert first_report() == 5
-    assert first_report(resume=False) == first_report(intervals=9) == first_report(seed=1) == 1
+    assert first_report() == first_report(intervals=9) == 5
+    assert first_report(resume=False) == first_report(seed=1) == 1
+    with pytest.raises(ValueError, match="of a training that has done 5 intervals, more than the 4 asked for"):
+        first_report(intervals=4)
 
 
 def test_a_finished_record_needs_no_checkpoint(tmp_path):
@@ -217,7 +221,9 @@ def test_a_finished_record_needs_no_checkpoint(tmp_path):
     assert sorted(path.name for path in (tmp_path / "prdp").iterdir()) == ["seed_0.json", "seed_0.pt"]
     assert recorded(scene, tmp_path, True) == curves
     (tmp_path / "prdp/seed_0.json").write_text("{")
-    with pytest.raises(ValueError, match=r"record: '.*seed_0.json' is damaged; delete it, and its training is run"):
+    with pytest.raises(
+        ValueError, match=r"record: '.*seed_0.json' is damaged or of another version; delete it, and its training"
+    ):
         recorded(scene, tmp_path, True)
 
 
@@ -286,19 +292,21 @@ def test_a_changed_byte_or_a_missing_end_is_found(tmp_path):
     changed = (whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :] for i in range(0, len(whole), 3))
     for damaged in (*changed, *(whole[:n] for n in range(0, len(whole), 50)), whole + b"\0"):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=f"checkpoint: '{path}' is damaged; delete it"):
+        with pytest.raises(ValueError, match=f"checkpoint: '{path}' is damaged or of another version; delete it"):
             checkpoint.load()
     path.write_bytes(whole)
     assert checkpoint.load()["weight"].tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path):
-    path = tmp_path / "kept"
-    checkpoint = Checkpoint(path, seed=0)
+    folder, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    folder.mkdir()
+    checkpoint = Checkpoint(folder / "kept", seed=0)
     checkpoint.save(1)
-    (tmp_path / "kept.part").mkdir()
-    with pytest.raises(ValueError, match=f"cannot write '{path}'"):
+    folder.rename(elsewhere)
+    with pytest.raises(ValueError, match=f"cannot write '{folder}/kept': No such file or directory"):
         checkpoint.save(2)
+    elsewhere.rename(folder)
     assert checkpoint.load() == 1
 
 

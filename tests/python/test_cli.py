@@ -61,8 +61,12 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
     missing.unlink()
     done = prdp("compare", "heat_1d", "--seeds", 2, "--intervals", 4, "--resume", cwd=folder)
     assert done.returncode == 0 and missing.exists() and kept.stat().st_mtime_ns == before
-    other = prdp("train", "heat_1d", "--prdp", "--intervals", 5, "--resume", "--out", records, cwd=folder)
-    assert other.returncode == 0 and kept.stat().st_mtime_ns > before  # other settings: not the same training
+    longer = prdp("train", "heat_1d", "--intervals", 5, "--resume", "--out", records, cwd=folder)
+    assert longer.returncode == 2 and "of a finished training of 4 intervals, not 5; it cannot go on" in longer.stderr
+    assert kept.stat().st_mtime_ns == before
+    other = ("--backward", "unrolled", "--intervals", 5, "--resume")  # not the same training
+    assert prdp("train", "heat_1d", *other, "--out", records, cwd=folder).returncode == 0
+    assert kept.stat().st_mtime_ns > before
 
 
 @pytest.mark.parametrize(
@@ -86,7 +90,10 @@ def test_scenes_are_listed(tmp_path):
     [
         (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, heat_1d"),
         (["compare", "nosuch.toml"], "prdp: scene: cannot read 'nosuch.toml'"),
-        (["train", "heat_1d", "--schedule", "3"], "prdp: --schedule: expected START:STEP, two whole numbers, got '3'"),
+        (
+            ["train", "heat_1d", "--schedule", "3"],
+            "prdp: --schedule: expected START:STEP, two whole numbers up to 1000000000, got '3'",
+        ),
         (["train", "heat_1d", "--prdp", "--direct"], "give one of --auto, --prdp, --constant, --schedule and --direct"),
         (
             ["train", "heat_1d", "--backward", "both"],
@@ -148,7 +155,10 @@ def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path, ignored):
     "arguments, message",
     [
         (["nosuch.toml"], "prdp_train: scene: cannot read 'nosuch.toml'"),
-        ([ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"], "expected START:STEP, two whole numbers, got '3'"),
+        (
+            [ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"],
+            "expected START:STEP, two whole numbers up to 1000000000, got '3'",
+        ),
         ([ROOT / "examples/scenes/heat_1d.toml", "--out", "/proc/nothing"], "prdp_train: "),
     ],
 )

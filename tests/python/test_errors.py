@@ -50,6 +50,12 @@ def test_matrix_and_right_hand_side_must_fit():
     "make, message",
     [
         (lambda: prdp.Jacobi(-1), "Jacobi: max_iter must be >= 0, got -1"),
+        (lambda: prdp.Jacobi(2**63), f"Jacobi: max_iter must be less than 2\\*\\*63, got {2**63}"),
+        (
+            lambda: prdp.Heat((2**70,), 1e-3, 1.0, prdp.Jacobi(1)),
+            r"Heat: every extent of shape must be less than 2\*\*63",
+        ),
+        (lambda: prdp.CG(3, rtol=10**400), r"CG: rtol must be less than 2\*\*1024"),
         (lambda: prdp.CG(3, rtol=-1e-5), "CG: rtol must be >= 0, got -1e-05"),
         (lambda: prdp.SteepestDescent(3, rtol=math.nan), "SteepestDescent: rtol must be >= 0, got nan"),
         (lambda: heat(backward="adjoint"), "backward: unknown name 'adjoint'; allowed: implicit, unrolled, none"),
@@ -64,6 +70,13 @@ def test_matrix_and_right_hand_side_must_fit():
 def test_arguments_out_of_range(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_step_costs_no_memory_until_it_is_taken():
+    for kind in (prdp.Heat, prdp.Burgers, prdp.NavierStokes):
+        assert kind((10**7, 10**7), 1e-3, 1.0, prdp.Jacobi(1)).max_iter == 1  # a field would take 400 TB
+        with pytest.raises(ValueError, match=r"\[1099511627776, 1099511627776\] has more than 2\*\*63 numbers"):
+            kind((2**40, 2**40), 1e-3, 1.0, prdp.Jacobi(1))
 
 
 def test_arguments_out_of_range_where_they_reach_the_op():

@@ -1,6 +1,8 @@
 """Operators of one's own, by their products."""
 
+import copy
 import gc
+import pickle
 
 import numpy as np
 import pytest
@@ -98,6 +100,10 @@ def test_nan_stays_with_its_sample():
     "call, error, message",
     [
         (lambda: operators.Function("a", shifted), TypeError, "Function: matvec must be callable, got 'a'"),
+        (lambda: operators.Function(shifted, 3), TypeError, "Function: transpose must be callable, got 3"),
+        (lambda: operators.Function(shifted, diagonal=3), TypeError, "Function: diagonal must be callable, got 3"),
+        (lambda: operators.Function(shifted, shifted, symmetric=True), ValueError, "give only one of the two"),
+        (lambda: operators.Function(shifted, tensors=3.0), TypeError, "tensors must be a tuple of tensors, got 3.0"),
         (lambda: operators.Function(shifted, shifted_transpose, (3.0,)), TypeError, "every tensor must be a torch"),
         (
             lambda: solve_with(lambda v: v[:, 1:]),
@@ -105,6 +111,20 @@ def test_nan_stays_with_its_sample():
             r"matvec must return what it was given, \[2, 4\] in Float",
         ),
         (lambda: solve_with(lambda v: v.double()), ValueError, "matvec must return what it was given"),
+        (lambda: solve_with(lambda v: None), TypeError, "matvec must return a torch tensor, got NoneType"),
+        (lambda: solve_with(lambda v: v.to("meta")), ValueError, "matvec must return a tensor on cpu, got one on meta"),
+        (lambda: solve_with(lambda v: v.mul_(2.0)), ValueError, "matvec changes its arguments in place"),
+        (lambda: solve_with(in_place, tensors=torch.ones(4)), ValueError, "matvec changes its arguments in place"),
+        (
+            lambda: solve_with(lambda v: v, prdp.Jacobi(3), diagonal=lambda: None),
+            TypeError,
+            "diagonal must return a torch tensor, got NoneType",
+        ),
+        (
+            lambda: solve_with(lambda v: v, prdp.Jacobi(3), diagonal=lambda: torch.ones(3)),
+            ValueError,
+            r"diagonal must return a shape that broadcasts against the vectors, \[2, 4\], got \[3\]",
+        ),
         (lambda: solve_with(lambda v: v, prdp.Jacobi(3)), ValueError, "its diagonal, which Jacobi divides by"),
         (lambda: solve_with(lambda v: v / (1 / 0)), ZeroDivisionError, "division by zero"),
     ],
@@ -114,5 +134,122 @@ def test_mistakes(call, error, message):
         call()
 
 
-def solve_with(matvec, solver=None):
-    return prdp.linear_solve(operators.Function(matvec, matvec), torch.ones(2, 4), solver or prdp.GMRES(3))
+def solve_with(matvec, solver=None, **options):
+    transpose = {} if "diagonal" in options or "tensors" in options else {"transpose": matvec}
+    a = operators.Function(matvec, **transpose, **options)
+    return prdp.linear_solve(a, torch.ones(2, 4), solver or prdp.GMRES(3))
+
+
+def in_place(v, k):
+    return v * k.add_(1.0)
+
+
+def diagonal(k, s):
+    return 2 + k**2
+
+
+WITHOUT_TRANSPOSE = [prdp.GMRES(3, restart=6, rtol=0.0), prdp.Jacobi(90, rtol=1e-15), prdp.Direct()]
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("solver", WITHOUT_TRANSPOSE, ids=["gmres", "jacobi", "direct"])
+def test_without_a_transpose_it_is_torchs_own_derivative(solver, backward):
+    """And with a diagonal Jacobi works, whose own derivative counts in unrolled mode."""
+    k, s = (t.requires_grad_() for t in tensors())
+    b = right_hand_side().requires_grad_()
+
+    def solve(b, k, s):
+        a = operators.Function(shifted, tensors=(k, s), diagonal=diagonal)
+        return prdp.linear_solve(a, b, solver, backward=backward)[0]
+
+    a = operators.Function(shifted, tensors=(k, s))
+    torch.testing.assert_close(a.apply_transpose(b), shifted_transpose(b, k, s))
+    torch.testing.assert_close(solve(b, k, s), torch.linalg.solve(dense(k, s), b))
+    assert torch.autograd.gradcheck(solve, (b, k, s))
+    assert torch.autograd.gradgradcheck(solve, (b, k, s), fast_mode=True)
+
+
+def test_few_jacobi_sweeps_unrolled_differentiate_the_diagonal():
+    k, s = (t.requires_grad_() for t in tensors())
+    b = right_hand_side().requires_grad_()
+
+    def by_hand(b, k, s):
+        u = torch.zeros_like(b)
+        for _ in range(3):
+            u = u + (b - shifted(u, k, s)) / diagonal(k, s)
+        return u
+
+    a = operators.Function(shifted, tensors=(k, s), diagonal=diagonal)
+    u, _ = prdp.linear_solve(a, b, prdp.Jacobi(3), backward="unrolled")
+    expected = by_hand(b, k, s)
+    torch.testing.assert_close(u, expected)
+    found, truth = (torch.autograd.grad((x**2).sum(), (b, k, s)) for x in (u, expected))
+    torch.testing.assert_close(found, truth)
+
+
+def test_symmetric_says_that_matvec_is_its_own_transpose():
+    calls = []
+
+    def scaled(v, k):
+        calls.append(torch.is_grad_enabled())
+        return k * v
+
+    k, v = torch.tensor(2.0), torch.ones(2, 4)
+    a = operators.Function(scaled, tensors=k, symmetric=True)  # a single tensor will do
+    with torch.no_grad():
+        assert torch.equal(a.apply_transpose(v), 2 * v)
+    assert calls == [False]
+
+
+def test_a_product_that_torch_cannot_differentiate_needs_a_transpose():
+    def detached(v):
+        return torch.from_numpy(2 * v.detach().numpy())
+
+    b = right_hand_side().requires_grad_()
+    u, _ = prdp.linear_solve(operators.Function(detached), b, prdp.GMRES(3))
+    with pytest.raises(ValueError, match=r"torch cannot differentiate matvec .* or give transpose"):
+        u.sum().backward()
+    u, _ = prdp.linear_solve(operators.Function(detached, symmetric=True), b, prdp.GMRES(3))
+    u.sum().backward()
+    torch.testing.assert_close(b.grad, torch.full_like(b, 0.5))
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("rhs_requires_grad", [False, True])
+def test_tensors_that_would_lose_their_gradient_are_refused(rhs_requires_grad, backward):
+    k, b = torch.tensor(2.0, dtype=torch.float64, requires_grad=True), right_hand_side()
+    b.requires_grad_(rhs_requires_grad)
+
+    def solve(backward=backward):
+        return prdp.linear_solve(operators.Function(lambda v: k * v), b, prdp.GMRES(3), backward=backward)[0]
+
+    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
+        solve()
+    torch.testing.assert_close(solve("none"), b.detach() / 2)
+    with torch.no_grad():
+        torch.testing.assert_close(solve(), b / 2)
+    k.requires_grad_(False)
+    torch.testing.assert_close(solve(), b / 2)
+
+
+def test_what_is_captured_is_looked_for_once():
+    recorded = []
+
+    def matvec(v, k):
+        recorded.append(torch.is_grad_enabled())
+        return k * v
+
+    a = operators.Function(matvec, tensors=torch.tensor([2.0], dtype=torch.float64, requires_grad=True))
+    for _ in range(2):
+        prdp.linear_solve(a, right_hand_side(), prdp.GMRES(3))
+    assert recorded[0] and not any(recorded[1:])
+
+
+def test_copies_and_pickles():
+    a = operators.Function(shifted, shifted_transpose, tensors(), diagonal)
+    v = right_hand_side()
+    for clone in (copy.deepcopy(a), pickle.loads(pickle.dumps(a))):
+        clone.tensors[1].fill_(0.0)
+        torch.testing.assert_close(clone.apply(v), diagonal(*clone.tensors) * v)
+        torch.testing.assert_close(clone.diagonal(), a.diagonal())
+    assert a.tensors[1] == 0.7

@@ -62,6 +62,7 @@ def test_unrolled_is_the_exact_derivative_of_k_iterations(name, solver, k):
     assert gradgradcheck(solve, inputs)
 
 
+@pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("batched", [False, True])
 def test_gradients_of_sparse_matrices_live_on_their_pattern(solver, batched):

@@ -12,7 +12,7 @@ from PIL import Image
 from test_corrector import cache, tiny  # noqa: F401, cache is a fixture of every test here
 
 import prdp_torch as prdp
-from prdp_torch import _C, compare, fields, records, report, scenes, trajectories, trajectory_charts
+from prdp_torch import _C, compare, fields, report, scenes, trajectories, trajectory_charts
 from prdp_torch.networks import make_network
 
 PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
@@ -121,23 +121,6 @@ def test_resume_reads_the_weights_instead_of_training_again(tmp_path, monkeypatc
         assert torch.equal(before.states, after.states) and np.array_equal(before.errors, after.errors)
 
 
-def test_no_record_stands_beside_weights_of_another_training(tmp_path, monkeypatch):
-    """Where writing stops half-way, --resume must train again."""
-    scene = heat(tmp_path)
-    trained(scene, tmp_path)
-    record = tmp_path / "prdp/seed_0.json"
-    assert record.exists()
-
-    def interrupted(path, network):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compare.records, "write_weights", interrupted)
-    prdp, environment = compare.Refinement.prdp(scene), records.environment()
-    with pytest.raises(KeyboardInterrupt):
-        compare.run_one(scene, "prdp", prdp, 0, tmp_path, environment, False, lambda *_: None)
-    assert not record.exists() and not list(tmp_path.rglob("*.part"))
-
-
 def test_trainings_without_weights_or_that_diverged_are_left_out_and_named(tmp_path):
     scene = heat(tmp_path)
     rows, _ = trained(scene, tmp_path)
@@ -157,6 +140,7 @@ def test_trainings_without_weights_or_that_diverged_are_left_out_and_named(tmp_p
         lambda path: path.write_bytes(path.read_bytes()[:300]),
         lambda path: path.write_text(""),
         lambda path: torch.save({"other": torch.ones(2)}, path),
+        lambda path: torch.save({k: v + 1 for k, v in torch.load(path).items()}, path),
     ],
 )
 def test_weights_that_do_not_fit_are_refused_with_the_remedy(tmp_path, damage):
@@ -164,7 +148,7 @@ def test_weights_that_do_not_fit_are_refused_with_the_remedy(tmp_path, damage):
     rows, _ = trained(scene, tmp_path)
     path = tmp_path / "prdp/seed_0.pt"
     damage(path)
-    with pytest.raises(ValueError, match=f"weights: '{path}' is damaged or of another network; delete it"):
+    with pytest.raises(ValueError, match=f"weights: '{path}' is damaged or not of the record beside it; delete it"):
         trajectories.collect(scene, rows, tmp_path)
 
 

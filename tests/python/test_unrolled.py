@@ -10,6 +10,8 @@ from torch.library import opcheck
 import prdp_torch as prdp
 from prdp_torch import operators
 
+pytestmark = pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
+
 MATRIX = spd_matrices(3, 5)
 # name: (operator out of its tensors, the tensors, shape of one right-hand side)
 SWEPT = {

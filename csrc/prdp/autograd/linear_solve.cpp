@@ -30,6 +30,7 @@ struct Call : torch::CustomClassHolder {
   OperatorSpec a;
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products;  // kept alive for the backward pass
+  std::pair<int64_t, int64_t> step;                    // of a rollout, for what the backward pass reports
 };
 
 using Signature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
@@ -112,6 +113,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
     ctx->save_for_backward(std::move(saved));
 
     if (call->a.kind == "function") call->products = RegisteredProducts::find(call->a.shape[0]);
+    call->step = FailuresOfStep::now();
     call->a.tensors.clear();  // they are among the saved ones
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {u, iterations, residual, status, applications};
@@ -120,6 +122,7 @@ class LinearSolve : public torch::autograd::Function<LinearSolve> {
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
     const auto saved = ctx->get_saved_variables();
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
+    const FailuresOfStep here(call->step.first, call->step.second);
     auto a = call->a;
     a.tensors.assign(saved.begin() + 3, saved.end());
     const size_t inputs = a.tensors.size() + 1;
@@ -140,8 +143,9 @@ template <class... Args>
 Outputs autograd_kernel(const at::Tensor& b, Args... args) {
   const auto call = unpack(args...);
   const auto tensors = call->a.tensors;
-  const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
-                              (b.requires_grad() || any_requires_grad(tensors));
+  const bool may_differentiate = at::GradMode::is_enabled() && call->options.backward != Backward::kNone;
+  if (may_differentiate && call->a.kind == "function") refuse_captured_gradients(call->a);
+  const bool differentiable = may_differentiate && (b.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) return call_below(b, call->a, call->options);
   const auto out = LinearSolve::apply(b, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4]};

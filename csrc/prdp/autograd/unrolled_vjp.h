@@ -1,10 +1,10 @@
 #pragma once
 #include <ATen/ATen.h>
-#include <ATen/core/grad_mode.h>
 
 #include <vector>
 
 #include "prdp/operators/operator.h"
+#include "prdp/operators/with_autograd.h"
 #include "prdp/solvers/solver.h"
 
 namespace prdp {
@@ -45,16 +45,5 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
 /// By autograd, one iteration at a time, in plain tensor operations: everything else.
 UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                        at::IntArrayRef needed);
-
-/// Runs body() recorded by autograd: an op may run where that is switched off, inside a compiled graph
-/// for one.
-template <class Body>
-auto with_autograd(const Body& body) {
-  const auto keys = c10::impl::tls_local_dispatch_key_set();
-  const c10::impl::ForceDispatchKeyGuard guard(
-      keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
-  const at::AutoGradMode record(true);
-  return body();
-}
 
 }  // namespace prdp

@@ -1,11 +1,12 @@
 #include "prdp/grid/grid.h"
 
+#include <cmath>
 #include <numbers>
 
 namespace prdp {
 
-Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary)
-    : owner_(owner), shape_(std::move(shape)), boundary_(boundary) {
+Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary, std::vector<double> lengths)
+    : owner_(owner), shape_(std::move(shape)), boundary_(boundary), lengths_(std::move(lengths)) {
   TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3, owner_, ": shape must have 1, 2 or 3 extents, got ",
                     at::IntArrayRef(shape_));
   // A point of a periodic axis must not be its own neighbour.
@@ -13,6 +14,12 @@ Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary)
   for (const int64_t n : shape_)
     TORCH_CHECK_VALUE(n >= least, owner_, ": every extent of shape must be >= ", least, ", got ",
                       at::IntArrayRef(shape_));
+  if (lengths_.empty()) lengths_.assign(shape_.size(), 1.0);
+  TORCH_CHECK_VALUE(lengths_.size() == shape_.size(), owner_, ": length must be one number or one per axis, ",
+                    dim(), " here, got ", at::ArrayRef<double>(lengths_));
+  for (const double length : lengths_)
+    TORCH_CHECK_VALUE(std::isfinite(length) && length > 0.0, owner_, ": length must be finite and > 0, got ",
+                      at::ArrayRef<double>(lengths_));
 }
 
 int64_t Grid::unknowns() const {

@@ -8,25 +8,28 @@ namespace prdp {
 
 /// What lies beyond the ends of every axis.
 enum class Boundary {
-  kDirichlet,  // zero; boundary points are not unknowns, dx = 1/(N + 1)
-  kPeriodic,   // the other end; dx = 1/N
+  kDirichlet,  // zero; boundary points are not unknowns, dx = length/(N + 1)
+  kPeriodic,   // the other end; dx = length/N
 };
 
-/// A uniform grid on the unit interval, square or cube. `shape` counts the unknowns in tensor order,
-/// (N,), (Ny, Nx) or (Nz, Ny, Nx): the x direction is the last axis. Functions of a field and a grid
+/// A uniform grid on an interval, a rectangle or a box, of side 1 where no lengths are given. `shape` counts
+/// the unknowns in tensor order, (N,), (Ny, Nx) or (Nz, Ny, Nx): the x direction is the last axis; `lengths`
+/// are the sides of the domain in the same order. Functions of a field and a grid
 /// take the last dim() axes of the tensor for it, and name an axis by its place in `shape`.
 class Grid {
  public:
-  /// Raises ValueError unless `shape` has 1 to 3 positive extents, >= 2 where the grid is periodic;
-  /// `owner` names the caller.
-  Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary = Boundary::kDirichlet);
+  /// Raises ValueError unless `shape` has 1 to 3 positive extents, >= 2 where the grid is periodic, and
+  /// `lengths` is empty or holds a finite number > 0 per axis; `owner` names the caller.
+  Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary = Boundary::kDirichlet,
+       std::vector<double> lengths = {});
 
   const std::vector<int64_t>& shape() const { return shape_; }
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   int64_t unknowns() const;
   Boundary boundary() const { return boundary_; }
+  double length(int64_t axis) const { return lengths_[axis]; }
   double dx(int64_t axis) const {
-    return 1.0 / static_cast<double>(shape_[axis] + (boundary_ == Boundary::kDirichlet));
+    return lengths_[axis] / static_cast<double>(shape_[axis] + (boundary_ == Boundary::kDirichlet));
   }
 
   /// Raises ValueError unless v has shape (batch, channels, *shape); TypeError unless it is real.
@@ -36,6 +39,7 @@ class Grid {
   const char* owner_;
   std::vector<int64_t> shape_;
   Boundary boundary_;
+  std::vector<double> lengths_;
 };
 
 /// Discrete Laplacian L v, Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Differentiable.

@@ -25,7 +25,8 @@ class Burgers : public PeriodicBase<T, Dim, Burgers<T, Dim>> {
       scratch[p.nx + 1] = w[0];
       return {scratch, scratch + 1, scratch + 2};
     };
-    stencil_.emplace(p.ny, p.nx, typename Stencil::Terms{1.0, p.dt, p.nu * p.dt, p.transposed}, winds);
+    const typename Stencil::Terms terms{1.0, p.dt, p.nu * p.dt, p.transposed, p.length_y, p.length_x};
+    stencil_.emplace(p.ny, p.nx, terms, winds);
   }
 
   Burgers sample(int64_t s) const { return Burgers(this->parameters_.sample(s)); }

@@ -17,10 +17,10 @@ class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
 
  public:
   explicit NavierStokes(const UpwindParameters<T>& p)
-      : Base(p), inverse_dx_(inverse_spacing(p.nx, p.transposed)),
-        inverse_dy_(inverse_spacing(p.ny, p.transposed)) {
+      : Base(p), inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
+        inverse_dy_(inverse_spacing(p.ny, p.length_y, p.transposed)) {
     if (!this->is_shared()) return;
-    const typename Stencil::Terms terms{1.0 / p.dt, 1.0, p.nu, p.transposed};
+    const typename Stencil::Terms terms{1.0 / p.dt, 1.0, p.nu, p.transposed, p.length_y, p.length_x};
     const auto u1 = [&p](int64_t j) { return p.winds + (j + p.ny) % p.ny * p.nx; };
     const auto u2 = [&](int64_t j) { return u1(j) + p.ny * p.nx; };
     const auto at_point = [](const T* wind) { return WindRow<T>{wind, wind, wind}; };
@@ -90,8 +90,9 @@ class NavierStokes : public PeriodicBase<T, 3, NavierStokes<T>> {
   enum Weight { kX, kXLower, kXUpper, kY, kOne, kZero, kWeights };  // the first four: StaggeredStencil
 
   /// Along an axis of one point all differences vanish.
-  static T inverse_spacing(int64_t n, bool transposed) {
-    return n == 1 ? T(0) : static_cast<T>(transposed ? -n : n);
+  static T inverse_spacing(int64_t n, double length, bool transposed) {
+    const double inverse = static_cast<double>(n) / length;
+    return n == 1 ? T(0) : static_cast<T>(transposed ? -inverse : inverse);
   }
   /// From sums over two rows to means over four points.
   const T* finish_mean(T* sum) const {

@@ -8,7 +8,7 @@
 namespace prdp::kernels {
 
 /// An operator that depends on a velocity field, as plain arrays: the winds (batch, channel, ny, nx) on
-/// a periodic grid of the unit domain; ny = 1 in one dimension.
+/// a periodic grid; ny = 1 in one dimension.
 template <class T>
 struct UpwindParameters {
   const T* winds;
@@ -16,6 +16,7 @@ struct UpwindParameters {
   int64_t ny, nx;
   double nu, dt;
   bool transposed;
+  double length_y = 1.0, length_x = 1.0;  // of the domain
 
   UpwindParameters sample(int64_t s) const {
     UpwindParameters p = *this;
@@ -41,6 +42,7 @@ class UpwindStencil {
   struct Terms {
     double shift, advection, diffusion;
     bool transposed;
+    double length_y = 1.0, length_x = 1.0;
   };
 
   /// `winds(axis, j, scratch)` is the WindRow along the axis (0: x, 1: y) at row j; it may lie in
@@ -93,23 +95,24 @@ class UpwindStencil {
   template <class Winds>
   void assemble_row(int64_t j, const Terms& terms, const Winds& winds, T* scratch) {
     const auto& loops = kernels::loops<T>();
-    const auto couple = [&](int axis, int64_t n, T* lower, T* upper, T* winds_memory) {
+    const auto couple = [&](int axis, double inverse_dx, T* lower, T* upper, T* winds_memory) {
       const WindRow<T> w = winds(axis, j, winds_memory);
-      const double inverse_dx = static_cast<double>(n);
       loops.upwind_row(static_cast<T>(terms.advection * inverse_dx),
                        static_cast<T>(terms.diffusion * inverse_dx * inverse_dx), w.before, w.here, w.after,
                        lower, upper, coefficient(j, 0), nx_);
     };
     std::fill(coefficient(j, 0), coefficient(j, 0) + nx_, static_cast<T>(terms.shift));
+    const double inverse_dx = static_cast<double>(nx_) / terms.length_x;
+    const double inverse_dy = static_cast<double>(ny_) / terms.length_y;
     if (nx_ > 1) {
-      couple(0, nx_, scratch, scratch + row_, scratch + 2 * row_);
+      couple(0, inverse_dx, scratch, scratch + row_, scratch + 2 * row_);
       place_along_row(j, scratch, scratch + row_);
     }
     if (Dim == 1 || ny_ == 1) return;
     if (transposed_)
-      couple(1, ny_, coefficient(previous(j), 4), coefficient(next(j), 3), scratch + 2 * row_);
+      couple(1, inverse_dy, coefficient(previous(j), 4), coefficient(next(j), 3), scratch + 2 * row_);
     else
-      couple(1, ny_, coefficient(j, 3), coefficient(j, 4), scratch + 2 * row_);
+      couple(1, inverse_dy, coefficient(j, 3), coefficient(j, 4), scratch + 2 * row_);
   }
   void place_along_row(int64_t j, const T* lower, const T* upper) {
     T *to_lower = coefficient(j, 1) + 1, *to_upper = coefficient(j, 2), *wraps = wraps_ + 2 * j;

@@ -43,7 +43,9 @@ at::Tensor BurgersOperator::solve_rows(const at::Tensor& matrix, const at::Tenso
 }
 
 KernelParameters BurgersOperator::kernel() const {
-  return BurgersParameters{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+  BurgersParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+  for (int64_t d = 0; d < grid_.dim(); ++d) k.length[2 - grid_.dim() + d] = grid_.length(d);
+  return k;
 }
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {

@@ -3,7 +3,7 @@
 namespace prdp {
 
 FlowOperator::FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels)
-    : grid_(owner, spec.shape, Boundary::kPeriodic),
+    : grid_(owner, spec.shape, Boundary::kPeriodic, lengths_of(spec, 1)),
       step_(owner, spec, 2, "two tensors, the winds and nu"),
       winds_(spec.tensors[0]),
       channels_(channels) {}

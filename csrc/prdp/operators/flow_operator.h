@@ -6,7 +6,7 @@
 namespace prdp {
 
 /// What Burgers and Navier-Stokes share: one step of a flow on a periodic grid, linearised about given
-/// winds. Parameters (dt), tensors (winds, nu); the winds are (batch, channels, *shape), or
+/// winds. Parameters (dt, length per axis if not 1), tensors (winds, nu); the winds are (batch, channels, *shape), or
 /// (1, channels, *shape) for all samples alike. Channel 0 is the velocity along x, the last axis,
 /// channel 1 along y.
 class FlowOperator : public Operator {

@@ -1,5 +1,6 @@
 #include "prdp/operators/function_operator.h"
 
+#include <ATen/ExpandUtils.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <limits>
@@ -7,6 +8,7 @@
 #include <unordered_map>
 
 #include "prdp/operators/dense.h"
+#include "prdp/operators/with_autograd.h"
 
 namespace prdp {
 
@@ -24,10 +26,22 @@ Registry& registry() {
 }
 
 at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* name) {
+  TORCH_CHECK_TYPE(result.defined(), "Function: ", name, " must return a tensor, got none");
+  TORCH_CHECK_VALUE(result.device() == v.device(), "Function: ", name, " must return a tensor on ", v.device(),
+                    ", got one on ", result.device());
   TORCH_CHECK_VALUE(result.sizes() == v.sizes() && result.scalar_type() == v.scalar_type(), "Function: ", name,
                     " must return what it was given, ", v.sizes(), " in ", v.scalar_type(), ", got ",
                     result.sizes(), " in ", result.scalar_type());
   return result;
+}
+
+/// How often a tensor was written to; unknown in inference mode.
+int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<int64_t>(t._version()); }
+
+std::vector<at::Tensor> detached(const std::vector<at::Tensor>& tensors) {
+  std::vector<at::Tensor> plain;
+  for (const auto& t : tensors) plain.push_back(t.detach());
+  return plain;
 }
 
 /// The matrix of a product, (batch, n, n), one unit vector at a time.
@@ -73,6 +87,12 @@ RegisteredProducts::~RegisteredProducts() {
   registry().entries.erase(number_);
 }
 
+void refuse_captured_gradients(const OperatorSpec& a) {
+  auto unknown = RegisteredProducts::Captures::kUnknown;
+  RegisteredProducts::find(a.shape.at(0))
+      ->captures.compare_exchange_strong(unknown, RegisteredProducts::Captures::kWanted);
+}
+
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
   TORCH_CHECK_VALUE(spec.shape.size() == 1 && spec.parameters.empty(),
                     "Function: takes the number of its products and no parameters");
@@ -83,18 +103,75 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(b.dim() >= 2, "Function: expected (batch, ...), got ", b.sizes());
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
                    "Function: expected float32 or float64, got ", b.scalar_type());
+  vectors_ = b.sizes().vec();
 }
 
 at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
-  return checked(registered_->products().apply(v, tensors_), v, "matvec");
+  if (registered_->captures == RegisteredProducts::Captures::kWanted && !at::GradMode::is_enabled())
+    return product_without_captures(v);
+  return product(registered_->products().apply, v, tensors_, "matvec");
 }
 
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {
-  return checked(registered_->products().apply_transpose(v, tensors_), v, "transpose");
+  const auto& transpose = registered_->products().apply_transpose;
+  return transpose ? product(transpose, v, tensors_, "transpose") : derivative_transposed(v);
+}
+
+at::Tensor FunctionOperator::product(const Products::Product& function, const at::Tensor& v,
+                                     const std::vector<at::Tensor>& tensors, const char* name) const {
+  const auto of_all = [&] {
+    auto sum = writes(v);
+    for (const auto& t : tensors) sum += writes(t);
+    return sum;
+  };
+  const auto before = of_all();
+  const auto result = checked(function(v, tensors), v, name);
+  TORCH_CHECK_VALUE(of_all() == before, "Function: ", name,
+                    " changes its arguments in place; it must return a new tensor and leave them as they are");
+  return result;
+}
+
+at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const {
+  const auto result =
+      with_autograd([&] { return product(registered_->products().apply, v.detach(), detached(tensors_), "matvec"); });
+  TORCH_CHECK_VALUE(!result.requires_grad(),
+                    "Function: matvec uses a tensor that requires grad but is not among its tensors, so that no "
+                    "gradient would reach it; hand it over in tensors, or detach it");
+  registered_->captures = RegisteredProducts::Captures::kNone;
+  return result;  // no graph hangs on it
+}
+
+at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
+  // A v is linear in v, so its derivative is the same everywhere: take it at zero.
+  const bool create_graph = at::GradMode::is_enabled();
+  const auto found = with_autograd([&]() -> at::Tensor {
+    auto at_zero = create_graph ? std::nullopt : recorded_;
+    if (!at_zero || at_zero->point.sizes() != v.sizes() || at_zero->point.dtype() != v.dtype()) {
+      const auto point = at::zeros_like(v).detach().requires_grad_();
+      const auto tensors = create_graph ? tensors_ : detached(tensors_);
+      at_zero = Recorded{point, product(registered_->products().apply, point, tensors, "matvec")};
+      if (!create_graph) recorded_ = at_zero;
+    }
+    if (!at_zero->product.requires_grad()) return {};
+    return torch::autograd::grad({at_zero->product}, {at_zero->point}, {create_graph ? v : v.detach()},
+                                 /*retain_graph=*/true, create_graph, /*allow_unused=*/true)[0];
+  });
+  TORCH_CHECK_VALUE(found.defined(), "Function: torch cannot differentiate matvec with respect to its vector; make "
+                                     "it of torch operations, or give transpose");
+  return found;
 }
 
 at::Tensor FunctionOperator::diagonal() const {
-  TORCH_CHECK_VALUE(false, "Function: its diagonal, which Jacobi divides by, is not known; take another method");
+  const auto& function = registered_->products().diagonal;
+  TORCH_CHECK_VALUE(function, "Function: its diagonal, which Jacobi divides by, is not known; give diagonal, or "
+                              "take another method");
+  const auto found = function(tensors_);
+  TORCH_CHECK_TYPE(found.defined() && at::isFloatingType(found.scalar_type()),
+                   "Function: diagonal must return a real tensor");
+  TORCH_CHECK_VALUE(vectors_.empty() || at::is_expandable_to(found.sizes(), vectors_),
+                    "Function: diagonal must return a shape that broadcasts against the vectors, ",
+                    at::IntArrayRef(vectors_), ", got ", found.sizes());
+  return found;
 }
 
 std::vector<int64_t> FunctionOperator::vector_shape() const {
@@ -122,9 +199,9 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   }
   std::vector<at::Tensor> gradients(tensors_.size());
   if (wanted.empty()) return gradients;
-  const auto product = checked(registered_->products().apply(create_graph ? u : u.detach(), arguments), u, "matvec");
-  if (!product.requires_grad()) return gradients;
-  const auto found = torch::autograd::grad({product}, wanted, {create_graph ? lambda : lambda.detach()},
+  const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, "matvec");
+  if (!made.requires_grad()) return gradients;
+  const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()},
                                            create_graph, create_graph, /*allow_unused=*/true);
   for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
     if (arguments[i].requires_grad()) gradients[i] = found[next++];

@@ -43,13 +43,13 @@ KernelParameters LaplacianOperator::kernel() const {
 }
 
 PoissonOperator::PoissonOperator(const OperatorSpec& spec)
-    : LaplacianOperator(Grid("Poisson", spec.shape)) {
-  TORCH_CHECK_VALUE(spec.parameters.empty() && spec.tensors.empty(),
-                    "Poisson: takes no parameters and no tensors");
+    : LaplacianOperator(Grid("Poisson", spec.shape, Boundary::kDirichlet, lengths_of(spec, 0))) {
+  TORCH_CHECK_VALUE(spec.tensors.empty(), "Poisson: takes no tensors");
 }
 
 HeatOperator::HeatOperator(const OperatorSpec& spec)
-    : LaplacianOperator(Grid("Heat", spec.shape)), step_("Heat", spec, 1, "one tensor, nu") {}
+    : LaplacianOperator(Grid("Heat", spec.shape, Boundary::kDirichlet, lengths_of(spec, 1))),
+      step_("Heat", spec, 1, "one tensor, nu") {}
 
 at::Tensor HeatOperator::apply(const at::Tensor& v) const {
   return v - (step_.nu * step_.dt) * laplacian(v, grid_);

@@ -49,7 +49,8 @@ class PoissonOperator final : public LaplacianOperator {
   at::Tensor symbol(const at::Tensor& x) const override { return x; }
 };
 
-/// One implicit Euler step of the heat equation, A = I - ν Δt L; parameters (dt), tensors (nu).
+/// One implicit Euler step of the heat equation, A = I - ν Δt L; parameters (dt, length per axis if not
+/// 1), tensors (nu).
 class HeatOperator final : public LaplacianOperator {
  public:
   explicit HeatOperator(const OperatorSpec& spec);

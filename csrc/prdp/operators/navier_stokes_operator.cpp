@@ -110,7 +110,9 @@ at::Tensor NavierStokesOperator::precondition(const at::Tensor& v, bool transpos
 }
 
 KernelParameters NavierStokesOperator::kernel() const {
-  return NavierStokesParameters{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+  NavierStokesParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
+  k.length = {grid_.length(kY), grid_.length(kX)};
+  return k;
 }
 
 std::unique_ptr<Operator> NavierStokesOperator::select(const at::Tensor& index) const {

@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <memory>
 #include <string>
 #include <variant>
@@ -14,7 +15,7 @@ namespace prdp {
 struct OperatorSpec {
   std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "dense", "csr"
   std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
-  std::vector<double> parameters;    // plain numbers that carry no gradient, such as dt
+  std::vector<double> parameters;    // plain numbers without gradient, such as dt and the lengths
   std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
   bool transposed = false;
 };
@@ -38,6 +39,7 @@ struct BurgersParameters {
   at::Tensor winds;
   double nu, dt;
   bool transposed = false;
+  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
 /// The velocity (batch or 1, 2 or more, Ny, Nx), contiguous, about which the Navier–Stokes equations
@@ -46,6 +48,7 @@ struct NavierStokesParameters {
   at::Tensor velocity;
   double nu, dt;
   bool transposed = false;
+  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
 /// What the CPU loops need to know of an operator; monostate: it has plain tensor operations only.

@@ -4,11 +4,16 @@
 
 namespace prdp {
 
+std::vector<double> lengths_of(const OperatorSpec& spec, size_t others) {
+  if (spec.parameters.size() <= others) return {};
+  return {spec.parameters.begin() + static_cast<std::ptrdiff_t>(others), spec.parameters.end()};
+}
+
 StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t tensors,
                                const char* expected)
     : owner(who) {
-  TORCH_CHECK_VALUE(spec.parameters.size() == 1 && spec.tensors.size() == tensors, owner,
-                    ": takes one parameter, dt, and ", expected);
+  TORCH_CHECK_VALUE(!spec.parameters.empty() && spec.tensors.size() == tensors, owner,
+                    ": takes the parameter dt, then the length of each axis if not 1, and ", expected);
   dt = spec.parameters[0];
   nu = spec.tensors.back();
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0.0, owner, ": dt must be finite and > 0, got ", dt);

@@ -6,10 +6,11 @@ namespace prdp {
 
 namespace {
 
-/// Symbol of the backward difference along an axis of n points: (1 - exp(-2πi k/n)) n.
-at::Tensor backward_symbol(const at::Tensor& frequency, double n) {
+/// Symbol of the backward difference along an axis of n points: (1 - exp(-2πi k/n))/dx.
+at::Tensor backward_symbol(const at::Tensor& frequency, double n, double length) {
   const auto angle = frequency * (2.0 * std::numbers::pi / n);
-  return at::complex(n - n * angle.cos(), n * angle.sin());
+  const double inverse_dx = n / length;
+  return at::complex(inverse_dx - inverse_dx * angle.cos(), inverse_dx * angle.sin());
 }
 
 }  // namespace
@@ -17,8 +18,9 @@ at::Tensor backward_symbol(const at::Tensor& frequency, double n) {
 StokesSolve::StokesSolve(const Grid& grid, const at::Tensor& nu, double dt, at::ScalarType dtype) {
   const int64_t ny = grid.shape()[0], nx = grid.shape()[1];
   const auto real = nu.options().dtype(at::kDouble);
-  const auto along_x = backward_symbol(at::arange(nx / 2 + 1, real), static_cast<double>(nx));
-  const auto along_y = backward_symbol(at::arange(ny, real), static_cast<double>(ny)).unsqueeze(-1);
+  const auto along_x = backward_symbol(at::arange(nx / 2 + 1, real), static_cast<double>(nx), grid.length(1));
+  const auto along_y =
+      backward_symbol(at::arange(ny, real), static_cast<double>(ny), grid.length(0)).unsqueeze(-1);
   const auto symbol = at::stack({along_x.expand({ny, -1}), along_y.expand({-1, nx / 2 + 1})});
   const auto laplacian = symbol.abs().square().sum(0);
   const auto mean = laplacian.eq(0);

@@ -3,10 +3,8 @@
 #include <c10/util/Exception.h>
 
 #include <cstdlib>
-#include <fstream>
-#include <iterator>
 
-#include "prdp/scenes/files.h"
+#include "prdp/scenes/seal.h"
 
 namespace prdp {
 
@@ -14,6 +12,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
+constexpr const char *kKind = "checkpoint", *kRemedy = "its training starts afresh";
 constexpr double kSeconds = 10.0;  // between two checkpoints: what a kill may cost, beside one interval
 
 double seconds() {
@@ -26,11 +25,6 @@ double seconds() {
   return value;
 }
 
-/// The first line: what tells a whole file of this format.
-std::string mark(const std::string& content) {
-  return "prdp checkpoint 1, " + std::to_string(fingerprint(content));
-}
-
 }  // namespace
 
 Checkpoint::Checkpoint(fs::path path, std::string settings)
@@ -38,30 +32,29 @@ Checkpoint::Checkpoint(fs::path path, std::string settings)
 
 bool Checkpoint::due() const { return Clock::now() - last_ >= pause_; }
 
-void Checkpoint::write(const std::string& state) {
-  const auto content = settings_ + '\n' + state;
-  write_whole(path_, mark(content) + '\n' + content);
+void Checkpoint::write(std::string state) {
+  write_sealed(path_, kKind, {settings_, std::move(state)});
   last_ = Clock::now();
 }
 
 std::optional<std::string> Checkpoint::read() const {
-  if (!fs::exists(path_)) return std::nullopt;
-  std::ifstream file(path_, std::ios::binary);
-  std::string found;
-  std::getline(file, found);
-  const std::string content{std::istreambuf_iterator<char>(file), {}};
-  TORCH_CHECK_VALUE(found == mark(content), "checkpoint: '", path_.string(),
-                    "' is damaged; delete it, and its training starts afresh");
-  const auto end = content.find('\n');
-  if (content.substr(0, end) != settings_) return std::nullopt;
-  return content.substr(end + 1);
+  auto found = read_sealed(path_, kKind, kRemedy);
+  if (!found || found->settings != settings_) return std::nullopt;
+  return std::move(found->content);
+}
+
+void Checkpoint::refuse() const { refuse_damaged(path_, kKind, kRemedy); }
+
+void Checkpoint::check_length(int64_t done, int64_t intervals) const {
+  TORCH_CHECK_VALUE(done <= intervals, "checkpoint: '", path_.string(), "' is of a training that has done ", done,
+                    " intervals, more than the ", intervals, " asked for; ask for as many, or delete it");
 }
 
 void Checkpoint::remove() const {
   std::error_code error;
+  TORCH_CHECK_VALUE(!fs::is_directory(path_, error), "checkpoint: cannot remove '", path_.string(), "': it is a folder");
   fs::remove(path_, error);
   TORCH_CHECK_VALUE(!error, "checkpoint: cannot remove '", path_.string(), "': ", error.message());
-  fs::remove(path_.string() + ".part", error);  // where a write was killed
 }
 
 }  // namespace prdp

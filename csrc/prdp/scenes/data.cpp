@@ -105,7 +105,7 @@ Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
 
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto make = [&] { return compute_dataset(scene, on_progress); };
-  return scene.task == Scene::Task::kCorrector ? cached_dataset(scene, make) : make();
+  return scene.physics.direct_is_cheap() ? make() : cached_dataset(scene, make);
 }
 
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress) {

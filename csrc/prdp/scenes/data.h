@@ -25,7 +25,8 @@ struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
   at::Tensor train_first;  // after one step; of the task "corrector" alone
 };
-/// Data of the task "corrector" take minutes: they are kept on disk (data_cache.h).
+/// The data of flows in the plane, whose reference solves are iterative, take seconds to minutes: they are kept on
+/// disk (data_cache.h).
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
 /// The same without the file on disk.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});

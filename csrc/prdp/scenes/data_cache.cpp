@@ -1,16 +1,14 @@
 #include "prdp/scenes/data_cache.h"
 
-#include <torch/csrc/jit/serialization/pickle.h>
 #include <unistd.h>
 
 #include <cstdlib>
 #include <filesystem>
-#include <fstream>
 #include <iomanip>
-#include <iterator>
 #include <sstream>
 
-#include "prdp/scenes/files.h"
+#include "prdp/scenes/seal.h"
+#include "prdp/scenes/tensor_map.h"
 
 namespace prdp {
 
@@ -18,7 +16,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr int kFormat = 1;
+constexpr int kFormat = 2;
 
 /// All that the data depend on, in words.
 std::string settings_of(const Scene& scene) {
@@ -27,8 +25,8 @@ std::string settings_of(const Scene& scene) {
   std::ostringstream text;
   text << std::setprecision(17) << "prdp data " << kFormat << ": " << p.equation << ", shape "
        << at::IntArrayRef(p.shape) << ", reference_shape " << at::IntArrayRef(d.reference_shape) << ", nu " << p.nu
-       << ", dt " << p.dt << ", train " << d.train << ", valid " << d.valid << ", valid_steps " << d.valid_steps
-       << ", seed " << d.seed << ", " << scene.dtype;
+       << ", dt " << p.dt << ", modes " << d.modes << ", train " << d.train << ", valid " << d.valid
+       << ", valid_steps " << d.valid_steps << ", seed " << d.seed << ", " << scene.dtype;
   return text.str();
 }
 
@@ -44,56 +42,42 @@ fs::path cache_folder() {
   return folder;
 }
 
-std::vector<at::Tensor> tensors_of(const Dataset& d) {
-  return {d.train_start, d.train_end, d.valid_start, d.valid_end, d.train_first};
+TensorMap tensors_of(const Dataset& d) {
+  TensorMap tensors{{"train_start", d.train_start}, {"train_end", d.train_end},
+                    {"valid_start", d.valid_start}, {"valid_end", d.valid_end}};
+  if (d.train_first.defined()) tensors["train_first"] = d.train_first;
+  return tensors;
 }
 
-void write(const fs::path& path, const std::string& settings, const Dataset& data) {
-  const auto bytes = torch::jit::pickle_save(
-      c10::ivalue::Tuple::create({settings, c10::List<at::Tensor>(at::ArrayRef<at::Tensor>(tensors_of(data)))}));
-  // Another process may be writing the same.
-  write_whole(path, {bytes.data(), bytes.size()}, std::to_string(getpid()) + ".part");
-}
-
-bool fits(const Dataset& data, const Scene& scene) {
-  const auto& shape = scene.physics.shape;
-  const auto holds = [&](int64_t samples, const at::Tensor& u) {
-    return u.scalar_type() == scene.dtype && u.sizes().equals({samples, 3, shape[0], shape[1]});
+Dataset dataset_of(const TensorMap& tensors, const Scene& scene) {
+  const auto states = [&](const char* name, int64_t samples) {
+    std::vector<int64_t> sizes{samples, scene.physics.channels()};
+    sizes.insert(sizes.end(), scene.physics.shape.begin(), scene.physics.shape.end());
+    return entry(tensors, name, scene.dtype, sizes);
   };
-  const int64_t train = scene.data.train, valid = scene.data.valid;
-  return holds(train, data.train_start) && holds(train, data.train_first) && holds(train, data.train_end) &&
-         holds(valid, data.valid_start) && holds(valid, data.valid_end);
-}
-
-Dataset read(const fs::path& path, const std::string& settings, const Scene& scene) {
-  std::ifstream file(path, std::ios::binary);
-  const std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
-  std::string found;
-  Dataset data;
-  try {
-    const auto content = torch::jit::pickle_load(bytes).toTuple();
-    found = content->elements().at(0).toStringRef();
-    const auto tensors = content->elements().at(1).toTensorVector();
-    data = {tensors.at(0), tensors.at(1), tensors.at(2), tensors.at(3), tensors.at(4)};
-  } catch (const std::exception&) {
-    TORCH_CHECK_VALUE(false, "data: '", path.string(), "' is damaged; delete it, and it is made again");
-  }
-  TORCH_CHECK_VALUE(found == settings && fits(data, scene), "data: '", path.string(), "' holds '", found,
-                    "', not '", settings, "'; delete it, and it is made again");
-  return data;
+  const auto [train, valid] = std::pair(scene.data.train, scene.data.valid);
+  return {states("train_start", train), states("train_end", train), states("valid_start", valid),
+          states("valid_end", valid),
+          scene.task == Scene::Task::kCorrector ? states("train_first", train) : at::Tensor()};
 }
 
 }  // namespace
 
 Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
+  constexpr const char *kKind = "data", *kRemedy = "it is made again";
   const auto settings = settings_of(scene);
-  std::ostringstream name;
-  name << scene.physics.equation << '-' << std::hex << std::setw(16) << std::setfill('0')
-       << fingerprint(settings) << ".pt";
-  const auto path = cache_folder() / name.str();
-  if (fs::exists(path)) return read(path, settings, scene);
+  const auto path = cache_folder() / (scene.physics.equation + '-' + fingerprint(settings) + ".data");
+  if (const auto found = read_sealed(path, kKind, kRemedy)) {
+    TORCH_CHECK_VALUE(found->settings == settings, "data: '", path.string(), "' holds '", found->settings, "', not '",
+                      settings, "'; delete it, and ", kRemedy);
+    try {
+      return dataset_of(unpack(found->content), scene);
+    } catch (const c10::ValueError&) {
+      refuse_damaged(path, kKind, kRemedy);
+    }
+  }
   const auto data = make();
-  write(path, settings, data);
+  write_sealed(path, kKind, {settings, pack(tensors_of(data))});
   return data;
 }
 

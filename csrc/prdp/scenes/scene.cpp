@@ -3,10 +3,9 @@
 #include <algorithm>
 #include <cmath>
 #include <filesystem>
-#include <fstream>
 #include <numbers>
-#include <sstream>
 
+#include "prdp/scenes/files.h"
 #include "prdp/scenes/toml_section.h"
 
 namespace prdp {
@@ -48,9 +47,9 @@ void read_solver(TomlSection s, Scene& scene) {
   std::vector<std::string> methods{"jacobi", "steepest_descent", "cg", "gmres", "direct"};
   if (!scene.physics.periodic()) methods.insert(methods.begin() + 1, "chebyshev");  // heat and Poisson
   scene.solver.method = method_from_name(s.choice("method", methods));
-  scene.solver.max_iter = s.whole("max_iter", 0);
+  scene.solver.max_iter = s.count("max_iter", 1);
   scene.solver.rtol = s.at_least("rtol", 0.0);
-  if (scene.solver.method == Method::kGmres) scene.solver.restart = s.whole("restart", 1);
+  if (scene.solver.method == Method::kGmres) scene.solver.restart = s.count("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
   s.finish();
 }
@@ -65,7 +64,7 @@ Scene::Data read_data(TomlSection s, const Scene& scene) {
     for (auto& n : finer) n = 2 * n + 1;
     if (d.reference_shape != finer)
       s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
-    d.valid_max_iter = s.whole("valid_max_iter", 1);
+    d.valid_max_iter = s.count("valid_max_iter", 1);
   }
   d.train = s.whole("train", 1);
   d.valid = s.whole("valid", 1);
@@ -101,9 +100,9 @@ Scene::Training read_training(TomlSection s, Task task) {
       t.decay_steps = s.whole("decay_steps", 1);
     }
     t.batch = s.whole("batch", 1);
-    t.intervals = s.whole("epochs", 1);
+    t.intervals = s.count("epochs", 1);
   } else {
-    t.intervals = s.whole("updates", 1);
+    t.intervals = s.count("updates", 1);
   }
   s.finish();
   return t;
@@ -134,7 +133,7 @@ PRDPSettings read_prdp(TomlSection s) {
 
 Scene::Compare read_compare(TomlSection s) {
   Scene::Compare c;
-  c.seeds = s.whole("seeds", 1);
+  c.seeds = s.count("seeds", 1);
   c.constant = s.wholes("constant", 0);
   if (s.has("growth")) c.growth = s.above("growth", 1.0);
   if (s.has("target")) c.target = s.above("target", 0.0);
@@ -179,15 +178,15 @@ double Scene::learning_rate(int64_t update) const {
 }
 
 Scene read_scene(const std::string& path) {
-  std::ifstream file(path);
-  TORCH_CHECK_VALUE(file && !std::filesystem::is_directory(path), "scene: cannot read '", path,
-                    "'; expected the path of a .toml file");
-  std::ostringstream text;
-  text << file.rdbuf();
+  const auto text = read_whole("scene", path);
+  // toml++ ends the process on tables nested a hundred thousand deep; a file of this size cannot hold so many.
+  constexpr size_t kLongest = 65536;
+  TORCH_CHECK_VALUE(text.size() <= kLongest, "scene: '", path, "' has ", text.size(), " bytes; a scene has at most ",
+                    kLongest);
 
   toml::table table;
   try {
-    table = toml::parse(text.str(), path);
+    table = toml::parse(text, path);
   } catch (const toml::parse_error& error) {
     TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
   }
@@ -195,7 +194,7 @@ Scene read_scene(const std::string& path) {
   Scene scene;
   scene.path = path;
   scene.name = std::filesystem::path(path).stem().string();
-  scene.text = text.str();
+  scene.text = text;
   TomlSection s(table, path, "");
   scene.title = s.text("title");
   scene.task = read_task(s);

@@ -9,6 +9,10 @@
 
 namespace prdp {
 
+/// The most seeds, intervals and iterations of a solve that a scene or a command may ask for: products of them count
+/// the costs.
+inline constexpr int64_t kMostCounted = 1'000'000'000;
+
 /// A training experiment as data: what a scene file says. One reader serves both languages.
 struct Scene {
   enum class Task {

@@ -9,6 +9,8 @@
 #include <toml++/toml.h>
 #include <vector>
 
+#include "prdp/scenes/scene.h"
+
 namespace prdp {
 
 /// One table of a TOML file while it is read. Every key that is asked for is an allowed one; what is
@@ -61,13 +63,19 @@ class TomlSection {
   }
   int64_t whole(const char* key, int64_t least) {
     const auto k = value<int64_t>(key, "a whole number");
-    if (k < least) fail(key, bound(">=", static_cast<double>(least), static_cast<double>(k)));
+    if (k < least) fail(key, bound(">=", least, k));
+    return k;
+  }
+  /// A whole number that costs are multiples of.
+  int64_t count(const char* key, int64_t least) {
+    const auto k = whole(key, least);
+    if (k > kMostCounted) fail(key, bound("<=", kMostCounted, k));
     return k;
   }
   std::vector<int64_t> wholes(const char* key, int64_t least) {
     const auto all = values<int64_t>(key, "whole numbers");
     for (const auto k : all)
-      if (k < least) fail(key, bound(">=", static_cast<double>(least), static_cast<double>(k)));
+      if (k < least) fail(key, bound(">=", least, k));
     return all;
   }
   std::vector<double> numbers(const char* key) { return values<double>(key, "numbers"); }
@@ -96,7 +104,8 @@ class TomlSection {
     for (const auto& [other, node] : table_) present << (present.tellp() > 0 ? ", " : "") << other.str();
     fail(key, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
   }
-  static std::string bound(const char* relation, double least, double got) {
+  template <class T>
+  static std::string bound(const char* relation, T least, T got) {
     std::ostringstream text;
     text << "must be " << relation << " " << least << ", got " << got;
     return text.str();
@@ -104,9 +113,7 @@ class TomlSection {
   template <class T>
   T value(const char* key, const char* expected) {
     require(key);
-    const auto x = table_[key].value<T>();
-    if (!x) fail(key, std::string("expected ") + expected);
-    return *x;
+    return read<T>(key, *table_.get(key), std::string("expected ") + expected);
   }
   template <class T>
   std::vector<T> values(const char* key, const char* expected) {
@@ -114,12 +121,14 @@ class TomlSection {
     const auto* array = table_[key].as_array();
     if (!array) fail(key, std::string("expected a list of ") + expected);
     std::vector<T> all;
-    for (const auto& node : *array) {
-      const auto x = node.value<T>();
-      if (!x) fail(key, std::string("expected a list of ") + expected);
-      all.push_back(*x);
-    }
+    for (const auto& node : *array) all.push_back(read<T>(key, node, std::string("expected a list of ") + expected));
     return all;
+  }
+  template <class T>
+  T read(const char* key, const toml::node& node, const std::string& expected) const {
+    const auto x = node.value<T>();
+    if (!x || node.is_boolean()) fail(key, expected);  // toml++ takes true for 1
+    return *x;
   }
 
   const toml::table& table_;

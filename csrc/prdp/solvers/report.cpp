@@ -1,4 +1,5 @@
 #include <sstream>
+#include <utility>
 
 #include "prdp/solvers/solve.h"
 
@@ -35,11 +36,13 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus stat
 
 }  // namespace
 
-FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps) {
-  step_now = step;
-  steps_in_all = steps;
+FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
+    : step_before_(std::exchange(step_now, step)), steps_before_(std::exchange(steps_in_all, steps)) {}
+FailuresOfStep::~FailuresOfStep() {
+  step_now = step_before_;
+  steps_in_all = steps_before_;
 }
-FailuresOfStep::~FailuresOfStep() { step_now = 0; }
+std::pair<int64_t, int64_t> FailuresOfStep::now() { return {step_now, steps_in_all}; }
 
 void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure, const char* role) {

@@ -69,6 +69,11 @@ class FailuresOfStep {
   FailuresOfStep(int64_t step, int64_t steps);
   FailuresOfStep(const FailuresOfStep&) = delete;
   ~FailuresOfStep();
+  /// The step this thread is in and their number; 0 and 0 outside of a rollout.
+  static std::pair<int64_t, int64_t> now();
+
+ private:
+  int64_t step_before_, steps_before_;
 };
 
 /// Where warnings go; torch's own by default, which prints them on stderr.

@@ -33,28 +33,29 @@ void with_kernel(const CsrParameters& a, const Body& body) {
 }
 
 /// `winds`: (batch or 1, channel, nx) or (batch or 1, channel, ny, nx).
-template <class T>
-kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, double nu, double dt,
-                                               bool transposed) {
+template <class T, class Parameters>
+kernels::UpwindParameters<T> upwind_parameters(const at::Tensor& winds, const Parameters& a) {
   return {winds.const_data_ptr<T>(),
           winds.size(0) == 1 ? 0 : winds.numel() / winds.size(0),
           winds.dim() > 3 ? winds.size(2) : 1,
           winds.size(-1),
-          nu,
-          dt,
-          transposed};
+          a.nu,
+          a.dt,
+          a.transposed,
+          a.length[0],
+          a.length[1]};
 }
 
 template <class T, class Body>
 void with_kernel(const BurgersParameters& a, const Body& body) {
-  const auto p = upwind_parameters<T>(a.winds, a.nu, a.dt, a.transposed);
+  const auto p = upwind_parameters<T>(a.winds, a);
   if (a.winds.dim() == 3) return body(kernels::Burgers<T, 1>(p));
   body(kernels::Burgers<T, 2>(p));
 }
 
 template <class T, class Body>
 void with_kernel(const NavierStokesParameters& a, const Body& body) {
-  body(kernels::NavierStokes<T>(upwind_parameters<T>(a.velocity, a.nu, a.dt, a.transposed)));
+  body(kernels::NavierStokes<T>(upwind_parameters<T>(a.velocity, a)));
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #include "prdp/steppers/equation.h"
 
+#include <c10/util/safe_numerics.h>
 #include <torch/library.h>
 
 #include <algorithm>
@@ -17,7 +18,10 @@ at::Tensor rest(const Equation& equation) {
   std::vector<int64_t> sizes{1, has_pressure ? 3 : static_cast<int64_t>(equation.shape.size())};
   // A negative extent is left for the operator to refuse.
   for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
-  return at::zeros(sizes);
+  uint64_t numbers = 0;
+  TORCH_CHECK_VALUE(!c10::safe_multiplies_u64(sizes, &numbers) && numbers < uint64_t{1} << 63, equation.kind,
+                    ": a state of shape ", at::IntArrayRef(equation.shape), " has more than 2**63 numbers");
+  return at::zeros({1}).expand(sizes);  // of any size in the memory of one number
 }
 
 }  // namespace

@@ -1,18 +1,25 @@
 #include "prdp/steppers/stepper.h"
 
-#include "prdp/autograd/adjoint_log.h"
+#include <algorithm>
 
 namespace prdp {
 
+namespace {
+
+/// The parameters of an equation: those before the lengths, and a length per axis unless all are 1.
+std::vector<double> parameters(std::vector<double> first, const Length& length, size_t axes) {
+  auto sides = length.sides;
+  if (sides.size() == 1) sides.resize(axes, sides[0]);
+  if (std::any_of(sides.begin(), sides.end(), [](double side) { return side != 1.0; }))
+    first.insert(first.end(), sides.begin(), sides.end());
+  return first;
+}
+
+}  // namespace
+
 Stepper::Stepper(Equation equation, SolveOptions options)
-    : equation_(std::move(equation)),
-      options_(std::move(options)),
-      adjoint_log_(new int64_t(adjoint_log::open()), [](const int64_t* log) {
-        adjoint_log::close(*log);
-        delete log;
-      }) {
-  options_.adjoint_log = *adjoint_log_;
-  options_.check(equation_.kind.c_str());
+    : Solving(equation.kind, std::move(options)), equation_(std::move(equation)) {
+  options_.adjoint_log = *log_;
   equation_.check();
 }
 
@@ -28,33 +35,23 @@ at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
   return states;
 }
 
-void Stepper::set_max_iter(int64_t k) {
-  Solver{options_.solver.method, k}.check(equation_.kind.c_str());
-  options_.solver.max_iter = k;
-}
+Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward, Length length)
+    : Stepper({"poisson", shape, parameters({}, length, shape.size()), {}}, {std::move(solver), backward}) {}
 
-std::optional<SolveInfo> Stepper::adjoint_info() const { return adjoint_log::read(*adjoint_log_); }
-
-bool Stepper::converged() const {
-  const auto adjoint = adjoint_info();
-  return info_ && info_->status.gt(0).all().item<bool>() &&
-         (!adjoint || adjoint->status.gt(0).all().item<bool>());
-}
-
-Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward)
-    : Stepper({"poisson", std::move(shape), {}, {}}, {std::move(solver), backward}) {}
-
-Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward)
-    : Stepper({"heat", std::move(shape), {dt}, {std::move(nu.tensor)}}, {std::move(solver), backward}) {}
+Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
+           Length length)
+    : Stepper({"heat", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}},
+              {std::move(solver), backward}) {}
 
 Burgers::Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
-                 int64_t picard_steps)
-    : Stepper({"burgers", std::move(shape), {dt}, {std::move(nu.tensor)}, picard_steps},
+                 int64_t picard_steps, Length length)
+    : Stepper({"burgers", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}, picard_steps},
               {std::move(solver), backward}) {}
 
 NavierStokes::NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-                           Backward backward, int64_t picard_steps)
-    : Stepper({"navier_stokes", std::move(shape), {dt}, {std::move(nu.tensor)}, picard_steps},
+                           Backward backward, int64_t picard_steps, Length length)
+    : Stepper({"navier_stokes", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)},
+               picard_steps},
               {std::move(solver), backward}) {}
 
 }  // namespace prdp

@@ -1,15 +1,14 @@
 #pragma once
-#include <memory>
-#include <optional>
+#include <vector>
 
-#include "prdp/autograd/linear_solve.h"
 #include "prdp/steppers/rollout.h"
+#include "prdp/steppers/solving.h"
 
 namespace prdp {
 
 /// One time step (or one elliptic solve) as a function u → u_next on (batch, channel, *shape) in
-/// float32 or float64; differentiable as options().backward says. Copies share their reports.
-class Stepper {
+/// float32 or float64; differentiable as options().backward says.
+class Stepper : public Solving {
  public:
   /// Raises ValueError for bad shapes, parameters or budgets, before any work.
   Stepper(Equation equation, SolveOptions options);
@@ -22,29 +21,23 @@ class Stepper {
   OperatorSpec operator_at(const at::Tensor& u) const { return equation_operator(equation_, u); }
   at::Tensor rhs(const at::Tensor& u) const { return equation_rhs(equation_, u); }
 
-  /// K, the budget of the primal solve, and of the adjoint one unless it has its own.
-  int64_t max_iter() const { return options_.solver.max_iter.expect_int(); }
-  void set_max_iter(int64_t k);
-  SolveOptions& options() { return options_; }
-
-  /// Of the last step; nothing before the first.
-  const std::optional<SolveInfo>& info() const { return info_; }
-  /// Of the last adjoint solve; nothing before the first backward pass in implicit mode.
-  std::optional<SolveInfo> adjoint_info() const;
-  /// Whether every sample of the last step, and of its adjoint solve where there was one, met rtol.
-  bool converged() const;
-
  private:
   Equation equation_;
-  SolveOptions options_;
-  std::optional<SolveInfo> info_;
-  std::shared_ptr<const int64_t> adjoint_log_;
 };
 
-/// Δu = -p on `shape` unknowns of the unit domain, u = 0 on its boundary: p → u.
+/// Sides of the domain: one number for all axes, or one number per axis in the order of `shape`.
+struct Length {
+  Length(double all) : sides{all} {}
+  Length(std::vector<double> of_axes) : sides(std::move(of_axes)) {}
+  Length(std::initializer_list<double> of_axes) : sides(of_axes) {}
+  std::vector<double> sides;
+};
+
+/// Δu = -p on `shape` unknowns, u = 0 on the boundary of the domain: p → u.
 class Poisson : public Stepper {
  public:
-  Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit);
+  Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit,
+          Length length = 1.0);
 };
 
 /// nu >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient.
@@ -58,7 +51,7 @@ struct Viscosity {
 class Heat : public Stepper {
  public:
   Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-       Backward backward = Backward::kImplicit);
+       Backward backward = Backward::kImplicit, Length length = 1.0);
 };
 
 /// One implicit Euler step of u_t + (u·∇)u = ν Δu on a periodic grid, shape (N) or (Ny, Nx); u has one
@@ -67,7 +60,7 @@ class Heat : public Stepper {
 class Burgers : public Stepper {
  public:
   Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-          Backward backward = Backward::kImplicit, int64_t picard_steps = 1);
+          Backward backward = Backward::kImplicit, int64_t picard_steps = 1, Length length = 1.0);
 };
 
 /// One implicit Euler step of u_t + (u·∇)u + ∇p = ν Δu, ∇·u = 0 on a periodic grid (Ny, Nx). The state
@@ -76,7 +69,7 @@ class Burgers : public Stepper {
 class NavierStokes : public Stepper {
  public:
   NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-               Backward backward = Backward::kImplicit, int64_t picard_steps = 1);
+               Backward backward = Backward::kImplicit, int64_t picard_steps = 1, Length length = 1.0);
 };
 
 }  // namespace prdp

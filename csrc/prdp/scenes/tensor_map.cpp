@@ -1,0 +1,41 @@
+#include "prdp/scenes/tensor_map.h"
+
+#include <torch/csrc/jit/serialization/pickle.h>
+
+namespace prdp {
+
+std::string pack(const TensorMap& tensors) {
+  std::vector<c10::IValue> entries;
+  for (const auto& [name, tensor] : tensors) {
+    entries.emplace_back(name);
+    entries.emplace_back(tensor.detach());
+  }
+  const auto bytes = torch::jit::pickle_save(c10::ivalue::Tuple::create(std::move(entries)));
+  return {bytes.data(), bytes.size()};
+}
+
+TensorMap unpack(const std::string& bytes) {
+  TensorMap tensors;
+  try {
+    // This reader knows no classes and has no interpreter, unlike torch::jit::load and torch::serialize.
+    const auto loaded = torch::jit::pickle_load({bytes.begin(), bytes.end()});
+    const auto& entries = loaded.toTupleRef().elements();
+    for (size_t i = 0; i + 1 < entries.size(); i += 2)
+      tensors.emplace(entries[i].toStringRef(), entries[i + 1].toTensor());
+  } catch (const std::exception&) {
+    TORCH_CHECK_VALUE(false, "expected named tensors");
+  }
+  return tensors;
+}
+
+const at::Tensor& entry(const TensorMap& tensors, const std::string& name, at::ScalarType dtype,
+                        at::IntArrayRef sizes) {
+  const auto found = tensors.find(name);
+  TORCH_CHECK_VALUE(found != tensors.end(), "no tensor '", name, "'");
+  const auto& tensor = found->second;
+  TORCH_CHECK_VALUE(tensor.defined() && tensor.scalar_type() == dtype && tensor.sizes() == sizes, "tensor '", name,
+                    "' is not ", dtype, " of sizes ", sizes);
+  return tensor;
+}
+
+}  // namespace prdp

@@ -1,0 +1,58 @@
+#include "prdp/steppers/implicit_step.h"
+
+#include "prdp/solvers/solve.h"
+#include "prdp/steppers/rollout_vjp.h"
+
+namespace prdp {
+
+ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, SolveOptions options)
+    : Solving("ImplicitStep", std::move(options)), operator_(std::move(a)), rhs_(std::move(rhs)) {
+  TORCH_CHECK_VALUE(operator_, who_, ": needs an operator");
+}
+
+ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, Solver solver, Backward backward)
+    : ImplicitStep(std::move(a), std::move(rhs), SolveOptions{std::move(solver), backward}) {}
+
+ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward backward)
+    : ImplicitStep([a = std::move(a)](const at::Tensor&) { return a; }, std::move(rhs), std::move(solver),
+                   backward) {}
+
+SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
+  TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());
+  const auto a = operator_(u);
+  const auto b = rhs(u);
+  TORCH_CHECK_VALUE(b.sizes() == u.sizes() && b.scalar_type() == u.scalar_type(), who_,
+                    ": rhs must return the shape and dtype of the state, ", u.sizes(), " in ", u.scalar_type(),
+                    ", got ", b.sizes(), " in ", b.scalar_type());
+  auto options = options_;
+  options.adjoint_log = adjoint_log;
+  return linear_solve(a, b, options);
+}
+
+at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
+  auto [next, info] = solve(u, *log_);
+  if (next.requires_grad()) logs_of_steps_.clear();
+  info_ = std::move(info);
+  return next;
+}
+
+at::Tensor ImplicitStep::rollout(const at::Tensor& u, int64_t steps) {
+  TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
+  std::vector<at::Tensor> states{u};
+  std::vector<AdjointLog> logs;
+  Reports reports;
+  for (int64_t step = 1; step <= steps; ++step) {
+    const FailuresOfStep here(step, steps);
+    logs.push_back(open_adjoint_log());
+    auto [next, info] = solve(states.back(), *logs.back());
+    states.push_back(std::move(next));
+    reports.push(info);
+  }
+  auto all = at::stack(states, 1);
+  // A rollout without gradients, such as a validation, leaves the reports of the last backward pass.
+  if (all.requires_grad()) logs_of_steps_ = std::move(logs);
+  info_ = reports.joined(u);
+  return all;
+}
+
+}  // namespace prdp

@@ -1,0 +1,54 @@
+#include "prdp/steppers/solving.h"
+
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/solvers/status.h"
+#include "prdp/steppers/rollout_vjp.h"
+
+namespace prdp {
+
+AdjointLog open_adjoint_log() {
+  return {new int64_t(adjoint_log::open()), [](const int64_t* log) {
+            adjoint_log::close(*log);
+            delete log;
+          }};
+}
+
+std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs) {
+  std::vector<std::optional<SolveInfo>> found;
+  const SolveInfo* any = nullptr;
+  for (const int64_t log : logs) found.push_back(adjoint_log::read(log));
+  for (const auto& info : found)
+    if (info) any = &*info;
+  if (!any) return std::nullopt;
+  const SolveInfo none{at::zeros_like(any->iterations), at::zeros_like(any->residual),
+                       at::full_like(any->status, static_cast<int64_t>(SolveStatus::kConverged)),
+                       at::zeros_like(any->operator_applications)};
+  Reports reports;
+  for (const auto& info : found) reports.push(info.value_or(none));
+  return reports.joined(any->residual);
+}
+
+Solving::Solving(std::string who, SolveOptions options)
+    : who_(std::move(who)), options_(std::move(options)), log_(open_adjoint_log()) {
+  options_.check(who_.c_str());
+}
+
+void Solving::set_max_iter(int64_t k) {
+  Solver{options_.solver.method, k}.check(who_.c_str());
+  options_.solver.max_iter = k;
+}
+
+std::optional<SolveInfo> Solving::adjoint_info() const {
+  if (logs_of_steps_.empty()) return adjoint_log::read(*log_);
+  std::vector<int64_t> numbers;
+  for (const auto& log : logs_of_steps_) numbers.push_back(*log);
+  return join_adjoint_logs(numbers);
+}
+
+bool Solving::converged() const {
+  const auto adjoint = adjoint_info();
+  return info_ && info_->status.gt(0).all().item<bool>() &&
+         (!adjoint || adjoint->status.gt(0).all().item<bool>());
+}
+
+}  // namespace prdp

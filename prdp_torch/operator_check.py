@@ -1,0 +1,124 @@
+"""`check_operator`: whether an operator's parts agree with each other."""
+
+import torch
+
+from prdp_torch import _C, _check, operators
+
+_UNIT_VECTORS = 256
+
+
+def check_operator(A, example):
+    """Compare the parts of an operator with each other, and name those that are wrong. Meant for
+    `operators.Function`; takes any operator.
+
+    Args:
+        A: an operator of `prdp_torch.operators`, or a tensor as `linear_solve` takes it.
+        example: a right-hand side, (batch, ...) in float32 or float64; its shape and dtype count. In
+            float64 the comparison is sharp, in float32 it finds coarse mistakes.
+
+    Checked are: A is linear; samples do not influence each other; nothing that requires grad is used without
+    being among the operator's tensors; ⟨A v, w⟩ = ⟨v, Aᵀ w⟩; the diagonal, where
+    there is one, against products with unit vectors (all of them, or 256); and the gradient of ⟨w, A v⟩ for
+    each tensor of A against finite differences, in one random direction.
+
+    Returns True. Raises ValueError that lists what is wrong.
+    """
+    who = "check_operator"
+    A = operators.as_operator(who, "A", A)
+    if _check.dense(who, "example", example).dim() < 2:
+        raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
+    generator = torch.Generator().manual_seed(0)
+    v, w = (_noise(example, generator) for _ in range(2))
+    with torch.no_grad():
+        wrong = [*_products(A, v, w), *_captures(A, v), *_diagonal(A, v), *_gradients(A, v, w, generator)]
+    if wrong:
+        raise ValueError(f"{who}: {type(A).__name__}: " + "; ".join(wrong))
+    return True
+
+
+def _noise(like, generator):
+    return torch.randn(like.shape, generator=generator, dtype=like.dtype).to(like.device)
+
+
+def _dot(v, w):
+    """One product per sample."""
+    return (v * w).flatten(1).sum(1)
+
+
+def _norm(v):
+    return v.flatten(1).norm(dim=1)
+
+
+def _products(A, v, w):
+    rounding = 1e3 * torch.finfo(v.dtype).eps
+    av, aw, atw = A.apply(v), A.apply(w), A.apply_transpose(w)
+    scale = _norm(av) + _norm(aw)
+    if (_norm(A.apply(2 * v + w) - (2 * av + aw)) > rounding * scale).any():
+        yield "A is not linear: A (2 v + w) differs from 2 A v + A w"
+    left, right = _dot(av, w), _dot(v, atw)
+    bound = rounding * (_norm(av) * _norm(w) + _norm(v) * _norm(atw))
+    if ((left - right).abs() > bound).any():
+        worst = (left - right).abs().argmax()
+        yield f"the transpose is wrong: <A v, w> = {left[worst]:.6g} but <v, A^T w> = {right[worst]:.6g}"
+    if len(v) > 1:
+        other = v.clone()
+        other[0] = w[0]
+        if (_norm(A.apply(other) - av)[1:] > rounding * scale[1:]).any():
+            yield "samples influence each other: A v changes in a sample whose v did not"
+
+
+def _captures(A, v):
+    tensors = [t.detach() for t in A.tensors]
+    with torch.enable_grad():
+        if torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False).requires_grad:
+            yield "matvec uses a tensor that requires grad but is not among its tensors: no gradient reaches it"
+
+
+def _diagonal(A, v):
+    try:
+        diagonal = A.diagonal()
+    except ValueError as error:
+        if "is not known" in str(error):
+            return
+        raise
+    try:
+        flat = diagonal.to(v.dtype).expand_as(v).flatten(1)
+    except RuntimeError:
+        yield f"the diagonal has shape {tuple(diagonal.shape)}, which does not broadcast against {tuple(v.shape)}"
+        return
+    n, rounding = flat.shape[1], 1e3 * max(torch.finfo(v.dtype).eps, torch.finfo(diagonal.dtype).eps)
+    for i in torch.linspace(0, n - 1, min(n, _UNIT_VECTORS)).round().long().tolist():
+        unit = torch.zeros_like(v).flatten(1)
+        unit[:, i] = 1.0
+        product = A.apply(unit.view_as(v)).flatten(1)
+        found, expected = flat[:, i], product[:, i]
+        if ((found - expected).abs() > rounding * _norm(product)).any():
+            yield f"the diagonal is wrong: entry {i} is {found[0]:.6g}, by the product {expected[0]:.6g}"
+            return
+
+
+def _gradients(A, v, w, generator):
+    found = _C.product_rule(w, v, A.tensors, A.kind, A.shape, A.parameters)
+    for i, (t, gradient) in enumerate(zip(A.tensors, found, strict=True)):
+        if not t.is_floating_point():
+            continue
+        eps = max(torch.finfo(v.dtype).eps, torch.finfo(t.dtype).eps)
+        largest = t.abs().max().item() if t.numel() else 0.0
+        step = eps ** (1 / 3) * (largest or 1.0)
+        direction = _noise(t, generator)
+
+        def product(s, i=i, t=t, direction=direction):
+            tensors = [t + s * direction if j == i else other for j, other in enumerate(A.tensors)]
+            return torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False)
+
+        forward, backward = product(step), product(-step)
+        expected = ((w * (forward - backward)).sum() / (2 * step)).item()
+        terms = torch.zeros_like(direction) if gradient is None else gradient * direction
+        slope = terms.sum().item()
+        # Rounding of the two products; and a kink, such as that of upwind differences, within the step.
+        size = (w.norm() * (forward.norm() + backward.norm())).item()
+        if abs(expected - slope) > 20 * eps * size / step + 20 * eps ** (1 / 3) * terms.abs().sum().item():
+            yield (
+                f"the gradient for tensor {i} of shape {tuple(t.shape)} is wrong: "
+                f"{slope:.6g} along a direction in which the product changes by {expected:.6g}"
+            )

@@ -1,0 +1,191 @@
+"""The README and the pages of docs/: every Python block runs, and what the others name exists."""
+
+import re
+import shlex
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import typer.main
+
+from prdp_torch import cli, scenes
+
+ROOT = Path(__file__).parents[2]
+PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(r'^--8<-- "(.*)"$', re.MULTILINE)
+COMMAND = typer.main.get_command(cli.app)
+
+
+def shown(file):
+    return (ROOT / file[1]).read_text()
+
+
+def blocks(language):
+    """(page, first line, code) of every block in this language, with the files that it shows."""
+    return [
+        SimpleNamespace(page=page, line=text.count("\n", 0, found.start(2)), code=SHOWN.sub(shown, found[2]))
+        for page, text in PAGES.items()
+        for found in BLOCK.finditer(text)
+        if found[1] == language
+    ]
+
+
+def prdp_commands():
+    """Every `prdp …` in a shell block, or in the text as inline code, as (page, words)."""
+    lines = [(block.page, line) for block in blocks("sh") for line in block.code.splitlines()]
+    lines += [(page, code) for page, text in PAGES.items() for code in re.findall(r"`(prdp [a-z][^`\n]*)`", text)]
+    return [(page, shlex.split(line, comments=True)) for page, line in lines if line.startswith("prdp ")]
+
+
+@pytest.fixture
+def alone():
+    """One thread, for the blocks are small, and the random numbers of the other tests stay what they are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with torch.random.fork_rng(devices=[]):
+        yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("page", sorted({block.page for block in blocks("python")}))
+def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, alone):
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": page}
+    for block in blocks("python"):
+        if block.page == page:
+            code = "\n" * block.line + block.code  # so that a traceback names the line of the page
+            exec(compile(code, ROOT / page, "exec"), namespace)
+
+
+@pytest.mark.parametrize("page, words", prdp_commands(), ids=lambda v: v if isinstance(v, str) else " ".join(v))
+def test_the_commands_exist_with_their_options(page, words):
+    _, name, *arguments = words
+    if not arguments or any(word.isupper() for word in arguments):  # a placeholder such as SCENE or K
+        unknown = [word for word in arguments if word.startswith("--") and word not in options(name)]
+        assert name in COMMAND.commands and not unknown
+        return
+    context = COMMAND.commands[name].make_context(name, arguments)
+    if (scene := context.params.get("scene")) is not None:
+        assert scene in scenes.available() or (ROOT / scene).is_file()
+
+
+def options(name):
+    return {
+        option
+        for parameter in COMMAND.commands[name].params
+        if parameter.param_type_name == "option"
+        for option in parameter.opts
+    }
+
+
+@pytest.mark.parametrize("name", COMMAND.commands)
+def test_the_page_of_the_command_line_names_every_option(name):
+    page = PAGES["docs/command_line.md"]
+    section = re.search(rf"^### `prdp {name}\b.*?(?=^##)", page, re.MULTILINE | re.DOTALL)
+    assert section, f"docs/command_line.md has no section on `prdp {name}`"
+    missing = [option for option in options(name) if f"`{option}" not in section[0]]
+    assert not missing
+
+
+@pytest.mark.parametrize("block", blocks("sh"), ids=lambda block: f"{block.page}:{block.line}")
+def test_the_files_and_targets_of_the_shell_blocks_exist(block):
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for line in block.code.splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["make"]:
+            assert set(words[1:]) <= set(targets), line
+        for word in words:
+            if word.startswith(("examples/", "tests/", "benchmarks/")) or word.endswith("requirements.txt"):
+                assert (ROOT / word).exists(), line
+
+
+@pytest.mark.parametrize("block", blocks("toml"), ids=lambda block: f"{block.page}:{block.line}")
+def test_the_scenes_are_read(block, tmp_path):
+    """A block without a title is a part of a scene: its keys are put into heat_1d."""
+    path = tmp_path / "scene.toml"
+    content = tomllib.loads(block.code)
+    if "title" not in content:
+        whole = tomllib.loads(scenes.available()["heat_1d"].read_text())
+        for name, value in content.items():
+            whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value
+        content = whole
+    path.write_text(as_toml(content))
+    assert scenes.load(path).name == "scene"
+
+
+def as_toml(content):
+    """Plain keys first, then one level of tables."""
+
+    def written(value):
+        return str(value).lower() if isinstance(value, bool) else repr(value)
+
+    lines = [f"{name} = {written(value)}" for name, value in content.items() if not isinstance(value, dict)]
+    for name, table in content.items():
+        if isinstance(table, dict):
+            lines += [f"[{name}]", *(f"{key} = {written(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+READER = (ROOT / "csrc/prdp/scenes/scene.cpp").read_text()
+SECTIONS = {
+    "Top level": "Task read_task(.*?)^}.*^  Scene scene;(.*)",
+    "`[physics]`": "read_physics(.*?)^}",
+    "`[solver]`": "read_solver(.*?)^}",
+    "`[data]`": "read_data(.*?)^}",
+    "`[network]`": "read_network(.*?)^}",
+    "`[training]`": "read_training(.*?)^}",
+    "`[parameters]`": "read_parameters(.*?)^}",
+    "`[prdp]`": "read_prdp(.*?)^}",
+    "`[compare]`": "read_compare(.*?)^}",
+}
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_the_key_tables_hold_what_the_reader_asks_for(section):
+    """Keys both ways; the names to choose from and the lower bounds that the reader gives as literals."""
+    functions = re.search(SECTIONS[section], READER, re.MULTILINE | re.DOTALL)
+    source = "".join(functions.groups())
+    text = re.search(rf"^### {re.escape(section)}\n(.*?)(?=^##|\Z)", PAGES["docs/command_line.md"], re.M | re.S)[1]
+    rows = {row[1]: row[2] for row in re.finditer(r"^\| `(\w+)` \| (.*)$", text, re.MULTILINE)}
+
+    asked = re.findall(r'\bs\.(\w+)\("(\w+)"(?:, ([\d.]+))?', source)
+    assert set(rows) == {key for call, key, _ in asked if call != "fail"}
+    chosen = set(re.findall(r'"([a-z]\w*)"', source)) - {key for _, key, _ in asked}
+    assert all(f"`{name}`" in text for name in chosen)
+    for call, key, bound in asked:
+        if bound:
+            assert f"{'>' if call == 'above' else '>='} {float(bound):g}" in rows[key], key
+
+
+def test_the_page_of_the_command_line_names_every_option_of_the_cpp_trainer():
+    source = (ROOT / "csrc/train/main.cpp").read_text()
+    page = PAGES["docs/command_line.md"]
+    section = re.search(r"^### `prdp_train.*?(?=^##)", page, re.MULTILINE | re.DOTALL)[0]
+    options = re.findall(r'add_(?:option|flag)\("(--[\w-]+)"', source)
+    assert len(options) > 5 and all(f"`{option}`" in section for option in options)
+
+
+@pytest.mark.parametrize("block", blocks("cpp"), ids=lambda block: f"{block.page}:{block.line}")
+def test_the_cpp_blocks_use_public_names(block):
+    headers = re.findall(r"^  (csrc/prdp/\S+\.h)\)?$", (ROOT / "CMakeLists.txt").read_text(), re.MULTILINE)
+    public = "".join((ROOT / header).read_text() for header in headers)
+    for header in re.findall(r"#include <(prdp/[^>]+)>", block.code):
+        assert f"csrc/{header}" in headers
+    for name in re.findall(r"prdp::(\w+)", block.code):
+        assert re.search(rf"\b(class|struct|namespace) {name}\b|\b{name}\(|TORCH_MODULE\({name}\)", public), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_links_to_files_lead_somewhere(page):
+    """mkdocs checks the pages of the site; this also covers the README."""
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[\w-]*)?\)", BLOCK.sub("", PAGES[page])):
+        if "://" not in target:
+            assert (ROOT / page).parent.joinpath(target).is_file(), target
+
+
+def test_every_page_is_in_the_navigation():
+    named = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert named == {Path(page).name for page in PAGES if page.startswith("docs/")}

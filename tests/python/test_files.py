@@ -1,0 +1,359 @@
+"""Files that were damaged, forged, or written by two processes at once; commands that cannot do what they are asked."""
+
+import io
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import tiny, written
+from typer.testing import CliRunner
+
+from prdp_torch import _C, cli, compare, records, scenes
+from prdp_torch.checkpoint import Checkpoint
+from prdp_torch.networks import make_network
+from prdp_torch.training import Refinement, train
+
+ROOT = Path(__file__).parents[2]
+PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+TRAINER = ROOT / "build" / "prdp_train"
+TRAINERS = {"python": [*PRDP, "train"], "cpp": [TRAINER]}
+HEAT = scenes.available()["heat_1d"]
+
+
+@pytest.fixture(autouse=True)
+def environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs
+    monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
+
+
+def in_process_of_its_own(trainer, *arguments, **options):
+    """Exit status and errors of a trainer."""
+    command = [*TRAINERS[trainer], *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+    return done.returncode, done.stderr
+
+
+def run(trainer, *arguments):
+    """The same; the Python trainer in this process, which has imported torch already."""
+    if trainer == "cpp":
+        return in_process_of_its_own(trainer, *arguments)
+    done = CliRunner().invoke(cli.app, ["train", *map(str, arguments)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.stderr
+
+
+def short(intervals=2):
+    scene = scenes.load("heat_1d")
+    scene.training.intervals = intervals
+    return scene
+
+
+def trained(scene, folder, resume=False):
+    environment = records.environment()
+    return compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume, lambda *report: None)
+
+
+def damages(whole, count):
+    """Copies with a few bytes changed, cut short, or with something inserted."""
+    dice = random.Random(0)
+    for i in range(count):
+        at = dice.randrange(len(whole))
+        if i % 4 == 0:
+            yield whole[:at]
+        elif i % 4 == 1:
+            yield whole[:at] + dice.randbytes(dice.randrange(1, 9)) + whole[at:]
+        else:
+            changed = bytearray(whole)
+            for _ in range(dice.randrange(1, 5)):
+                changed[dice.randrange(len(whole))] ^= 1 << dice.randrange(8)
+            yield bytes(changed)
+
+
+def refused(path, read, count=300):
+    """Every damaged copy of the file is refused in one line that names it."""
+    whole = path.read_bytes()
+    for damaged in damages(whole, count):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=f"'{path}' is damaged or ") as error:
+            read()
+        assert "\n" not in str(error.value)
+    path.write_bytes(whole)
+    read()
+
+
+# ---- damage
+
+
+def test_damaged_data_are_refused(tmp_path):
+    scene = scenes.load(tiny(tmp_path))
+    _C.make_dataset(scene)
+    (file,) = (tmp_path / "cache").iterdir()
+    refused(file, lambda: _C.make_dataset(scene))
+
+
+def test_damaged_records_and_weights_are_refused(tmp_path):
+    scene = short()
+    curves = trained(scene, tmp_path)
+    record, weights = (tmp_path / "prdp" / f"seed_0.{kind}" for kind in ("json", "pt"))
+    refused(record, lambda: records.read(record))
+    network = make_network(scene, 0)
+    refused(weights, lambda: records.read_weights(record, network))
+    assert trained(scene, tmp_path, resume=True) == curves
+
+
+def test_damaged_checkpoints_are_refused(tmp_path):
+    checkpoint = Checkpoint(tmp_path / "kept", seed=0)
+    checkpoint.save({"weights": torch.randn(50)})
+    refused(tmp_path / "kept", checkpoint.load)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize("content", ["{}", "null", "", None])
+def test_what_is_no_record_is_one_line(tmp_path, trainer, content):
+    record = tmp_path / "prdp/seed_0.json"
+    record.parent.mkdir()
+    record.mkdir() if content is None else record.write_text(content)
+    status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1, "--resume")
+    words = "cannot read '{}': it is not a regular file" if content is None else "'{}' is damaged or of another version"
+    assert status == 2 and words.format(record) in errors and errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_checkpoint_that_is_a_folder_is_one_line(tmp_path, trainer):
+    checkpoint = tmp_path / "prdp/seed_0.checkpoint"
+    checkpoint.mkdir(parents=True)
+    for resume in ([], ["--resume"]):
+        status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1, *resume)
+        assert status == 2 and f"'{checkpoint}': it is" in errors and errors.count("\n") == 1
+
+
+# ---- forgery
+
+
+class Forged(torch.nn.Module):
+    """TorchScript that leaves a trace where it is loaded."""
+
+    def forward(self, u: torch.Tensor):
+        return u
+
+    @torch.jit.export
+    def __getstate__(self):
+        return 0, self.training
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[int, bool]):
+        raise RuntimeError("code was run")
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def reseal(path, state):
+    """Puts another state into a checkpoint, with the fingerprint that belongs to it."""
+    mark, settings, _ = path.read_bytes().split(b"\n", 2)
+    rest = settings + b"\n" + state
+    path.write_bytes(mark.split(b", ")[0] + b", " + _C.fingerprint(rest).encode() + b"\n" + rest)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit", "ignore:'torch.load' received a zip file")
+def test_no_checkpoint_runs_code(tmp_path):
+    process = subprocess.Popen([TRAINER, HEAT, "--out", tmp_path / "cpp"], stdout=subprocess.PIPE, text=True)
+    path = tmp_path / "cpp/prdp/seed_0.checkpoint"
+    while not path.exists():
+        assert process.poll() is None
+    process.kill()
+    process.communicate()
+    script = io.BytesIO()
+    torch.jit.save(torch.jit.script(Forged()), script)
+    bomb = io.BytesIO()
+    torch.save(Bomb(str(tmp_path / "crater")), bomb)
+    for state in (script.getvalue(), bomb.getvalue(), b"", b"nothing"):
+        reseal(path, state)
+        status, errors = run("cpp", HEAT, "--out", tmp_path / "cpp", "--resume")
+        assert status == 2 and f"'{path}' is damaged or of another version" in errors and "code was run" not in errors
+
+    checkpoint = Checkpoint(tmp_path / "kept", seed=0)
+    checkpoint.save(1)
+    for state in (script.getvalue(), bomb.getvalue(), b"", b"nothing"):
+        reseal(tmp_path / "kept", state)
+        with pytest.raises(ValueError, match="is damaged or of another version"):
+            checkpoint.load()
+    assert not (tmp_path / "crater").exists()
+
+
+# ---- going on
+
+
+class Dropout(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer = torch.nn.Linear(30, 30)
+
+    def forward(self, u):
+        return torch.nn.functional.dropout(self.layer(u), 0.3)
+
+
+def test_a_network_with_dropout_goes_on_bit_for_bit(tmp_path):
+    scene = short(6)
+    alone = train(scene, Refinement.prdp(scene), network=Dropout())
+    checkpoint = Checkpoint(tmp_path / "kept")
+
+    def stop(done, metric, k):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint, on_interval=stop)
+    torch.rand(17)
+    rest = train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint)
+    assert rest["update_loss"] == alone["update_loss"] and rest["metric"] == alone["metric"]
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    scene, checkpoint = short(3), Checkpoint(tmp_path / "kept")
+    train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint)
+    with pytest.raises(ValueError, match="is damaged or of another version"):
+        train(scene, Refinement.prdp(scene), checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_finished_training_is_not_overwritten_by_a_longer_one(tmp_path, trainer):
+    arguments = (trainer, HEAT, "--out", tmp_path, "--constant", 2)
+    assert run(*arguments, "--intervals", 2)[0] == 0
+    record = (tmp_path / "constant_2/seed_0.json").read_bytes()
+    status, errors = run(*arguments, "--intervals", 3, "--resume")
+    assert status == 2 and "is of a finished training of 2 intervals, not 3; it cannot go on" in errors
+    assert (tmp_path / "constant_2/seed_0.json").read_bytes() == record
+
+
+# ---- two processes, and a full disk
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_folder_is_trained_into_by_one_process_at_a_time(tmp_path, trainer):
+    folder = tmp_path / "prdp"
+    folder.mkdir()
+    (folder / "seed_0.json.1-0.part").touch()  # of a killed process
+    lock = _C.FolderLock(folder)
+    assert list(folder.iterdir()) == []
+    status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1)
+    assert status == 2 and f"--out: another process is training into '{folder}'; wait until it ends" in errors
+    lock.release()
+    assert run(trainer, HEAT, "--out", tmp_path, "--intervals", 1)[0] == 0
+
+
+def test_many_processes_with_one_folder_finish_or_say_why(tmp_path):
+    command = [TRAINER, HEAT, "--out", tmp_path, "--intervals", "5"]
+    processes = [
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) for _ in range(8)
+    ]
+    ends = [(process.communicate(timeout=300)[1], process.returncode) for process in processes]
+    assert any(status == 0 for _, status in ends)
+    for errors, status in ends:
+        assert status == 0 or (status == 2 and "another process is training into" in errors and errors.count("\n") == 1)
+    assert records.read(tmp_path / "prdp/seed_0.json")["curves"]["metric"]
+    assert [path.name for path in (tmp_path / "prdp").iterdir()] == ["seed_0.json"]
+
+
+@pytest.mark.parametrize("trainer, most", [("python", 8000), ("cpp", 1000)])  # weights, a record
+def test_a_full_disk_is_one_line_and_leaves_the_old_record(tmp_path, trainer, most):
+    def no_room():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+
+    arguments = (trainer, HEAT, "--out", tmp_path, "--intervals")
+    assert run(*arguments, 1)[0] == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()}
+    calm = {**os.environ, "PRDP_CHECKPOINT_SECONDS": "1000"}
+    status, errors = in_process_of_its_own(*arguments, 2, preexec_fn=no_room, env=calm)
+    assert status == 2 and "cannot write '" in errors and "File too large" in errors and errors.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()} == before
+
+
+# ---- errors in one line
+
+
+def both(*arguments):
+    """Exit status and errors of both trainers."""
+    return [run(trainer, *arguments) for trainer in TRAINERS]
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ([("train = 200", "train = 10000000000000")], "out of memory: cannot allocate 800000000"),
+        ([('title = "', 'title = "\x00')], "changed.toml:4: Error while parsing string"),
+    ],
+)
+def test_a_scene_that_asks_for_too_much_is_one_line_in_both_languages(tmp_path, changes, words):
+    path = written(tmp_path, *changes)
+    for status, errors in both(path, "--out", tmp_path / "out"):
+        assert status == 2 and words in errors and errors.count("\n") == 1
+
+
+def test_a_reference_that_does_not_converge_is_one_line_in_both_languages(tmp_path):
+    path = written(tmp_path, ("dt = 0.2", "dt = 2e9"), ("nu = 1e-2", "nu = 0"), scene="burgers_2d")
+    path = Path(path)
+    path.write_text(path.read_text().replace("shape = [96, 96]", "shape = [12, 12]"))
+    for status, errors in both(path, "--out", tmp_path / "out"):
+        assert status == 2 and "the scene's dt is too long for it" in errors and errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--constant", "--intervals", "--seeds"])
+def test_numbers_beyond_all_bounds_exit_2_in_both_languages(tmp_path, option):
+    for status, errors in both(HEAT, "--out", tmp_path / "out", option, 99999999999999999999):
+        assert status == 2 and option in errors and "1000000000" in errors and not (tmp_path / "out").exists()
+
+
+def test_brackets_in_a_path_are_no_markup(tmp_path):
+    for status, errors in both(HEAT, "--out", tmp_path / "x[/red]y", "--intervals", 1):
+        assert status == 0, errors
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "nested"])
+def test_what_is_no_scene_is_refused(tmp_path, kind):
+    path = tmp_path / "scene.toml"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.write_text(".".join(["a"] * 300_000) + " = 1\n")
+    words = "has 600004 bytes; a scene has at most 65536" if kind == "nested" else "it is not a regular file"
+    with pytest.raises(ValueError, match=words):
+        _C.read_scene(str(path))
+
+
+def test_emulators_whose_data_take_long_are_cached(tmp_path):
+    path = Path(written(tmp_path, ("train = ", "train = 4 # "), scene="burgers_2d"))
+    path.write_text(path.read_text().replace("shape = [96, 96]", "shape = [8, 8]"))
+    scene = scenes.load(path)
+    once = _C.make_dataset(scene)
+    (file,) = (tmp_path / "cache").iterdir()
+    assert file.name.startswith("burgers-")
+
+    def no_solve(done, total):
+        raise AssertionError("the data were made again")
+
+    again = _C.make_dataset(scene, no_solve)
+    assert torch.equal(once.train_end, again.train_end) and again.train_first is None
+    _C.make_dataset(scenes.load("heat_1d"))
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    other = Path(shutil.copy(path, tmp_path / "modes.toml"))
+    other.write_text(other.read_text().replace("modes = ", "modes = 2 # "))
+    _C.make_dataset(scenes.load(other))
+    assert len(list((tmp_path / "cache").iterdir())) == 2

@@ -1,0 +1,113 @@
+"""`operators.Matrix.csr`: gradients at the values, never dense."""
+
+import warnings
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+N = 6
+CROW = torch.tensor([0, 2, 5, 8, 11, 14, 16])
+COL = torch.tensor([0, 1, 0, 1, 2, 1, 2, 3, 2, 3, 4, 3, 4, 5, 4, 5])
+modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+
+
+def entries(batch=None, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.rand(*(() if batch is None else (batch,)), 16, dtype=torch.float64, generator=generator) - 0.5
+    rows = torch.arange(N).repeat_interleave(CROW.diff())
+    return values + 3.0 * (rows == COL)
+
+
+def dense(values):
+    rows = torch.arange(N).repeat_interleave(CROW.diff())
+    matrix = torch.zeros(*values.shape[:-1], N, N, dtype=values.dtype)
+    matrix[..., rows, COL] = values
+    return matrix
+
+
+def right_hand_side(batch=3):
+    return torch.randn(batch, N, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+@modes
+@pytest.mark.parametrize("batch", [None, 3])
+@pytest.mark.parametrize("index", [torch.int32, torch.int64])
+@pytest.mark.parametrize("solver", [prdp.Jacobi(300, rtol=1e-14), prdp.GMRES(9, restart=N, rtol=1e-14), prdp.Direct()])
+def test_values_and_gradients_are_those_of_the_dense_matrix(solver, index, batch, backward):
+    values, b = entries(batch).requires_grad_(), right_hand_side().requires_grad_()
+    a = operators.Matrix.csr(CROW.to(index), COL.to(index), values, (N, N))
+    u, info = prdp.linear_solve(a, b, solver, backward=backward)
+    expected = torch.linalg.solve(dense(values), b.mT if batch is None else b[..., None])
+    expected = expected.mT if batch is None else expected[..., 0]
+    assert (info.status > 0).all()
+    torch.testing.assert_close(u, expected)
+    g = right_hand_side().cos()
+    found, truth = (torch.autograd.grad(x, (values, b), g) for x in (u, expected))
+    assert found[0].shape == values.shape and found[0].layout == torch.strided
+    torch.testing.assert_close(found, truth, rtol=1e-9, atol=1e-12)
+
+
+@modes
+def test_derivatives(backward):
+    values, b = entries(2).requires_grad_(), right_hand_side(2).requires_grad_()
+
+    def solve(values, b):
+        a = operators.Matrix.csr(CROW, COL, values, N)
+        return prdp.linear_solve(a, b, prdp.GMRES(3, restart=N, rtol=1e-14), backward=backward)[0]
+
+    assert torch.autograd.gradcheck(solve, (values, b))
+    assert torch.autograd.gradgradcheck(solve, (values, b), fast_mode=True)
+
+
+def test_products_and_parts():
+    values = entries(2)
+    a, m = operators.Matrix.csr(CROW, COL, values, (2, N, N)), dense(values)
+    v = right_hand_side(2)
+    torch.testing.assert_close(a.apply(v), (m @ v[..., None])[..., 0])
+    torch.testing.assert_close(a.apply_transpose(v), (m.mT @ v[..., None])[..., 0])
+    torch.testing.assert_close(a.diagonal(), m.diagonal(dim1=1, dim2=2))
+    torch.testing.assert_close(a.dense(), m)
+    assert prdp.check_operator(operators.Matrix.csr(CROW, COL, values.requires_grad_(), N), v)
+
+
+def test_no_gradient_is_ever_dense():
+    n = 20_000  # a dense gradient would take 3 GB
+    crow, col = torch.arange(n + 1), torch.arange(n)
+    values = torch.full((n,), 2.0).requires_grad_()
+    u, _ = prdp.linear_solve(operators.Matrix.csr(crow, col, values, n), torch.ones(1, n), prdp.Jacobi(2))
+    u.sum().backward()
+    torch.testing.assert_close(values.grad, torch.full((n,), -0.25))
+
+
+def test_a_csr_tensor_with_a_gradient_warns_once(monkeypatch):
+    monkeypatch.setattr(operators, "_warned_of_csr_gradient", False)
+    m, b = dense(entries()).to_sparse_csr().requires_grad_(), right_hand_side()
+    with torch.no_grad():
+        prdp.linear_solve(m, b, prdp.Jacobi(2))
+    with pytest.warns(UserWarning, match=r"operators.Matrix.csr\(crow, col, values, size\)") as caught:
+        prdp.linear_solve(m, b, prdp.Jacobi(2))
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prdp.linear_solve(m, b, prdp.Jacobi(2))
+
+
+@pytest.mark.parametrize(
+    "call, error, message",
+    [
+        (lambda v: operators.Matrix.csr(CROW.double(), COL, v, N), TypeError, "crow must hold whole numbers"),
+        (lambda v: operators.Matrix.csr(CROW, None, v, N), TypeError, "col must be a torch tensor, got NoneType"),
+        (lambda v: operators.Matrix.csr(CROW, COL, COL, N), TypeError, "values must be float32 or float64"),
+        (lambda v: operators.Matrix.csr(CROW, COL, v, 2.5), TypeError, "size must be a whole number, got 2.5"),
+        (lambda v: operators.Matrix.csr(CROW, COL, v, (N, 5)), ValueError, r"size must be \(n, n\), .*got \(6, 5\)"),
+        (lambda v: operators.Matrix.csr(CROW, COL, v, (2, N, N)), ValueError, r"values of shape \(16,\)"),
+        (lambda v: operators.Matrix.csr(CROW, COL, v, 7), ValueError, r"crow must have shape \(8,\), got \(7,\)"),
+        (lambda v: operators.Matrix.csr(CROW, COL[1:], v, N), ValueError, r"col must have shape \(16,\), got \(15,\)"),
+    ],
+)
+def test_mistakes(call, error, message):
+    with pytest.raises(error, match="Matrix.csr: .*" + message):
+        call(entries())

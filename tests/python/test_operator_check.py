@@ -1,0 +1,102 @@
+"""`prdp.check_operator` finds each kind of mistake, and none where there is none."""
+
+import pytest
+import torch
+from helpers import field, spd_matrices
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+N = 7
+K = torch.rand(2, N, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 1
+EXAMPLE = torch.zeros(2, N, dtype=torch.float64)
+
+
+def right(v, k):
+    return 3 * k * v - k.roll(1, -1) * v.roll(1, -1)
+
+
+def right_transpose(v, k):
+    return 3 * k * v - (k.roll(1, -1) * v).roll(-1, -1)
+
+
+def diagonal(k):
+    return 3 * k
+
+
+class Lossy(torch.autograd.Function):
+    """k v with a wrong derivative for k."""
+
+    @staticmethod
+    def forward(ctx, v, k):
+        ctx.save_for_backward(v, k)
+        return k * v
+
+    @staticmethod
+    def backward(ctx, g):
+        v, k = ctx.saved_tensors
+        return k * g, 1.01 * v * g
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda dtype: operators.Function(right, right_transpose, (K.to(dtype),), diagonal),
+        lambda dtype: operators.Function(right, tensors=K.to(dtype)),
+        lambda dtype: operators.Matrix(spd_matrices(2, N, dtype=dtype)),
+        lambda dtype: spd_matrices(2, N, dtype=dtype)[0].to_sparse_csr(),
+    ],
+)
+def test_right_operators_pass(make, dtype):
+    assert prdp.check_operator(make(dtype), EXAMPLE.to(dtype)) is True
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_built_in_ones_pass(dtype):
+    w = field((5, 6), dtype=dtype, channels=3)
+    assert prdp.check_operator(operators.Poisson((4, 5, 3)), field((4, 5, 3), dtype=dtype))
+    assert prdp.check_operator(operators.Heat((30,), 1e-3, 0.5, length=2.0), field((30,), dtype=dtype))
+    assert prdp.check_operator(operators.Burgers(w[:, :2], 1e-2, 0.1), w[:, :2])
+    assert prdp.check_operator(operators.NavierStokes(w, torch.tensor(1e-2, dtype=dtype), 0.1), w)
+
+
+CAPTURED = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    "a, message",
+    [
+        (operators.Function(right, right, (K,)), r"the transpose is wrong: <A v, w> = .* but <v, A\^T w> = "),
+        (operators.Function(right, tensors=K, symmetric=True), "the transpose is wrong"),
+        (
+            operators.Function(right, tensors=K, diagonal=lambda k: k),
+            "the diagonal is wrong: entry 0 is .*, by the prod",
+        ),
+        (operators.Function(right, tensors=K, diagonal=lambda k: k[:, 1:]), r"diagonal has shape \(2, 6\), which does"),
+        (operators.Function(lambda v, k: v + k, tensors=K), "A is not linear"),
+        (operators.Function(lambda v: v + v.sum(0), symmetric=True), "samples influence each other"),
+        (operators.Function(lambda v: CAPTURED * v), "requires grad but is not among its tensors"),
+        (
+            operators.Function(Lossy.apply, tensors=K, symmetric=True),
+            r"gradient for tensor 0 of shape \(2, 7\) is wrong",
+        ),
+        (operators.Function(lambda v, k: k.detach() * v, tensors=K), "the gradient for tensor 0 .* is wrong: 0 along"),
+    ],
+)
+def test_mistakes_are_named(a, message):
+    with pytest.raises(ValueError, match="check_operator: Function: .*" + message):
+        prdp.check_operator(a, EXAMPLE)
+
+
+def test_all_mistakes_come_at_once():
+    a = operators.Function(right, right, (K,), diagonal=lambda k: k)
+    with pytest.raises(ValueError, match=r"the transpose is wrong: .*; the diagonal is wrong"):
+        prdp.check_operator(a, EXAMPLE)
+
+
+def test_bad_arguments():
+    with pytest.raises(TypeError, match=r"check_operator: A must be an operator of prdp_torch.operators, got 3"):
+        prdp.check_operator(3, EXAMPLE)
+    with pytest.raises(ValueError, match=r"check_operator: example must have shape \(batch, ...\), got \(7,\)"):
+        prdp.check_operator(torch.eye(N), torch.zeros(N))
