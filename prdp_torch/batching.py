@@ -9,7 +9,15 @@ from torch.utils._pytree import tree_map
 
 # Per tensor of an operator, how many dimensions it has where it has a batch axis: of a grid its axes and
 # two (None), of the rest as many; 0 where all samples share it.
-_DIMS = {"poisson": [], "heat": [0], "burgers": [None, 0], "navier_stokes": [None, 0], "dense": [3], "csr": [2, 2, 2], "stencil": [None]}
+_DIMS = {
+    "poisson": [],
+    "heat": [0],
+    "burgers": [None, 0],
+    "navier_stokes": [None, 0],
+    "dense": [3],
+    "csr": [2, 2, 2],
+    "stencil": [None],
+}
 
 
 @torch.library.register_vmap("prdp::linear_solve")
