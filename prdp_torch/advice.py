@@ -76,9 +76,8 @@ class _Update:
         return self.forwards * row.forward.seconds + self.adjoints * adjoint
 
     def share(self, physics):
-        return f"{_percent(physics / (physics + self.network))} of an update: {_ms(physics)} of " + _ms(
-            physics + self.network
-        )
+        whole = physics + self.network
+        return f"{_percent(physics / whole)} of an update: {_ms(physics)} of {_ms(whole)}"
 
     def fastest(self, rows, rtol):
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
@@ -131,7 +130,7 @@ def advise_scene(scene, seconds=5.0):
         network = make_network(scene, 0)
         # A corrector's first solve starts from data, which need no gradient.
         adjoints = 0 if scene.backward == "none" else 1
-        update = _Update(scene.executions * _network_seconds(network, sample), scene.executions, adjoints)
+        update = _Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
     cotangent = random_cotangent(step, sample)
     run(step, sample, cotangent)  # to warm up
     physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
@@ -141,7 +140,7 @@ def advise_scene(scene, seconds=5.0):
     )
     if update.network > physics and scene.dtype == torch.float32:
         with torch.autocast(sample.device.type, torch.bfloat16):
-            low = scene.executions * _network_seconds(network, sample)
+            low = scene.executions * _network_seconds(network, sample, seconds)
         update.notes.append(
             f"The network is the larger part, {_ms(update.network)}; in bfloat16 autocast it takes {_ms(low)}, "
             f"{low / update.network:.2g} times that."
@@ -164,7 +163,7 @@ def _advise(step, sample, seconds, update):
     twin = update.fastest(others, TOLERANCES[-1])
     if best is not None and twin is not None:
         ratio = update.physics(twin) / update.physics(best)
-        notes.append(f"{best.name} in {_name(other)} takes {ratio:.2g} times the seconds of {_name(sample.dtype)}.")
+        notes.append(f"{best.name} in {_name(other)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}.")
     words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
     return Advice(rows + others, notes, words)
 
@@ -221,15 +220,15 @@ def _call(solver, max_iter, rtol):
     return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
 
 
-def _network_seconds(network, u):
-    """One forward and one backward pass."""
-    times = []
-    for _ in range(RUNS + 1):
+def _network_seconds(network, u, limit):
+    """One forward and one backward pass; a first one that exceeds the limit is also the last."""
+    times, deadline = [], now(u) + limit
+    while len(times) <= RUNS and (not times or now(u) < deadline):
         started = now(u)
         out = network(u)
         torch.autograd.grad(out, list(network.parameters()), torch.ones_like(out))
         times.append(now(u) - started)
-    return median(times[1:])
+    return median(times[1:] or times)
 
 
 def _limit(seconds):
@@ -251,7 +250,7 @@ def _ms(seconds):
 
 
 def _percent(share):
-    return "1%" if 0 < share < 0.01 else f"{share:.0%}"
+    return f"{share:.1%}" if share < 0.01 else f"{share:.0%}"
 
 
 def _power(rtol):

@@ -56,7 +56,7 @@ class Row:
 
     @property
     def status(self):
-        """ "solved", or the worse of the two statuses."""
+        """The word solved, or the worse of the two statuses."""
         return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
 
 
