@@ -11,6 +11,7 @@ from prdp_torch import _load
 _load.check_torch()
 
 from prdp_torch import _C, fields, operators  # noqa: E402
+from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
@@ -24,6 +25,7 @@ __version__ = _C.VERSION
 __all__ = [
     "CG",
     "GMRES",
+    "Advice",
     "Burgers",
     "Chebyshev",
     "Direct",
@@ -39,6 +41,7 @@ __all__ = [
     "SteepestDescent",
     "Stepper",
     "ToleranceController",
+    "advise",
     "check_operator",
     "fields",
     "linear_solve",

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, records, report, trajectories
+from prdp_torch import _C, advice, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
 from prdp_torch.training import Refinement
@@ -174,6 +174,19 @@ def compare(
     _print_table(loaded, table)
     said = [report.headline(loaded, table), *report.failures(loaded, table), f"report: {folder / 'report.html'}"]
     console.print("\n" + "\n".join(said), soft_wrap=True)
+
+
+@command
+def advise(
+    scene: SceneName,
+    seconds: Annotated[float, typer.Option(metavar="S", help="The limit for each solver.")] = 5.0,
+):
+    """Measure which solver a scene needs and how much refinement can save, without training."""
+    loaded = scene_files.load(scene)
+    with console.status("trying the solvers"):
+        advised = advice.advise_scene(loaded, seconds)
+    console.print(advised.table())
+    console.print(advised.words(), soft_wrap=True)
 
 
 @command

@@ -1,0 +1,257 @@
+"""`advise`: measure which solver an equation needs, and whether refining it is worth anything."""
+
+import copy
+from dataclasses import dataclass, field
+from statistics import median
+
+import torch
+
+from prdp_torch import _C, _check
+from prdp_torch.networks import make_network
+from prdp_torch.scenes import make_stepper
+from prdp_torch.solvers import GMRES, Direct
+from prdp_torch.stepper import Stepper
+from prdp_torch.trials import (
+    RUNS,
+    TOLERANCES,
+    Row,
+    candidates,
+    measure,
+    measure_one_iteration,
+    now,
+    random_cotangent,
+    run,
+)
+
+WORTH_REFINING = 0.1  # of an update
+
+
+@dataclass
+class Advice:
+    """What `advise` found. `str(advice)` is the table, the notes and the recommendation."""
+
+    rows: list[Row]
+    notes: list[str]
+    recommendation: str
+
+    def table(self):
+        """The rows as a `rich.table.Table`."""
+        from rich import box
+        from rich.table import Table
+
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        for i, name in enumerate(("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")):
+            table.add_column(name, justify="right" if 2 < i < 7 else "left", no_wrap=True)
+        for row in self.rows:
+            costs = ["", ""] * 2
+            for i, solve in enumerate(row.solves):
+                costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
+            table.add_row(row.name, _power(row.rtol), _name(row.dtype), *costs, row.status)
+        return table
+
+    def words(self):
+        """What stands below the table."""
+        return "\n".join([*self.notes, "", self.recommendation])
+
+    def __str__(self):
+        from rich.console import Console
+
+        console = Console(width=100, color_system=None, highlight=False)
+        with console.capture() as text:
+            console.print(self.table())
+        return text.get() + self.words()
+
+
+@dataclass
+class _Update:
+    """What an update consists of beside one kind of solve."""
+
+    network: float = 0.0  # seconds
+    forwards: int = 1
+    adjoints: int = 1
+    notes: list = field(default_factory=list)
+
+    def physics(self, row):
+        adjoint = 0.0 if row.adjoint is None else row.adjoint.seconds
+        return self.forwards * row.forward.seconds + self.adjoints * adjoint
+
+    def share(self, physics):
+        whole = physics + self.network
+        return f"{_percent(physics / whole)} of an update: {_ms(physics)} of {_ms(whole)}"
+
+    def fastest(self, rows, rtol):
+        return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
+
+
+def advise(step, sample, seconds=5.0):
+    """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
+
+    Args:
+        step: a `Stepper`, such as `Heat` or `ImplicitStep`. Its own budget is not used.
+        sample: states (batch, channel, *shape) to step from, as many as a batch of the training has.
+        seconds: the limit for each solver. A solver that does not reach a tolerance in time is marked
+            MAX_ITER.
+
+    Returns:
+        An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-3 and 1e-5,
+        forward and adjoint. Its `notes` name the solvers that the operator does not allow. Its
+        `recommendation` is one choice with the reason for it.
+
+    Raises TypeError or ValueError where step and sample do not fit each other, before any measurement.
+
+    >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
+    >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
+    """
+    if not isinstance(step, Stepper):
+        raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
+    if type(step).operator is Stepper.operator:
+        raise TypeError(f"advise: {type(step).__name__} must define operator(u)")
+    _check.dense("advise", "sample", sample)
+    if sample.dim() < 2 or sample.numel() == 0 or sample.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            "advise: sample must be states (batch, channel, *shape) in float32 or float64, got "
+            f"{tuple(sample.shape)} in {sample.dtype}"
+        )
+    if not sample.isfinite().all():
+        raise ValueError("advise: sample holds NaN or Inf")
+    return _advise(step, sample.detach(), _limit(seconds), _Update())
+
+
+def advise_scene(scene, seconds=5.0):
+    """Advise on a scene of `prdp_torch.scenes.load`, with the share of its network: from a batch of the scene's
+    initial states, and a forward and backward pass of the untrained network. Arguments, returns: as `advise`."""
+    seconds, step, update = _limit(seconds), make_stepper(scene), _Update()
+    if scene.task == "parameters":
+        problem = _C.make_parameter_problem(scene)
+        sample = (problem.start @ problem.modes)[None, None]
+    else:
+        states = _C.validation_trajectories(scene, 0)[:, 0]
+        sample = states[torch.arange(scene.training.batch) % len(states)]
+        network = make_network(scene, 0)
+        # A corrector's first solve starts from data, which need no gradient.
+        adjoints = 0 if scene.backward == "none" else 1
+        update = _Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
+    cotangent = random_cotangent(step, sample)
+    run(step, sample, cotangent)  # to warm up
+    physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
+    update.notes.append(
+        f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
+        f"{update.share(physics)}."
+    )
+    if update.network > physics and scene.dtype == torch.float32:
+        with torch.autocast(sample.device.type, torch.bfloat16):
+            low = scene.executions * _network_seconds(network, sample, seconds)
+        update.notes.append(
+            f"The network is the larger part, {_ms(update.network)}; in bfloat16 autocast it takes {_ms(low)}, "
+            f"{low / update.network:.2g} times that."
+        )
+    return _advise(step, sample, seconds, update)
+
+
+def _advise(step, sample, seconds, update):
+    rows, refused = measure(step, sample, candidates(step), seconds)
+    best = update.fastest(rows, TOLERANCES[-1])
+    other = torch.float64 if sample.dtype == torch.float32 else torch.float32
+    threads = f"threads: {torch.get_num_threads()}"
+    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}; {threads}.", *update.notes, *refused]
+    try:
+        trials = candidates(step) if best is None else [best.solver]
+        others, _ = measure(copy.deepcopy(step).to(other), sample.to(other), trials, seconds)
+    except (ValueError, TypeError, RuntimeError) as error:
+        notes.append(f"{_name(other)} was not tried: {_C.sentence(str(error))}.")
+        others = []
+    twin = update.fastest(others, TOLERANCES[-1])
+    if best is not None and twin is not None:
+        ratio = update.physics(twin) / update.physics(best)
+        notes.append(f"{best.name} in {_name(other)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}.")
+    words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
+    return Advice(rows + others, notes, words)
+
+
+def _recommend(step, sample, rows, best, update):
+    """The recommendation where `best` is the fastest solver to the finest tolerance."""
+    physics = update.physics(best)
+    most = max(solve.iterations for solve in best.solves)
+    if isinstance(best.solver, Direct):
+        rough = update.fastest(rows, TOLERANCES[0])
+        least, cheapest = update.physics(rough), f"{rough.name} to {_power(rough.rtol)}"
+    else:
+        least = update.physics(measure_one_iteration(step, sample, best.solver))
+        cheapest = "a single iteration"
+    saving = max(0.0, 1 - least / physics) * physics / (physics + update.network)
+    if isinstance(best.solver, Direct):
+        choice = "Use the direct solver, Direct()"
+    elif saving < WORTH_REFINING:
+        choice = f"Use converged solves with {_call(best.solver, 2 * most, best.rtol)}"
+    else:
+        choice = f"Refine {best.name} with a controller, up to K = {most}"
+    whole = "an update" if update.network else "a step"
+    reason = (
+        f"physics is {update.share(physics)}" if update.network else f"{whole} takes {_ms(physics)} with its adjoint"
+    )
+    limit = f"at most {_percent(saving)} of {whole}, as {cheapest} takes {_ms(least)}"
+    if saving >= WORTH_REFINING:
+        limit = f"Refinement can save {limit}."
+    elif saving > 0.0:
+        limit = f"Refinement has nothing to save: {limit}."
+    else:
+        limit = f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."
+    return f"{choice}: it is the fastest to {_power(best.rtol)}, and {reason}. {limit}"
+
+
+def _make_do(rows, twin, update, seconds):
+    """The recommendation where no solver reaches the finest tolerance in the dtype of the sample."""
+    rough, fine = (_power(rtol) for rtol in TOLERANCES)
+    if twin is not None:
+        return f"Use {_name(twin.dtype)} with {twin.name}: no solver reaches {fine} in the dtype of the sample."
+    best = update.fastest(rows, TOLERANCES[0])
+    if best is not None:
+        return f"Use {best.name} with rtol={rough}, the fastest to it: no solver reaches {fine} within {seconds:g} s."
+    return (
+        f"No solver reaches {rough} within {seconds:g} s: take a shorter time step or a smaller grid, or look for a "
+        "mistake with prdp.check_operator."
+    )
+
+
+def _call(solver, max_iter, rtol):
+    extra = f", restart={solver.restart}" if isinstance(solver, GMRES) else ""
+    if getattr(solver, "preconditioner", None):
+        extra += f", preconditioner={solver.preconditioner!r}"
+    return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
+
+
+def _network_seconds(network, u, limit):
+    """One forward and one backward pass; a first one that exceeds the limit is also the last."""
+    times, deadline = [], now(u) + limit
+    while len(times) <= RUNS and (not times or now(u) < deadline):
+        started = now(u)
+        out = network(u)
+        torch.autograd.grad(out, list(network.parameters()), torch.ones_like(out))
+        times.append(now(u) - started)
+    return median(times[1:] or times)
+
+
+def _limit(seconds):
+    if not 0 < _check.real("advise", "seconds", seconds) < float("inf"):
+        raise ValueError(f"advise: seconds must be a number > 0, got {seconds}")
+    return float(seconds)
+
+
+def _name(dtype):
+    return str(dtype).removeprefix("torch.")
+
+
+def _short(ms):
+    return f"{ms:.3g}" if ms < 1000 else f"{ms:.0f}"
+
+
+def _ms(seconds):
+    return f"{_short(1e3 * seconds)} ms"
+
+
+def _percent(share):
+    return f"{share:.1%}" if share < 0.01 else f"{share:.0%}"
+
+
+def _power(rtol):
+    return f"{rtol:.0e}".replace("e-0", "e-")

@@ -1,0 +1,215 @@
+"""Trials of solvers on one step: products and seconds to a tolerance, forward and adjoint."""
+
+import copy
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
+
+import torch
+
+from prdp_torch import _C, operators
+from prdp_torch.solve import SolveStatus
+from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, Solver, SteepestDescent
+
+TOLERANCES = (1e-3, 1e-5)
+RESTARTS = (2, 8, 30)
+MOST_UNKNOWNS = {"sparse": 2**15, "dense": 2**12}  # of a factorisation, which the time limit cannot interrupt
+RUNS = 5  # of which the median counts
+
+
+@dataclass
+class Solve:
+    """One direction of a measured step."""
+
+    iterations: int
+    """Of the slowest sample, as are the products with A."""
+    products: int
+    seconds: float
+    """Of the whole batch; the median of up to five runs."""
+    status: str
+    """The worst of the samples, a name of `SolveStatus`."""
+
+
+@dataclass
+class Row:
+    """What one solver takes to one tolerance."""
+
+    solver: Solver
+    dtype: torch.dtype
+    rtol: float
+    forward: Solve
+    adjoint: Solve | None
+    """With a random cotangent; None where nothing in the step needs a gradient."""
+
+    @property
+    def name(self):
+        return name_of(self.solver)
+
+    @property
+    def solves(self):
+        return [self.forward] if self.adjoint is None else [self.forward, self.adjoint]
+
+    @property
+    def solved(self):
+        return all(SolveStatus[solve.status] > 0 for solve in self.solves)
+
+    @property
+    def status(self):
+        """The word solved, or the worse of the two statuses."""
+        return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
+
+
+def name_of(solver):
+    if not isinstance(solver, GMRES):
+        return type(solver).__name__
+    return f"GMRES({solver.restart})" if solver.preconditioner is None else f"GMRES({solver.restart}, stokes)"
+
+
+def candidates(step):
+    """The solvers to try on a step."""
+    own = [step.restart] if step.method.startswith("gmres") else []
+    restarts = sorted({*RESTARTS, *own})
+    every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), *(GMRES(1, restart=m) for m in restarts)]
+    if getattr(step, "kind", None) == "navier_stokes":
+        every.append(GMRES(1, restart=8, preconditioner="stokes"))
+    return [*every, Direct(1)]
+
+
+def measure(step, sample, solvers, seconds):
+    """Try the solvers on a step, `seconds` each. Returns the rows of all that the operator allows, and a sentence
+    for each of the others. Raises TypeError or ValueError where step and sample do not fit each other."""
+    trial = _copy(step)
+    set_solver(trial, GMRES(1, restart=1), 1, 0.0)
+    trial(sample)  # what does not fit is refused here
+    cotangent = random_cotangent(trial, sample)
+    run(trial, sample, cotangent)  # the first backward pass of a process starts its threads
+    symmetric = _symmetric(trial, sample, cotangent)
+    rows, refused = [], []
+    for solver in solvers:
+        try:
+            if isinstance(solver, CG) and not symmetric:
+                raise ValueError("A is not symmetric")
+            if isinstance(solver, Direct):
+                _check_direct(trial, sample, seconds)
+            rows += _measure_one(trial, sample, cotangent, solver, seconds)
+        except ValueError as error:
+            why = _C.sentence(str(error)).removeprefix(f"{type(solver).__name__}: ")
+            refused.append(f"{name_of(solver)} was not tried: {why}.")
+    return rows, refused
+
+
+def measure_one_iteration(step, sample, solver):
+    """The row of a single iteration."""
+    trial = _copy(step)
+    set_solver(trial, solver, 1, 0.0)
+    return run(trial, sample, random_cotangent(trial, sample), solver, RUNS)
+
+
+def _measure_one(trial, sample, cotangent, solver, seconds):
+    """K doubles until the tolerance is met or the time is spent; a finer one is not tried after a failure."""
+    rows, k, deadline = [], 1, time.perf_counter() + seconds
+    for rtol in TOLERANCES:
+        while True:
+            set_solver(trial, solver, k, rtol)
+            row = run(trial, sample, cotangent, solver)
+            # The next run takes about as long as all that were before it.
+            if row.status != "MAX_ITER" or time.perf_counter() > deadline - seconds / 2:
+                break
+            k *= 2
+        if not row.solved:
+            return [*rows, row]
+        rows.append(run(trial, sample, cotangent, solver, RUNS, time.perf_counter() + seconds / 10))
+    return rows
+
+
+def run(trial, sample, cotangent, solver=None, max_runs=1, deadline=float("inf")):
+    """The row of a step and its adjoint as they are set; no run starts after the deadline but the first."""
+    u = sample.clone().requires_grad_()
+    inputs = [u, *(p for p in trial.parameters() if p.requires_grad)]
+    forward, adjoint = [], []
+    while not forward or (len(forward) < max_runs and time.perf_counter() < deadline):
+        started = now(u)
+        u_next = trial(u)
+        between = now(u)
+        forward.append(between - started)
+        if u_next.requires_grad:
+            torch.autograd.grad(u_next, inputs, cotangent, allow_unused=True)
+            adjoint.append(now(u) - between)
+    backward = _solve(trial.adjoint_info, adjoint) if adjoint and trial.adjoint_info is not None else None
+    return Row(solver, u.dtype, trial.rtol, _solve(trial.info, forward), backward)
+
+
+def _solve(info, seconds):
+    worst = SolveStatus(int(info.status.min())).name
+    return Solve(int(info.iterations.max()), int(info.operator_applications.max()), median(seconds), worst)
+
+
+def _copy(step):
+    trial = copy.deepcopy(step)
+    trial.backward, trial.on_failure = "implicit", "return"
+    trial.adjoint_max_iter = trial.adjoint_rtol = trial.checkpoint_every = None
+    return trial
+
+
+def set_solver(trial, solver, max_iter, rtol):
+    trial.method, trial.restart, trial.rtol = solver.method, solver.restart, rtol
+    trial.max_iter = max_iter
+
+
+def _check_direct(trial, sample, seconds):
+    """ValueError where a factorisation would take too much time or memory."""
+    a = _operator(trial, sample)
+    if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
+        return
+    n = sample[0].numel()
+    most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
+    if n > most:
+        raise ValueError(f"{n} unknowns are too many to factorise within the limit; at most {most}")
+    set_solver(trial, Direct(1), 1, 0.0)
+    with torch.no_grad():
+        times = [now(sample)]
+        for _ in range(2):
+            trial(sample[:1])
+            times.append(now(sample))
+    one = min(after - before for before, after in pairwise(times))
+    if 2 * one * len(sample) > seconds:
+        raise ValueError(f"one sample takes {one:.2g} s, the batch forward and adjoint more than {seconds:g} s")
+
+
+def _operator(step, sample):
+    return operators.as_operator("advise", "operator(u)", step.operator(sample))
+
+
+def _symmetric(trial, sample, v):
+    """Whether A v and Aᵀ v agree to rounding, entry by entry."""
+    with torch.no_grad():
+        a = _operator(trial, sample)
+        product, transposed = a.apply(v), a.apply_transpose(v)
+    return float((product - transposed).abs().max()) <= _rounding(product)
+
+
+def random_cotangent(step, sample):
+    """Random, without the mean of a channel whose constants A maps to zero, such as a pressure."""
+    c = torch.randn(sample.shape, generator=torch.Generator().manual_seed(0), dtype=sample.dtype).to(sample.device)
+    with torch.no_grad():
+        a = _operator(step, sample)
+        rounding = _rounding(a.apply(c))
+        for channel in range(c.shape[1]) if c.dim() > 2 else (slice(None),):
+            constant = torch.zeros_like(c)
+            constant[:, channel] = 1.0
+            if float(a.apply(constant).abs().max()) <= rounding:
+                part = c[:, channel]
+                part -= part.flatten(1).mean(1).view(-1, *[1] * (part.dim() - 1))
+    return c
+
+
+def _rounding(v):
+    return 100 * torch.finfo(v.dtype).eps * float(v.abs().max())
+
+
+def now(u):
+    """Seconds, when all work on the device of u is done."""
+    if u.is_cuda:
+        torch.cuda.synchronize(u.device)
+    return time.perf_counter()

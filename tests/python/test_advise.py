@@ -1,0 +1,225 @@
+"""`prdp.advise` and `prdp advise`: what they count, what they leave out, and what they recommend."""
+
+import math
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+from helpers import field
+
+import prdp_torch as prdp
+from prdp_torch import advice as module
+from prdp_torch import scenes
+from prdp_torch.trials import Row, Solve, random_cotangent
+
+
+def advise(step, sample, seconds=1.0):
+    return prdp.advise(step, sample, seconds=seconds)
+
+
+def own_step(operator, rhs=None):
+    return prdp.ImplicitStep(operator, rhs, prdp.GMRES(1))
+
+
+def rows(advice, name, dtype):
+    return {row.rtol: row for row in advice.rows if row.name == name and row.dtype == dtype}
+
+
+@pytest.fixture(scope="module")
+def heat():
+    step = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(1), backward="none")
+    u = field((30,), batch=3, dtype=torch.float32)
+    return step, u, advise(step, u)
+
+
+def test_the_counts_are_those_of_the_solves(heat):
+    step, u, advice = heat
+    cotangent = random_cotangent(step, u)
+    for name, solver in (("Jacobi", prdp.Jacobi), ("Chebyshev", prdp.Chebyshev), ("CG", prdp.CG)):
+        for rtol, row in rows(advice, name, torch.float32).items():
+            b = u.clone().requires_grad_()
+            x, info = prdp.linear_solve(step.operator(u), b, solver(1000, rtol=rtol))
+            x.backward(cotangent)
+            for solve, truth in ((row.forward, info), (row.adjoint, info.adjoint)):
+                assert solve.iterations == int(truth.iterations.max())
+                assert solve.products == int(truth.operator_applications.max())
+                assert solve.status == "CONVERGED" and solve.seconds > 0
+    assert {row.rtol for row in advice.rows} == {1e-3, 1e-5}
+
+
+def test_the_recommendation_names_the_fastest_solver_and_its_reason(heat):
+    _, _, advice = heat
+    fine = [row for row in advice.rows if row.rtol == 1e-5 and row.dtype == torch.float32 and row.solved]
+    best = min(fine, key=lambda row: row.forward.seconds + row.adjoint.seconds)
+    assert best.name.split("(")[0] in advice.recommendation
+    assert "it is the fastest to 1e-5" in advice.recommendation and "a step takes" in advice.recommendation
+    assert {row.name for row in advice.rows if row.dtype == torch.float64} == {best.name}
+    text = str(advice)
+    assert "SteepestDescent" in text and text.endswith(advice.recommendation)
+
+
+def test_the_step_stays_as_it_is(heat):
+    step, u, _ = heat
+    assert (step.method, step.max_iter, step.backward, step.info) == ("jacobi", 1, "none", None)
+    assert u.dtype == torch.float32 and not u.requires_grad
+
+
+def test_burgers_leaves_out_what_needs_symmetry_or_a_known_spectrum():
+    step = prdp.Burgers((64,), nu=1e-2, dt=1e-2, solver=prdp.GMRES(1, restart=5))
+    advice = advise(step, field((64,), batch=2))
+    assert {"Jacobi", "SteepestDescent", "GMRES(5)", "GMRES(8)", "Direct"} <= {row.name for row in advice.rows}
+    assert not {"CG", "Chebyshev"} & {row.name for row in advice.rows}
+    assert "CG was not tried: A is not symmetric." in advice.notes
+    assert any(note.startswith("Chebyshev was not tried: the spectrum is known of Heat") for note in advice.notes)
+
+
+def test_a_function_without_diagonal_leaves_out_jacobi():
+    function = prdp.operators.Function(lambda v: 3 * v + v.roll(1, -1))
+    advice = advise(own_step(function), field((16,), batch=2))
+    names = {row.name for row in advice.rows}
+    assert {"GMRES(8)", "Direct"} <= names and "Jacobi" not in names
+    assert any("Jacobi was not tried" in note and "diagonal" in note for note in advice.notes)
+
+
+def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype():
+    k = torch.full((16,), 2.0)
+    step = own_step(lambda u: prdp.operators.Matrix(torch.diag(k)))
+    advice = advise(step, torch.randn(2, 16))
+    assert any(note.startswith("float64 was not tried: ") for note in advice.notes)
+    assert {row.dtype for row in advice.rows} == {torch.float32} and "Use " in advice.recommendation
+
+
+def test_a_solver_that_diverges_is_named():
+    """0.1 I + 0.9 ones(3): positive definite, but Jacobi's spectral radius is 1.8."""
+    step = own_step(0.1 * torch.eye(3, dtype=torch.float64) + 0.9)
+    advice = advise(step, torch.randn(2, 3, dtype=torch.float64))
+    jacobi = rows(advice, "Jacobi", torch.float64)
+    assert jacobi.keys() == {1e-3} and jacobi[1e-3].status == "DIVERGED"
+    assert re.search(r"Jacobi .* DIVERGED", str(advice)) and "Jacobi" not in advice.recommendation
+
+
+def test_a_solver_that_takes_too_long_is_marked_and_bounded():
+    """On 3000 points Jacobi needs tens of millions of iterations."""
+    advice = advise(prdp.Poisson((3000,), prdp.CG(1)), field((3000,), batch=1), seconds=0.2)
+    (jacobi,) = rows(advice, "Jacobi", torch.float64).values()
+    assert jacobi.rtol == 1e-3 and jacobi.status == "MAX_ITER" and "MAX_ITER" in str(advice)
+    assert jacobi.forward.seconds + jacobi.adjoint.seconds < 2.0
+    assert rows(advice, "Direct", torch.float64)[1e-5].solved and "Direct" in advice.recommendation
+
+
+def test_no_solver_is_recommended_where_none_gets_there():
+    """A cyclic shift: Krylov methods stand still, and it has more unknowns than `Direct` may probe."""
+    function = prdp.operators.Function(lambda v: v.roll(1, -1), lambda v: v.roll(-1, -1))
+    advice = advise(own_step(function), field((5000,), batch=1), seconds=0.1)
+    assert advice.rows and not any(row.solved for row in advice.rows)
+    assert any(note.startswith("Direct was not tried: 5000 unknowns are too many") for note in advice.notes)
+    assert advice.recommendation.startswith("No solver reaches 1e-3 within 0.1 s")
+
+
+def test_the_finer_dtype_is_recommended_where_the_coarser_cannot_reach_1e_5():
+    advice = advise(prdp.Poisson((2000,), prdp.CG(1)), field((2000,), batch=1, dtype=torch.float32))
+    coarse = [row for row in advice.rows if row.dtype == torch.float32 and row.rtol == 1e-5]
+    assert not any(row.solved for row in coarse)
+    assert advice.recommendation.startswith("Use float64 with Direct: no solver reaches 1e-5 in the dtype")
+
+
+def test_a_pressure_gets_a_cotangent_that_can_be_solved_for():
+    step = prdp.NavierStokes((8, 8), nu=1e-2, dt=1e-2, solver=prdp.GMRES(1, restart=8))
+    u = prdp.fields.project(field((8, 8), batch=2, channels=3))
+    cotangent = random_cotangent(step, u)
+    assert float(cotangent[:, 2].mean((-2, -1)).abs().max()) < 1e-15 < float(cotangent[:, 0].mean().abs())
+    found = rows(advise(step, u), "Direct", torch.float64)
+    assert found[1e-5].solved
+
+
+def test_gradients_of_parameters_count_though_the_state_has_none():
+    k = torch.nn.Parameter(torch.tensor(2.0))
+    step = own_step(prdp.operators.Function(lambda v, k: k * v, tensors=k, symmetric=True), torch.ones_like)
+    advice = advise(step, field((5,), batch=1))
+    assert all(row.adjoint is not None for row in advice.rows)
+    constant = own_step(torch.eye(5, dtype=torch.float64), torch.ones_like)
+    assert all(row.adjoint is None for row in advise(constant, field((5,), batch=1)[:, 0]).rows)
+
+
+def made_up(name, rtol, seconds, iterations=10):
+    solve = Solve(iterations, iterations + 1, seconds / 2, "CONVERGED")
+    solver = {"CG": prdp.CG(1), "Direct": prdp.Direct(1)}[name]
+    return Row(solver, torch.float64, rtol, solve, solve)
+
+
+@pytest.mark.parametrize(
+    "seconds, network, words",
+    [
+        (1.0, 0.0, "Refine CG with a controller, up to K = 10: it is the fastest to 1e-5, and a step takes 1000 ms"),
+        (1.0, 24.0, "Use converged solves with CG(max_iter=20, rtol=1e-5): it is the fastest to 1e-5, and physics is 4%"
+         " of an update: 1000 ms of 25000 ms. Refinement has nothing to save: at most 4% of an update"),
+        (1.0, 3.0, "Refine CG with a controller, up to K = 10: it is the fastest to 1e-5, and physics is 25% of an"),
+    ],
+)  # fmt: skip
+def test_refinement_is_recommended_where_physics_is_a_large_part(seconds, network, words):
+    step = prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1))
+    best = made_up("CG", 1e-5, seconds)
+    text = module._recommend(step, field((8,)), [best], best, module._Update(network))
+    assert text.startswith(words)
+
+
+def test_the_direct_solver_says_whether_a_rough_solve_is_faster():
+    best, equal, rough = (made_up(*row) for row in (("Direct", 1e-5, 1.0), ("Direct", 1e-3, 1.0), ("CG", 1e-3, 0.4)))
+    update = module._Update(network=1.0)
+    assert module._recommend(None, None, [best, equal], best, update) == (
+        "Use the direct solver, Direct(): it is the fastest to 1e-5, and physics is 50% of an update: 1000 ms of "
+        "2000 ms. Refinement has nothing to save: no solver is faster to 1e-3."
+    )
+    assert module._recommend(None, None, [best, equal, rough], best, update).endswith(
+        "Refinement can save at most 30% of an update, as CG to 1e-3 takes 400 ms."
+    )
+
+
+def test_a_scene_says_what_share_its_physics_has():
+    advice = module.advise_scene(scenes.load("heat_1d"), seconds=1.0)
+    own = next(note for note in advice.notes if note.startswith("As the scene sets it"))
+    share, physics, whole = map(float, re.search(r"(\d+)% of an update: (\S+) ms of (\S+) ms", own).groups())
+    assert math.isclose(share, 100 * physics / whole, abs_tol=1.0) and "jacobi, K = 25, implicit" in own
+    assert "physics is" in advice.recommendation and "Refinement" in advice.recommendation
+
+
+def test_the_command_ends_with_a_recommendation(tmp_path):
+    command = [sys.executable, "-c", "from prdp_torch.cli import main; main()", "advise", "heat_1d", "--seconds", "1"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "Chebyshev" in done.stdout and "of an update" in done.stdout and not list(tmp_path.iterdir())
+    assert re.match("(Use|Refine) .*it is the fastest to 1e-5", done.stdout.splitlines()[-1])
+    assert max(map(len, done.stdout.split("Batch of")[0].splitlines())) <= 80 and "…" not in done.stdout
+    wrong = subprocess.run([*command[:-1], "0"], cwd=tmp_path, capture_output=True, text=True)
+    assert wrong.returncode == 2 and wrong.stderr == "prdp: advise: seconds must be a number > 0, got 0.0\n"
+
+
+class OwnForward(prdp.Stepper):
+    def forward(self, u):
+        return u
+
+
+@pytest.mark.parametrize(
+    "step, sample, error, message",
+    [
+        (torch.nn.Linear(3, 3), torch.ones(2, 3), TypeError, "step must be a Stepper such as Heat or ImplicitStep"),
+        (OwnForward(prdp.CG(1)), torch.ones(2, 3), TypeError, r"OwnForward must define operator\(u\)"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), None, TypeError, "sample must be a torch tensor, got NoneType"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 9), ValueError, r"\(batch, 1, 8\).*\(2, 1, 9\)"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(8), ValueError, r"states \(batch, channel, \*shape\)"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(0, 1, 8), ValueError, r"got \(0, 1, 8\) in torch.float32"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 8).int(), ValueError, "in float32 or float64"),
+        (prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.full((2, 1, 8), torch.nan), ValueError, "holds NaN or Inf"),
+    ],
+)
+def test_what_cannot_be_advised_on_is_refused_in_words(step, sample, error, message):
+    with pytest.raises(error, match=message):
+        prdp.advise(step, sample)
+
+
+@pytest.mark.parametrize("seconds", [0, -1.0, math.nan, math.inf])
+def test_the_limit_is_a_positive_number(seconds):
+    with pytest.raises(ValueError, match="advise: seconds must be a number > 0"):
+        prdp.advise(prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 8), seconds)
