@@ -171,7 +171,7 @@ class Function(Operator):
         tensors: what A is made of, a tuple of tensors or a single one; they get gradients. A tensor that
             requires grad and reaches matvec in another way is refused.
         diagonal: `diagonal(*tensors)`, the diagonal of A in a shape that broadcasts against the vectors;
-            `Jacobi` needs it.
+            `Jacobi` and `preconditioner="diagonal"` need it.
         symmetric: A = Aᵀ, so that matvec serves for both.
 
     `Direct` probes A with unit vectors, for small systems. `prdp.check_operator` compares all of these with

@@ -5,7 +5,7 @@ residual) or `max_iter` iterations; rtol = 0 runs exactly `max_iter`. Arguments 
 ValueError.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
@@ -15,20 +15,34 @@ from prdp_torch import _C, _check
 
 @dataclass
 class Solver:
-    """What every solver is: a method and its budget K = max_iter."""
+    """What every solver is: a method and its budget K = max_iter. CG and GMRES take a `preconditioner`."""
 
     max_iter: int
     rtol: float = _C.DEFAULT_RTOL
+    preconditioner: str | None = field(default=None, kw_only=True)
 
     restart: ClassVar[int] = _C.DEFAULT_RESTART
     method: ClassVar[str]
+    preconditioners: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self):
+        self._check_preconditioner()
+        if self.preconditioner is not None:
+            self.method = f"{type(self).method}_{self.preconditioner}"
         if not torch.compiler.is_compiling():
             who = type(self).__name__
             self.max_iter = _check.whole(who, "max_iter", self.max_iter)
             self.rtol = _check.real(who, "rtol", self.rtol)
             _C.check_solver(who, self.method, self.max_iter, self.rtol, self.restart)
+
+    def _check_preconditioner(self):
+        who, name, allowed = type(self).__name__, self.preconditioner, self.preconditioners
+        if name is None or name in allowed:
+            return
+        if not allowed:
+            raise ValueError(f"{who}: takes no preconditioner, got {name!r}; CG and GMRES take one")
+        names = ", ".join(map(repr, (None, *allowed)))
+        raise ValueError(f"{who}: unknown preconditioner {name!r}; allowed: {names}")
 
 
 @dataclass
@@ -55,28 +69,32 @@ class SteepestDescent(Solver):
 
 @dataclass
 class CG(Solver):
-    """Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators."""
+    """Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators.
+
+    `preconditioner="diagonal"` divides by the magnitude of the diagonal: several times fewer iterations where
+    it varies much, as with a diffusivity that varies in space; none where it is constant. It refuses an
+    operator with a zero there (ZERO_DIAGONAL)."""
 
     method: ClassVar[str] = "cg"
+    preconditioners: ClassVar[tuple[str, ...]] = ("diagonal",)
 
 
 @dataclass(kw_only=True)
 class GMRES(Solver):
     """Restarted GMRES(m) with m = `restart` products a cycle, for any operator (Saad and Schultz 1986);
     `max_iter` counts cycles. The residual never grows. In float32 unrolled derivatives can be far off:
-    prefer implicit ones. `preconditioner="stokes"`, for NavierStokes alone: from the right, by the same
-    step without winds, solved with FFTs; it meets 1e-5 in few products."""
+    prefer implicit ones.
+
+    Preconditioned from the right: by "diagonal", for operators without a zero there (else ZERO_DIAGONAL), or
+    by "stokes", for NavierStokes alone: the same step without winds, solved with FFTs; it meets 1e-5 in few
+    products."""
 
     restart: int = _C.DEFAULT_RESTART
-    preconditioner: str | None = None
 
     method: ClassVar[str] = "gmres"
+    preconditioners: ClassVar[tuple[str, ...]] = ("diagonal", "stokes")
 
     def __post_init__(self):
-        if self.preconditioner not in (None, "stokes"):
-            raise ValueError(f"GMRES: unknown preconditioner {self.preconditioner!r}; allowed: None, 'stokes'")
-        if self.preconditioner is not None:
-            self.method = "gmres_stokes"
         if not torch.compiler.is_compiling():
             self.restart = _check.whole("GMRES", "restart", self.restart)
         super().__post_init__()

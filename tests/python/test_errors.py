@@ -174,7 +174,7 @@ def unsuited():
         (function, prdp.Chebyshev(5), chebyshev),
         (burgers, prdp.GMRES(3, preconditioner="stokes"), stokes),
         (function, prdp.GMRES(3, preconditioner="stokes"), stokes),
-        (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi divides by, is not known"),
+        (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi and preconditioner"),
     ]
 
 

@@ -160,7 +160,7 @@ def test_nan_stays_with_its_sample():
             ValueError,
             r"diagonal must return a shape that broadcasts against the vectors, \[2, 4\], got \[3\]",
         ),
-        (lambda: solve_with(lambda v: v, prdp.Jacobi(3)), ValueError, "its diagonal, which Jacobi divides by"),
+        (lambda: solve_with(lambda v: v, prdp.Jacobi(3)), ValueError, "its diagonal, which Jacobi and preconditioner"),
         (lambda: solve_with(lambda v: v / (1 / 0)), ZeroDivisionError, "division by zero"),
     ],
 )

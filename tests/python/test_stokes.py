@@ -75,5 +75,5 @@ def test_derivatives(backward, max_iter, rtol):
 def test_it_is_for_navier_stokes_alone():
     with pytest.raises(ValueError, match='preconditioner "stokes" is for NavierStokes operators alone'):
         prdp.Heat((5,), 1e-3, 1.0, solver=stokes())(field((5,)))
-    with pytest.raises(ValueError, match="unknown preconditioner 'ilu'; allowed: None, 'stokes'"):
+    with pytest.raises(ValueError, match="unknown preconditioner 'ilu'; allowed: None, 'diagonal', 'stokes'"):
         prdp.GMRES(3, preconditioner="ilu")

@@ -96,6 +96,18 @@ def test_replays_equal_autograd_through_all_iterations_at_once(name):
         assert one.abs().max() > 0
 
 
+@pytest.mark.parametrize("solver", [prdp.GMRES(6, rtol=0.0), prdp.Jacobi(300, rtol=1e-15), prdp.Direct()])
+def test_a_function_solved_to_rounding_keeps_the_gradients_of_its_tensors(solver):
+    found = []
+    for backward in ("implicit", "unrolled"):
+        k = (torch.arange(5.0, dtype=torch.float64) + 2).requires_grad_()
+        a = operators.Function(lambda v, k: k * v + 0.1 * v.roll(1, 1), tensors=(k,), diagonal=lambda k: k)
+        u, _ = prdp.linear_solve(a, field((5,))[:, 0], solver, backward=backward, on_failure="return")
+        found += torch.autograd.grad(u.square().sum(), k)
+    assert found[0].abs().min() > 0
+    torch.testing.assert_close(found[1], found[0], rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("name, method", [*CASES, *((name, None) for name in REPLAYED)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_checkpoints_do_not_change_a_bit(name, method, dtype):

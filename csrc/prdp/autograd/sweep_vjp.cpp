@@ -51,9 +51,9 @@ void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<
 
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
   const auto method = solve.solver.method;
-  // Chebyshev's weights depend on A too: autograd knows how.
-  const bool written_out =
-      method != Method::kDirect && method != Method::kGmresStokes && method != Method::kChebyshev;
+  // Chebyshev's weights and the preconditioners depend on A too: autograd knows how.
+  const bool written_out = method == Method::kJacobi || method == Method::kSteepestDescent ||
+                           method == Method::kConjugateGradient || method == Method::kGmres;
   return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 

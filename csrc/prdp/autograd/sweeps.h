@@ -286,7 +286,7 @@ class GmresSweep : public SweepBase<GmresMethod<Space>, Space> {
 
  public:
   GmresSweep(Space& space, Vector x_bar, int64_t restart)
-      : Base(space, x_bar, restart, false),
+      : Base(space, x_bar, restart, Preconditioner::kNone),
         b_bar_(space.vector()),
         r_bar_(space.vector()),
         e_(space.vector()),

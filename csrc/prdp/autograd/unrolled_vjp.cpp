@@ -88,7 +88,7 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
   if (solver.method == Method::kJacobi || solver.method == Method::kChebyshev)
     leave_out(solver.max_iter.expect_int(), none);
   const int64_t unknowns = solved.b.numel() / batch;
-  if (solver.method == Method::kConjugateGradient &&
+  if (is_conjugate_gradient(solver.method) &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
     const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};

@@ -178,8 +178,8 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
 
 at::Tensor FunctionOperator::diagonal() const {
   const auto& function = registered_->products().diagonal;
-  TORCH_CHECK_VALUE(function, "Function: its diagonal, which Jacobi divides by, is not known; give diagonal, or "
-                              "take another method");
+  TORCH_CHECK_VALUE(function, "Function: its diagonal, which Jacobi and preconditioner=\"diagonal\" divide by, is not "
+                              "known; give diagonal, or take another method");
   const auto found = function(tensors_);
   TORCH_CHECK_TYPE(found.defined() && at::isFloatingType(found.scalar_type()),
                    "Function: diagonal must return a real tensor");
@@ -207,23 +207,24 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   // Recorded on copies of its own, or, where the derivative is itself to be differentiated, on views:
   // the partial derivative must not follow a tensor's way through u.
   const bool create_graph = at::GradMode::is_enabled();
-  const at::AutoGradMode record(true);
-  std::vector<at::Tensor> arguments, wanted;
-  for (const auto& t : tensors_) {
-    const bool real = at::isFloatingType(t.scalar_type());
-    const bool recorded = create_graph && t.requires_grad();
-    arguments.push_back(recorded ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
-    if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
-  }
-  std::vector<at::Tensor> gradients(tensors_.size());
-  if (wanted.empty()) return gradients;
-  const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, "matvec");
-  if (!made.requires_grad()) return gradients;
-  const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()},
-                                           create_graph, create_graph, /*allow_unused=*/true);
-  for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
-    if (arguments[i].requires_grad()) gradients[i] = found[next++];
-  return gradients;
+  return with_autograd([&] {
+    std::vector<at::Tensor> arguments, wanted;
+    for (const auto& t : tensors_) {
+      const bool real = at::isFloatingType(t.scalar_type());
+      const bool recorded = create_graph && t.requires_grad();
+      arguments.push_back(recorded ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
+      if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
+    }
+    std::vector<at::Tensor> gradients(tensors_.size());
+    if (wanted.empty()) return gradients;
+    const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, "matvec");
+    if (!made.requires_grad()) return gradients;
+    const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()},
+                                             create_graph, create_graph, /*allow_unused=*/true);
+    for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
+      if (arguments[i].requires_grad()) gradients[i] = found[next++];
+    return gradients;
+  });
 }
 
 at::Tensor FunctionOperator::norm() const {

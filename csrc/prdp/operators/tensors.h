@@ -2,6 +2,7 @@
 #include <ATen/ATen.h>
 
 #include <algorithm>
+#include <tuple>
 
 /// What batches of tensors need everywhere.
 namespace prdp {
@@ -10,6 +11,13 @@ namespace prdp {
 inline at::Tensor per_sample(at::Tensor t, const at::Tensor& like) {
   while (t.dim() < like.dim()) t = t.unsqueeze(-1);
   return t;
+}
+
+/// The powers of two that bring these magnitudes to the order of one.
+inline at::Tensor power_of_two_scale(const at::Tensor& magnitude) {
+  const int limit = magnitude.scalar_type() == at::kFloat ? 126 : 1022;
+  const auto exponent = std::get<1>(at::frexp(magnitude)).sub(1).clamp(-limit, limit);
+  return at::ldexp(at::ones_like(magnitude), exponent.neg());
 }
 
 /// sum += term; an undefined tensor is a zero of any shape.

@@ -4,6 +4,8 @@
 #include <tuple>
 #include <vector>
 
+#include "prdp/solvers/solver.h"
+
 namespace prdp {
 
 /// GMRES(m), restarted (Saad and Schultz 1986), for any operator. An iteration is a cycle: m products,
@@ -19,9 +21,9 @@ class GmresMethod {
   using Scalar = typename Space::Scalar;
   using Vector = typename Space::Vector;
 
-  /// Preconditioned from the right, by what the space has for A: A M⁻¹ y = b, x = M⁻¹ y.
-  GmresMethod(Space& space, int64_t restart, bool preconditioned)
-      : x(space.vector()), space_(space), preconditioned_(preconditioned),
+  /// Preconditioned from the right, A M⁻¹ y = b with x = M⁻¹ y: the residual is that of A u = b.
+  GmresMethod(Space& space, int64_t restart, Preconditioner preconditioner)
+      : x(space.vector()), space_(space), preconditioner_(preconditioner),
         m_(std::min(restart, space.unknowns())), r_(space.vector()), kept_x_(space.vector()),
         kept_r_(space.vector()), h_(m_ * (m_ + 1)), inverse_(m_), cos_(m_), sin_(m_), g_(m_ + 1), y_(m_),
         again_(m_ + 1) {
@@ -43,7 +45,7 @@ class GmresMethod {
     space_.copy(r_, kept_r_);
     columns_ = extend_basis();
     minimise(columns_);
-    space_.add_combination(y_, v_, columns_, x, preconditioned_);
+    space_.add_combination(y_, v_, columns_, x, preconditioner_);
     ready_ = false;
   }
   /// ‖b - A x‖². A cycle that made it grow was rounding errors and is taken back.
@@ -82,7 +84,7 @@ class GmresMethod {
     exhausted_ = space_.is_zero(g_[0]);
     loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
-      space_.apply(v_[j], v_[j + 1], preconditioned_);
+      space_.apply(v_[j], v_[j + 1], preconditioner_);
       if (space_.recording()) products_[j] = v_[j + 1];
       scale_ = space_.larger(scale_, orthogonalise(j));
       const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
@@ -170,7 +172,7 @@ class GmresMethod {
   }
 
   Space& space_;
-  bool preconditioned_;
+  Preconditioner preconditioner_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_;
   std::vector<Vector> v_, products_;  // orthonormal basis; A v_j, kept while recording

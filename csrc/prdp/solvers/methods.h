@@ -3,6 +3,7 @@
 #include "prdp/solvers/direct.h"
 #include "prdp/solvers/gmres.h"
 #include "prdp/solvers/jacobi.h"
+#include "prdp/solvers/preconditioned_conjugate_gradient.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
@@ -10,7 +11,7 @@ namespace prdp {
 
 /// Vectors that a method keeps at most, beside b and one of scratch.
 inline int64_t vectors_of(Method method, int64_t restart) {
-  return method == Method::kGmres ? restart + 5 : 4;
+  return is_gmres(method) ? restart + 5 : method == Method::kConjugateGradientDiagonal ? 6 : 4;
 }
 
 /// Calls body(method object) for the method that runs in this space.
@@ -21,8 +22,10 @@ auto with_method(Method method, int64_t restart, Space& space, const Body& body)
     case Method::kChebyshev: return body(JacobiMethod<Space>(space, /*accelerated=*/true));
     case Method::kSteepestDescent: return body(SteepestDescentMethod<Space>(space));
     case Method::kConjugateGradient: return body(ConjugateGradientMethod<Space>(space));
-    case Method::kGmres: return body(GmresMethod<Space>(space, restart, false));
-    case Method::kGmresStokes: return body(GmresMethod<Space>(space, restart, true));
+    case Method::kConjugateGradientDiagonal: return body(PreconditionedConjugateGradientMethod<Space>(space));
+    case Method::kGmres: return body(GmresMethod<Space>(space, restart, Preconditioner::kNone));
+    case Method::kGmresDiagonal: return body(GmresMethod<Space>(space, restart, Preconditioner::kDiagonal));
+    case Method::kGmresStokes: return body(GmresMethod<Space>(space, restart, Preconditioner::kStokes));
     case Method::kDirect: break;
   }
   return body(DirectMethod<Space>(space));

@@ -58,7 +58,7 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
     return hand_out_zeros(SolveStatus::kNonfiniteInput, std::numeric_limits<double>::infinity());
   if (!operator_is_finite)
     return hand_out_zeros(SolveStatus::kNonfiniteOperator, std::numeric_limits<double>::infinity());
-  if (batch.method == Method::kJacobi && kernel.has_zero_diagonal())
+  if (divides_by_diagonal(batch.method) && kernel.has_zero_diagonal())
     return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
   if (magnitude == T(0)) return hand_out_zeros(SolveStatus::kConverged, 0.0);
 

@@ -1,6 +1,8 @@
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <utility>
 #include <vector>
@@ -8,6 +10,7 @@
 #include "prdp/kernels/direct_factors.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/iterate.h"
+#include "prdp/solvers/solver.h"
 
 namespace prdp {
 
@@ -62,11 +65,31 @@ class SampleSpace {
     kernel_->apply(v, out);
     return {dot(v, out), dot(out, out)};
   }
-  void apply(const T* v, Vector out, bool /*preconditioned: never, solve() sees to it*/ = false) {
+  void apply(const T* v, Vector out) {
     count(1);
     kernel_->apply(v, out);
   }
+  /// out = A M⁻¹ v. M is the diagonal, if anything: for others solve() takes plain tensors.
+  void apply(const T* v, Vector out, Preconditioner preconditioner) {
+    if (preconditioner == Preconditioner::kNone) return apply(v, out);
+    kernel_->divide_by_diagonal(v, scratch());
+    apply(scratch(), out);
+  }
   void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
+  /// w = |D|⁻¹, times the power of two that brings its largest entry to the order of one.
+  void inverse_diagonal(Vector w) {
+    std::fill_n(scratch(), kernel_->unknowns(), T(1));
+    kernel_->load(scratch(), T(1), w);
+    fill_zero(scratch());
+    kernel_->divide_by_diagonal(w, w);
+    std::transform(w, w + length(), w, [](T d) { return std::abs(d); });
+    loops_.scale(kernels::power_of_two_scale(loops_.largest_magnitude(w, length())), w, w, length());
+  }
+  /// z = w v, entry by entry; returns v·z.
+  Scalar weigh(const T* w, const T* v, Vector z) const {
+    std::transform(w, w + length(), v, z, std::multiplies<T>());
+    return dot(v, z);
+  }
   /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
   /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
   void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
@@ -130,8 +153,13 @@ class SampleSpace {
     return loops_.multi_axpy(T(-1), h, v.data(), count, w, length());
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x,
-                       bool /*preconditioned*/) {
-    loops_.multi_axpy(T(1), y.data(), v.data(), count, x, length());
+                       Preconditioner preconditioner) {
+    const bool plain = preconditioner == Preconditioner::kNone;
+    if (!plain) fill_zero(scratch());
+    loops_.multi_axpy(T(1), y.data(), v.data(), count, plain ? x : scratch(), length());
+    if (plain) return;
+    kernel_->divide_by_diagonal(scratch(), scratch());
+    add(scratch(), x);
   }
   /// Whether w, of which `left2` is left beside the `taken2` that went along the basis, needs another
   /// pass: each takes a share of the digits away, and three may be missing.

@@ -17,7 +17,8 @@ SolveInfo empty_info(const at::Tensor& b) {
 /// What an iteration takes of a core for each unknown, in nanoseconds; in GMRES a product of a cycle.
 double cost_per_unknown(Method method) {
   if (method == Method::kJacobi || method == Method::kChebyshev) return 0.1;
-  return method == Method::kGmres ? 0.8 : 0.3;
+  if (is_gmres(method)) return 0.8;
+  return method == Method::kConjugateGradientDiagonal ? 0.6 : 0.3;
 }
 
 template <class T, class Parameters>
@@ -49,7 +50,7 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
   const double products = static_cast<double>(iterations) *
-                          static_cast<double>(method == Method::kGmres ? std::min(restart, unknowns) : 1);
+                          static_cast<double>(is_gmres(method) ? std::min(restart, unknowns) : 1);
   const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
                       (std::min(products, 1000.0) + 4.0);
   const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));

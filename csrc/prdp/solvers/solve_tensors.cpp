@@ -9,13 +9,6 @@ namespace prdp {
 
 namespace {
 
-/// Power of two per sample that brings its largest magnitude to the order of one.
-at::Tensor power_of_two_scale(const at::Tensor& magnitude) {
-  const int limit = magnitude.scalar_type() == at::kFloat ? 126 : 1022;
-  const auto exponent = std::get<1>(at::frexp(magnitude)).sub(1).clamp(-limit, limit);
-  return at::ldexp(at::ones_like(magnitude), exponent.neg());
-}
-
 /// Says of each sample whether it is settled before iterating, and how; MAX_ITER: it is not.
 std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
                                            const at::Tensor& magnitude) {
@@ -30,7 +23,7 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
   if (method == Method::kChebyshev) a.jacobi_radius();
   // The last mark holds: the order is that of the CPU loops, from the end.
   mark(magnitude.eq(0), SolveStatus::kConverged);
-  if (method == Method::kJacobi) {
+  if (divides_by_diagonal(method)) {
     const auto zero = a.diagonal().eq(0);
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }

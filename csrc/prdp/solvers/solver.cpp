@@ -11,11 +11,13 @@ namespace {
 template <class Enum, size_t N>
 using Names = std::array<std::pair<Enum, std::string_view>, N>;
 
-constexpr Names<Method, 7> kMethods{{{Method::kJacobi, "jacobi"},
+constexpr Names<Method, 9> kMethods{{{Method::kJacobi, "jacobi"},
                                      {Method::kChebyshev, "chebyshev"},
                                      {Method::kSteepestDescent, "steepest_descent"},
                                      {Method::kConjugateGradient, "cg"},
+                                     {Method::kConjugateGradientDiagonal, "cg_diagonal"},
                                      {Method::kGmres, "gmres"},
+                                     {Method::kGmresDiagonal, "gmres_diagonal"},
                                      {Method::kGmresStokes, "gmres_stokes"},
                                      {Method::kDirect, "direct"}}};
 constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
@@ -63,6 +65,22 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
 }
 
 }  // namespace
+
+CG::operator Solver() const {
+  TORCH_CHECK_VALUE(preconditioner != Preconditioner::kStokes,
+                    "CG: preconditioner must be kNone or kDiagonal; kStokes is for GMRES");
+  const bool diagonal = preconditioner == Preconditioner::kDiagonal;
+  return {diagonal ? Method::kConjugateGradientDiagonal : Method::kConjugateGradient, max_iter, rtol};
+}
+
+GMRES::operator Solver() const {
+  switch (preconditioner) {
+    case Preconditioner::kNone: break;
+    case Preconditioner::kDiagonal: return {Method::kGmresDiagonal, max_iter, rtol, restart};
+    case Preconditioner::kStokes: return {Method::kGmresStokes, max_iter, rtol, restart};
+  }
+  return {Method::kGmres, max_iter, rtol, restart};
+}
 
 void Solver::check(const char* who) const {
   check_budget(who, "", max_iter, rtol);

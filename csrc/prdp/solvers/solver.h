@@ -12,10 +12,26 @@ enum class Method {
   kChebyshev,
   kSteepestDescent,
   kConjugateGradient,
+  kConjugateGradientDiagonal,
   kGmres,
+  kGmresDiagonal,
   kGmresStokes,
   kDirect
 };
+
+/// What CG and GMRES may be preconditioned by: the diagonal of A, or a Navier-Stokes step without winds.
+enum class Preconditioner { kNone, kDiagonal, kStokes };
+
+/// Methods that divide by the diagonal, and refuse an operator with a zero on it.
+constexpr bool divides_by_diagonal(Method m) {
+  return m == Method::kJacobi || m == Method::kConjugateGradientDiagonal || m == Method::kGmresDiagonal;
+}
+constexpr bool is_conjugate_gradient(Method m) {
+  return m == Method::kConjugateGradient || m == Method::kConjugateGradientDiagonal;
+}
+constexpr bool is_gmres(Method m) {
+  return m == Method::kGmres || m == Method::kGmresDiagonal || m == Method::kGmresStokes;
+}
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -50,21 +66,21 @@ struct SteepestDescent {
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kSteepestDescent, max_iter, rtol}; }
 };
+/// For symmetric definite operators. Preconditioner: kNone or kDiagonal; another one raises ValueError.
 struct CG {
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol}; }
+  Preconditioner preconditioner = Preconditioner::kNone;
+  operator Solver() const;
 };
-/// Restarted; max_iter counts cycles. With `stokes`, preconditioned by a Navier-Stokes step without
-/// winds, for NavierStokes alone; it runs in plain tensor operations.
+/// Restarted; max_iter counts cycles. Preconditioned from the right; kStokes is for NavierStokes alone
+/// and runs in plain tensor operations.
 struct GMRES {
   int64_t restart = kDefaultRestart;
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  bool stokes = false;
-  operator Solver() const {
-    return {stokes ? Method::kGmresStokes : Method::kGmres, max_iter, rtol, restart};
-  }
+  Preconditioner preconditioner = Preconditioner::kNone;
+  operator Solver() const;
 };
 /// The cheapest exact method of the operator; an iteration is one direct solve, those after the
 /// first refine its result.

@@ -18,7 +18,7 @@ const std::vector<StatusText>& solve_statuses() {
        "a number left the range of the dtype; float64 or another method would help"},
       {S::kBreakdown, "BREAKDOWN",
        "the operator is singular, or this method does not fit it"},
-      {S::kZeroDiagonal, "ZERO_DIAGONAL", "Jacobi divides by the diagonal; take another method"},
+      {S::kZeroDiagonal, "ZERO_DIAGONAL", "this method divides by the diagonal; take another one"},
       {S::kInconsistent, "INCONSISTENT",
        "the right-hand side lies outside the range of a singular operator"},
       {S::kNonfiniteInput, "NONFINITE_INPUT", "the right-hand side holds NaN or Inf"},

@@ -2,6 +2,8 @@
 
 #include <limits>
 
+#include "prdp/operators/tensors.h"
+
 namespace prdp {
 
 namespace {
@@ -32,6 +34,28 @@ TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states, bool r
 }
 
 double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
+
+const at::Tensor& TensorSpace::diagonal() {
+  if (!diagonal_.defined()) {
+    const auto d = a_.diagonal().to(b_.options());
+    diagonal_ = at::where(d.eq(0), at::ones_like(d), d);
+  }
+  return diagonal_;
+}
+
+void TensorSpace::inverse_diagonal(Vector& w) {
+  const auto inverse = diagonal().abs().reciprocal().expand_as(b_);
+  w = inverse * power_of_two_scale(inverse.detach().amax(all_but_batch_, /*keepdim=*/true));
+}
+
+TensorSpace::Vector TensorSpace::precondition(const Vector& v, Preconditioner preconditioner) {
+  switch (preconditioner) {
+    case Preconditioner::kNone: break;
+    case Preconditioner::kDiagonal: return v / diagonal();
+    case Preconditioner::kStokes: return a_.precondition(v, false);
+  }
+  return v;
+}
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   const auto solution = a_.solve_directly(r);

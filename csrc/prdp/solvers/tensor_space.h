@@ -7,6 +7,7 @@
 #include "prdp/operators/operator.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/iterate.h"
+#include "prdp/solvers/solver.h"
 
 namespace prdp {
 
@@ -47,17 +48,19 @@ class TensorSpace {
     return dot(r, r);
   }
 
-  void apply(const Vector& v, Vector& out, bool preconditioned = false) {
+  void apply(const Vector& v, Vector& out, Preconditioner preconditioner = Preconditioner::kNone) {
     count();
-    out = a_.apply(preconditioned ? a_.precondition(v, false) : v);
+    out = a_.apply(precondition(v, preconditioner));
   }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
     apply(v, out);
     return {dot(v, out), dot(out, out)};
   }
-  void divide_by_diagonal(const Vector& b, Vector& c) {
-    diagonal_ = a_.diagonal().to(b_.options());
-    c = b / diagonal_;
+  void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
+  void inverse_diagonal(Vector& w);
+  Scalar weigh(const Vector& w, const Vector& v, Vector& z) const {
+    z = w * v;
+    return dot(v, z);
   }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
     for (int64_t s = 0; s < n; ++s) {
@@ -68,7 +71,7 @@ class TensorSpace {
   Scalar measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega) {
     const auto change = jacobi_change(c, x);
     next = swept(x, change, next, omega);
-    const auto r = diagonal_ * change;
+    const auto r = diagonal() * change;
     return dot(r, r);
   }
   Scalar radius2() const { return a_.jacobi_radius().square(); }
@@ -96,10 +99,10 @@ class TensorSpace {
     return dot(w.detach(), w.detach());
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
-                       bool preconditioned) const {
+                       Preconditioner preconditioner) {
     auto sum = y[0] * v[0];
     for (int64_t i = 1; i < count; ++i) sum = sum + y[i] * v[i];
-    x = keep_frozen(x + (preconditioned ? a_.precondition(sum, false) : sum), x);
+    x = keep_frozen(x + precondition(sum, preconditioner), x);
   }
   bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
@@ -139,8 +142,12 @@ class TensorSpace {
   Vector jacobi_change(const Vector& c, const Vector& x) {
     Vector product;
     apply(x, product);
-    return c - product / diagonal_;
+    return c - product / diagonal();
   }
+  /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
+  const at::Tensor& diagonal();
+  /// M⁻¹ v
+  Vector precondition(const Vector& v, Preconditioner preconditioner);
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;

@@ -1,0 +1,60 @@
+#pragma once
+#include <cstdint>
+#include <tuple>
+
+namespace prdp {
+
+/// Conjugate gradients for symmetric definite operators of either sign, preconditioned by the magnitude of
+/// the diagonal: z = |D|⁻¹ r, α = r·z / p·Ap; u += α p; r -= α A p; p ← z + β p. The residual that it is
+/// judged by is r itself.
+template <class Space>
+class PreconditionedConjugateGradientMethod {
+ public:
+  static constexpr bool kHasRecursiveResidual = true;
+
+  explicit PreconditionedConjugateGradientMethod(Space& space)
+      : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()),
+        z_(space.vector()), weights_(space.vector()) {}
+
+  void start() {
+    space_.fill_zero(x);
+    space_.inverse_diagonal(weights_);
+    space_.copy(space_.b(), r_);
+    rr_ = space_.b2();
+    rz_ = pp_ = space_.weigh(weights_, r_, z_);
+    space_.copy(z_, p_);
+  }
+  void step() {
+    space_.apply(p_, q_);
+    const auto qq = space_.weigh(weights_, q_, z_);
+    alpha_ = space_.step_length(rz_, space_.dot(p_, q_), pp_, qq);
+    rr_ = space_.descend(alpha_, p_, q_, x, r_);
+    const auto rz = space_.weigh(weights_, r_, z_);
+    beta_ = space_.ratio(rz, rz_);
+    space_.xpby(z_, beta_, p_);
+    pp_ = rz + beta_ * beta_ * pp_;  // r and p before are orthogonal
+    rz_ = rz;
+  }
+  auto residual2() const { return rr_; }
+  auto recompute_residual() {
+    rr_ = space_.residual(x, r_);
+    rz_ = space_.weigh(weights_, r_, z_);
+    space_.copy(z_, p_);
+    space_.assign(rz_, pp_);
+    return rr_;
+  }
+
+  /// What the next iteration starts from, beside x; resume() once it has been put back.
+  auto carried() { return std::tie(r_, p_, rr_, rz_, pp_); }
+  void resume(int64_t) {}
+
+  typename Space::Vector x;
+
+ private:
+  Space& space_;
+  typename Space::Vector r_, p_, q_, z_, weights_;  // residual; direction; A p; |D|⁻¹ r; |D|⁻¹, scaled
+  typename Space::Scalar rr_{}, rz_{}, pp_{};       // r·r, r·z, p·|D|p
+  typename Space::Scalar alpha_{}, beta_{};
+};
+
+}  // namespace prdp
