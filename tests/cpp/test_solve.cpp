@@ -14,6 +14,7 @@ using prdp::Method;
 const std::vector<std::pair<Method, const char*>> kMethods{{Method::kJacobi, "jacobi"},
                                                            {Method::kSteepestDescent, "steepest_descent"},
                                                            {Method::kConjugateGradient, "cg"},
+                                                           {Method::kConjugateGradientDiagonal, "cg_diagonal"},
                                                            {Method::kDirect, "direct"}};
 
 prdp::OperatorSpec heat(std::vector<int64_t> shape) {
@@ -84,6 +85,17 @@ TEST(Solve, CountsProductsWithTheOperator) {
   EXPECT_EQ(products(Method::kConjugateGradient, 10, 0.0), 11);
   EXPECT_EQ(products(Method::kDirect, 1, 0.0), 1);
   EXPECT_EQ(products(Method::kJacobi, 10, 1e-30), 11);
+}
+
+TEST(Solve, PreconditionersAreMethodsOfTheirOwn) {
+  using prdp::Preconditioner;
+  const auto of = [](const prdp::Solver& solver) { return prdp::name(solver.method); };
+  EXPECT_EQ(of(prdp::CG{.max_iter = 3}), "cg");
+  EXPECT_EQ(of(prdp::CG{.max_iter = 3, .preconditioner = Preconditioner::kDiagonal}), "cg_diagonal");
+  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3}), "gmres");
+  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3, .preconditioner = Preconditioner::kDiagonal}), "gmres_diagonal");
+  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3, .preconditioner = Preconditioner::kStokes}), "gmres_stokes");
+  EXPECT_THROW(of(prdp::CG{.max_iter = 3, .preconditioner = Preconditioner::kStokes}), c10::ValueError);
 }
 
 TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
