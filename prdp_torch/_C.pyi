@@ -12,6 +12,7 @@ DEFAULT_RESTART: int
 CHECKPOINT_SQRT: int
 SOLVE_STATUSES: dict[str, int]
 PRDP_DEFAULTS: dict[str, float | int | None]
+TOLERANCE_DEFAULTS: dict[str, float | int]
 
 class RegisteredProducts:
     def __init__(
@@ -63,7 +64,13 @@ def solve_with_tensors(
     restart: int = ...,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]: ...
 
-class PRDPController:
+class Controller:
+    @property
+    def max_iter(self) -> int: ...
+    @property
+    def warning(self) -> str | None: ...
+
+class PRDPController(Controller):
     def __init__(
         self,
         *,
@@ -75,18 +82,24 @@ class PRDPController:
         increment: int,
         maximum: int | None,
         growth: float,
+        adjoint_ratio: float | None,
     ) -> None: ...
-    @property
-    def max_iter(self) -> int: ...
     @property
     def settings(self) -> dict[str, float | int | None]: ...
 
-class LinearSchedule:
-    def __init__(self, *, initial: int, increment: int, maximum: int) -> None: ...
+class ToleranceController(Controller):
+    def __init__(self, *, ratio: float, adjoint_ratio: float, floor: float, maximum: int) -> None: ...
     @property
-    def max_iter(self) -> int: ...
+    def rtol(self) -> float: ...
     @property
-    def settings(self) -> dict[str, int]: ...
+    def adjoint_rtol(self) -> float: ...
+    @property
+    def settings(self) -> dict[str, float | int]: ...
+
+class LinearSchedule(Controller):
+    def __init__(self, *, initial: int, increment: int, maximum: int, adjoint_ratio: float | None) -> None: ...
+    @property
+    def settings(self) -> dict[str, float | int | None]: ...
 
 class Physics:
     equation: str

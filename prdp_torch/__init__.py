@@ -1,9 +1,9 @@
 """Progressively Refined Differentiable Physics for PyTorch.
 
 Differentiable PDE steps whose linear solves may stop early, and a controller that decides how early:
-`Heat`, `Poisson`, `Burgers`, `NavierStokes` and `linear_solve` solve, `PRDPController` refines. Tensors
-are (batch, channel, *shape); see the README for a first program and docs/ for the discretisation, the
-derivatives and what a solve says when it fails.
+`Heat`, `Poisson`, `Burgers`, `NavierStokes` and `linear_solve` solve, `ToleranceController` and
+`PRDPController` refine. Tensors are (batch, channel, *shape); see the README for a first program and docs/
+for the discretisation, the derivatives and what a solve says when it fails.
 """
 
 from prdp_torch import _load
@@ -11,7 +11,7 @@ from prdp_torch import _load
 _load.check_torch()
 
 from prdp_torch import _C, fields, operators  # noqa: E402
-from prdp_torch.controller import LinearSchedule, PRDPController  # noqa: E402
+from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
@@ -38,6 +38,7 @@ __all__ = [
     "SolveStatus",
     "SteepestDescent",
     "Stepper",
+    "ToleranceController",
     "check_operator",
     "fields",
     "linear_solve",

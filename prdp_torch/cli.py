@@ -74,6 +74,7 @@ def scenes():
 @command
 def train(
     scene: SceneName,
+    auto: Annotated[bool, typer.Option("--auto", help="A tolerance tied to the error; nothing to choose.")] = False,
     prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings; the default.")] = False,
     constant: Annotated[int | None, typer.Option(**COUNT, metavar="K", help="Constant K.")] = None,
     schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
@@ -89,6 +90,7 @@ def train(
     chosen = [
         name
         for name, given in (
+            ("--auto", auto),
             ("--prdp", prdp),
             ("--constant", constant is not None),
             ("--schedule", schedule is not None),
@@ -97,8 +99,8 @@ def train(
         if given
     ]
     if len(chosen) > 1:
-        raise ValueError(f"give one of --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
-    refinement = Refinement.prdp(loaded)
+        raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
+    refinement = Refinement.auto() if auto else Refinement.prdp(loaded)
     if constant is not None:
         refinement = Refinement.constant(constant)
     elif direct:
@@ -107,7 +109,7 @@ def train(
         refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment()
-    diverged = {}
+    diverged, warnings = {}, {}
     with records.alone_in([folder / refinement.label]), _progress() as progress:
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
@@ -128,7 +130,11 @@ def train(
             )
             if "diverged" in curves:
                 diverged[seed] = curves["diverged"]
+            if "warning" in curves:
+                warnings[seed] = curves["warning"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)
+    for seed, what in warnings.items():
+        print(f"prdp: warning: seed {seed}, {what}", file=sys.stderr)
     for seed, why in diverged.items():
         print(f"prdp: seed {seed} diverged, {why}", file=sys.stderr)
     if diverged:
@@ -144,7 +150,7 @@ def compare(
     backward: Backward = None,
     intervals: Intervals = None,
 ):
-    """Compare converged, exact, PRDP and a sweep of constant K: table, records and an HTML report."""
+    """Compare converged, exact, auto, PRDP and a sweep of constant K: table, records and an HTML report."""
     loaded = _load(scene, backward, intervals)
     folder = records.prepare_folder(out or Path("runs") / loaded.name)
     seeds = seeds or loaded.compare.seeds
@@ -166,7 +172,8 @@ def compare(
         shown = trajectories.collect(loaded, rows, folder, _bar(progress, "pictures, steps"))
     report.write(loaded, rows, table, shown, folder)
     _print_table(loaded, table)
-    console.print(f"\n{report.headline(loaded, table)}\nreport: {folder / 'report.html'}", soft_wrap=True)
+    said = [report.headline(loaded, table), *report.failures(loaded, table), f"report: {folder / 'report.html'}"]
+    console.print("\n" + "\n".join(said), soft_wrap=True)
 
 
 @command
@@ -234,14 +241,13 @@ def _bar(progress, name):
 
 def _print_table(scene, table):
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    # Eighty columns hold all but one; the report has it.
     names = [column.short for column in report.columns(scene)]
-    kept = [i for i, name in enumerate(names) if name != "taken"]
+    kept = report.in_terminal(scene)  # the report has the others
     for i in kept:
         shown.add_column(names[i], justify="right" if i else "left", no_wrap=True)
     for entry in table:
         row = report.cells(scene, entry)
-        shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] == "prdp" else None)
+        shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] in ("auto", "prdp") else None)
     console.print(shown)
     console.print(report.notes(scene, kept))
 

@@ -1,4 +1,4 @@
-"""`prdp compare`: the converged solver, the exact one, PRDP and a sweep of constant K, over seeds."""
+"""`prdp compare`: the converged solver, the exact one, auto, PRDP and a sweep of constant K, over seeds."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ class Row:
 
     label: str
     title: str
-    kind: str  # "converged", "constant", "prdp", "growth", "schedule", "direct"
+    kind: str  # "converged", "constant", "auto", "prdp", "growth", "schedule", "direct"
     refinement: Refinement
     k: int = 0
     curves: list = field(default_factory=list)
@@ -53,16 +53,28 @@ class Row:
     def last_k(self):
         return self.stack("max_iter")[:, -1]
 
+    def taken_per_solve(self):
+        """Iterations that a solve took in the mean, one row a seed and one column an interval; NaN where none
+        was run."""
+        solves = self.stack("budget") / np.maximum(1.0, self.stack("max_iter"))
+        return self.stack("iterations") / np.where(solves > 0, solves, np.nan)
+
+    def warnings(self):
+        """What the controllers said in the end, of every seed that has something to say."""
+        return [c["warning"] for c in self.curves if "warning" in c]
+
     def reaches(self, target):
         return (self.stack("metric") <= target).any(1)
 
 
 def rows_of(scene):
-    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, PRDP, constant K."""
+    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, auto, PRDP and
+    constant K."""
     converged = scene.max_iter
     rows = [Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged)]
     if scene.physics.direct_is_cheap:
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
+    rows.append(Row("auto", "auto", "auto", Refinement.auto()))
     rows.append(Row("prdp", "PRDP", "prdp", Refinement.prdp(scene)))
     if scene.compare.growth is not None:
         growth = scene.compare.growth
@@ -152,28 +164,44 @@ def _finished(path, scene, checkpoint):
 def summarise(scene, rows):
     """The table of a comparison: one dict a row, means over seeds; savings against the first row."""
     target = scene.compare.target
-    base = max(1.0, rows[0].total("budget", target).mean())  # a run that diverged at once has none
-    table = []
-    for row in rows:
-        final = row.final()
-        budget = row.total("budget", target).mean()
-        table.append(
-            {
-                "label": row.label,
-                "title": row.title,
-                "kind": row.kind,
-                "diverged": row.diverged(),
-                "metric": float(final.mean()),
-                "metric_std": float(final.std(ddof=1)) if len(final) > 1 else 0.0,
-                "last_k": float(row.last_k().mean()),
-                "intervals": float(row.counted(target).mean()),
-                "reaches_target": None if target is None else bool(row.reaches(target).all()),
-                "budget": float(budget),
-                "saved": float(1 - budget / base),
-                "saved_by_incomplete_convergence": float(max(0.0, 1 - row.last_k().mean() / scene.max_iter)),
-                "iterations": float(row.total("iterations", target).mean()),
-                "operator_applications": float(row.total("operator_applications", target).mean()),
-                "seconds": float(row.total("seconds", target).mean()),
-            }
-        )
+    table = [_entry(scene, row, target) for row in rows]
+    base = table[0]
+    for entry in table:
+        entry["as_good"] = _as_good(entry, base)
+        # K is a cap to auto, so it has no use of an allowance; the products are everybody's.
+        entry["saved"] = None if entry["kind"] == "auto" else 1 - entry["budget"] / max(1.0, base["budget"])
+        entry["products_saved"] = 1 - entry["operator_applications"] / max(1.0, base["operator_applications"])
     return table
+
+
+def _entry(scene, row, target):
+    final = row.final()
+    costs = ("budget", "iterations", "operator_applications", "adjoint_applications", "seconds")
+    warnings = row.warnings()
+    auto = row.kind == "auto"
+    return {
+        "label": row.label,
+        "title": row.title,
+        "kind": row.kind,
+        "seeds": len(row.curves),
+        "diverged": row.diverged(),
+        "warnings": len(warnings),
+        "warning": warnings[0] if warnings else None,
+        "metric": float(final.mean()),
+        "metric_std": float(final.std(ddof=1)) if len(final) > 1 else 0.0,
+        "last_k": float((row.taken_per_solve()[:, -1] if auto else row.last_k()).mean()),
+        "intervals": float(row.counted(target).mean()),
+        "reaches_target": None if target is None else bool(row.reaches(target).all()),
+        "saved_by_incomplete_convergence": float(max(0.0, 1 - row.last_k().mean() / scene.max_iter)),
+        **{cost: float(row.total(cost, target).mean()) for cost in costs},
+    }
+
+
+def _as_good(entry, base):
+    """Whether a row ends as well as the converged one: at its target where both have one to reach, else
+    within its spread. A tenth of the error counts as its spread where seeds show less."""
+    if entry["diverged"] or not math.isfinite(base["metric"]):
+        return not entry["diverged"]
+    if entry["reaches_target"] is not None and base["reaches_target"]:
+        return entry["reaches_target"]
+    return entry["metric"] <= base["metric"] + max(base["metric_std"], 0.1 * base["metric"])

@@ -1,5 +1,6 @@
-"""Controllers: how many iterations K the solver gets, from one training interval to the next."""
+"""Controllers: how far the solver goes, from one training interval to the next."""
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from prdp_torch import _C, _check
 
 
 class Record(NamedTuple):
-    """One call of `PRDPController.step`."""
+    """One call of `step` of a `PRDPController`."""
 
     metric: float
     smoothed: float
@@ -17,10 +18,27 @@ class Record(NamedTuple):
     max_iter: int
     """K before the decision."""
     refined: bool
+    error: float | None = None
+    """The relative error that `step` was given."""
+    residual: float | None = None
+    """‖b - A u‖ / ‖b‖ where the attached solves ended, the mean over the samples."""
+
+
+class ToleranceRecord(NamedTuple):
+    """One call of `step` of a `ToleranceController`."""
+
+    error: float
+    smallest: float
+    """The smallest error so far."""
+    rtol: float
+    """Before the decision."""
+    tightened: bool
+    residual: float | None = None
+    """As of a `Record`."""
 
 
 class _Attached:
-    """Hands K on to the steppers."""
+    """What controllers share: they hand K and tolerances on to the steppers, and ask them how the solves went."""
 
     def _take(self, steppers):
         who = type(self).__name__
@@ -28,15 +46,34 @@ class _Attached:
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
         for stepper in self.steppers:
-            if not hasattr(stepper, "max_iter"):
-                raise TypeError(f"{who}: a stepper must have max_iter, got {stepper!r}")
+            for name, value in self._budget.items():
+                if value is not None and not hasattr(stepper, name):
+                    raise TypeError(f"{who}: a stepper must have {name}, got {stepper!r}")
+        self._push()
 
     def _push(self):
+        budget = {name: value for name, value in self._budget.items() if value is not None}
         for stepper in self.steppers:
-            stepper.max_iter = self.max_iter
+            for name, value in budget.items():
+                setattr(stepper, name, value)
 
-    def _solves_converge(self):
-        return bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
+    def _decide(self, metric, converged, error):
+        """One step of the compiled controller, and what follows from it for the steppers."""
+        if converged is None:
+            converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
+        refined = self._step(metric, bool(converged), self._residual(), error)
+        self._push()
+        return refined
+
+    def _residual(self):
+        """Where the last solves ended: the mean over the samples, of several steppers the largest."""
+        infos = [info for stepper in self.steppers if (info := getattr(stepper, "info", None)) is not None]
+        residuals = [float(info.residual.double().mean()) for info in infos]
+        return max((r for r in residuals if math.isfinite(r)), default=None)
+
+    def state_dict(self):
+        """What `load_state_dict` needs to continue exactly, as plain values."""
+        return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
 
     def load_state_dict(self, state):
         """Continue exactly where `state_dict()` was taken. ValueError for anything else."""
@@ -46,20 +83,32 @@ class _Attached:
         self._load(**state)
         self._push()
 
+    def __reduce__(self):
+        return _remade, (type(self), self.steppers, self.settings, self.state_dict())
 
-def _number(who, metric):
+
+def _remade(kind, steppers, settings, state):
+    """A copy of a controller."""
+    controller = kind(steppers, **settings)
+    controller.load_state_dict(state)
+    return controller
+
+
+def _number(who, name, value):
     """A metric as a float; a tensor of one element is one."""
-    if isinstance(metric, torch.Tensor) and metric.numel() == 1:
-        return metric.item()
-    return _check.real(who, "metric", metric)
+    if isinstance(value, torch.Tensor) and value.numel() == 1:
+        return value.item()
+    return _check.real(who, name, value)
 
 
 def _checked(who, settings, defaults):
-    """The settings over the defaults; a setting is a real number where its default is one."""
+    """The settings over the defaults, each of its default's type; a maximum or ratio may be None where its
+    default is."""
+    whole = {"delta", "window", "initial", "increment", "maximum"}
     for name, value in settings.items():
         if name not in defaults:
             raise TypeError(f"{who}: unknown setting '{name}'; allowed: {', '.join(defaults)}")
-        check = _check.real if isinstance(defaults[name], float) else _check.whole
+        check = _check.whole if name in whole else _check.real
         if value is not defaults[name]:
             check(who, name, value)
     return {**defaults, **settings}
@@ -79,33 +128,32 @@ class PRDPController(_C.PRDPController, _Attached):
         window: of the exponential mean L̃, α = 2/(window + 1); 1 smooths nothing.
         initial, increment, maximum: K₀, ΔK, and a bound (None: none).
         growth: refine to K ← growth·K where that is more than K + increment.
+        adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations; None: what the stepper says.
 
     K stays where every solve of the attached steppers already meets its tolerance.
+    `warning`, of every controller: None, or in words what is wrong if the training ends here, with solves
+    that stop so far from the solution that their own error makes up what is trained.
     Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
     """
 
     def __init__(self, steppers=(), **settings):
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
         self._take(steppers)
-        self._push()
 
-    def step(self, metric, converged=None):
+    def step(self, metric, converged=None, error=None):
         """Take the metric (finite, >= 0; smaller is better) of an interval. True if K was raised.
 
         converged: that the solves meet their tolerance; asked of the steppers where None.
+        error: the relative error of what is trained, as `ToleranceController.step` takes it, where you
+            know it. `warning` compares it with the residual of the solves.
         """
-        converged = self._solves_converge() if converged is None else converged
-        refined = self._step(_number("PRDPController", metric), bool(converged))
-        self._push()
-        return refined
+        error = None if error is None else _number("PRDPController", "error", error)
+        return self._decide(_number("PRDPController", "metric", metric), converged, error)
 
     @property
     def history(self):
         """Every call of `step` as a `Record`."""
         return [Record(*row) for row in self._history]
-
-    def state_dict(self):
-        return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
 
     def __repr__(self):
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items() if value is not None)
@@ -113,25 +161,80 @@ class PRDPController(_C.PRDPController, _Attached):
         return f"PRDPController(max_iter={self.max_iter}, smoothed metric {smoothed}; {settings})"
 
 
-class LinearSchedule(_C.LinearSchedule, _Attached):
-    """The manual schedule: K = initial + increment·(calls of step), at most `maximum`; increment = 0
-    is a constant K. The same interface as `PRDPController`; the metric is not looked at."""
+class ToleranceController(_C.ToleranceController, _Attached):
+    """Tie the tolerance of the solves to the error of what is trained: nothing to tune, no K to choose.
 
-    def __init__(self, steppers=(), *, initial, increment, maximum):
-        settings = {"initial": initial, "increment": increment, "maximum": maximum}
-        super().__init__(**{name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()})
+    While a network is wrong by a fifth, a solve that is right to a fiftieth serves it; as the error falls,
+    the solves follow. Take this one unless you have tuned `PRDPController` for your problem
+    (docs/refinement.md compares them).
+
+    Args:
+        steppers: their `rtol`, `adjoint_rtol`, `max_iter` and `adjoint_max_iter` are set now and after
+            every step; may be empty, then read `.rtol`, `.adjoint_rtol` and `.max_iter`.
+        ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1).
+        adjoint_ratio: the adjoint solve's rtol is rtol / adjoint_ratio, at most 1/2, and its K is
+            ⌈adjoint_ratio·K⌉; in (0, 1].
+        floor: no rtol is smaller; > 0. In float32 about 1e-5 is what can be reached.
+        maximum: K, a cap that a solve should never meet; >= 1.
+
+    Under `torch.compile` a step compiles again for each new rtol, and goes on uncompiled after
+    `torch._dynamo.config.recompile_limit` of them (8): raise it, or leave this step uncompiled.
+
+    Raises ValueError for a setting or an error out of range, TypeError for one of a wrong type.
+
+        heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
+        controller = prdp.ToleranceController([heat])
+        # after each epoch: controller.step(relative_error)
+
+    Source: the forcing term of inexact Newton methods (Eisenstat and Walker, SIAM J. Sci. Comput. 17, 1996)
+    and of optimisation with approximate gradients (Pedregosa, ICML 2016).
+    """
+
+    def __init__(self, steppers=(), **settings):
+        super().__init__(**_checked("ToleranceController", settings, _C.TOLERANCE_DEFAULTS))
         self._take(steppers)
-        self._push()
 
-    def step(self, metric=0.0, converged=None):
-        """Go one step of the schedule. True if K was raised."""
-        raised = self._step(_number("LinearSchedule", metric), bool(converged))
-        self._push()
-        return raised
+    def step(self, error, converged=None):
+        """Take the relative error of what is trained (finite, >= 0) after an interval. True if rtol became
+        smaller.
 
-    def state_dict(self):
-        return {"max_iter": self.max_iter}
+        error: ‖u - u_ref‖ / ‖u_ref‖ on validation data, which is the square root of a normalised squared
+            metric. In an inverse problem the relative misfit, ‖simulated - observed‖ / ‖observed‖.
+        converged: not looked at; for the interface of `PRDPController`.
+        """
+        return self._decide(_number("ToleranceController", "error", error), converged, None)
+
+    @property
+    def history(self):
+        """Every call of `step` as a `ToleranceRecord`."""
+        before = [math.inf, *(smallest for _, smallest, *_ in self._history)]
+        return [
+            ToleranceRecord(error, smallest, self._rtol_for(earlier), tightened, residual)
+            for earlier, (error, smallest, _, tightened, _, residual) in zip(before, self._history, strict=False)
+        ]
 
     def __repr__(self):
-        settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
+        settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items())
+        return f"ToleranceController(rtol={self.rtol:.1e}, adjoint_rtol={self.adjoint_rtol:.1e}; {settings})"
+
+
+class LinearSchedule(_C.LinearSchedule, _Attached):
+    """The manual schedule: K = initial + increment·(calls of step), at most `maximum`; increment = 0
+    is a constant K. The same interface as `PRDPController`; the metric is not looked at. `adjoint_ratio`
+    as there."""
+
+    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None):
+        settings = {"initial": initial, "increment": increment, "maximum": maximum}
+        settings = {name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()}
+        adjoint_ratio = _check.optional(_check.real, "LinearSchedule", "adjoint_ratio", adjoint_ratio)
+        super().__init__(**settings, adjoint_ratio=adjoint_ratio)
+        self._take(steppers)
+
+    def step(self, metric=0.0, converged=None, error=None):
+        """Go one step of the schedule. True if K was raised."""
+        error = None if error is None else _number("LinearSchedule", "error", error)
+        return self._decide(_number("LinearSchedule", "metric", metric), converged, error)
+
+    def __repr__(self):
+        settings = ", ".join(f"{name}={value}" for name, value in self.settings.items() if value is not None)
         return f"LinearSchedule(max_iter={self.max_iter}; {settings})"

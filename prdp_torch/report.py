@@ -28,19 +28,25 @@ def columns(scene):
     if target is not None:
         reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
     return [
-        Column("", "", "Converged: K_ε, the K that the scene takes for converged."),
+        Column("", "", "Converged: K_ε, the K that the scene takes for converged. !: the controller warns, see below."),
         Column("error", f"final {error}", "± one standard deviation over the seeds." if network else ""),
-        Column("last K", "last K"),
+        Column("last K", "last K", "last K: of auto, what its last solves took."),
         *reached,
         Column(
-            "allowed", f"iterations allowed{until}", f"allowed: K summed over the solves{until}, the paper's count."
+            "", f"iterations allowed{until}", f"Iterations allowed: K summed over the solves{until}, the paper's count."
         ),
-        Column("saved", "saved", "saved: of the converged run's."),
-        Column("taken", "iterations taken", "taken: fewer where a solve meets its tolerance before K."),
+        Column("", "of these saved"),
+        Column("", "iterations taken", "Fewer are taken where a solve meets its tolerance before K."),
+        Column("forward", "forward products"),
         Column(
-            "A·v",
-            "products with A",
-            "A·v: products with A, those of the adjoint solves included; like the iterations, per sample of a batch.",
+            "adjoint",
+            "adjoint products",
+            "forward, adjoint: products with A of the solves; like the iterations, per sample of a batch.",
+        ),
+        Column(
+            "saved",
+            "products saved",
+            "saved: of the converged run's products, where the error is as good: within its spread, or a tenth.",
         ),
         Column("s", "seconds of training"),
     ]
@@ -51,20 +57,32 @@ def cells(scene, entry):
     spread = f" ±{entry['metric_std']:.0e}" if entry["metric_std"] else ""
     exact = entry["kind"] == "direct"
     missed = entry["reaches_target"] is False
-    unsaved = exact or missed or entry["diverged"] or entry["kind"] == "converged"
+    plain = exact or entry["kind"] == "converged"
+    forward = entry["operator_applications"] - entry["adjoint_applications"]
     row = [
-        entry["title"],
+        entry["title"] + (" !" if entry["warning"] else ""),
         f"{entry['diverged']} diverged" if entry["diverged"] else f"{entry['metric']:.2e}{spread}",
         "–" if exact else f"{entry['last_k']:.1f}".removesuffix(".0"),
-        "–" if exact else f"{entry['budget']:,.0f}",
-        "–" if unsaved else f"{100 * entry['saved']:.1f} %",
+        "–" if exact or entry["saved"] is None else f"{entry['budget']:,.0f}",
+        "–" if plain or entry["saved"] is None else _saving(entry, "saved"),
         "–" if exact else f"{entry['iterations']:,.0f}",
-        f"{entry['operator_applications']:,.0f}",
+        f"{forward:,.0f}",
+        f"{entry['adjoint_applications']:,.0f}",
+        "–" if plain else _saving(entry, "products_saved"),
         f"{entry['seconds']:.2f}",
     ]
     if scene.compare.target is not None:
         row.insert(3, "never" if missed else f"{entry['intervals']:.0f}")
     return row
+
+
+def _saving(entry, name):
+    return f"{100 * entry[name]:.1f} %" if entry["as_good"] else "fails"
+
+
+def in_terminal(scene):
+    """The columns that eighty characters hold, by index."""
+    return [i for i, column in enumerate(columns(scene)) if column.short or i == 0]
 
 
 def notes(scene, kept=None):
@@ -73,43 +91,61 @@ def notes(scene, kept=None):
 
 
 def headline(scene, table):
-    """What the comparison shows of PRDP, in a sentence or two, whichever way it went."""
-    by_kind = {entry["kind"]: entry for entry in table}
-    base, prdp = by_kind["converged"], by_kind["prdp"]
-    name = f"K = {scene.max_iter}"
-    if prdp["diverged"] or base["diverged"]:
-        return f"Trainings that diverged: {prdp['diverged']} with PRDP, {base['diverged']} with {name}."
+    """What the comparison shows of auto and of PRDP, in a sentence each, whichever way it went."""
+    base = table[0]
+    tried = [entry for entry in table if entry["kind"] in ("auto", "prdp")]
+    if base["diverged"] or any(entry["diverged"] for entry in tried):
+        counts = [f"{entry['diverged']} with {_short(scene, entry)}" for entry in (*tried[::-1], base)]
+        return f"Trainings that diverged: {', '.join(counts)}."
+    return " ".join(_verdict(scene, base, entry) for entry in tried)
+
+
+def failures(scene, table):
+    """The rows that do not end as well as the converged one, and what controllers warn of; a list of sentences.
+    The sweep of constant K is there to fail at its coarse end: its rows are only marked."""
+    worse = [_short(scene, entry) for entry in table if not entry["as_good"] and not entry["diverged"]]
+    said = []
+    if worse:
+        goal = f"the error of {_short(scene, table[0])}"
+        if table[0]["reaches_target"]:
+            goal = f"an error of {scene.compare.target:g}"
+        said.append(f"Do not reach {goal}: {', '.join(worse)}.")
+    for entry in table:
+        if entry["warning"] and entry["kind"] != "constant":
+            count = f", {entry['warnings']} of {entry['seeds']} seeds" if entry["seeds"] > 1 else ""
+            said.append(f"! {_short(scene, entry)}{count}: {entry['warning']}.")
+    return said
+
+
+def _short(scene, entry):
+    return f"K = {scene.max_iter}" if entry["kind"] == "converged" else entry["title"]
+
+
+def _verdict(scene, base, entry):
+    """How far a row comes and what it saves. Nothing is said of savings where the error is worse or the controller
+    warns."""
+    name, against = _short(scene, entry), _short(scene, base)
     if scene.compare.target is not None:
-        return _to_target(scene, base, prdp, name)
-    change = f"{abs(100 * prdp['saved']):.1f} % {'fewer' if prdp['saved'] >= 0 else 'more'} iterations"
-    allowed = f"PRDP was allowed {change} than {name} throughout"
-    if not base["metric_std"]:
-        return f"{allowed}; its error ends at {prdp['metric']:.2e}, that of {name} at {base['metric']:.2e}."
-    distance = prdp["metric"] - base["metric"]
-    verdict = "within one standard deviation of"
-    if abs(distance) > base["metric_std"]:
-        verdict = f"{'worse' if distance > 0 else 'better'} by more than one standard deviation than"
-    return (
-        f"{allowed}; its final error, {prdp['metric']:.2e}, is {verdict} "
-        f"{base['metric']:.2e} ± {base['metric_std']:.1e} of {name}."
-    )
-
-
-def _to_target(scene, base, prdp, name):
-    """PRDP against the converged run where an error is to be reached."""
-
-    def course(entry):
+        reach = f"an error of {scene.compare.target:g}"
         if not entry["reaches_target"]:
-            return f"did not reach an error of {scene.compare.target:g} in {entry['intervals']:.0f} {scene.unit}s"
-        return (
-            f"reached an error of {scene.compare.target:g} after {entry['intervals']:.0f} {scene.unit}s and "
-            f"{entry['budget']:,.0f} iterations"
-        )
+            return f"{name} does not reach {reach} in {entry['intervals']:.0f} {scene.unit}s."
+        ending = f"reaches {reach} after {entry['intervals']:.0f} {scene.unit}s"
+        if not base["reaches_target"]:
+            return f"{name} {ending}; {against} does not."
+        return f"{name} {ending}, {against} after {base['intervals']:.0f}, {_savings(entry)}."
+    spread = f" ± {base['metric_std']:.1e}" if base["metric_std"] else ""
+    ending = f"{name} ends at an error of {entry['metric']:.2e}, {against} at {base['metric']:.2e}{spread}"
+    if not entry["as_good"]:
+        return f"{ending}: it fails."
+    return f"{ending}; its controller warns." if entry["warning"] else f"{ending}: {_savings(entry)}."
 
-    text = f"PRDP {course(prdp)}, {name} {course(base)}"
-    if prdp["reaches_target"] and base["reaches_target"]:
-        text += f": {abs(100 * prdp['saved']):.1f} % {'fewer' if prdp['saved'] >= 0 else 'more'} iterations"
-    return text + "."
+
+def _savings(entry):
+    def change(share, what):
+        return f"{abs(100 * share):.1f} % {'fewer' if share >= 0 else 'more'} {what}"
+
+    text = change(entry["products_saved"], "products with A")
+    return text if entry["saved"] is None else f"{text}, {change(entry['saved'], 'iterations allowed')}"
 
 
 def _svg(figure):
@@ -137,8 +173,9 @@ def write(scene, rows, table, shown, folder):
         seeds=len(rows[0].curves),
         environment=records.environment(),
         headline=headline(scene, table),
+        failures=failures(scene, table),
         columns=[column.long for column in columns(scene)],
-        cells=[{"kind": entry["kind"], "cells": cells(scene, entry)} for entry in table],
+        cells=[{"entry": entry, "cells": cells(scene, entry)} for entry in table],
         notes=notes(scene),
         charts=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in drawn],
         learned=[{"svg": _svg(figure), "caption": caption} for _, figure, caption in learned],

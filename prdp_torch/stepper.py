@@ -18,6 +18,8 @@ class Stepper(torch.nn.Module):
     Attributes:
         max_iter: K, the solver's budget; set it at any time, by hand or by a controller. A change
             costs nothing, under `torch.compile` neither.
+        rtol, adjoint_rtol: the tolerances; set them at any time as well. Under `torch.compile` every new value
+            compiles once more, up to `torch._dynamo.config.recompile_limit` of them.
         info: `SolveInfo` of the last forward or rollout; None before the first.
         adjoint_info: `SolveInfo` of the last adjoint solve, or rollout of them; None before the first
             backward.

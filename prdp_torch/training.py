@@ -9,19 +9,32 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import _C, fields
-from prdp_torch.controller import LinearSchedule, PRDPController
+from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 from prdp_torch.solve import SolveStatus
 
 
 class Refinement:
-    """How a training chooses K: `label` for the records, `attach` to make the controller."""
+    """How a training decides how far the solver goes.
 
-    def __init__(self, label, attach, direct=False):
+    Args:
+        label: for the records.
+        attach: called with the steppers; sets them up and returns their controller.
+        direct: the exact solver in place of the scene's.
+        watches_error: whether the controller's `step` takes the relative error, not the metric.
+    """
+
+    def __init__(self, label, attach, direct=False, watches_error=False):
         self.label = label
         self.attach = attach
         self.direct = direct
+        self.watches_error = watches_error
+
+    @classmethod
+    def auto(cls):
+        """What fits every scene with nothing chosen for it; docs/refinement.md says why."""
+        return cls("auto", ToleranceController, watches_error=True)
 
     @classmethod
     def prdp(cls, scene, growth=None):
@@ -51,7 +64,8 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
     the solves, of which an update of the task "corrector" has two; iterations and operator applications
-    are per sample of a batch, summed over the solves.
+    are per sample of a batch, summed over the solves, the applications over the adjoint solves as well, whose
+    own are "adjoint_applications". "warning" is there where the controller ends with one.
     A training whose loss or metric is no longer finite stops there: "diverged" says where and why, and the
     curves end with the interval that was lost, with a metric of NaN and no costs.
 
@@ -70,7 +84,7 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
     """
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene.training.intervals, steppers, refinement.attach(steppers), checkpoint)
+    run = _Run(scene.training.intervals, steppers, refinement, checkpoint)
     make_task = _parameters if scene.task == "parameters" else _network
     task = make_task(scene, steppers, seed, network, on_data)
     try:
@@ -89,6 +103,7 @@ class _Task(NamedTuple):
 
     updates: Callable  # the number of the first → an iterator over the losses of an interval's updates
     metric: Callable
+    error: Callable  # the metric → the relative error of what is trained, as far as a user knows it
     state: Callable  # all that the updates change
     load: Callable  # its inverse
 
@@ -96,26 +111,32 @@ class _Task(NamedTuple):
 class _Run:
     """What the tasks share: the intervals, their costs, and when a training is lost."""
 
-    def __init__(self, intervals, steppers, controller, checkpoint):
+    COSTS = (
+        "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "seconds"
+    )  # fmt: skip
+
+    def __init__(self, intervals, steppers, refinement, checkpoint):
         self.intervals = intervals
         self.steppers = steppers
-        self.controller = controller
+        self.controller = refinement.attach(steppers)
+        self.watches_error = refinement.watches_error
         self.checkpoint = checkpoint
-        names = ("update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds")
-        self.curves = {name: [] for name in names}
+        self.curves = {name: [] for name in ("update_loss", "metric", *self.COSTS)}
 
     def go(self, task, saved, on_interval):
         if saved is None:
-            self._observe(task.metric(), 0)
+            self._observe(task, 0)
         else:
             self._restore(task, saved)
             on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
         while self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
-            self._observe(task.metric(), self._done())
+            self._observe(task, self._done())
             if self.checkpoint is not None and self._done() < self.intervals and self.checkpoint.due():
                 self._keep(task)
             on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
+        if self.controller.warning is not None:
+            self.curves["warning"] = self.controller.warning
 
     def _done(self):
         return len(self.curves["seconds"])
@@ -137,18 +158,20 @@ class _Run:
         self.checkpoint.check_length(done, self.intervals)
 
     def _run_interval(self, task, number):
-        k, started, solves = self.controller.max_iter, time.perf_counter(), 0
-        iterations = applications = 0.0
+        k, rtol = self.controller.max_iter, self.steppers[0].rtol
+        started, solves = time.perf_counter(), 0
+        iterations = forward = adjoint = 0.0
         for loss in task.updates(len(self.curves["update_loss"])):
             self._check(loss, number)
             self.curves["update_loss"].append(loss)
             for stepper in self.steppers:
                 solves += 1
                 iterations += float(stepper.info.iterations.double().mean())
-                for report in (stepper.info, stepper.adjoint_info):
-                    if report is not None:
-                        applications += float(report.operator_applications.double().mean())
-        self._append(k, k * solves, iterations, applications, time.perf_counter() - started)
+                forward += float(stepper.info.operator_applications.double().mean())
+                if stepper.adjoint_info is not None:
+                    adjoint += float(stepper.adjoint_info.operator_applications.double().mean())
+        seconds = time.perf_counter() - started
+        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
 
     def give_up(self, why):
         """The curves end with the interval that was lost."""
@@ -156,19 +179,22 @@ class _Run:
         lost = max(1, len(self.curves["metric"]))
         self.curves["metric"] += [math.nan] * (lost + 1 - len(self.curves["metric"]))
         if self._done() < lost:
-            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0)
+            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0.0)
 
     def _append(self, *costs):
-        for name, value in zip(
-            ("max_iter", "budget", "iterations", "operator_applications", "seconds"), costs, strict=True
-        ):
+        for name, value in zip(self.COSTS, costs, strict=True):
             self.curves[name].append(value)
 
-    def _observe(self, metric, done):
+    def _observe(self, task, done):
+        metric = task.metric()
         if not math.isfinite(metric):
             raise _Diverged(f"interval {done}: the metric is {metric}")
         self.curves["metric"].append(metric)
-        self.controller.step(metric)
+        error = task.error(metric)
+        if self.watches_error:
+            self.controller.step(error)
+        else:
+            self.controller.step(metric, error=error)
 
     def _check(self, loss, done):
         if not math.isfinite(loss):
@@ -222,7 +248,8 @@ def _network(scene, steppers, seed, network, on_data):
         optimiser.load_state_dict(saved["optimiser"])
         generator.set_state(saved["shuffling"])
 
-    return _Task(updates, _metric(scene, data, network), state, load)
+    # The metric is a mean of squares relative to the reference.
+    return _Task(updates, _metric(scene, data, network), math.sqrt, state, load)
 
 
 def _metric(scene, data, network):
@@ -270,13 +297,17 @@ def _parameters(scene, steppers, seed, network, on_data):
     (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)
     theta = problem.start.clone().requires_grad_()
+    # What a user sees, who does not know θ; before the first solve nothing is explained yet.
+    misfit = 1.0
 
     def updates(number):
+        nonlocal misfit
         u = stepper((theta @ problem.modes)[None, None])
         loss = _C.half_mse(u, problem.solution)
         (gradient,) = torch.autograd.grad(loss, theta)
         with torch.no_grad():
             theta.sub_(gradient, alpha=scene.learning_rate(number))
+        misfit = float(_C.relative_error(u.detach(), problem.solution))
         yield float(loss.detach())
 
     def metric():
@@ -285,4 +316,4 @@ def _parameters(scene, steppers, seed, network, on_data):
     def load(saved):
         theta.detach().copy_(saved["theta"])
 
-    return _Task(updates, metric, lambda: {"theta": theta.detach()}, load)
+    return _Task(updates, metric, lambda _: misfit, lambda: {"theta": theta.detach()}, load)

@@ -1,62 +1,97 @@
 #include "bindings.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
+#include "prdp/controller/tolerance_controller.h"
 
 namespace py = pybind11;
 using namespace prdp;
+using namespace py::literals;
+
+namespace {
+
+using Known = std::optional<double>;
+/// A record of any controller: metric, smoothed, max_iter, refined, error, residual.
+using Row = std::tuple<double, double, int64_t, bool, Known, Known>;
+
+std::vector<Row> rows_of(const Controller& controller) {
+  std::vector<Row> rows;
+  for (const auto& r : controller.state().history)
+    rows.emplace_back(r.metric, r.smoothed, r.max_iter, r.refined, r.error, r.residual);
+  return rows;
+}
+
+void load(Controller& controller, int64_t max_iter, double checkpoint, const std::vector<Row>& rows) {
+  Controller::State state{max_iter, checkpoint, {}};
+  for (const auto& [metric, smoothed, k, refined, error, residual] : rows)
+    state.history.push_back({metric, smoothed, k, refined, error, residual});
+  controller.load_state(std::move(state));
+}
+
+/// What all of them have.
+void bind_interface(py::module_& m) {
+  py::class_<Controller>(m, "Controller")
+      .def(
+          "_step",
+          [](Controller& c, double metric, bool converged, Known residual, Known error) {
+            return c.step(metric, {converged, residual, error});
+          },
+          "metric"_a, "converged"_a, "residual"_a, "error"_a)
+      .def("_load", &load, "max_iter"_a, "checkpoint"_a, "history"_a)
+      .def_property_readonly("max_iter", &Controller::max_iter)
+      .def_property_readonly("warning", &Controller::warning)
+      .def_property_readonly("_budget",
+                             [](const Controller& c) {
+                               const auto b = c.budget();
+                               return py::dict("max_iter"_a = b.max_iter, "adjoint_max_iter"_a = b.adjoint_max_iter,
+                                               "rtol"_a = b.rtol, "adjoint_rtol"_a = b.adjoint_rtol);
+                             })
+      .def_property_readonly("_checkpoint", [](const Controller& c) { return c.state().checkpoint; })
+      .def_property_readonly("_history", &rows_of);
+}
+
+py::dict as_dict(const ToleranceSettings& s) {
+  return py::dict("ratio"_a = s.ratio, "adjoint_ratio"_a = s.adjoint_ratio, "floor"_a = s.floor,
+                  "maximum"_a = s.maximum);
+}
+
+}  // namespace
 
 py::dict as_dict(const PRDPSettings& s) {
-  using namespace py::literals;
   return py::dict("tau_step"_a = s.tau_step, "tau_stop"_a = s.tau_stop, "delta"_a = s.delta,
                   "window"_a = s.window, "initial"_a = s.initial, "increment"_a = s.increment,
-                  "maximum"_a = s.maximum, "growth"_a = s.growth);
+                  "maximum"_a = s.maximum, "growth"_a = s.growth, "adjoint_ratio"_a = s.adjoint_ratio);
 }
 
 void bind_controllers(py::module_& m) {
   m.attr("PRDP_DEFAULTS") = as_dict(PRDPSettings{});
-  py::class_<PRDPController>(m, "PRDPController")
-      .def(py::init([](double tau_step, double tau_stop, int64_t delta, int64_t window, int64_t initial,
-                       int64_t increment, std::optional<int64_t> maximum, double growth) {
-             return PRDPController(
-                 {tau_step, tau_stop, delta, window, initial, increment, maximum, growth});
-           }),
-           py::kw_only(), py::arg("tau_step"), py::arg("tau_stop"), py::arg("delta"), py::arg("window"),
-           py::arg("initial"), py::arg("increment"), py::arg("maximum"), py::arg("growth"))
-      .def("_step", &PRDPController::step, py::arg("metric"), py::arg("converged"))
-      .def_property_readonly("max_iter", &PRDPController::max_iter)
-      .def_property_readonly("settings",
-                             [](const PRDPController& c) { return as_dict(c.settings()); })
-      .def_property_readonly("_checkpoint",
-                             [](const PRDPController& c) { return c.state().checkpoint; })
-      .def_property_readonly("_history",
-                             [](const PRDPController& c) {
-                               std::vector<std::tuple<double, double, int64_t, bool>> rows;
-                               for (const auto& r : c.state().history)
-                                 rows.emplace_back(r.metric, r.smoothed, r.max_iter, r.refined);
-                               return rows;
-                             })
-      .def("_load",
-           [](PRDPController& c, int64_t max_iter, double checkpoint,
-              const std::vector<std::tuple<double, double, int64_t, bool>>& history) {
-             PRDPController::State state{max_iter, checkpoint, {}};
-             for (const auto& [metric, smoothed, k, refined] : history)
-               state.history.push_back({metric, smoothed, k, refined});
-             c.load_state(std::move(state));
-           },
-           py::arg("max_iter"), py::arg("checkpoint"), py::arg("history"));
+  m.attr("TOLERANCE_DEFAULTS") = as_dict(ToleranceSettings{});
 
-  py::class_<LinearSchedule>(m, "LinearSchedule")
-      .def(py::init<int64_t, int64_t, int64_t>(), py::kw_only(), py::arg("initial"),
-           py::arg("increment"), py::arg("maximum"))
-      .def("_step", &LinearSchedule::step, py::arg("metric"), py::arg("converged"))
-      .def_property_readonly("max_iter", &LinearSchedule::max_iter)
-      .def_property_readonly("settings",
-                             [](const LinearSchedule& s) {
-                               using namespace py::literals;
-                               return py::dict("initial"_a = s.initial(), "increment"_a = s.increment(),
-                                               "maximum"_a = s.maximum());
-                             })
-      .def(
-          "_load", [](LinearSchedule& s, int64_t max_iter) { s.load_state({max_iter}); },
-          py::arg("max_iter"));
+  bind_interface(m);
+  py::class_<PRDPController, Controller>(m, "PRDPController")
+      .def(py::init([](double tau_step, double tau_stop, int64_t delta, int64_t window, int64_t initial,
+                       int64_t increment, std::optional<int64_t> maximum, double growth, Known adjoint_ratio) {
+             return PRDPController(
+                 {tau_step, tau_stop, delta, window, initial, increment, maximum, growth, adjoint_ratio});
+           }),
+           py::kw_only(), "tau_step"_a, "tau_stop"_a, "delta"_a, "window"_a, "initial"_a, "increment"_a, "maximum"_a,
+           "growth"_a, "adjoint_ratio"_a)
+      .def_property_readonly("settings", [](const PRDPController& c) { return as_dict(c.settings()); });
+
+  py::class_<ToleranceController, Controller>(m, "ToleranceController")
+      .def(py::init([](double ratio, double adjoint_ratio, double floor, int64_t maximum) {
+             return ToleranceController({ratio, adjoint_ratio, floor, maximum});
+           }),
+           py::kw_only(), "ratio"_a, "adjoint_ratio"_a, "floor"_a, "maximum"_a)
+      .def_property_readonly("rtol", &ToleranceController::rtol)
+      .def_property_readonly("adjoint_rtol", &ToleranceController::adjoint_rtol)
+      .def("_rtol_for", &ToleranceController::rtol_for, "smallest"_a)
+      .def_property_readonly("settings", [](const ToleranceController& c) { return as_dict(c.settings()); });
+
+  py::class_<LinearSchedule, Controller>(m, "LinearSchedule")
+      .def(py::init<int64_t, int64_t, int64_t, Known>(), py::kw_only(), "initial"_a, "increment"_a, "maximum"_a,
+           "adjoint_ratio"_a)
+      .def_property_readonly("settings", [](const LinearSchedule& s) {
+        return py::dict("initial"_a = s.initial(), "increment"_a = s.increment(), "maximum"_a = s.maximum(),
+                        "adjoint_ratio"_a = s.adjoint_ratio());
+      });
 }

@@ -28,7 +28,7 @@ struct Interrupted {};
 struct Options {
   std::string scene, out, schedule, backward;
   int64_t seeds = 1, constant = -1, intervals = 0;
-  bool direct = false, resume = false;
+  bool direct = false, automatic = false, resume = false;
 };
 
 /// What a record or a checkpoint must agree on to be of the same training, which may go on for more intervals.
@@ -50,6 +50,7 @@ Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, co
   Json curves;
   prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
   if (!c.diverged.empty()) curves["diverged"] = c.diverged;
+  if (!c.warning.empty()) curves["warning"] = c.warning;
   return {{"label", label},
           {"seed", seed},
           {"settings", all},
@@ -97,6 +98,7 @@ std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
 prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
   if (options.constant >= 0) return prdp::train::constant(options.constant);
   if (options.direct) return prdp::train::direct();
+  if (options.automatic) return prdp::train::automatic();
   if (options.schedule.empty()) return prdp::train::prdp(scene);
   const auto [start, step] = parse_schedule(options.schedule);
   return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
@@ -135,6 +137,8 @@ int run(const Options& options, const std::string& command) {
     checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
+      if (!curves.warning.empty())
+        std::fprintf(stderr, "prdp_train: warning: seed %ld, %s\n", seed, curves.warning.c_str());
     } else {
       ++diverged;
       std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, curves.diverged.c_str());
@@ -154,12 +158,14 @@ int main(int argc, char** argv) {
   auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
   auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
   auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
+  auto* a = app.add_flag("--auto", options.automatic, "a tolerance tied to the error, with nothing to choose");
   app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
   app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
-  k->excludes(s)->excludes(d);
-  s->excludes(d);
+  k->excludes(s)->excludes(d)->excludes(a);
+  s->excludes(d)->excludes(a);
+  d->excludes(a);
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {

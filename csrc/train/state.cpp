@@ -2,6 +2,9 @@
 
 #include <ATen/CPUGeneratorImpl.h>
 
+#include <cmath>
+#include <optional>
+
 namespace prdp::train {
 
 namespace {
@@ -41,7 +44,10 @@ void save(TensorMap& tensors, const Curves& curves, const Controller& controller
   const auto& state = controller.state();
   std::vector<double> metric, smoothed;
   std::vector<int64_t> max_iter, refined;
+  std::vector<double> error, residual;  // NaN where not known
   for (const auto& record : state.history) {
+    error.push_back(record.error.value_or(NAN));
+    residual.push_back(record.residual.value_or(NAN));
     metric.push_back(record.metric);
     smoothed.push_back(record.smoothed);
     max_iter.push_back(record.max_iter);
@@ -53,6 +59,8 @@ void save(TensorMap& tensors, const Curves& curves, const Controller& controller
   put(tensors, "history_smoothed", smoothed);
   put(tensors, "history_max_iter", max_iter);
   put(tensors, "history_refined", refined);
+  put(tensors, "history_error", error);
+  put(tensors, "history_residual", residual);
 }
 
 void load(const TensorMap& tensors, Curves& curves, Controller& controller) {
@@ -62,9 +70,14 @@ void load(const TensorMap& tensors, Curves& curves, Controller& controller) {
                           get_one<double>(tensors, "controller_checkpoint")};
   const auto metric = get<double>(tensors, "history_metric"), smoothed = get<double>(tensors, "history_smoothed");
   const auto max_iter = get<int64_t>(tensors, "history_max_iter"), refined = get<int64_t>(tensors, "history_refined");
+  const auto error = get<double>(tensors, "history_error"), residual = get<double>(tensors, "history_residual");
   const auto n = metric.size();
-  TORCH_CHECK_VALUE(smoothed.size() == n && max_iter.size() == n && refined.size() == n, "a torn history");
-  for (size_t i = 0; i < n; ++i) state.history.push_back({metric[i], smoothed[i], max_iter[i], refined[i] != 0});
+  for (const auto size : {smoothed.size(), max_iter.size(), refined.size(), error.size(), residual.size()})
+    TORCH_CHECK_VALUE(size == n, "a torn history");
+  const auto known = [](double x) { return std::isnan(x) ? std::optional<double>() : x; };
+  for (size_t i = 0; i < n; ++i)
+    state.history.push_back(
+        {metric[i], smoothed[i], max_iter[i], refined[i] != 0, known(error[i]), known(residual[i])});
   controller.load_state(std::move(state));
 }
 

@@ -10,7 +10,9 @@
 #include <limits>
 
 #include "fused_adam.h"
+#include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"
+#include "prdp/controller/tolerance_controller.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/networks/resnet.h"
 #include "prdp/operators/navier_stokes_operator.h"
@@ -20,6 +22,12 @@
 #include "state.h"
 
 namespace prdp::train {
+
+Refinement automatic() {
+  Refinement refinement{"auto", [] { return std::make_unique<ToleranceController>(); }};
+  refinement.watches_error = true;
+  return refinement;
+}
 
 Refinement prdp(const Scene& scene) {
   return {"prdp", [settings = scene.prdp] { return std::make_unique<PRDPController>(settings); }};
@@ -51,11 +59,21 @@ struct Diverged {
   std::string why;
 };
 
+/// Of an interval; iterations and products per sample.
+struct Costs {
+  int64_t max_iter;
+  double rtol;
+  int64_t solves = 0;
+  double iterations = 0.0, forward = 0.0, adjoint = 0.0, seconds = 0.0;
+};
+
 /// What a task supplies: the updates of one interval, numbered from `update` and each reporting its loss;
-/// the metric; and all that the updates change, to and from tensors.
+/// the metric; the relative error of what is trained, as far as a user knows it, given the metric; and all
+/// that the updates change, to and from tensors.
 struct Task {
   std::function<void(int64_t update, const std::function<void(double)>& on_update)> updates;
   std::function<double()> metric;
+  std::function<double(double metric)> error;
   std::function<void(TensorMap&)> save;
   std::function<void(const TensorMap&)> load;
 };
@@ -65,12 +83,13 @@ class Run {
  public:
   Run(const Scene& scene, const Refinement& refinement, Checkpoint& checkpoint)
       : intervals_(scene.training.intervals),
+        watches_error_(refinement.watches_error),
         controller_(refinement.controller()),
         checkpoint_(checkpoint),
         saved_(checkpoint.read()) {
     for (int64_t i = 0; i < scene.executions(); ++i)
       steppers.push_back(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver));
-    take_max_iter();
+    take_budget();
   }
 
   Curves go(const Task& task, const OnInterval& on_interval) {
@@ -80,11 +99,11 @@ class Run {
         restore(task);
         report();
       } else {
-        observe(task.metric(), 0);
+        observe(task, 0);
       }
       while (done() < intervals_) {
         run_interval(task, done() + 1);
-        observe(task.metric(), done());
+        observe(task, done());
         if (done() < intervals_ && checkpoint_.due()) keep(task);
         report();
       }
@@ -97,8 +116,8 @@ class Run {
   std::vector<Stepper> steppers;  // of the solves of an update, one after the other
 
  private:
-  void take_max_iter() {
-    for (auto& stepper : steppers) stepper.set_max_iter(controller_->max_iter());
+  void take_budget() {
+    for (auto& stepper : steppers) set_budget(stepper, controller_->budget());
   }
 
   int64_t done() const { return static_cast<int64_t>(curves_.seconds.size()); }
@@ -119,43 +138,47 @@ class Run {
       checkpoint_.refuse();
     }
     checkpoint_.check_length(done(), intervals_);
-    take_max_iter();
+    take_budget();
   }
 
   void run_interval(const Task& task, int64_t done) {
-    const int64_t k = controller_->max_iter();
+    Costs costs{.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol};
     const auto started = std::chrono::steady_clock::now();
-    int64_t solves = 0;
-    double iterations = 0.0, applications = 0.0;
     task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss) {
       check(loss, done);
       curves_.update_loss.push_back(loss);
       for (const auto& stepper : steppers) {
-        ++solves;
-        iterations += per_sample(stepper.info()->iterations);
-        applications += per_sample(stepper.info()->operator_applications);
-        if (const auto adjoint = stepper.adjoint_info()) applications += per_sample(adjoint->operator_applications);
+        ++costs.solves;
+        costs.iterations += per_sample(stepper.info()->iterations);
+        costs.forward += per_sample(stepper.info()->operator_applications);
+        if (const auto adjoint = stepper.adjoint_info()) costs.adjoint += per_sample(adjoint->operator_applications);
       }
     });
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
-    append(k, k * solves, iterations, applications, elapsed.count());
+    costs.seconds = elapsed.count();
+    append(costs);
   }
 
-  void append(int64_t k, int64_t budget, double iterations, double applications, double seconds) {
-    curves_.max_iter.push_back(k);
-    curves_.budget.push_back(budget);
-    curves_.iterations.push_back(iterations);
-    curves_.operator_applications.push_back(applications);
-    curves_.seconds.push_back(seconds);
+  void append(const Costs& costs) {
+    curves_.max_iter.push_back(costs.max_iter);
+    curves_.budget.push_back(costs.max_iter * costs.solves);
+    curves_.iterations.push_back(costs.iterations);
+    curves_.operator_applications.push_back(costs.forward + costs.adjoint);
+    curves_.adjoint_applications.push_back(costs.adjoint);
+    curves_.rtol.push_back(costs.rtol);
+    curves_.seconds.push_back(costs.seconds);
   }
 
-  void observe(double metric, int64_t done) {
+  void observe(const Task& task, int64_t done) {
+    const double metric = task.metric();
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(metric)) throw Diverged{interval + ": the metric is " + std::to_string(metric)};
     curves_.metric.push_back(metric);
-    controller_->step(metric, std::all_of(steppers.begin(), steppers.end(),
-                                          [](const Stepper& stepper) { return stepper.converged(); }));
-    take_max_iter();
+    auto solves = last_solves(steppers);
+    solves.error = task.error(metric);
+    controller_->step(watches_error_ ? *solves.error : metric, solves);
+    curves_.warning = controller_->warning().value_or("");
+    take_budget();
   }
 
   void check(double loss, int64_t done) const {
@@ -170,12 +193,15 @@ class Run {
   /// The curves end with the interval that was lost.
   void give_up(const std::string& why) {
     curves_.diverged = why;
+    curves_.warning.clear();
     const auto lost = std::max<size_t>(1, curves_.metric.size());
     curves_.metric.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
-    if (curves_.seconds.size() < lost) append(controller_->max_iter(), 0, 0.0, 0.0, 0.0);
+    if (curves_.seconds.size() < lost)
+      append({.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol});
   }
 
   int64_t intervals_;
+  bool watches_error_;
   std::unique_ptr<Controller> controller_;
   Checkpoint& checkpoint_;
   std::optional<std::string> saved_;
@@ -267,12 +293,16 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
   auto& module = *network.ptr();
   const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
   const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
-  return run.go({updates, metric, save_all, load_all}, on_interval);
+  // The metric is a mean of squares relative to the reference.
+  const auto error = [](double squared) { return std::sqrt(squared); };
+  return run.go({updates, metric, error, save_all, load_all}, on_interval);
 }
 
 Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
   auto theta = problem.start.clone().requires_grad_();
+  // What a user sees, who does not know θ; before the first solve nothing is explained yet.
+  double misfit = 1.0;
 
   const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
     const auto u = run.steppers[0](at::matmul(theta, problem.modes).view({1, 1, -1}));
@@ -282,6 +312,7 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
       const torch::NoGradGuard no_grad;
       theta.sub_(gradient, scene.learning_rate(update));
     }
+    misfit = relative_error(u.detach(), problem.solution).item<double>();
     on_update(error.item<double>());
   };
   const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
@@ -289,7 +320,7 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
   const auto load_theta = [&](const TensorMap& tensors) {
     theta.detach().copy_(entry(tensors, "theta", theta.scalar_type(), theta.sizes()));
   };
-  return run.go({updates, metric, save_theta, load_theta}, on_interval);
+  return run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
 }
 
 }  // namespace

@@ -12,12 +12,15 @@
 /// The C++ trainer: the same loops as prdp_torch/training.py.
 namespace prdp::train {
 
-/// How a training chooses K.
+/// How a training decides how far the solver goes.
 struct Refinement {
-  std::string label;  // "prdp", "constant_25", "schedule_25_6", "direct"
+  std::string label;  // "auto", "prdp", "constant_25", "schedule_25_6", "direct"
   std::function<std::unique_ptr<Controller>()> controller;
   bool direct = false;
+  bool watches_error = false;  // the controller is given the relative error, not the metric
 };
+/// What fits every scene with nothing chosen for it; docs/refinement.md says why.
+Refinement automatic();
 Refinement prdp(const Scene& scene);
 Refinement schedule(int64_t start, int64_t step, int64_t maximum);
 Refinement constant(int64_t k);
@@ -30,9 +33,12 @@ struct Curves {
   std::vector<double> metric;       // starts before the first interval
   std::vector<int64_t> max_iter;    // K
   std::vector<int64_t> budget;      // K times the solves, the paper's count
-  std::vector<double> iterations, operator_applications;  // per sample of a batch, summed over updates
+  // Per sample of a batch, summed over updates; the applications are those of both solves.
+  std::vector<double> iterations, operator_applications, adjoint_applications;
+  std::vector<double> rtol;  // of the forward solves
   std::vector<double> seconds;
   std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
+  std::string warning;   // what the controller says in the end
 };
 
 /// Calls f(name, values) for each of them that has an entry for every interval or update.
@@ -44,6 +50,8 @@ void each_curve(AnyCurves& curves, const F& f) {
   f("budget", curves.budget);
   f("iterations", curves.iterations);
   f("operator_applications", curves.operator_applications);
+  f("adjoint_applications", curves.adjoint_applications);
+  f("rtol", curves.rtol);
   f("seconds", curves.seconds);
 }
 

@@ -3,8 +3,10 @@
 
 #include <cmath>
 
+#include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
+#include "prdp/controller/tolerance_controller.h"
 
 namespace {
 
@@ -102,6 +104,87 @@ TEST(LinearSchedule, GrowsByItsStepUpToTheMaximum) {
   EXPECT_THROW(prdp::LinearSchedule(25, 6, 24), c10::ValueError);
 }
 
+TEST(ToleranceController, TiesTheToleranceToTheSmallestErrorSoFar) {
+  prdp::ToleranceController controller({.ratio = 0.1, .adjoint_ratio = 0.2, .floor = 1e-3});
+  EXPECT_DOUBLE_EQ(controller.rtol(), 0.1);
+  EXPECT_FALSE(controller.step(7.0));  // an error above 1 is worse than no answer, and asks for no more
+  EXPECT_DOUBLE_EQ(controller.rtol(), 0.1);
+  EXPECT_TRUE(controller.step(0.4));
+  EXPECT_DOUBLE_EQ(controller.rtol(), 0.04);
+  EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 0.2);
+  EXPECT_FALSE(controller.step(0.9));
+  EXPECT_DOUBLE_EQ(controller.rtol(), 0.04);
+  EXPECT_TRUE(controller.step(0.0));
+  EXPECT_DOUBLE_EQ(controller.rtol(), 1e-3);
+  EXPECT_EQ(controller.max_iter(), 10000);
+  EXPECT_EQ(controller.budget().adjoint_max_iter, 2000);
+}
+
+TEST(ToleranceController, NeverAsksForAnAdjointSolveThatIsNone) {
+  EXPECT_DOUBLE_EQ(prdp::ToleranceController({.ratio = 0.1, .adjoint_ratio = 0.1}).adjoint_rtol(), 0.5);
+  EXPECT_DOUBLE_EQ(prdp::ToleranceController({.ratio = 0.8, .adjoint_ratio = 0.1}).adjoint_rtol(), 0.8);
+}
+
+TEST(ToleranceController, ABadErrorRaisesAndChangesNothing) {
+  prdp::ToleranceController controller;
+  controller.step(0.3);
+  for (const double bad : {-1.0, std::nan(""), std::numeric_limits<double>::infinity()}) {
+    EXPECT_THROW(controller.step(bad), c10::ValueError);
+    EXPECT_EQ(controller.state().history.size(), 1u);
+  }
+  EXPECT_THROW(prdp::ToleranceController({.ratio = 1.0}), c10::ValueError);
+  EXPECT_THROW(prdp::ToleranceController({.adjoint_ratio = 0.0}), c10::ValueError);
+  EXPECT_THROW(prdp::ToleranceController({.floor = 0.0}), c10::ValueError);
+  EXPECT_THROW(prdp::ToleranceController({.maximum = 0}), c10::ValueError);
+}
+
+TEST(Controller, GivesTheAdjointItsShareOfK) {
+  const PRDPController controller({.initial = 7, .adjoint_ratio = 0.3});
+  EXPECT_EQ(controller.budget().adjoint_max_iter, 3);
+  EXPECT_EQ(prdp::LinearSchedule(5, 0, 5, 0.2).budget().adjoint_max_iter, 1);
+  EXPECT_FALSE(PRDPController().budget().adjoint_max_iter.has_value());
+  EXPECT_THROW(PRDPController({.adjoint_ratio = 1.5}), c10::ValueError);
+  EXPECT_THROW(prdp::LinearSchedule(5, 0, 5, 0.0), c10::ValueError);
+}
+
+TEST(Controller, SetsTheBudgetOfASolveAndReadsHowItWent) {
+  std::vector<prdp::Stepper> steppers{prdp::Heat({30}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 1})};
+  EXPECT_FALSE(prdp::last_solves(steppers).residual.has_value());
+  prdp::ToleranceController controller;
+  controller.step(0.2);
+  prdp::set_budget(steppers[0], controller.budget());
+  auto u = at::randn({3, 1, 30}, at::kDouble).requires_grad_();
+  steppers[0](u).sum().backward();
+  const auto solves = prdp::last_solves(steppers);
+  EXPECT_TRUE(solves.converged);
+  EXPECT_LE(*solves.residual, 0.02);
+  EXPECT_GT(*solves.residual, 0.001);  // no more than it was asked for
+  EXPECT_GT(steppers[0].adjoint_info()->residual.max().item<double>(), 0.02);
+  EXPECT_LE(steppers[0].adjoint_info()->residual.max().item<double>(), 0.2);
+}
+
+TEST(Controller, WarnsWhereTheSolversErrorMakesUpWhatIsTrained) {
+  PRDPController controller;
+  EXPECT_FALSE(controller.warning().has_value());
+  controller.step(0.04, {false, 0.01, 0.2});
+  EXPECT_FALSE(controller.warning().has_value());
+  controller.step(0.04, {false, 0.1, 0.2});
+  EXPECT_NE(controller.warning()->find("PRDPController: the solves stop at a residual of 1.0e-01 (K = 1)"),
+            std::string::npos);
+  controller.step(1e-12, {false, 9e-5, 1e-6});  // as good as converged
+  EXPECT_FALSE(controller.warning().has_value());
+}
+
+TEST(Controller, WarnsOfAStalledMetricWhereNoErrorIsKnown) {
+  auto controller = plain();
+  for (const double metric : {5.0, 4.0, 3.0}) controller.step(metric, {false, 0.3});
+  EXPECT_FALSE(controller.warning().has_value());  // it still falls
+  controller.step(3.0, {false, 0.3});
+  EXPECT_NE(controller.warning()->find("no longer falls"), std::string::npos);
+  controller.step(1.0, {false, 0.3});
+  EXPECT_FALSE(controller.warning().has_value());
+}
+
 TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
   const auto goes_on = [](prdp::Controller& whole, prdp::Controller& rest) {
     for (int i = 0; i < 40; ++i) {
@@ -119,6 +202,10 @@ TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
   PRDPController a, b;
   goes_on(a, b);
   EXPECT_GT(a.max_iter(), 2);
+  prdp::ToleranceController e, f;
+  goes_on(e, f);
+  EXPECT_LT(e.rtol(), 0.02);
+  EXPECT_EQ(e.rtol(), f.rtol());
   prdp::LinearSchedule c(1, 2, 60), d(1, 2, 60);
   goes_on(c, d);
   EXPECT_EQ(c.max_iter(), 60);

@@ -30,7 +30,7 @@ def comparison(tmp_path_factory):
 
 def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
     folder, done = comparison
-    for title in ("converged, K = 25", "direct solver", "PRDP", "PRDP, K ← 1.5 K", "K = 1", "K = 15"):
+    for title in ("converged, K = 25", "direct solver", "auto", "PRDP", "PRDP, K ← 1.5 K", "K = 1", "K = 15"):
         assert title in done.stdout
     record = json.loads((folder / "runs/heat_1d/prdp/seed_1.json").read_text())
     assert record["seed"] == 1 and record["versions"]["torch"] and record["machine"]["cores"] >= 1
@@ -38,7 +38,8 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
     curves = record["curves"]
     assert len(curves["metric"]) == 5 and len(curves["update_loss"]) == 32
     assert set(curves) == {
-        "update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "seconds",
+        "update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications",
+        "rtol", "seconds", "warning",
     }  # fmt: skip
     summary = json.loads((folder / "runs/heat_1d/summary.json").read_text())
     by_label = {row["label"]: row for row in summary["rows"]}
@@ -70,7 +71,7 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
 
 @pytest.mark.parametrize(
     "options, label", [([], "prdp"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
-                       (["--direct"], "direct")]
+                       (["--direct"], "direct"), (["--auto"], "auto")]
 )  # fmt: skip
 def test_train_writes_one_record_and_the_weights_of_each_seed(tmp_path, options, label):
     done = prdp("train", "heat_1d", *options, "--seeds", 2, "--intervals", 2, "--out", "here", cwd=tmp_path)
@@ -93,7 +94,7 @@ def test_scenes_are_listed(tmp_path):
             ["train", "heat_1d", "--schedule", "3"],
             "prdp: --schedule: expected START:STEP, two whole numbers up to 1000000000, got '3'",
         ),
-        (["train", "heat_1d", "--prdp", "--direct"], "give one of --prdp, --constant, --schedule and --direct"),
+        (["train", "heat_1d", "--prdp", "--direct"], "give one of --auto, --prdp, --constant, --schedule and --direct"),
         (
             ["train", "heat_1d", "--backward", "both"],
             "backward: unknown name 'both' for a scene; allowed: implicit, unrolled",
@@ -166,8 +167,10 @@ def test_the_cpp_trainer_says_what_is_wrong(tmp_path, arguments, message):
     assert done.returncode == 2 and message in done.stderr and not list(tmp_path.iterdir())
 
 
-def test_the_quickstart_refines(tmp_path):
+def test_the_quickstart_tightens_its_tolerance(tmp_path):
     done = subprocess.run(
         [sys.executable, ROOT / "examples/quickstart.py"], cwd=tmp_path, capture_output=True, text=True
     )
-    assert done.returncode == 0 and "K raised to 2" in done.stdout
+    assert done.returncode == 0 and done.stdout.endswith("The solves were accurate enough.\n"), done.stderr
+    tolerances = [float(rtol) for rtol in re.findall(r"tolerance (\S+)", done.stdout)]
+    assert len(tolerances) > 5 and tolerances == sorted(tolerances, reverse=True) and tolerances[-1] < 0.07

@@ -1,6 +1,8 @@
 """The controller against the decisions of the published code, and its rules."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -163,3 +165,169 @@ def test_the_manual_schedule_has_the_same_interface():
     assert "max_iter=40; initial=25, increment=6" in repr(schedule)
     with pytest.raises(ValueError, match="maximum must be >= initial = 25, got 3"):
         prdp.LinearSchedule(initial=25, increment=6, maximum=3)
+
+
+# ---- a tolerance tied to the error
+
+
+def heat_step(max_iter=1, **options):
+    return prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(max_iter), **options)
+
+
+@given(st.lists(st.floats(0, 10), max_size=30))
+def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(errors):
+    heat = heat_step()
+    controller = prdp.ToleranceController([heat], ratio=0.2, adjoint_ratio=0.25, floor=1e-3)
+    for i in range(len(errors) + 1):
+        expected = max(1e-3, 0.2 * min([1.0, *errors[:i]]))
+        assert heat.rtol == controller.rtol == pytest.approx(expected)
+        assert heat.adjoint_rtol == controller.adjoint_rtol == pytest.approx(min(0.5, 4 * expected))
+        assert (heat.max_iter, heat.adjoint_max_iter) == (10000, 2500)
+        if i < len(errors):
+            assert controller.step(errors[i]) == (controller.rtol < expected)
+
+
+def test_solves_meet_what_the_tolerance_controller_asks_for():
+    heat = heat_step()
+    controller = prdp.ToleranceController([heat])
+    controller.step(torch.tensor(0.05))  # a tensor of one element is a number
+    b = field((30,)).requires_grad_()
+    heat(b).sum().backward()
+    assert heat.info.residual.max() <= 5e-3 < heat.adjoint_info.residual.max() <= 5e-2
+    assert heat.converged and controller.warning is None
+
+
+def test_the_history_of_tolerances():
+    heat = heat_step()
+    controller = prdp.ToleranceController([heat])
+    heat(field((30,)))
+    assert [controller.step(error) for error in (2.0, 0.5, 0.6)] == [False, True, False]
+    first, second, third = controller.history
+    assert (second.error, second.smallest, second.rtol, second.tightened) == (0.5, 0.5, 0.1, True)
+    assert (third.smallest, third.rtol) == (0.5, 0.05)
+    assert first.residual == pytest.approx(float(heat.info.residual.mean()))
+    assert "ToleranceController(rtol=5.0e-02, adjoint_rtol=5.0e-01; ratio=0.1" in repr(controller)
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan, math.inf])
+def test_a_bad_error_raises_and_changes_nothing(bad):
+    controller = prdp.ToleranceController()
+    controller.step(0.5)
+    before = controller.state_dict()
+    with pytest.raises(ValueError, match="ToleranceController: error must be finite and >= 0, got"):
+        controller.step(bad)
+    assert controller.state_dict() == before
+    with pytest.raises(TypeError, match="error must be a real number, got 'small'"):
+        controller.step("small")
+
+
+@pytest.mark.parametrize(
+    "settings, error, message",
+    [
+        ({"ratio": 1.0}, ValueError, "ratio must be > 0 and < 1, got 1"),
+        ({"ratio": math.nan}, ValueError, "ratio must be > 0 and < 1, got nan"),
+        ({"adjoint_ratio": 0}, ValueError, "adjoint_ratio must be > 0 and <= 1, got 0"),
+        ({"floor": 0.0}, ValueError, "floor must be > 0 and < 1, got 0"),
+        ({"maximum": 0}, ValueError, "maximum must be >= 1, got 0"),
+        ({"maximum": 1.5}, TypeError, "maximum must be a whole number, got 1.5"),
+        ({"tau_step": 0.9}, TypeError, "unknown setting 'tau_step'; allowed: ratio, adjoint_ratio, floor, maximum"),
+    ],
+)
+def test_bad_settings_of_a_tolerance_raise_by_name(settings, error, message):
+    with pytest.raises(error, match=message):
+        prdp.ToleranceController(**settings)
+
+
+def test_a_stepper_without_a_tolerance_is_refused():
+    class Step:
+        max_iter = adjoint_max_iter = 3
+
+    with pytest.raises(TypeError, match="ToleranceController: a stepper must have rtol"):
+        prdp.ToleranceController([Step()])
+
+
+# ---- of every controller
+
+CONTROLLERS = {
+    "prdp": lambda steppers: prdp.PRDPController(steppers, window=2, adjoint_ratio=0.5),
+    "tolerance": lambda steppers: prdp.ToleranceController(steppers, ratio=0.2),
+    "schedule": lambda steppers: prdp.LinearSchedule(steppers, initial=2, increment=2, maximum=9, adjoint_ratio=0.3),
+}
+WAYS = {
+    "state_dict": None,
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda controller: pickle.loads(pickle.dumps(controller)),
+}
+
+
+def budget_of(stepper):
+    return stepper.max_iter, stepper.adjoint_max_iter, stepper.rtol, stepper.adjoint_rtol
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("way", WAYS)
+def test_controllers_go_on_from_copies(name, way):
+    heat = heat_step()
+    controller = CONTROLLERS[name]([heat])
+    heat(field((30,)))
+    for metric in (0.9, 0.5, 0.5, 0.5, 0.5):
+        controller.step(metric)
+    if way == "state_dict":
+        other = CONTROLLERS[name]([heat_step()])
+        other.load_state_dict(controller.state_dict())
+    else:
+        other = WAYS[way](controller)
+    assert type(other) is type(controller) and repr(other) == repr(controller)
+    assert other.state_dict() == controller.state_dict() and other.warning == controller.warning
+    assert budget_of(other.steppers[0]) == budget_of(heat)
+    assert (other.steppers[0] is heat) == (way == "copy")
+    metrics = (0.4, 0.4, 0.1, 0.1, 0.1)
+    assert [other.step(m, converged=False) for m in metrics] == [controller.step(m, converged=False) for m in metrics]
+    assert budget_of(other.steppers[0]) == budget_of(heat)
+
+
+@pytest.mark.parametrize("ratio, k, share", [(0.34, 7, 3), (1 / 3, 9, 3), (1.0, 7, 7), (0.01, 7, 1)])
+def test_the_adjoint_gets_its_share_of_k(ratio, k, share):
+    heat = heat_step()
+    prdp.PRDPController([heat], initial=k, adjoint_ratio=ratio)
+    assert (heat.max_iter, heat.adjoint_max_iter) == (k, share)
+    b = field((30,)).requires_grad_()
+    heat(b).sum().backward()
+    assert heat.info.iterations.tolist() == [k, k] and heat.adjoint_info.iterations.tolist() == [share, share]
+
+
+def test_without_a_ratio_the_steppers_own_adjoint_budget_stays():
+    heat = heat_step(adjoint_max_iter=4)
+    controller = prdp.PRDPController([heat], initial=7)
+    controller.step(1.0)
+    assert (heat.max_iter, heat.adjoint_max_iter) == (7, 4)
+    with pytest.raises(ValueError, match="PRDPController: adjoint_ratio must be > 0 and <= 1, got 2"):
+        prdp.PRDPController(adjoint_ratio=2)
+
+
+def test_a_controller_warns_while_the_residual_makes_up_the_error():
+    """K = 3 leaves a residual of about a fifth."""
+    heat = heat_step()
+    controller = prdp.LinearSchedule([heat], initial=3, increment=0, maximum=3)
+    heat(field((30,)))
+    residual = float(heat.info.residual.mean())
+    controller.step(error=0.3)
+    assert f"the solves stop at a residual of {residual:.1e} (K = 3), too far off" in controller.warning
+    heat.max_iter = 25
+    heat(field((30,)))
+    controller.step(error=0.3)
+    assert controller.warning is None
+
+
+def test_without_an_error_prdp_warns_of_a_stalled_metric():
+    heat = heat_step()
+    controller = prdp.PRDPController([heat], delta=2, window=1)
+    heat(field((30,)))
+    for metric in (80.0, 40.0, 20.0):
+        controller.step(metric)
+    assert controller.warning is None  # it still falls
+    for _ in range(3):
+        controller.step(20.0)
+    assert "PRDPController: the solves stop at a residual of" in controller.warning
+    assert "the metric no longer falls" in controller.warning

@@ -217,8 +217,9 @@ def test_compare_leaves_the_exact_solver_out(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "runs/tiny/summary.json").read_text())
-    assert [row["label"] for row in summary["rows"]] == ["converged", "prdp", "constant_2"]
-    assert [row["budget"] for row in summary["rows"]] == [44 * 4 * 2 * 2, 1 * 4 * 2 * 2, 2 * 4 * 2 * 2]
+    assert [row["label"] for row in summary["rows"]] == ["converged", "auto", "prdp", "constant_2"]
+    budgets = [row["budget"] for row in summary["rows"] if row["label"] != "auto"]  # to auto, K is a cap
+    assert budgets == [44 * 4 * 2 * 2, 1 * 4 * 2 * 2, 2 * 4 * 2 * 2]
     assert (tmp_path / "runs/tiny/report.html").exists()
 
 

@@ -15,7 +15,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
     assert (heat.data.valid_steps, heat.physics.channels, heat.physics.periodic) == (2, 1, False)
     assert heat.prdp == {
         "tau_step": 0.98, "tau_stop": 0.9, "delta": 3, "window": 8, "initial": 1, "increment": 1,
-        "maximum": None, "growth": 1.0,
+        "maximum": None, "growth": 1.0, "adjoint_ratio": None,
     }  # fmt: skip
     square, cube = scenes.load("heat_2d"), scenes.load("heat_3d")
     assert (square.method, square.max_iter, square.backward) == ("jacobi", 43, "unrolled")

@@ -42,6 +42,8 @@ def short(name, intervals=3, backward=None):
         ("heat_1d", ["--direct"], lambda scene: Refinement.exact()),
         ("poisson_1p", ["--schedule", "25:6"], lambda scene: Refinement.schedule(25, 6, 600)),
         ("poisson_3p", [], Refinement.prdp),
+        ("heat_1d", ["--auto"], lambda scene: Refinement.auto()),
+        ("poisson_3p", ["--auto"], lambda scene: Refinement.auto()),
     ],
 )
 def test_both_languages_train_alike(tmp_path, name, arguments, refinement):
@@ -51,6 +53,7 @@ def test_both_languages_train_alike(tmp_path, name, arguments, refinement):
     np.testing.assert_allclose(cpp["metric"][:3], python["metric"][:3], rtol=1e-5)
     assert cpp["max_iter"][:20] == python["max_iter"][:20]
     assert cpp["budget"][:20] == python["budget"][:20]
+    np.testing.assert_allclose(cpp["rtol"][:3], python["rtol"][:3], rtol=1e-5)
     np.testing.assert_allclose(cpp["operator_applications"][:2], python["operator_applications"][:2], rtol=1e-3)
     assert set(cpp) == set(python) and all(len(cpp[key]) == len(python[key]) for key in cpp)
 

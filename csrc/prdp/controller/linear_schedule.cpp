@@ -6,18 +6,32 @@
 
 namespace prdp {
 
-LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum)
-    : initial_(initial), increment_(increment), maximum_(maximum), state_{initial} {
+LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum,
+                               std::optional<double> adjoint_ratio)
+    : initial_(initial),
+      increment_(increment),
+      maximum_(maximum),
+      adjoint_ratio_(adjoint_ratio),
+      state_{initial} {
   TORCH_CHECK_VALUE(initial >= 0, "LinearSchedule: initial must be >= 0, got ", initial);
   TORCH_CHECK_VALUE(increment >= 0, "LinearSchedule: increment must be >= 0, got ", increment);
   TORCH_CHECK_VALUE(maximum >= initial, "LinearSchedule: maximum must be >= initial = ", initial,
                     ", got ", maximum);
+  budget();
 }
 
-bool LinearSchedule::step(double, bool) {
+Budget LinearSchedule::budget() const {
+  Budget budget{state_.max_iter};
+  if (adjoint_ratio_) budget.adjoint_max_iter = adjoint_share("LinearSchedule", *adjoint_ratio_, state_.max_iter);
+  return budget;
+}
+
+bool LinearSchedule::step(double metric, const Solves& solves) {
   const int64_t before = state_.max_iter;
   state_.max_iter = std::min(maximum_, before + increment_);
-  return state_.max_iter > before;
+  const bool raised = state_.max_iter > before;
+  state_.history = {{metric, metric, before, raised, solves.error, solves.residual}};
+  return raised;
 }
 
 void LinearSchedule::load_state(State state) {

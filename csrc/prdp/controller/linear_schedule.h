@@ -7,20 +7,28 @@ namespace prdp {
 /// constant K.
 class LinearSchedule final : public Controller {
  public:
-  /// Raises ValueError unless 0 <= initial <= maximum and increment >= 0.
-  LinearSchedule(int64_t initial, int64_t increment, int64_t maximum);
+  /// Raises ValueError unless 0 <= initial <= maximum, increment >= 0 and 0 < adjoint_ratio <= 1, of K for
+  /// the adjoint.
+  LinearSchedule(int64_t initial, int64_t increment, int64_t maximum, std::optional<double> adjoint_ratio = {});
 
   int64_t max_iter() const override { return state_.max_iter; }
-  bool step(double metric = 0.0, bool converged = false) override;
+  Budget budget() const override;
+  bool step(double metric = 0.0, const Solves& solves = {}) override;
   const State& state() const override { return state_; }
   void load_state(State state) override;
 
   int64_t initial() const { return initial_; }
   int64_t increment() const { return increment_; }
   int64_t maximum() const { return maximum_; }
+  std::optional<double> adjoint_ratio() const { return adjoint_ratio_; }
 
  private:
+  const char* name() const override { return "LinearSchedule"; }
+  const char* remedy() const override { return "give a larger K, or take a ToleranceController"; }
+  bool stalled() const override { return false; }  // it does not look
+
   int64_t initial_, increment_, maximum_;
+  std::optional<double> adjoint_ratio_;
   State state_;
 };
 

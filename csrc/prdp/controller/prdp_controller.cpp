@@ -23,32 +23,43 @@ PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
   TORCH_CHECK_VALUE(std::isfinite(s.growth) && s.growth >= 1.0,
                     "PRDPController: growth must be finite and >= 1, got ", s.growth);
   state_.max_iter = s.initial;
+  budget();
+}
+
+Budget PRDPController::budget() const {
+  Budget budget{state_.max_iter};
+  if (settings_.adjoint_ratio)
+    budget.adjoint_max_iter = adjoint_share("PRDPController", *settings_.adjoint_ratio, state_.max_iter);
+  return budget;
+}
+
+bool PRDPController::stalled() const {
+  const auto& history = state_.history;
+  if (static_cast<int64_t>(history.size()) < settings_.delta + 1) return false;
+  // As a product, so that a metric of zero needs no division.
+  return history.back().smoothed > settings_.tau_step * history[history.size() - settings_.delta].smoothed;
 }
 
 bool PRDPController::should_refine() const {
-  const auto& history = state_.history;
-  if (static_cast<int64_t>(history.size()) < settings_.delta + 1) return false;
-  // As products, so that a metric of zero needs no division.
+  if (!stalled()) return false;
   constexpr double rounding = 1e-12;
-  const double newest = history.back().smoothed;
-  const double before = history[history.size() - settings_.delta].smoothed;
-  const bool plateau = newest > settings_.tau_step * before;
+  const double newest = state_.history.back().smoothed;
   const bool paid = newest < settings_.tau_stop * state_.checkpoint;
   const bool worse = newest > (1.0 + rounding) * state_.checkpoint;
-  return plateau && (paid || worse);
+  return paid || worse;
 }
 
-bool PRDPController::step(double metric, bool converged) {
+bool PRDPController::step(double metric, const Solves& solves) {
   TORCH_CHECK_VALUE(std::isfinite(metric) && metric >= 0.0,
                     "PRDPController: metric must be finite and >= 0, got ", metric);
   const double alpha = 2.0 / static_cast<double>(settings_.window + 1);
   const auto& history = state_.history;
   const double smoothed =
       history.empty() ? metric : history.back().smoothed + alpha * (metric - history.back().smoothed);
-  state_.history.push_back({metric, smoothed, state_.max_iter, false});
+  state_.history.push_back({metric, smoothed, state_.max_iter, false, solves.error, solves.residual});
 
   const int64_t limit = settings_.maximum.value_or(std::numeric_limits<int64_t>::max());
-  if (converged || state_.max_iter >= limit || !should_refine()) return false;
+  if (solves.converged || state_.max_iter >= limit || !should_refine()) return false;
   const auto grown = static_cast<int64_t>(
       std::ceil(settings_.growth * static_cast<double>(state_.max_iter) - 1e-9));
   state_.checkpoint = smoothed;

@@ -13,8 +13,9 @@ struct PRDPSettings {
   int64_t window = 6;       // of the exponential mean, α = 2 / (window + 1); 1: no smoothing
   int64_t initial = 1;      // K₀
   int64_t increment = 1;    // ΔK
-  std::optional<int64_t> maximum;  // K is never raised beyond
+  std::optional<int64_t> maximum{};  // K is never raised beyond
   double growth = 1.0;      // K is raised to growth·K where that is more than K + ΔK
+  std::optional<double> adjoint_ratio{};  // the adjoint's K is ⌈adjoint_ratio·K⌉; in (0, 1]
 };
 
 /// Progressively Refined Differentiable Physics: raises K when the smoothed metric L̃ reaches a
@@ -31,14 +32,20 @@ class PRDPController final : public Controller {
   explicit PRDPController(PRDPSettings settings = {});
 
   int64_t max_iter() const override { return state_.max_iter; }
+  Budget budget() const override;
   /// Raises ValueError, and changes nothing, unless the metric is finite and >= 0.
-  bool step(double metric, bool converged = false) override;
+  bool step(double metric, const Solves& solves = {}) override;
 
   const PRDPSettings& settings() const { return settings_; }
   const State& state() const override { return state_; }
   void load_state(State state) override;
 
  private:
+  const char* name() const override { return "PRDPController"; }
+  const char* remedy() const override {
+    return "give a larger initial, a larger tau_stop, or take a ToleranceController";
+  }
+  bool stalled() const override;
   bool should_refine() const;
 
   PRDPSettings settings_;

@@ -126,6 +126,7 @@ PRDPSettings read_prdp(TomlSection s) {
   p.increment = s.whole("increment", 1);
   if (s.has("maximum")) p.maximum = s.whole("maximum", p.initial);
   if (s.has("growth")) p.growth = s.at_least("growth", 1.0);
+  if (s.has("adjoint_ratio")) p.adjoint_ratio = s.above("adjoint_ratio", 0.0);
   s.finish();
   return p;
 }
@@ -208,7 +209,7 @@ Scene read_scene(const std::string& path) {
     scene.parameters = read_parameters(s.section("parameters"));
     if (scene.physics.shape.size() != 1) s.fail("physics", "the task 'parameters' is one-dimensional");
   }
-  scene.prdp = read_prdp(s.section("prdp"));
+  if (s.has("prdp")) scene.prdp = read_prdp(s.section("prdp"));
   scene.compare = read_compare(s.section("compare"));
   s.finish();
   return scene;

@@ -1,0 +1,52 @@
+#include "prdp/controller/tolerance_controller.h"
+
+#include <c10/util/Exception.h>
+
+#include <algorithm>
+#include <cmath>
+
+namespace prdp {
+
+ToleranceController::ToleranceController(ToleranceSettings settings)
+    : settings_(settings), state_{settings.maximum} {
+  const auto& s = settings_;
+  TORCH_CHECK_VALUE(s.ratio > 0.0 && s.ratio < 1.0, "ToleranceController: ratio must be > 0 and < 1, got ", s.ratio);
+  TORCH_CHECK_VALUE(s.floor > 0.0 && s.floor < 1.0, "ToleranceController: floor must be > 0 and < 1, got ", s.floor);
+  TORCH_CHECK_VALUE(s.maximum >= 1, "ToleranceController: maximum must be >= 1, got ", s.maximum);
+  budget();
+}
+
+double ToleranceController::rtol_for(double smallest) const {
+  return std::max(settings_.floor, settings_.ratio * std::min(1.0, smallest));
+}
+
+double ToleranceController::adjoint_rtol() const {
+  constexpr double loosest = 0.5;
+  return std::max(rtol(), std::min(loosest, rtol() / settings_.adjoint_ratio));
+}
+
+Budget ToleranceController::budget() const {
+  return {max_iter(), adjoint_share(name(), settings_.adjoint_ratio, max_iter()), rtol(), adjoint_rtol()};
+}
+
+bool ToleranceController::step(double error, const Solves& solves) {
+  TORCH_CHECK_VALUE(std::isfinite(error) && error >= 0.0,
+                    "ToleranceController: error must be finite and >= 0, got ", error);
+  const double before = rtol();
+  state_.checkpoint = std::min(state_.checkpoint, error);
+  const bool tightened = rtol() < before;
+  state_.history.push_back({error, state_.checkpoint, state_.max_iter, tightened, error, solves.residual});
+  return tightened;
+}
+
+void ToleranceController::load_state(State state) {
+  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "ToleranceController: state has a smallest error of ",
+                    state.checkpoint, ", expected >= 0");
+  for (const auto& record : state.history)
+    TORCH_CHECK_VALUE(std::isfinite(record.metric) && record.metric >= 0.0,
+                      "ToleranceController: state has an error that is not finite and >= 0");
+  state.max_iter = settings_.maximum;
+  state_ = std::move(state);
+}
+
+}  // namespace prdp
