@@ -7,6 +7,7 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
+#include "prdp/steppers/stepper.h"
 
 namespace {
 
