@@ -76,7 +76,7 @@ def metric_over_intervals(scene, rows):
 
 
 def k_over_intervals(scene, rows):
-    """K over epochs, where a tolerance ends the solves the iterations that one took: each seed thin, their mean bold."""
+    """K over epochs, or the iterations that a solve took where K is only a cap: each seed thin, their mean bold."""
     figure, (axes,) = make_figure()
     for row in rows:
         if row.kind not in ("auto", "tolerance", "prdp", "growth", "schedule"):
@@ -87,7 +87,9 @@ def k_over_intervals(scene, rows):
             axes.plot(k.T, color=colour, lw=0.7, alpha=0.35)
         axes.plot(k.mean(0), color=colour, ls=line, lw=2.2, label=row.title)
     axes.axhline(scene.max_iter, color="#222222", lw=1.2, label=f"converged, K = {scene.max_iter}")
-    axes.set(xlabel=scene.unit, ylabel="K, iterations a solve may take\n(of auto, rtol: those that it took)", ylim=(0, None))
+    axes.set(
+        xlabel=scene.unit, ylabel="K, iterations a solve may take\n(of auto, rtol: those that it took)", ylim=(0, None)
+    )
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)

@@ -29,7 +29,9 @@ def columns(scene):
         reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
     return [
         Column("", "", "Converged: K_ε, the K that the scene takes for converged. !: the controller warns, see below."),
-        Column("error", f"final {error}", "" if scene.task == "parameters" else "± one standard deviation over the seeds."),
+        Column(
+            "error", f"final {error}", "" if scene.task == "parameters" else "± one standard deviation over the seeds."
+        ),
         Column("last K", "last K", "last K: of auto and rtol, what their last solves took."),
         *reached,
         Column(

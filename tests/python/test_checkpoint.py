@@ -83,8 +83,12 @@ def seconds_in(trainer, checkpoint):
 @pytest.mark.parametrize("trainer", TRAINERS)
 @pytest.mark.parametrize(
     "task, intervals, signals",
-    [("emulator", 150, [SIGKILL, SIGTERM, SIGINT]), ("parameters", 500, [SIGKILL]), ("corrector", 40, [SIGKILL]),
-     ("field", 150, [SIGKILL])],
+    [
+        ("emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
+        ("parameters", 500, [SIGKILL]),
+        ("corrector", 40, [SIGKILL]),
+        ("field", 150, [SIGKILL]),
+    ],
 )
 def test_a_killed_training_goes_on_bit_for_bit(tmp_path, trainer, task, intervals, signals):
     scene = scene_of(task, tmp_path)

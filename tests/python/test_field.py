@@ -1,6 +1,7 @@
 """The task "field": its physics and data against dense matrices, its gradient, its trainings in both languages."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +44,9 @@ def random_kappa(*shape):
 def test_the_stencil_is_the_sum_of_its_fluxes(shape):
     kappa = random_kappa(*shape)
     a = operators.Stencil(*_C.diffusion_stencil(kappa, 0.03), "periodic")
-    np.testing.assert_allclose(a.dense().view(kappa.numel(), -1), dense_diffusion(kappa.numpy(), 0.03), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        a.dense().view(kappa.numel(), -1), dense_diffusion(kappa.numpy(), 0.03), rtol=1e-13, atol=1e-13
+    )
 
 
 def test_the_roughness_is_the_mean_square_of_the_gradient():
@@ -198,6 +201,15 @@ def test_a_comparison_has_a_row_with_a_looser_tolerance(tmp_path):
 )  # fmt: skip
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):
     assert_refused(small_field(tmp_path, (before, after)), where, message)
+
+
+def test_the_example_finds_the_field(tmp_path):
+    script = ROOT / "examples/variable_diffusion.py"
+    assert len(script.read_text().splitlines()) <= 40
+    done = subprocess.run([sys.executable, script, "16", "20"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    misfit, error, tolerance = (float(word) for word in re.findall(r"[\d.]+(?:e-\d+)?", done.stdout))
+    assert misfit < 0.05 and error < 0.15 and tolerance < 0.01
 
 
 def test_a_scene_without_a_network_has_no_validation_samples(tmp_path):
