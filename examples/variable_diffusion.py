@@ -29,7 +29,7 @@ log_kappa = torch.nn.Parameter(torch.full((n, n), 0.02).log())
 step = prdp.ImplicitStep(lambda u: operator, solver=prdp.CG(max_iter=1000))  # a cap; the controller sets rtol
 controller = prdp.ToleranceController([step])
 optimiser = torch.optim.Adam([log_kappa], lr=0.05)
-for epoch in range(epochs):
+for _ in range(epochs):
     optimiser.zero_grad()
     operator = diffusion(log_kappa.exp())  # once for all steps of the rollout
     misfit = (step.rollout(u0, 10)[:, 5::5] - observed).norm() / observed.norm()
