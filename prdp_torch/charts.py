@@ -165,9 +165,15 @@ def accuracy_against_cost(scene, rows):
     def draw(axes, name):
         cost = np.array([row.total(name).mean() for row in rows])
         for row, x, y in zip(rows, cost, error, strict=True):
-            marker = {"auto": "X", "prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}.get(
-                row.kind, "o"
-            )
+            marker = {
+                "auto": "X",
+                "tolerance": "v",
+                "prdp": "*",
+                "growth": "^",
+                "direct": "D",
+                "converged": "s",
+                "schedule": "P",
+            }.get(row.kind, "o")
             bars = {}
             if len(row.curves) > 1:
                 bars = {"xerr": row.total(name).std(ddof=1), "yerr": row.final().std(ddof=1)}
