@@ -29,6 +29,7 @@ SMALL_FIELD = (
     ("steps = 20", "steps = 6"),
     ("every = 4", "every = 2"),
     ("updates = 150\nupdates = 150", "updates = 30\nupdates = 30"),
+    ("initial = 10", "initial = 2"),
 )
 
 
