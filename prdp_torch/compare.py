@@ -73,8 +73,8 @@ class Row:
 
 
 def rows_of(scene):
-    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, auto, PRDP and
-    constant K."""
+    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, a looser tolerance
+    where the scene names one, auto, PRDP and constant K."""
     converged = scene.max_iter
     rows = [Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged)]
     if scene.physics.direct_is_cheap:

@@ -7,6 +7,7 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
+#include "prdp/steppers/implicit_step.h"
 #include "prdp/steppers/stepper.h"
 
 namespace {
@@ -212,6 +213,19 @@ TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
   EXPECT_EQ(c.max_iter(), 60);
   EXPECT_THROW(c.load_state({0}), c10::ValueError);
   EXPECT_THROW(c.load_state({61}), c10::ValueError);
+}
+
+TEST(Controller, TakesStepsOfOnesOwnEquation) {
+  prdp::ImplicitStep own(prdp::OperatorSpec{"heat", {30}, {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}}, nullptr,
+                         prdp::CG{.max_iter = 100});
+  prdp::ToleranceController controller;
+  controller.step(0.2);
+  prdp::set_budget(own, controller.budget());
+  own.rollout(at::randn({3, 1, 30}, at::kDouble), 4);
+  const auto solves = prdp::last_solves({&own});
+  EXPECT_TRUE(solves.converged);
+  EXPECT_LE(*solves.residual, 0.02);
+  EXPECT_GT(*solves.residual, 0.0001);
 }
 
 }  // namespace
