@@ -198,8 +198,9 @@ class ToleranceController(_C.ToleranceController, _Attached):
         """Take the relative error of what is trained (finite, >= 0) after an interval. True if rtol became
         smaller.
 
-        error: ‖u - u_ref‖ / ‖u_ref‖ on validation data, which is the square root of a normalised squared
-            metric. In an inverse problem the relative misfit, ‖simulated - observed‖ / ‖observed‖.
+        error: ‖u - u_ref‖ / ‖u_ref‖ on validation data after one step, which is the square root of a
+            normalised squared metric. Of an error after n steps take the n-th part, since errors add up. In
+            an inverse problem the relative misfit, ‖simulated - observed‖ / ‖observed‖.
         converged: not looked at; for the interface of `PRDPController`.
         """
         return self._decide(_number("ToleranceController", "error", error), converged, None)

@@ -258,8 +258,11 @@ def _network(scene, steppers, seed, network, on_data):
         optimiser.load_state_dict(saved["optimiser"])
         generator.set_state(saved["shuffling"])
 
-    # The metric is a mean of squares relative to the reference.
-    return Task(updates, _metric(scene, data, network), math.sqrt, state, load)
+    # The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
+    def of_a_step(metric):
+        return math.sqrt(metric) / scene.data.valid_steps
+
+    return Task(updates, _metric(scene, data, network), of_a_step, state, load)
 
 
 def _metric(scene, data, network):

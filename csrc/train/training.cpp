@@ -288,8 +288,8 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   auto& module = *network.ptr();
   const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
   const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
-  // The metric is a mean of squares relative to the reference.
-  const auto error = [](double squared) { return std::sqrt(squared); };
+  // The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
+  const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) { return std::sqrt(squared) / n; };
   return run.go({updates, metric, error, save_all, load_all}, on_interval);
 }
 

@@ -11,8 +11,8 @@ namespace prdp {
 struct Solves {
   bool converged = false;            // all of them met their tolerance
   std::optional<double> residual{};  // ‖b - A u‖ / ‖b‖ where they ended, mean over the samples
-  /// ‖u - u_ref‖ / ‖u_ref‖ of what is trained: the square root of a normalised squared metric, or the
-  /// relative misfit of an inverse problem.
+  /// ‖u - u_ref‖ / ‖u_ref‖ of what is trained, after one step: the square root of a normalised squared
+  /// metric over the steps that it follows, or the relative misfit of an inverse problem.
   std::optional<double> error{};
 
   Solves(bool converged = false, std::optional<double> residual = {}, std::optional<double> error = {})
