@@ -133,11 +133,17 @@ class Training:
     batch: int
     intervals: int
 
+class Field:
+    steps: int
+    every: int
+    smoothing: float
+
 class Compare:
     seeds: int
     constant: list[int]
     growth: float | None
     schedule: list[int]
+    rtol: float | None
     target: float | None
 
 class Scene:
@@ -147,11 +153,13 @@ class Scene:
     title: str
     task: str
     unit: str
+    trains_network: bool
     executions: int
     dtype: dtype
     physics: Physics
     data: Data
     network: Network
+    field: Field
     training: Training
     compare: Compare
     method: str
@@ -175,6 +183,12 @@ class ParameterProblem:
     start: Tensor
     reference: Tensor
     solution: Tensor
+
+class FieldProblem:
+    start: Tensor
+    snapshots: Tensor
+    theta: Tensor
+    reference: Tensor
 
 class Checkpoint:
     def __init__(self, path: str | PathLike[str], settings: str) -> None: ...
@@ -203,6 +217,10 @@ def validation_trajectories(
     scene: Scene, steps: int, on_progress: Callable[[int, int], None] | None = ...
 ) -> Tensor: ...
 def make_parameter_problem(scene: Scene) -> ParameterProblem: ...
+def make_field_problem(scene: Scene, seed: int) -> FieldProblem: ...
+def diffusion_stencil(kappa: Tensor, dt: float) -> tuple[Tensor, list[list[int]]]: ...
+def observed(states: Tensor, scene: Scene) -> Tensor: ...
+def roughness(theta: Tensor) -> Tensor: ...
 def loss(kind: str, u: Tensor, reference: Tensor) -> Tensor: ...
 def normalised_mse(u: Tensor, reference: Tensor) -> Tensor: ...
 def without_mean_pressure(u: Tensor) -> Tensor: ...

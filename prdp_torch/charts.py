@@ -11,6 +11,7 @@ WIDTH = 9.2  # inches, of every picture
 FIXED = {
     "converged": ("#222222", "-"),
     "direct": ("#7f7f7f", "--"),
+    "tolerance": ("#2ca02c", "--"),
     "auto": ("#1f77b4", "-"),
     "prdp": ("#d62728", "-"),
     "growth": ("#ff9f1c", "-."),
@@ -42,6 +43,8 @@ def error_measure(scene):
 def _metric_name(scene):
     if scene.task == "parameters":
         return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
+    if scene.task == "field":
+        return "error of the field ‖κ − κ_ref‖ / ‖κ_ref‖"
     error, measure = error_measure(scene)
     steps = scene.data.valid_steps
     if scene.task == "corrector":
@@ -73,18 +76,20 @@ def metric_over_intervals(scene, rows):
 
 
 def k_over_intervals(scene, rows):
-    """K over epochs, of auto the iterations that a solve took: each seed thin, their mean bold."""
+    """K over epochs, or the iterations that a solve took where K is only a cap: each seed thin, their mean bold."""
     figure, (axes,) = make_figure()
     for row in rows:
-        if row.kind not in ("auto", "prdp", "growth", "schedule"):
+        if row.kind not in ("auto", "tolerance", "prdp", "growth", "schedule"):
             continue
         colour, line = _style(row, rows)
-        k = row.taken_per_solve() if row.kind == "auto" else row.stack("max_iter")
+        k = row.taken_per_solve() if row.capped else row.stack("max_iter")
         if len(k) > 1:
             axes.plot(k.T, color=colour, lw=0.7, alpha=0.35)
         axes.plot(k.mean(0), color=colour, ls=line, lw=2.2, label=row.title)
     axes.axhline(scene.max_iter, color="#222222", lw=1.2, label=f"converged, K = {scene.max_iter}")
-    axes.set(xlabel=scene.unit, ylabel="K, iterations a solve may take\n(of auto: those that it took)", ylim=(0, None))
+    axes.set(
+        xlabel=scene.unit, ylabel="K, iterations a solve may take\n(of auto, rtol: those that it took)", ylim=(0, None)
+    )
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False)
@@ -160,9 +165,15 @@ def accuracy_against_cost(scene, rows):
     def draw(axes, name):
         cost = np.array([row.total(name).mean() for row in rows])
         for row, x, y in zip(rows, cost, error, strict=True):
-            marker = {"auto": "X", "prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}.get(
-                row.kind, "o"
-            )
+            marker = {
+                "auto": "X",
+                "tolerance": "v",
+                "prdp": "*",
+                "growth": "^",
+                "direct": "D",
+                "converged": "s",
+                "schedule": "P",
+            }.get(row.kind, "o")
             bars = {}
             if len(row.curves) > 1:
                 bars = {"xerr": row.total(name).std(ddof=1), "yerr": row.final().std(ddof=1)}

@@ -17,7 +17,7 @@ class Row:
 
     label: str
     title: str
-    kind: str  # "converged", "constant", "auto", "prdp", "growth", "schedule", "direct"
+    kind: str  # "converged", "constant", "tolerance", "auto", "prdp", "growth", "schedule", "direct"
     refinement: Refinement
     k: int = 0
     curves: list = field(default_factory=list)
@@ -50,6 +50,11 @@ class Row:
         """How many seeds were lost."""
         return sum("diverged" in c for c in self.curves)
 
+    @property
+    def capped(self):
+        """Whether a tolerance ends the solves, and K is only a cap."""
+        return self.kind in ("auto", "tolerance")
+
     def last_k(self):
         return self.stack("max_iter")[:, -1]
 
@@ -68,12 +73,15 @@ class Row:
 
 
 def rows_of(scene):
-    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, auto, PRDP and
-    constant K."""
+    """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, a looser tolerance
+    where the scene names one, auto, PRDP and constant K."""
     converged = scene.max_iter
     rows = [Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged)]
     if scene.physics.direct_is_cheap:
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
+    if scene.compare.rtol is not None:
+        tolerance = Refinement.tolerance(scene.compare.rtol, converged)
+        rows.append(Row(tolerance.label, f"rtol = {scene.compare.rtol:g}", "tolerance", tolerance))
     rows.append(Row("auto", "auto", "auto", Refinement.auto()))
     rows.append(Row("prdp", "PRDP", "prdp", Refinement.prdp(scene)))
     if scene.compare.growth is not None:
@@ -134,7 +142,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     if curves is not None:
         on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
         return curves
-    network = None if scene.task == "parameters" else make_network(scene, seed)
+    network = make_network(scene, seed) if scene.trains_network else None
     curves = train(scene, refinement, seed, network, on_interval, on_data, checkpoint)
     on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
     record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
@@ -168,8 +176,8 @@ def summarise(scene, rows):
     base = table[0]
     for entry in table:
         entry["as_good"] = _as_good(entry, base)
-        # K is a cap to auto, so it has no use of an allowance; the products are everybody's.
-        entry["saved"] = None if entry["kind"] == "auto" else 1 - entry["budget"] / max(1.0, base["budget"])
+        # A cap on K is no allowance; the products are everybody's.
+        entry["saved"] = None if entry["capped"] else 1 - entry["budget"] / max(1.0, base["budget"])
         entry["products_saved"] = 1 - entry["operator_applications"] / max(1.0, base["operator_applications"])
     return table
 
@@ -178,18 +186,18 @@ def _entry(scene, row, target):
     final = row.final()
     costs = ("budget", "iterations", "operator_applications", "adjoint_applications", "seconds")
     warnings = row.warnings()
-    auto = row.kind == "auto"
     return {
         "label": row.label,
         "title": row.title,
         "kind": row.kind,
+        "capped": row.capped,
         "seeds": len(row.curves),
         "diverged": row.diverged(),
         "warnings": len(warnings),
         "warning": warnings[0] if warnings else None,
         "metric": float(final.mean()),
         "metric_std": float(final.std(ddof=1)) if len(final) > 1 else 0.0,
-        "last_k": float((row.taken_per_solve()[:, -1] if auto else row.last_k()).mean()),
+        "last_k": float((row.taken_per_solve()[:, -1] if row.capped else row.last_k()).mean()),
         "intervals": float(row.counted(target).mean()),
         "reaches_target": None if target is None else bool(row.reaches(target).all()),
         "saved_by_incomplete_convergence": float(max(0.0, 1 - row.last_k().mean() / scene.max_iter)),

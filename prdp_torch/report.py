@@ -20,8 +20,8 @@ class Column(NamedTuple):
 
 def columns(scene):
     """The table's columns, in order."""
-    network, target = scene.task != "parameters", scene.compare.target
-    error = "validation error" if network else "parameter error"
+    target = scene.compare.target
+    error = {"parameters": "parameter error", "field": "error of the field"}.get(scene.task, "validation error")
     until = "" if target is None else f" to an error of {target:g}"
     unit = f"{scene.unit}s"
     reached = []
@@ -29,8 +29,10 @@ def columns(scene):
         reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
     return [
         Column("", "", "Converged: K_ε, the K that the scene takes for converged. !: the controller warns, see below."),
-        Column("error", f"final {error}", "± one standard deviation over the seeds." if network else ""),
-        Column("last K", "last K", "last K: of auto, what its last solves took."),
+        Column(
+            "error", f"final {error}", "" if scene.task == "parameters" else "± one standard deviation over the seeds."
+        ),
+        Column("last K", "last K", "last K: of auto and rtol, what their last solves took."),
         *reached,
         Column(
             "", f"iterations allowed{until}", f"Iterations allowed: K summed over the solves{until}, the paper's count."

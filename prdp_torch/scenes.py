@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from prdp_torch import _C, solvers, steppers
+from prdp_torch import _C, field_task, solvers, steppers
 
 _PACKAGE = Path(__file__).parent
 # In a checkout the scenes lie among the examples; a wheel carries them along.
@@ -38,6 +38,8 @@ def make_stepper(scene, direct=False, max_iter=None):
         "backward": scene.backward,
         "on_failure": "return",
     }
+    if physics.equation == "diffusion":
+        return field_task.make_stepper(scene, **options)
     if physics.equation == "poisson":
         return steppers.Poisson(physics.shape, **options)
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}

@@ -3,16 +3,15 @@
 
 import math
 import time
-from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, fields
+from prdp_torch import _C, field_task, fields
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 from prdp_torch.solve import SolveStatus
+from prdp_torch.task import Task
 
 
 class Refinement:
@@ -49,6 +48,17 @@ class Refinement:
         return cls.schedule(k, 0, k, label=f"constant_{k}")
 
     @classmethod
+    def tolerance(cls, rtol, k):
+        """The same rtol throughout; K is a cap."""
+
+        def attach(steppers):
+            for stepper in steppers:
+                stepper.rtol = rtol
+            return LinearSchedule(steppers, initial=k, increment=0, maximum=k)
+
+        return cls(f"rtol_{rtol:g}", attach)
+
+    @classmethod
     def schedule(cls, start, step, maximum, label=None):
         return cls(
             label or f"schedule_{start}_{step}",
@@ -62,17 +72,18 @@ class Refinement:
 
 def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=None, checkpoint=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
-    an update of the task "parameters". "metric" starts before the first interval; "budget" is K times
-    the solves, of which an update of the task "corrector" has two; iterations and operator applications
-    are per sample of a batch, summed over the solves, the applications over the adjoint solves as well, whose
-    own are "adjoint_applications". "warning" is there where the controller ends with one.
+    an update where there is no network. "metric" starts before the first interval, and so does "error", the
+    relative error that a user knows; "budget" is K times the solves, of which an update of the task "corrector"
+    has two and one of "field" one a step; iterations and operator applications are per sample of a batch, summed
+    over the solves, the applications over the adjoint solves as well, whose own are "adjoint_applications".
+    "warning" is there where the controller ends with one.
     A training whose loss or metric is no longer finite stops there: "diverged" says where and why, and the
     curves end with the interval that was lost, with a metric of NaN and no costs.
 
     Args:
         scene: from `prdp_torch.scenes.load`.
         refinement: a `Refinement`.
-        seed: of the network's weights and of the shuffling; the data stay the same.
+        seed: of the network's weights and of the shuffling, or of a field's noise; the other data stay the same.
         network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
         on_interval: called after each interval with (how many are done, the metric, K), and where a
             checkpoint is gone on from.
@@ -85,8 +96,10 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene.training.intervals, steppers, refinement, checkpoint)
-    make_task = _parameters if scene.task == "parameters" else _network
-    task = make_task(scene, steppers, seed, network, on_data)
+    if scene.trains_network:
+        task = _network(scene, steppers, seed, network, on_data)
+    else:
+        task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
     try:
         run.go(task, saved, on_interval or (lambda *report: None))
     except _Diverged as divergence:
@@ -96,16 +109,6 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
 
 class _Diverged(Exception):
     pass
-
-
-class _Task(NamedTuple):
-    """What a task supplies."""
-
-    updates: Callable  # the number of the first → an iterator over the losses of an interval's updates
-    metric: Callable
-    error: Callable  # the metric → the relative error of what is trained, as far as a user knows it
-    state: Callable  # all that the updates change
-    load: Callable  # its inverse
 
 
 class _Run:
@@ -121,7 +124,7 @@ class _Run:
         self.controller = refinement.attach(steppers)
         self.watches_error = refinement.watches_error
         self.checkpoint = checkpoint
-        self.curves = {name: [] for name in ("update_loss", "metric", *self.COSTS)}
+        self.curves = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
 
     def go(self, task, saved, on_interval):
         if saved is None:
@@ -165,11 +168,11 @@ class _Run:
             self._check(loss, number)
             self.curves["update_loss"].append(loss)
             for stepper in self.steppers:
-                solves += 1
-                iterations += float(stepper.info.iterations.double().mean())
-                forward += float(stepper.info.operator_applications.double().mean())
+                solves += stepper.info.iterations[0].numel()
+                iterations += _per_sample(stepper.info.iterations)
+                forward += _per_sample(stepper.info.operator_applications)
                 if stepper.adjoint_info is not None:
-                    adjoint += float(stepper.adjoint_info.operator_applications.double().mean())
+                    adjoint += _per_sample(stepper.adjoint_info.operator_applications)
         seconds = time.perf_counter() - started
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
 
@@ -177,7 +180,8 @@ class _Run:
         """The curves end with the interval that was lost."""
         self.curves["diverged"] = why
         lost = max(1, len(self.curves["metric"]))
-        self.curves["metric"] += [math.nan] * (lost + 1 - len(self.curves["metric"]))
+        for name in ("metric", "error"):
+            self.curves[name] += [math.nan] * (lost + 1 - len(self.curves[name]))
         if self._done() < lost:
             self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0.0)
 
@@ -191,6 +195,7 @@ class _Run:
             raise _Diverged(f"interval {done}: the metric is {metric}")
         self.curves["metric"].append(metric)
         error = task.error(metric)
+        self.curves["error"].append(error)
         if self.watches_error:
             self.controller.step(error)
         else:
@@ -201,6 +206,11 @@ class _Run:
             raise _Diverged(f"interval {done}: the loss is {loss}")
         if any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers):
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
+
+
+def _per_sample(counts):
+    """Of counts (batch,), or (batch, steps) of a rollout, summed over the steps."""
+    return float(counts.double().mean(0).sum())
 
 
 def propagator(scene, network):
@@ -252,7 +262,7 @@ def _network(scene, steppers, seed, network, on_data):
     def of_a_step(metric):
         return math.sqrt(metric) / scene.data.valid_steps
 
-    return _Task(updates, _metric(scene, data, network), of_a_step, state, load)
+    return Task(updates, _metric(scene, data, network), of_a_step, state, load)
 
 
 def _metric(scene, data, network):
@@ -295,7 +305,7 @@ def _corrector(scene, steppers, data, network):
     return loss
 
 
-def _parameters(scene, steppers, seed, network, on_data):
+def _parameters(scene, steppers, seed):
     """An interval is a single update, the metric the error of θ."""
     (stepper,) = steppers
     problem = _C.make_parameter_problem(scene)
@@ -319,4 +329,4 @@ def _parameters(scene, steppers, seed, network, on_data):
     def load(saved):
         theta.detach().copy_(saved["theta"])
 
-    return _Task(updates, metric, lambda _: misfit, lambda: {"theta": theta.detach()}, load)
+    return Task(updates, metric, lambda _: misfit, lambda: {"theta": theta.detach()}, load)

@@ -41,7 +41,7 @@ def collect(scene, rows, folder, on_data=None):
 
     on_data: called while the reference is made with (steps of a sample done, all of them).
     """
-    if scene.task == "parameters":
+    if not scene.trains_network:
         return None
     rows = [row for row in rows if row.kind in ("converged", "prdp")]
     networks = {row.label: _networks(scene, row, folder) for row in rows}

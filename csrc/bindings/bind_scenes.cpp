@@ -5,6 +5,7 @@
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/checkpoint.h"
 #include "prdp/scenes/data.h"
+#include "prdp/scenes/field_problem.h"
 #include "prdp/scenes/files.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"
@@ -41,11 +42,16 @@ void bind_scenes(py::module_& m) {
       .def_readonly("loss", &Scene::Training::loss)
       .def_readonly("batch", &Scene::Training::batch)
       .def_readwrite("intervals", &Scene::Training::intervals);
+  py::class_<Scene::Field>(m, "Field")
+      .def_readonly("steps", &Scene::Field::steps)
+      .def_readonly("every", &Scene::Field::every)
+      .def_readonly("smoothing", &Scene::Field::smoothing);
   py::class_<Scene::Compare>(m, "Compare")
       .def_readonly("seeds", &Scene::Compare::seeds)
       .def_readonly("constant", &Scene::Compare::constant)
       .def_readonly("growth", &Scene::Compare::growth)
       .def_readonly("schedule", &Scene::Compare::schedule)
+      .def_readonly("rtol", &Scene::Compare::rtol)
       .def_readonly("target", &Scene::Compare::target);
 
   py::class_<Scene>(m, "Scene")
@@ -56,17 +62,17 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("task",
                              [](const Scene& s) {
                                if (s.task == Scene::Task::kCorrector) return "corrector";
+                               if (s.task == Scene::Task::kField) return "field";
                                return s.task == Scene::Task::kEmulator ? "emulator" : "parameters";
                              })
       .def_property_readonly("executions", &Scene::executions)
-      .def_property_readonly("unit",
-                             [](const Scene& s) {
-                               return s.task == Scene::Task::kParameters ? "update" : "epoch";
-                             })
+      .def_property_readonly("trains_network", &Scene::trains_network)
+      .def_property_readonly("unit", [](const Scene& s) { return s.trains_network() ? "epoch" : "update"; })
       .def_readonly("dtype", &Scene::dtype)
       .def_readonly("physics", &Scene::physics)
       .def_readonly("data", &Scene::data)
       .def_readonly("network", &Scene::network)
+      .def_readonly("field", &Scene::field)
       .def_readonly("training", &Scene::training)
       .def_readonly("compare", &Scene::compare)
       .def_property_readonly("method", [](const Scene& s) { return name(s.solver.method); })
@@ -98,6 +104,22 @@ void bind_scenes(py::module_& m) {
       .def_readonly("solution", &ParameterProblem::solution);
   m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"),
         py::call_guard<py::gil_scoped_release>());
+  py::class_<FieldProblem>(m, "FieldProblem")
+      .def_readonly("start", &FieldProblem::start)
+      .def_readonly("snapshots", &FieldProblem::snapshots)
+      .def_readonly("theta", &FieldProblem::theta)
+      .def_readonly("reference", &FieldProblem::reference);
+  m.def("make_field_problem", &make_field_problem, py::arg("scene"), py::arg("seed"),
+        py::call_guard<py::gil_scoped_release>());
+  m.def(
+      "diffusion_stencil",
+      [](const at::Tensor& kappa, double dt) {
+        const auto stencil = diffusion_stencil(kappa, dt);
+        return std::make_pair(stencil.coefficients, stencil.offsets);
+      },
+      py::arg("kappa"), py::arg("dt"));
+  m.def("observed", &observed, py::arg("states"), py::arg("scene"));
+  m.def("roughness", &roughness, py::arg("theta"));
 
   py::class_<Checkpoint>(m, "Checkpoint")
       .def(py::init<std::filesystem::path, std::string>(), py::arg("path"), py::arg("settings"))

@@ -9,6 +9,7 @@
 #include <cmath>
 #include <limits>
 
+#include "field.h"
 #include "fused_adam.h"
 #include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"
@@ -53,7 +54,8 @@ Refinement direct() {
 
 namespace {
 
-double per_sample(const at::Tensor& counts) { return counts.to(at::kDouble).mean().item<double>(); }
+/// Of counts (batch), or (batch, steps) of a rollout, summed over the steps.
+double per_sample(const at::Tensor& counts) { return counts.to(at::kDouble).mean(0).sum().item<double>(); }
 
 struct Diverged {
   std::string why;
@@ -67,28 +69,17 @@ struct Costs {
   double iterations = 0.0, forward = 0.0, adjoint = 0.0, seconds = 0.0;
 };
 
-/// What a task supplies: the updates of one interval, numbered from `update` and each reporting its loss;
-/// the metric; the relative error of what is trained, as far as a user knows it, given the metric; and all
-/// that the updates change, to and from tensors.
-struct Task {
-  std::function<void(int64_t update, const std::function<void(double)>& on_update)> updates;
-  std::function<double()> metric;
-  std::function<double(double metric)> error;
-  std::function<void(TensorMap&)> save;
-  std::function<void(const TensorMap&)> load;
-};
-
 /// What the tasks share: the intervals, their costs, and when a training is lost.
 class Run {
  public:
-  Run(const Scene& scene, const Refinement& refinement, Checkpoint& checkpoint)
+  /// `steppers`: of the solves of an update, one after the other.
+  Run(const Scene& scene, const Refinement& refinement, Checkpoint& checkpoint, std::vector<Solving*> steppers)
       : intervals_(scene.training.intervals),
+        steppers_(std::move(steppers)),
         watches_error_(refinement.watches_error),
         controller_(refinement.controller()),
         checkpoint_(checkpoint),
         saved_(checkpoint.read()) {
-    for (int64_t i = 0; i < scene.executions(); ++i)
-      steppers.push_back(scene.stepper(refinement.direct ? Solver(Direct{}) : scene.solver));
     take_budget();
   }
 
@@ -113,12 +104,11 @@ class Run {
     return curves_;
   }
 
-  std::vector<Stepper> steppers;  // of the solves of an update, one after the other
-
  private:
   void take_budget() {
-    for (auto& stepper : steppers) set_budget(stepper, controller_->budget());
+    for (auto* stepper : steppers_) set_budget(*stepper, controller_->budget());
   }
+  double rtol() const { return steppers_[0]->options().solver.rtol; }
 
   int64_t done() const { return static_cast<int64_t>(curves_.seconds.size()); }
 
@@ -142,16 +132,17 @@ class Run {
   }
 
   void run_interval(const Task& task, int64_t done) {
-    Costs costs{.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol};
+    Costs costs{.max_iter = controller_->max_iter(), .rtol = rtol()};
     const auto started = std::chrono::steady_clock::now();
     task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss) {
       check(loss, done);
       curves_.update_loss.push_back(loss);
-      for (const auto& stepper : steppers) {
-        ++costs.solves;
-        costs.iterations += per_sample(stepper.info()->iterations);
-        costs.forward += per_sample(stepper.info()->operator_applications);
-        if (const auto adjoint = stepper.adjoint_info()) costs.adjoint += per_sample(adjoint->operator_applications);
+      for (const auto* stepper : steppers_) {
+        const auto& info = *stepper->info();
+        costs.solves += info.iterations.numel() / info.iterations.size(0);
+        costs.iterations += per_sample(info.iterations);
+        costs.forward += per_sample(info.operator_applications);
+        if (const auto adjoint = stepper->adjoint_info()) costs.adjoint += per_sample(adjoint->operator_applications);
       }
     });
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
@@ -174,8 +165,9 @@ class Run {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(metric)) throw Diverged{interval + ": the metric is " + std::to_string(metric)};
     curves_.metric.push_back(metric);
-    auto solves = last_solves(steppers);
+    auto solves = last_solves({steppers_.begin(), steppers_.end()});
     solves.error = task.error(metric);
+    curves_.error.push_back(*solves.error);
     controller_->step(watches_error_ ? *solves.error : metric, solves);
     curves_.warning = controller_->warning().value_or("");
     take_budget();
@@ -185,8 +177,8 @@ class Run {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
     const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
-    for (const auto& stepper : steppers)
-      if (stepper.info()->status.le(nonfinite).any().item<bool>())
+    for (const auto* stepper : steppers_)
+      if (stepper->info()->status.le(nonfinite).any().item<bool>())
         throw Diverged{interval + ": the solver was given NaN or Inf"};
   }
 
@@ -196,11 +188,12 @@ class Run {
     curves_.warning.clear();
     const auto lost = std::max<size_t>(1, curves_.metric.size());
     curves_.metric.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
-    if (curves_.seconds.size() < lost)
-      append({.max_iter = controller_->max_iter(), .rtol = steppers[0].options().solver.rtol});
+    curves_.error.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
+    if (curves_.seconds.size() < lost) append({.max_iter = controller_->max_iter(), .rtol = rtol()});
   }
 
   int64_t intervals_;
+  std::vector<Solving*> steppers_;
   bool watches_error_;
   std::unique_ptr<Controller> controller_;
   Checkpoint& checkpoint_;
@@ -226,15 +219,17 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   return network;
 }
 
+using Steppers = std::vector<Stepper>;
+
 /// What training a network is about: the loss of a batch, and the metric.
 struct Objective {
   std::function<at::Tensor(const at::Tensor& batch)> loss;
   std::function<double()> metric;
 };
 
-Objective emulator(const Scene& scene, Run& run, const Dataset& data, torch::nn::AnyModule& network) {
+Objective emulator(const Scene& scene, Steppers& steppers, const Dataset& data, torch::nn::AnyModule& network) {
   const auto loss_of = [&](const at::Tensor& batch) {
-    const auto u2 = run.steppers[0](network.forward(data.train_start.index_select(0, batch)));
+    const auto u2 = steppers[0](network.forward(data.train_start.index_select(0, batch)));
     return loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
   };
   const auto metric = [&] {
@@ -245,14 +240,14 @@ Objective emulator(const Scene& scene, Run& run, const Dataset& data, torch::nn:
   return {loss_of, metric};
 }
 
-Objective corrector(const Scene& scene, Run& run, const Dataset& data, torch::nn::AnyModule& network) {
+Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data, torch::nn::AnyModule& network) {
   const auto corrected = [&](Stepper& stepper, const at::Tensor& u) {
     const auto coarse = without_mean_pressure(stepper(u));
     return coarse + network.forward(coarse);
   };
   const auto loss_of = [&, corrected](const at::Tensor& batch) {
-    const auto u1 = corrected(run.steppers[0], data.train_start.index_select(0, batch));
-    const auto u2 = corrected(run.steppers[1], u1);
+    const auto u1 = corrected(steppers[0], data.train_start.index_select(0, batch));
+    const auto u2 = corrected(steppers[1], u1);
     return loss(scene.training.loss, u1, data.train_first.index_select(0, batch)) +
            loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
   };
@@ -266,12 +261,12 @@ Objective corrector(const Scene& scene, Run& run, const Dataset& data, torch::nn
   return {loss_of, metric};
 }
 
-Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterval& on_interval,
+Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed, const OnInterval& on_interval,
                      const OnProgress& on_data) {
   const auto data = make_dataset(scene, on_data);
   auto network = make_network(scene, seed);
-  const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, run, data, network)
-                                                              : corrector(scene, run, data, network);
+  const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
+                                                              : corrector(scene, steppers, data, network);
   FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
 
@@ -298,14 +293,14 @@ Curves train_network(const Scene& scene, Run& run, int64_t seed, const OnInterva
   return run.go({updates, metric, error, save_all, load_all}, on_interval);
 }
 
-Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_interval) {
+Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
   auto theta = problem.start.clone().requires_grad_();
   // What a user sees, who does not know θ; before the first solve nothing is explained yet.
   double misfit = 1.0;
 
   const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
-    const auto u = run.steppers[0](at::matmul(theta, problem.modes).view({1, 1, -1}));
+    const auto u = stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
     const auto error = half_mse(u, problem.solution);
     const auto gradient = torch::autograd::grad({error}, {theta})[0];
     {
@@ -327,9 +322,18 @@ Curves train_parameters(const Scene& scene, Run& run, const OnInterval& on_inter
 
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
              Checkpoint& checkpoint, const OnProgress& on_data) {
-  Run run(scene, refinement, checkpoint);
-  return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, on_interval)
-                                                : train_network(scene, run, seed, on_interval, on_data);
+  const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
+  if (scene.task == Scene::Task::kField) {
+    FieldTraining field(scene, solver, seed);
+    return Run(scene, refinement, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
+  }
+  Steppers steppers;
+  for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene.stepper(solver));
+  std::vector<Solving*> solves;
+  for (auto& stepper : steppers) solves.push_back(&stepper);
+  Run run(scene, refinement, checkpoint, solves);
+  return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, steppers[0], on_interval)
+                                                : train_network(scene, run, steppers, seed, on_interval, on_data);
 }
 
 }  // namespace prdp::train

@@ -26,11 +26,12 @@ Refinement schedule(int64_t start, int64_t step, int64_t maximum);
 Refinement constant(int64_t k);
 Refinement direct();
 
-/// What a training leaves, one entry an interval: an epoch, or an update of the task "parameters". Costs
-/// are those of all solves of an update, of which a corrector has two.
+/// What a training leaves, one entry an interval: an epoch, or an update where there is no network. Costs are those of
+/// all solves of an update, of which a corrector has two and a field one a step.
 struct Curves {
   std::vector<double> update_loss;  // one entry an update
   std::vector<double> metric;       // starts before the first interval
+  std::vector<double> error;        // as metric; the relative error that a user knows, which the tolerances follow
   std::vector<int64_t> max_iter;    // K
   std::vector<int64_t> budget;      // K times the solves, the paper's count
   // Per sample of a batch, summed over updates; the applications are those of both solves.
@@ -46,6 +47,7 @@ template <class AnyCurves, class F>
 void each_curve(AnyCurves& curves, const F& f) {
   f("update_loss", curves.update_loss);
   f("metric", curves.metric);
+  f("error", curves.error);
   f("max_iter", curves.max_iter);
   f("budget", curves.budget);
   f("iterations", curves.iterations);
@@ -59,7 +61,7 @@ void each_curve(AnyCurves& curves, const F& f) {
 /// from.
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
-/// Trains the scene once; `seed` is that of the network's weights and of the shuffling. Goes on from the
+/// Trains the scene once; `seed` is that of the network's weights and of the shuffling, or of a field's noise. Goes on from the
 /// checkpoint where there is one, and keeps itself there whenever one is due after an interval.
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
              Checkpoint& checkpoint, const OnProgress& on_data = {});

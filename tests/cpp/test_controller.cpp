@@ -8,6 +8,8 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
+#include "prdp/steppers/implicit_step.h"
+#include "prdp/steppers/stepper.h"
 
 namespace {
 
@@ -232,6 +234,19 @@ TEST(Controllers, KStopsAtTheLargestNumber) {
   EXPECT_EQ(last(PRDPController({.delta = kMost})), 1);
   EXPECT_EQ(last(prdp::LinearSchedule(1, kMost, kMost)), kMost);
   EXPECT_EQ(last(prdp::LinearSchedule(5, kMost, 9)), 9);
+}
+
+TEST(Controller, TakesStepsOfOnesOwnEquation) {
+  prdp::ImplicitStep own(prdp::OperatorSpec{"heat", {30}, {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}}, nullptr,
+                         prdp::CG{.max_iter = 100});
+  prdp::ToleranceController controller;
+  controller.step(0.2);
+  prdp::set_budget(own, controller.budget());
+  own.rollout(at::randn({3, 1, 30}, at::kDouble), 4);
+  const auto solves = prdp::last_solves({&own});
+  EXPECT_TRUE(solves.converged);
+  EXPECT_LE(*solves.residual, 0.02);
+  EXPECT_GT(*solves.residual, 0.0001);
 }
 
 }  // namespace

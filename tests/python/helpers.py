@@ -23,6 +23,14 @@ TINY = (
     ("epochs = 100", "epochs = 5"),
     ("constant = [2, 5, 10, 20]", "constant = [2]"),
 )
+SMALL_FIELD = (
+    ("shape = [64, 64]", "shape = [10, 12]"),
+    ("\nstates = 4", "\nstates = 3"),
+    ("steps = 20", "steps = 6"),
+    ("every = 4", "every = 2"),
+    ("updates = 150\nupdates = 150", "updates = 30\nupdates = 30"),
+    ("initial = 10", "initial = 2"),
+)
 
 
 def golden(name):
@@ -124,6 +132,11 @@ def written(tmp_path, *changes, scene="heat_1d", name="changed"):
 def tiny(tmp_path, *changes, name="tiny"):
     """The path of a small copy of the scene navier_stokes, with replacements."""
     return written(tmp_path, *TINY, *changes, scene="navier_stokes", name=name)
+
+
+def small_field(tmp_path, *changes, name="small"):
+    """The path of a small copy of the scene diffusion_inverse, with replacements."""
+    return written(tmp_path, *SMALL_FIELD, *changes, scene="diffusion_inverse", name=name)
 
 
 def line_of(path, text):

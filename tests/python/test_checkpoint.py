@@ -10,7 +10,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 import torch
-from helpers import tiny, written
+from helpers import small_field, tiny, written
 
 import prdp_torch as prdp
 from prdp_torch import compare, records, scenes
@@ -35,6 +35,8 @@ def scene_of(task, tmp_path):
     """The path of a scene of this task."""
     if task == "corrector":
         return tiny(tmp_path)
+    if task == "field":
+        return small_field(tmp_path)
     return written(tmp_path, scene={"emulator": "heat_1d", "parameters": "poisson_1p"}[task])
 
 
@@ -81,7 +83,12 @@ def seconds_in(trainer, checkpoint):
 @pytest.mark.parametrize("trainer", TRAINERS)
 @pytest.mark.parametrize(
     "task, intervals, signals",
-    [("emulator", 150, [SIGKILL, SIGTERM, SIGINT]), ("parameters", 500, [SIGKILL]), ("corrector", 40, [SIGKILL])],
+    [
+        ("emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
+        ("parameters", 500, [SIGKILL]),
+        ("corrector", 40, [SIGKILL]),
+        ("field", 150, [SIGKILL]),
+    ],
 )
 def test_a_killed_training_goes_on_bit_for_bit(tmp_path, trainer, task, intervals, signals):
     scene = scene_of(task, tmp_path)
@@ -166,6 +173,7 @@ class Linear(torch.nn.Module):
         ("emulator", lambda scene: Refinement.exact(), None),
         ("parameters", lambda scene: Refinement.schedule(25, 6, 600), None),
         ("corrector", lambda scene: Refinement.constant(2), None),
+        ("field", lambda scene: Refinement.auto(), None),
     ],
 )
 def test_every_kind_of_training_goes_on_from_any_interval(tmp_path, task, refine, make_network):

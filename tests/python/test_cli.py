@@ -38,8 +38,8 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
     curves = record["curves"]
     assert len(curves["metric"]) == 5 and len(curves["update_loss"]) == 32
     assert set(curves) == {
-        "update_loss", "metric", "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications",
-        "rtol", "seconds", "warning",
+        "update_loss", "metric", "error", "max_iter", "budget", "iterations", "operator_applications",
+        "adjoint_applications", "rtol", "seconds", "warning",
     }  # fmt: skip
     summary = json.loads((folder / "runs/heat_1d/summary.json").read_text())
     by_label = {row["label"]: row for row in summary["rows"]}
@@ -88,7 +88,7 @@ def test_scenes_are_listed(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, heat_1d"),
+        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, diffusion_inverse"),
         (["compare", "nosuch.toml"], "prdp: scene: cannot read 'nosuch.toml'"),
         (
             ["train", "heat_1d", "--schedule", "3"],

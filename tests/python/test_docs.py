@@ -138,6 +138,7 @@ SECTIONS = {
     "`[network]`": "read_network(.*?)^}",
     "`[training]`": "read_training(.*?)^}",
     "`[parameters]`": "read_parameters(.*?)^}",
+    "`[field]`": "read_field(.*?)^}",
     "`[prdp]`": "read_prdp(.*?)^}",
     "`[compare]`": "read_compare(.*?)^}",
 }

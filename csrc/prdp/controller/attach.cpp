@@ -5,7 +5,7 @@
 
 namespace prdp {
 
-void set_budget(Stepper& stepper, const Budget& budget) {
+void set_budget(Solving& stepper, const Budget& budget) {
   stepper.set_max_iter(budget.max_iter);
   auto& options = stepper.options();
   if (budget.adjoint_max_iter) options.adjoint_max_iter = *budget.adjoint_max_iter;
@@ -13,12 +13,12 @@ void set_budget(Stepper& stepper, const Budget& budget) {
   if (budget.adjoint_rtol) options.adjoint_rtol = *budget.adjoint_rtol;
 }
 
-Solves last_solves(const std::vector<Stepper>& steppers) {
+Solves last_solves(const std::vector<const Solving*>& steppers) {
   Solves solves(!steppers.empty());
-  for (const auto& stepper : steppers) {
-    solves.converged = solves.converged && stepper.converged();
-    if (!stepper.info()) continue;
-    const auto residual = stepper.info()->residual.to(at::kDouble).mean().item<double>();
+  for (const auto* stepper : steppers) {
+    solves.converged = solves.converged && stepper->converged();
+    if (!stepper->info()) continue;
+    const auto residual = stepper->info()->residual.to(at::kDouble).mean().item<double>();
     if (std::isfinite(residual)) solves.residual = std::max(residual, solves.residual.value_or(0.0));
   }
   return solves;

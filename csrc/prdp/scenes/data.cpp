@@ -118,8 +118,8 @@ Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
 }
 
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress) {
-  TORCH_CHECK_VALUE(scene.task != Scene::Task::kParameters,
-                    "validation_trajectories: the task \"parameters\" has no validation samples");
+  TORCH_CHECK_VALUE(scene.trains_network(), "validation_trajectories: the task trains no network and has no "
+                    "validation samples");
   TORCH_CHECK_VALUE(steps >= 0, "validation_trajectories: steps must be >= 0, got ", steps);
   const auto& d = scene.data;
   return follow(scene, starts(scene).narrow(0, d.train, d.valid), steps, counted(steps * d.valid, on_progress));

@@ -33,7 +33,7 @@ Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
 /// The validation samples and the states of `steps` steps of the converged equation from them, in all
 /// (samples, steps + 1, channels, *shape): at step data.valid_steps what `make_dataset` gives, and as far
-/// beyond as wanted. Raises ValueError for the task "parameters", which has no samples, and for steps < 0.
+/// beyond as wanted. Raises ValueError for a task that trains no network, which has no samples, and for steps < 0.
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
 
 /// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).

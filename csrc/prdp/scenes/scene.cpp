@@ -22,23 +22,24 @@ std::vector<std::string> backwards(Task task) {
 }
 
 Task read_task(TomlSection& s) {
-  const auto name = s.choice("task", {"emulator", "corrector", "parameters"});
+  const auto name = s.choice("task", {"emulator", "corrector", "parameters", "field"});
   if (name == "corrector") return Task::kCorrector;
+  if (name == "field") return Task::kField;
   return name == "emulator" ? Task::kEmulator : Task::kParameters;
 }
 
 Scene::Physics read_physics(TomlSection s, Task task) {
   Scene::Physics p;
   const bool flow = task == Task::kCorrector;
-  p.equation = s.choice("equation", flow ? std::vector<std::string>{"navier_stokes"}
-                                         : std::vector<std::string>{"poisson", "heat", "burgers"});
+  std::vector<std::string> equations{"poisson", "heat", "burgers"};
+  if (flow) equations = {"navier_stokes"};
+  if (task == Task::kField) equations = {"diffusion"};
+  p.equation = s.choice("equation", equations);
   p.shape = s.wholes("shape", 1);
   if (p.shape.empty() || p.shape.size() > 3) s.fail("shape", "expected 1 to 3 extents");
   if (flow && p.shape.size() != 2) s.fail("shape", "expected 2 extents");
-  if (p.equation != "poisson") {
-    p.nu = s.at_least("nu", 0.0);
-    p.dt = s.above("dt", 0.0);
-  }
+  if (p.equation != "poisson" && p.equation != "diffusion") p.nu = s.at_least("nu", 0.0);
+  if (p.equation != "poisson") p.dt = s.above("dt", 0.0);
   s.finish();
   return p;
 }
@@ -88,17 +89,19 @@ Scene::Network read_network(TomlSection s) {
   return n;
 }
 
-Scene::Training read_training(TomlSection s, Task task) {
+Scene::Training read_training(TomlSection s, const Scene& scene) {
   Scene::Training t;
   t.learning_rate = s.above("learning_rate", 0.0);
-  if (task != Task::kParameters) {
-    t.loss = s.choice("loss", {"nmse", "mse"});
+  if (scene.task != Task::kParameters) {
     if (s.has("cosine_updates")) {
       t.cosine_updates = s.whole("cosine_updates", 1);
     } else {
       t.decay = s.above("decay", 0.0);
       t.decay_steps = s.whole("decay_steps", 1);
     }
+  }
+  if (scene.trains_network()) {
+    t.loss = s.choice("loss", {"nmse", "mse"});
     t.batch = s.whole("batch", 1);
     t.intervals = s.count("epochs", 1);
   } else {
@@ -114,6 +117,23 @@ Scene::Parameters read_parameters(TomlSection s) {
   if (p.start.size() != p.reference.size()) s.fail("reference", "expected as many numbers as start");
   s.finish();
   return p;
+}
+
+Scene::Field read_field(TomlSection s) {
+  Scene::Field f;
+  f.mean = s.above("mean", 0.0);
+  f.contrast = s.at_least("contrast", 0.0);
+  f.modes = s.whole("modes", 1);
+  f.states = s.whole("states", 1);
+  f.state_modes = s.whole("state_modes", 1);
+  f.steps = s.count("steps", 1);
+  f.every = s.whole("every", 1);
+  if (f.every > f.steps) s.fail("every", "must be <= steps, for there to be a snapshot");
+  f.noise = s.at_least("noise", 0.0);
+  f.smoothing = s.at_least("smoothing", 0.0);
+  f.seed = s.whole("seed", 0);
+  s.finish();
+  return f;
 }
 
 PRDPSettings read_prdp(TomlSection s) {
@@ -136,6 +156,7 @@ Scene::Compare read_compare(TomlSection s) {
   c.seeds = s.count("seeds", 1);
   c.constant = s.wholes("constant", 0);
   if (s.has("growth")) c.growth = s.above("growth", 1.0);
+  if (s.has("rtol")) c.rtol = s.above("rtol", 0.0);
   if (s.has("target")) c.target = s.above("target", 0.0);
   if (s.has("schedule")) {
     c.schedule = s.wholes("schedule", 0);
@@ -158,8 +179,10 @@ Stepper Scene::stepper(Solver with) const {
     equation.parameters = {physics.dt};
     equation.tensors = {at::scalar_tensor(physics.nu, at::kDouble)};
   }
-  return {std::move(equation), {std::move(with), backward, {}, {}, OnFailure::kReturn}};
+  return {std::move(equation), options(std::move(with))};
 }
+
+SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, OnFailure::kReturn}; }
 
 void Scene::set_backward(const std::string& name) {
   const auto known = backwards(task);
@@ -201,10 +224,12 @@ Scene read_scene(const std::string& path) {
   scene.dtype = s.choice("dtype", {"float32", "float64"}) == "float32" ? at::kFloat : at::kDouble;
   scene.physics = read_physics(s.section("physics"), scene.task);
   read_solver(s.section("solver"), scene);
-  scene.training = read_training(s.section("training"), scene.task);
-  if (scene.task != Task::kParameters) {
+  scene.training = read_training(s.section("training"), scene);
+  if (scene.trains_network()) {
     scene.data = read_data(s.section("data"), scene);
     scene.network = read_network(s.section("network"));
+  } else if (scene.task == Task::kField) {
+    scene.field = read_field(s.section("field"));
   } else {
     scene.parameters = read_parameters(s.section("parameters"));
     if (scene.physics.shape.size() != 1) s.fail("physics", "the task 'parameters' is one-dimensional");

@@ -19,20 +19,23 @@ struct Scene {
     kEmulator,    // a network learns one step of the equation (paper, section 4.2)
     kCorrector,   // a network corrects the steps of a coarse flow (appendix E)
     kParameters,  // amplitudes of the right-hand side are found from the solution (section 4.1)
+    kField,       // a diffusivity field is found from snapshots of states (field_problem.h); not in the paper
   };
   struct Physics {
     std::string equation;
     std::vector<int64_t> shape;
-    double nu = 0.0, dt = 0.0;  // not of poisson
+    double nu = 0.0, dt = 0.0;  // neither of poisson; diffusion has no nu
 
-    bool periodic() const { return equation == "burgers" || equation == "navier_stokes"; }
+    bool periodic() const {
+      return equation == "burgers" || equation == "navier_stokes" || equation == "diffusion";
+    }
     /// Of a state (batch, channels, *shape): a velocity has a component for each axis, a flow a pressure too.
     int64_t channels() const {
       if (equation == "navier_stokes") return 3;
       return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1;
     }
-    /// Whether an exact solve costs about what an iterative one does: not that of a flow in the plane, whose
-    /// sparse LU takes tens of times as long.
+    /// Whether an exact solve costs about what an iterative one does: not that of a periodic grid in the plane,
+    /// whose sparse LU takes tens of times as long.
     bool direct_is_cheap() const { return !(periodic() && shape.size() > 1); }
   };
   struct Data {
@@ -55,15 +58,26 @@ struct Scene {
     int64_t decay_steps = 1;
     std::optional<int64_t> cosine_updates;  // in place of decay: down to a tenth, over so many updates
     int64_t batch = 0;      // of a network
-    int64_t intervals = 0;  // epochs of a network, updates of parameters: what the controller counts in
+    int64_t intervals = 0;  // epochs of a network, else updates: what the controller counts in
   };
   struct Parameters {
     std::vector<double> start, reference;
+  };
+  struct Field {
+    // κ = mean·exp(contrast·g), with g a random Fourier series of so many modes, scaled to max |g| = 1.
+    double mean = 0.0, contrast = 0.0;
+    int64_t modes = 0;
+    int64_t states = 0, state_modes = 0;  // the initial states, random Fourier series too
+    int64_t steps = 0, every = 0;         // how far they are followed, and how many steps apart the snapshots are
+    double noise = 0.0;                   // its standard deviation over the snapshots' root mean square
+    double smoothing = 0.0;               // the weight of the mean |∇θ|² in the loss
+    int64_t seed = 0;
   };
   struct Compare {
     int64_t seeds = 1;
     std::vector<int64_t> constant;       // the sweep of constant K
     std::optional<double> growth;        // PRDP with K ← growth·K, as a row of its own
+    std::optional<double> rtol;          // the converged K with this looser tolerance, as a row of its own
     std::vector<int64_t> schedule;       // manual schedule: start, step per interval; empty: none
     std::optional<double> target;        // iterations are counted until the metric gets there
   };
@@ -79,15 +93,19 @@ struct Scene {
   Network network;
   Training training;
   Parameters parameters;
+  Field field;
   PRDPSettings prdp;
   Compare compare;
 
-  /// How many solves there are one after the other in an update; K is the budget of each.
+  bool trains_network() const { return task == Task::kEmulator || task == Task::kCorrector; }
+  /// How many steppers an update has, one after the other; K is the budget of each of their solves.
   int64_t executions() const { return task == Task::kCorrector ? 2 : 1; }
   /// The converged solver of data and references: exact where that is cheap, else iterated until its error is
   /// below float32's rounding.
   Solver reference_solver() const;
-  /// The scene's step with this solver; a failed sample does not stop a training.
+  /// The options of the scene's solves, with this solver; a failed sample does not stop a training.
+  SolveOptions options(Solver solver) const;
+  /// The scene's step with this solver; not of the task "field", whose equation changes from update to update.
   Stepper stepper(Solver solver) const;
   /// Replaces the scene's derivative. Raises ValueError for an unknown name, or one that would leave
   /// the task without a gradient.

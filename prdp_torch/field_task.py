@@ -1,0 +1,69 @@
+"""The task "field": a diffusivity κ = exp(θ) is found from noisy snapshots of states that it diffuses."""
+
+import math
+
+import torch
+
+from prdp_torch import _C, operators
+from prdp_torch.implicit_step import ImplicitStep
+from prdp_torch.task import Task
+
+
+class Diffusion:
+    """The operator of an implicit Euler step of u_t = ∇·(κ ∇u) on a periodic grid, for an `ImplicitStep`: assembled
+    when κ changes, and the same for all steps of a rollout."""
+
+    def __init__(self, dt):
+        self.dt = dt
+        self._assembled = None
+
+    def take(self, kappa):
+        self._assembled = operators.Stencil(*_C.diffusion_stencil(kappa, self.dt), "periodic")
+
+    def __call__(self, u):
+        return self._assembled
+
+
+def make_stepper(scene, **options):
+    """The step of the scene; its operator needs a κ before the first one."""
+    return ImplicitStep(Diffusion(scene.physics.dt), **options)
+
+
+def misfit(scene, stepper, problem, theta):
+    """The mean over the states of (‖u - u_observed‖ / ‖u_observed‖)² over all snapshots."""
+    stepper.operator_at.take(theta.exp())
+    states = stepper.rollout(problem.start, scene.field.steps)
+    return _C.normalised_mse(_C.observed(states, scene), problem.snapshots)
+
+
+def make_task(scene, steppers, seed):
+    """An interval is a single update, the metric the relative error of κ. A user knows the relative misfit alone."""
+    (stepper,) = steppers
+    problem = _C.make_field_problem(scene, seed)
+    theta = problem.theta.clone().requires_grad_()
+    optimiser = torch.optim.Adam([theta], lr=scene.learning_rate(0), fused=True)
+    relative = 1.0  # before the first solve nothing is explained yet
+
+    def updates(number):
+        nonlocal relative
+        for group in optimiser.param_groups:
+            group["lr"] = scene.learning_rate(number)
+        optimiser.zero_grad()
+        squared = misfit(scene, stepper, problem, theta)
+        loss = squared + scene.field.smoothing * _C.roughness(theta)
+        loss.backward()
+        optimiser.step()
+        relative = math.sqrt(squared.detach())
+        yield float(loss.detach())
+
+    def metric():
+        return float(_C.relative_error(theta.detach().exp(), problem.reference))
+
+    def state():
+        return {"theta": theta.detach(), "optimiser": optimiser.state_dict()}
+
+    def load(saved):
+        theta.detach().copy_(saved["theta"])
+        optimiser.load_state_dict(saved["optimiser"])
+
+    return Task(updates, metric, lambda _: relative, state, load)
