@@ -142,23 +142,8 @@ def test_validation_follows_as_many_steps_as_the_scene_says(tmp_path):
     assert "after 2 steps" in charts._metric_name(two) and "after 5 steps" in charts._metric_name(five)
 
 
-def test_data_of_emulators_are_kept_on_disk_and_their_making_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "cache"))
+def test_the_making_of_data_is_reported(tmp_path):
     reports = []
-
-    def make(*changes, on_progress=lambda *_: None):
-        return _C.make_dataset(_C.read_scene(written(tmp_path, *changes)), on_progress)
-
-    once = make(on_progress=lambda *report: reports.append(report))
+    scene = _C.read_scene(written(tmp_path))
+    _C.make_dataset(scene, lambda *report: reports.append(report))
     assert reports == [(100, 410), (200, 410), (300, 410), (400, 410), (405, 410), (410, 410)]
-    assert len(list((tmp_path / "cache").iterdir())) == 1
-
-    def no_solve(done, total):
-        raise AssertionError("the data were made again")
-
-    again = make(on_progress=no_solve)
-    for name in ("train_start", "train_end", "valid_start", "valid_end"):
-        assert torch.equal(getattr(once, name), getattr(again, name))
-    other = make(("modes = 5", "modes = 4"))
-    assert len(list((tmp_path / "cache").iterdir())) == 2
-    assert not torch.equal(other.train_start, once.train_start)

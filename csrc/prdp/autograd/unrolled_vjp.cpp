@@ -30,6 +30,10 @@ using Signature =
 /// Residuals up to so many units of rounding are rounding.
 constexpr double kRoundings = 8.0;
 
+double epsilon_of(const at::Tensor& t) {
+  return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
+}
+
 /// One number per sample, on the host.
 template <class T>
 std::vector<T> to_host(const at::Tensor& t, int64_t batch) {
@@ -55,8 +59,7 @@ std::vector<double> growth(const at::Tensor& u, const at::Tensor& b) {
 template <class MakeU>
 Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_u) {
   const int64_t batch = solved.b.size(0);
-  const bool single = solved.b.scalar_type() == at::kFloat;
-  const double epsilon = single ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
+  const double epsilon = epsilon_of(solved.b);
   const auto residual = to_host<double>(solved.residual, batch);
   const auto status = to_host<int64_t>(solved.status, batch);
   Rows rows(batch, false), near(batch, false);
@@ -122,10 +125,9 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   auto implicit = options;
   implicit.backward = Backward::kImplicit;
   implicit.checkpoint_every = implicit.adjoint_log = 0;
-  implicit.adjoint_rtol = std::min(options.adjoint_rtol.value_or(options.solver.rtol),
-                                   solved.b.scalar_type() == at::kFloat
-                                       ? static_cast<double>(std::numeric_limits<float>::epsilon())
-                                       : std::numeric_limits<double>::epsilon());
+  implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
+  const double asked = options.adjoint_rtol.value_or(options.solver.rtol);
+  implicit.adjoint_rtol = std::min(asked, kRoundings / 2 * epsilon_of(solved.b));
 
   SolveInfo info{at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble), at::empty({batch}, at::kLong),
                  at::empty({batch}, at::kLong)};
@@ -159,8 +161,12 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
       const auto residual = to_host<double>(found.info.residual, batch);
       const auto statuses = to_host<int64_t>(found.info.status, batch);
       const auto products = to_host<int64_t>(found.info.operator_applications, batch);
-      for (int64_t i = 0; i < batch; ++i)
-        if (some[i]) says(i, iterations[i], residual[i], static_cast<SolveStatus>(statuses[i]), products[i]);
+      for (int64_t i = 0; i < batch; ++i) {
+        if (!some[i]) continue;
+        const auto found_status = static_cast<SolveStatus>(statuses[i]);
+        const bool good = statuses[i] < 0 && !is_refused(found_status) && residual[i] <= asked;
+        says(i, iterations[i], residual[i], good ? SolveStatus::kConverged : found_status, products[i]);
+      }
     }
     return sum;
   };
@@ -173,6 +179,9 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   auto failures = info;
   failures.status = at::full({batch}, static_cast<int64_t>(SolveStatus::kConverged), at::kLong);
   for (int64_t i = 0; i < batch; ++i) {
+    const auto of_sample = static_cast<SolveStatus>(info.status.const_data_ptr<int64_t>()[i]);
+    if (rows[i] && exact[i] && is_failure(of_sample))
+      failures.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(of_sample);
     if (rows[i]) continue;
     if (sound[i]) says(i, 0, 1.0, SolveStatus::kOverflow, 0);
     else says(i, 0, std::numeric_limits<double>::infinity(), SolveStatus::kNonfiniteInput, 0);
