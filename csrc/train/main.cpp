@@ -4,7 +4,6 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
-#include <chrono>
 #include <charconv>
 #include <csignal>
 #include <cstdio>
@@ -128,10 +127,9 @@ int run(const Options& options, const std::string& command) {
       if (std::exchange(first, false) || done % 10 == 0)
         std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
     };
-    const auto on_data = [start = std::chrono::steady_clock::now()](int64_t done, int64_t total) {
+    const auto on_data = [slow = !scene.physics.direct_is_cheap()](int64_t done, int64_t total) {
       if (interrupted) throw Interrupted{};
-      const bool takes_long = std::chrono::steady_clock::now() - start > std::chrono::seconds(1);
-      if (takes_long) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
+      if (slow) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
     const auto curves = prdp::train::train(scene, refinement, seed, on_interval, checkpoint, on_data);
     const auto text = prdp::seal_record(text_of(record(scene, refinement.label, seed, command, curves), 1));
