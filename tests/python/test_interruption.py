@@ -105,7 +105,7 @@ def handler(*_):
     except RuntimeError as error:
         seen.append(str(error))
 signal.signal(signal.SIGALRM, handler)
-heat = prdp.Heat((30,), 1e-3, 1.0, prdp.Jacobi(3 * 10**7, rtol=0))
+heat = prdp.Heat((30,), 1e-3, 1.0, prdp.Jacobi(10**8, rtol=0))
 u = torch.randn(2, 1, 30)
 signal.setitimer(signal.ITIMER_REAL, 0.2)
 wanted, during = heat(u), counted
