@@ -71,7 +71,7 @@ u = step(torch.randn(40, 1, 64, requires_grad=True))
 interrupted("adjoint", lambda: u.sum().backward())
 nu = torch.tensor(1e-2, requires_grad=True)
 step = prdp.Heat((96, 96), nu, 1.0, prdp.CG(800, rtol=0), "unrolled", checkpoint_every="sqrt")
-u = step(torch.randn(64, 1, 96, 96))
+u = step.rollout(torch.randn(64, 1, 96, 96), 60)
 interrupted("unrolled", lambda: u.sum().backward())
 """)
     assert lines == ["adjoint", "unrolled"]
