@@ -5,7 +5,7 @@ import importlib
 import sys
 from pathlib import Path
 
-STUDIES = ("data",)
+STUDIES = ("data", "widths")
 
 
 def main():
