@@ -5,7 +5,7 @@ import importlib
 import sys
 from pathlib import Path
 
-STUDIES = ("data", "widths")
+STUDIES = ("data", "widths", "unroll")
 
 
 def main():
