@@ -5,7 +5,7 @@ import importlib
 import sys
 from pathlib import Path
 
-STUDIES = ("data", "widths", "unroll")
+STUDIES = ("data", "inference", "precision", "unroll", "widths")
 
 
 def main():
