@@ -7,7 +7,6 @@ the same fields are (samples, times, channels, *shape), and x is the last axis o
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 _AXES = ("x", "y", "z")
@@ -24,8 +23,8 @@ def write(path, trajectories, scene):
         file["tensor"] = tensor[..., 0] if tensor.shape[-1] == 1 else tensor
         for name, n in zip(_AXES, reversed(scene.physics.shape), strict=False):
             first, dx = _grid(scene, n)
-            file[f"{name}-coordinate"] = first + dx * np.arange(n)
-        file["t-coordinate"] = (scene.physics.dt or 1.0) * np.arange(trajectories.shape[1])
+            file[f"{name}-coordinate"] = _points(first, dx, n)
+        file["t-coordinate"] = _points(0.0, scene.physics.dt or 1.0, trajectories.shape[1])
 
 
 def read(path, scene):
@@ -82,6 +81,10 @@ def _grid(scene, n):
     return (0.0, 1 / n) if scene.physics.periodic else (1 / (n + 1), 1 / (n + 1))
 
 
+def _points(first, spacing, n):
+    return (first + spacing * torch.arange(n, dtype=torch.float64)).numpy()
+
+
 def _dataset(path, file, name):
     if name not in file:
         raise ValueError(f"data: '{path}' has no '{name}'; it holds: {', '.join(file) or 'nothing'}")
@@ -106,13 +109,17 @@ def _check_shape(path, scene, tensor):
 
 def _check_spacing(path, file, axis, n, wanted, what):
     """The points of an axis must be evenly spaced, as the scene has them. Edges of cells are one more."""
-    points = np.asarray(_dataset(path, file, f"{axis}-coordinate"), dtype=float)
+    points = torch.from_numpy(_dataset(path, file, f"{axis}-coordinate")[...]).double()
     if points.shape not in ((n,), (n + 1,)):
-        raise ValueError(f"data: '{path}': {axis}-coordinate has shape {points.shape}, but tensor has {n} points there")
-    steps = np.diff(points)
-    if n > 1 and not np.allclose(steps, steps.mean(), rtol=10 * _SPACING, atol=0):
+        got = tuple(points.shape)
+        raise ValueError(f"data: '{path}': {axis}-coordinate has shape {got}, but tensor has {n} points there")
+    if n == 1:
+        return
+    steps = points.diff()
+    spacing = float(steps.mean())
+    if not ((steps - spacing).abs() <= 10 * _SPACING * abs(spacing)).all():
         raise ValueError(f"data: '{path}': {axis}-coordinate is not evenly spaced")
-    if n > 1 and not np.isclose(steps.mean(), wanted, rtol=_SPACING, atol=0):
+    if not abs(spacing - wanted) <= _SPACING * wanted:
         raise ValueError(
-            f"data: '{path}': the spacing of {axis}-coordinate is {steps.mean():.6g}, but {what} is {wanted:.6g}"
+            f"data: '{path}': the spacing of {axis}-coordinate is {spacing:.6g}, but {what} is {wanted:.6g}"
         )
