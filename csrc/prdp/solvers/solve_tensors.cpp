@@ -73,9 +73,9 @@ struct TensorStart {
   at::Tensor applied;  // (batch, 1, …)
 };
 
-/// As SampleSpace::start_from; b is scaled and within the range of A. No derivative.
+/// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
+/// operator keeps what it computes first, for later products as well.
 TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
-  const at::NoGradGuard no_grad;
   const auto of_order_one = [](const at::Tensor& v) {
     const auto magnitude = largest_magnitude(v);
     const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
@@ -88,7 +88,8 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
   const auto x = a.project(y) * scale * alpha, r = b - alpha * product;
   const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
-  return {at::where(better, x, at::zeros_like(x)), at::where(better, r, b), per_sample(y.flatten(1).ne(0).any(1), b)};
+  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
+          per_sample(y.flatten(1).ne(0).any(1), b)};
 }
 
 /// The same recorded, of b and the tensors of A, for a start that is a constant.
