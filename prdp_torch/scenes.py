@@ -31,12 +31,12 @@ def load(scene):
 
 def make_stepper(scene, direct=False, max_iter=None):
     """The scene's step, with its solver, its budget K or another one, or with the exact method. A failed
-    sample is only reported: coarse physics may well diverge early in a training."""
+    sample does not raise: coarse physics may well diverge early in a training."""
     physics = scene.physics
     options = {
         "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
-        "on_failure": "return",
+        "on_failure": scene.on_failure,
     }
     if physics.equation == "diffusion":
         return field_task.make_stepper(scene, **options)

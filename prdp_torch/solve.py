@@ -68,11 +68,38 @@ class SolveInfo(NamedTuple):
         return f"SolveInfo({statuses}; {ranges})"
 
     @property
+    def failed(self):
+        """Which samples failed (bool): their status is below STAGNATED."""
+        return self.status < SolveStatus.STAGNATED
+
+    @property
     def adjoint(self):
         """The same of the adjoint solve, after `backward()`; None before. In unrolled mode, of the sweeps back
         through the iterations: those, the solve's status, and NaN for a residual; the products are all that
         the backward pass took."""
         return None if self.log is None else self.log.read()
+
+
+def detach_failed(u, info):
+    """Take the failed samples out of the derivative: u with their values as constants.
+
+    A solve with on_failure="zero_grad" passes no gradient through a failed sample. A loss may reach the weights by
+    other ways as well, such as a network on top of the step; then take them from the loss with this function.
+
+    Args:
+        u: (batch, ...), or the states (batch, steps + 1, ...) of a rollout.
+        info: the `SolveInfo` of the solve or the rollout. Of a rollout, a sample is constant from the step on that
+            failed.
+
+    Returns:
+        A tensor of the shape and the values of u; u itself where no sample failed.
+
+    Raises:
+        ValueError: u and info of different batches or steps.
+
+    >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
+    """
+    return torch.ops.prdp.detach_failed(u, info.status)
 
 
 def linear_solve(
@@ -96,8 +123,10 @@ def linear_solve(
             the primal, ḡ = -λᵀ ∂(A u)/∂g; "unrolled", the exact derivative of the iterations that ran;
             "none".
         adjoint_max_iter, adjoint_rtol: budget of the adjoint solve; the primal's where None.
-        on_failure: "raise" (torch.linalg.LinAlgError naming the samples), "warn" or "return" where a
-            sample diverges, overflows, breaks down or is not finite. Reaching max_iter is no failure.
+        on_failure: what to do where a sample diverges, overflows, breaks down or is not finite: "raise"
+            (torch.linalg.LinAlgError naming the samples), "warn", "return", or "zero_grad". The last returns as
+            "return" does, and b and A get no gradient from the samples that failed, in the forward or in the
+            adjoint solve. Reaching max_iter is no failure.
         checkpoint_every: for "unrolled" alone: of the K iterates that the backward pass needs it keeps one
             in so many and computes those between again; "sqrt" for ⌈√K⌉, None for all. The gradient is
             the same to the last bit (docs/derivatives.md has the memory and the time).
