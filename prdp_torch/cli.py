@@ -192,8 +192,7 @@ def advise(
     loaded = scene_files.load(scene)
     with console.status("trying the solvers"):
         advised = advice.advise_scene(loaded, seconds)
-    console.print(advised.table())
-    console.print(advised.words(), soft_wrap=True)
+    console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
 
 
 @command
