@@ -90,6 +90,7 @@ struct Scene {
   Solver solver;  // converged: max_iter is K_ε
   Backward backward;
   OnFailure on_failure = OnFailure::kReturn;  // or kZeroGrad: a failed sample does not stop a training
+  Start start = Start::kZero;
   Data data;
   Network network;
   Training training;

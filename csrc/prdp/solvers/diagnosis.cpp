@@ -119,8 +119,10 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       case SolveStatus::kZeroDiagonal: return zero_diagonal(role);
       case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);
       case SolveStatus::kNonfiniteInput:
-        return role.adjoint ? "the cotangent is NaN or Inf there; look at the loss, or at the steps after this one"
-                            : "the right-hand side is NaN or Inf there; look at the state that it is made of";
+        if (!b.select(0, sample).isfinite().all().item<bool>())
+          return role.adjoint ? "the cotangent is NaN or Inf there; look at the loss, or at the steps after this one"
+                              : "the right-hand side is NaN or Inf there; look at the state that it is made of";
+        return "the start is NaN or Inf there; take another one, or none";
       case SolveStatus::kNonfiniteOperator:
         return "A is made of a NaN or Inf there; look at the state, the weights or the file that it comes from";
       default: return "it did not reach its tolerance; raise max_iter or rtol";

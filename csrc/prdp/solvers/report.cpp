@@ -22,12 +22,16 @@ std::string position(const std::vector<int64_t>& index) {
   return text.str();
 }
 
-/// Where in b or in A the trouble of this sample sits.
-std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus status, int64_t sample) {
+/// Where in b, in the start or in A the trouble of this sample sits.
+std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor& x0, SolveStatus status,
+                        int64_t sample) {
   std::ostringstream text;
-  if (status == SolveStatus::kNonfiniteInput)
-    text << " at index " << position(first_true(nonfinite(b.select(0, sample))));
-  else if (status == SolveStatus::kZeroDiagonal)
+  if (status == SolveStatus::kNonfiniteInput) {
+    const auto of_b = nonfinite(b.select(0, sample));
+    const bool in_b = !x0.defined() || of_b.any().item<bool>();
+    text << (in_b ? "" : " in x0") << " at index " << position(first_true(in_b ? of_b : nonfinite(x0.select(0, sample))));
+  }
+  if (status == SolveStatus::kZeroDiagonal)
     text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
   else if (status == SolveStatus::kNonfiniteOperator)
     text << " at index " << position(a.first_nonfinite(sample));
@@ -61,7 +65,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);
-    text << (k ? "; " : ": ") << "sample " << i << " " << name(what) << whereabouts(a, b, what, i);
+    text << (k ? "; " : ": ") << "sample " << i << " " << name(what) << whereabouts(a, b, role.x0, what, i);
     if (!is_refused(what))
       text << " (the iterate handed out has relative residual " << info.residual[i].item<double>()
            << " after " << info.iterations[i].item<int64_t>() << " iterations)";
