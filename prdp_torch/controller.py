@@ -131,8 +131,10 @@ class PRDPController(_C.PRDPController, _Attached):
         adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations; None: what the stepper says.
 
     K stays where every solve of the attached steppers already meets its tolerance.
-    `warning`, of every controller: None, or in words what is wrong if the training ends here, with solves
-    that stop so far from the solution that their own error makes up what is trained.
+    `warning`, of every controller: None, or in words what is wrong if the training ends here. The solves may stop
+    so far from the solution that their own error makes up what is trained; the metric may grow (more than twice its
+    least value, three times in a row), or have been refused by the last `step`. A metric that grows refines K as a
+    plateau does, once it is above its value at the last refinement.
     Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
     """
 
