@@ -6,7 +6,7 @@ from statistics import median
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, datasets
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 from prdp_torch.solvers import GMRES, Direct
@@ -119,7 +119,7 @@ def advise_scene(scene, seconds=5.0):
         problem = _C.make_parameter_problem(scene)
         sample = (problem.start @ problem.modes)[None, None]
     else:
-        states = _C.validation_trajectories(scene, 0)[:, 0]
+        states = datasets.reference(scene, 0)[:, 0]
         sample = states[torch.arange(scene.training.batch) % len(states)]
         network = make_network(scene, 0)
         # A corrector's first solve starts from data, which need no gradient.

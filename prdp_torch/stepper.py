@@ -61,8 +61,7 @@ class Stepper(torch.nn.Module):
         self.on_failure = on_failure
         self.checkpoint_every = checkpoint_every
         self.start = start
-        # A tensor, because torch.compile takes a module's plain numbers for constants.
-        self._max_iter = torch.tensor(solver.max_iter)
+        self._max_iter = int(solver.max_iter)
         self._adjoint_log = AdjointLog()
         self._last_log = self._adjoint_log
         self.info = None
@@ -139,7 +138,7 @@ class Stepper(torch.nn.Module):
     def _options(self, log_number):
         return (
             self.method,
-            self._max_iter.item(),
+            self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self),
             self.rtol,
             self.restart,
             self.backward,
@@ -152,13 +151,13 @@ class Stepper(torch.nn.Module):
 
     @property
     def max_iter(self):
-        return int(self._max_iter)
+        return self._max_iter
 
     @max_iter.setter
     def max_iter(self, k):
         who = type(self).__name__
         _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol, self.restart)
-        self._max_iter.fill_(k)
+        self._max_iter = int(k)
 
     @property
     def adjoint_info(self):
@@ -172,3 +171,10 @@ class Stepper(torch.nn.Module):
 
     def extra_repr(self):
         return f"solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
+
+
+def _as_graph_input(stepper):
+    """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
+    each of them."""
+    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
+        return stepper._max_iter + 0  # the number is read where it is used first, which must be here
