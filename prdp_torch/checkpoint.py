@@ -6,11 +6,12 @@ import pickle
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, processes
 
 
 class Checkpoint(_C.Checkpoint):
-    """The file of one training. csrc/prdp/scenes/checkpoint.h says when one is due and what makes it valid.
+    """The file of one training. csrc/prdp/scenes/checkpoint.h says when one is due and what makes it valid. Of several
+    processes that train together the first one writes and reads it.
 
     Args:
         path: of the file; it is written to a temporary name first.
@@ -20,15 +21,24 @@ class Checkpoint(_C.Checkpoint):
     def __init__(self, path, **settings):
         super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
+    def due(self):
+        return processes.is_first() and super().due()
+
+    def remove(self):
+        if processes.is_first():
+            super().remove()
+
     def save(self, state):
         """Replace the file by this state: tensors, state_dicts and plain values. ValueError if it cannot be written."""
+        if not processes.is_first():
+            return
         content = io.BytesIO()
         torch.save(state, content)
         self.write(content.getvalue())
 
     def load(self):
         """The state last saved, None where there is none of these settings. ValueError for a damaged file."""
-        content = self.read()
+        content = processes.from_first(self.read)
         if content is None:
             return None
         try:

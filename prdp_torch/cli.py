@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, advice, records, report, trajectories
+from prdp_torch import _C, advice, processes, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
 from prdp_torch.training import Refinement
@@ -46,7 +46,10 @@ def command(function):
     @functools.wraps(function)
     def guarded(*args, **kwargs):
         try:
-            function(*args, **kwargs)
+            if processes.launched() > 1 and function.__name__ != "train":
+                raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
+            with processes.joined():
+                function(*args, **kwargs)
         except KeyboardInterrupt:
             kept = "--resume keeps finished trainings and goes on from the last checkpoint"
             print(f"prdp: interrupted; {kept}", file=sys.stderr)

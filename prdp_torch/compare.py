@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prdp_torch import _C, records
+from prdp_torch import _C, processes, records
 from prdp_torch.checkpoint import Checkpoint
 from prdp_torch.networks import make_network
 from prdp_torch.training import Refinement, train
@@ -138,7 +138,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
     )
     if not resume:
         checkpoint.remove()
-    curves = _finished(path, scene, checkpoint) if resume else None
+    curves = processes.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
     if curves is not None:
         on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
         return curves

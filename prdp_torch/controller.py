@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, processes
 
 
 class Record(NamedTuple):
@@ -40,8 +40,11 @@ class ToleranceRecord(NamedTuple):
 class _Attached:
     """What controllers share: they hand K and tolerances on to the steppers, and ask them how the solves went."""
 
-    def _take(self, steppers):
+    def _take(self, steppers, process_group):
         who = type(self).__name__
+        if process_group is not None and processes.rank(who, process_group) < 0:
+            raise ValueError(f"{who}: this process does not belong to process_group")
+        self.process_group = process_group
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
@@ -61,15 +64,28 @@ class _Attached:
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
             converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
-        refined = self._step(metric, bool(converged), self._residual(), error)
+        refined = self._step(*self._of_all_processes(metric, bool(converged), error))
         self._push()
         return refined
 
-    def _residual(self):
-        """Where the last solves ended: the mean over the samples, of several steppers the largest."""
-        infos = [info for stepper in self.steppers if (info := getattr(stepper, "info", None)) is not None]
-        residuals = [float(info.residual.double().mean()) for info in infos]
-        return max((r for r in residuals if math.isfinite(r)), default=None)
+    def _of_all_processes(self, metric, converged, error):
+        """(metric, converged, residual, error), the same in every process: means, and whether all have converged. The
+        residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
+        ended = [getattr(stepper, "info", None) for stepper in self.steppers]
+        residuals = [torch.zeros(0) if info is None else info.residual.double() for info in ended]
+        many = processes.count(self.process_group)
+        if many > 1:
+            # One that is refused must be refused in every process.
+            numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
+            numbers += [converged, error is not None]
+            metric, error_sum, agree, known, *of_steppers = processes.sums(
+                [*numbers, *(n for r in residuals for n in (r.sum(), r.numel()))], self.process_group
+            )
+            metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None
+            means = [total / n for total, n in zip(of_steppers[::2], of_steppers[1::2], strict=True) if n]
+        else:
+            means = [float(r.mean()) for r in residuals if r.numel()]
+        return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error
 
     def state_dict(self):
         """What `load_state_dict` needs to continue exactly, as plain values."""
@@ -84,6 +100,8 @@ class _Attached:
         self._push()
 
     def __reduce__(self):
+        if self.process_group is not None:
+            raise TypeError(f"{type(self).__name__}: only a controller of the default process group can be copied")
         return _remade, (type(self), self.steppers, self.settings, self.state_dict())
 
 
@@ -129,6 +147,9 @@ class PRDPController(_C.PRDPController, _Attached):
         initial, increment, maximum: K₀, ΔK, and a bound (None: none).
         growth: refine to K ← growth·K where that is more than K + increment.
         adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations; None: what the stepper says.
+        process_group: of torch.distributed; None: the default one. Where that is initialised, `step` is a collective
+            call: every process calls it with the metric of its own samples, and all of them see the mean, so that
+            they refine in the same interval. No effect on a single process.
 
     K stays where every solve of the attached steppers already meets its tolerance.
     `warning`, of every controller: None, or in words what is wrong if the training ends here, with solves
@@ -136,9 +157,9 @@ class PRDPController(_C.PRDPController, _Attached):
     Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
     """
 
-    def __init__(self, steppers=(), **settings):
+    def __init__(self, steppers=(), *, process_group=None, **settings):
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, metric, converged=None, error=None):
         """Take the metric (finite, >= 0; smaller is better) of an interval. True if K was raised.
@@ -176,6 +197,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
             ⌈adjoint_ratio·K⌉; in (0, 1].
         floor: no rtol is smaller; > 0. In float32 about 1e-5 is what can be reached.
         maximum: K, a cap that a solve should never meet; >= 1.
+        process_group: as for `PRDPController`; the error is averaged over its processes.
 
     Under `torch.compile` a step compiles again for each new rtol, and goes on uncompiled after
     `torch._dynamo.config.recompile_limit` of them (8): raise it, or leave this step uncompiled.
@@ -190,9 +212,9 @@ class ToleranceController(_C.ToleranceController, _Attached):
     and of optimisation with approximate gradients (Pedregosa, ICML 2016).
     """
 
-    def __init__(self, steppers=(), **settings):
+    def __init__(self, steppers=(), *, process_group=None, **settings):
         super().__init__(**_checked("ToleranceController", settings, _C.TOLERANCE_DEFAULTS))
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, error, converged=None):
         """Take the relative error of what is trained (finite, >= 0) after an interval. True if rtol became
@@ -221,15 +243,15 @@ class ToleranceController(_C.ToleranceController, _Attached):
 
 class LinearSchedule(_C.LinearSchedule, _Attached):
     """The manual schedule: K = initial + increment·(calls of step), at most `maximum`; increment = 0
-    is a constant K. The same interface as `PRDPController`; the metric is not looked at. `adjoint_ratio`
-    as there."""
+    is a constant K. The same interface as `PRDPController`; the metric is not looked at. `adjoint_ratio` and
+    `process_group` as there."""
 
-    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None):
+    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None, process_group=None):
         settings = {"initial": initial, "increment": increment, "maximum": maximum}
         settings = {name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()}
         adjoint_ratio = _check.optional(_check.real, "LinearSchedule", "adjoint_ratio", adjoint_ratio)
         super().__init__(**settings, adjoint_ratio=adjoint_ratio)
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, metric=0.0, converged=None, error=None):
         """Go one step of the schedule. True if K was raised."""

@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from prdp_torch import _C, field_task, fields
+from prdp_torch import _C, field_task, fields, processes
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -92,7 +92,13 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
             the same machine with as many threads, and to keep the training in whenever it is due. It holds torch's
             global random state as well, for a network with dropout. ValueError for a state that does not fit the
             scene and the network, or has more intervals than the scene.
+
+    Where torch.distributed is initialised, every process calls this with the same arguments. They share each batch and
+    the validation samples, return the same curves, and the first one keeps the checkpoint. The result is that of one
+    process to rounding. ValueError for a task without a network, and for more processes than a batch has samples.
     """
+    if processes.count() > 1 and not scene.trains_network:
+        raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene.training.intervals, steppers, refinement, checkpoint)
@@ -165,14 +171,11 @@ class _Run:
         started, solves = time.perf_counter(), 0
         iterations = forward = adjoint = 0.0
         for loss in task.updates(len(self.curves["update_loss"])):
-            self._check(loss, number)
+            solves += sum(stepper.info.iterations[0].numel() for stepper in self.steppers)
+            loss, refused, *spent = processes.mean([loss, self._refused(), *self._spent()], self._samples())
+            self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
-            for stepper in self.steppers:
-                solves += stepper.info.iterations[0].numel()
-                iterations += _per_sample(stepper.info.iterations)
-                forward += _per_sample(stepper.info.operator_applications)
-                if stepper.adjoint_info is not None:
-                    adjoint += _per_sample(stepper.adjoint_info.operator_applications)
+            iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
         seconds = time.perf_counter() - started
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
 
@@ -201,10 +204,27 @@ class _Run:
         else:
             self.controller.step(metric, error=error)
 
-    def _check(self, loss, done):
+    def _samples(self):
+        return len(self.steppers[0].info.iterations)
+
+    def _refused(self):
+        """Whether the solver was given NaN or Inf by the last update."""
+        return any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers)
+
+    def _spent(self):
+        """Iterations, operator applications and adjoint applications of the last update."""
+        reports = [stepper.info for stepper in self.steppers]
+        adjoint = [report for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
+        return (
+            sum(_per_sample(info.iterations) for info in reports),
+            sum(_per_sample(info.operator_applications) for info in reports),
+            sum((_per_sample(info.operator_applications) for info in adjoint), 0.0),
+        )
+
+    def _check(self, loss, refused, done):
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
-        if any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers):
+        if refused:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
@@ -231,10 +251,11 @@ def error(scene, u, reference):
 
 def _network(scene, steppers, seed, network, on_data):
     """An interval is an epoch, the metric that of validation."""
-    data = _C.make_dataset(scene, on_data)
+    data = processes.first_before_others(lambda: _C.make_dataset(scene, on_data))
+    processes.check_batches(len(data.train_start), scene.training.batch)
     network = make_network(scene, seed) if network is None else network
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = objective(scene, steppers, data, network)
+    loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
@@ -244,8 +265,8 @@ def _network(scene, steppers, seed, network, on_data):
             for group in optimiser.param_groups:
                 group["lr"] = scene.learning_rate(number)
             optimiser.zero_grad()
-            loss = loss_of(batch)
-            loss.backward()
+            loss, part = loss_of(batch)
+            part.backward()
             optimiser.step()
             yield float(loss.detach())
 
@@ -267,11 +288,14 @@ def _network(scene, steppers, seed, network, on_data):
 
 def _metric(scene, data, network):
     step = propagator(scene, network)
+    start, end = processes.share(data.valid_start), processes.share(data.valid_end)
 
     def metric():
-        with torch.no_grad():
-            reached = fields.rollout(step, data.valid_start, scene.data.valid_steps)[:, -1]
-        return error(scene, reached, data.valid_end)
+        mine = math.nan  # of a process without a sample
+        if len(start):
+            with torch.no_grad():
+                mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
+        return processes.mean([mine], len(start))[0]
 
     return metric
 
