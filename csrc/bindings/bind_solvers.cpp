@@ -1,5 +1,6 @@
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
@@ -182,6 +183,8 @@ void bind_solvers(py::module_& m) {
         py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"),
         py::arg("kind"), py::arg("shape"), py::arg("parameters"));
 
+  m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
+  m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");
   m.def("solve_with_tensors",
         [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,
            std::vector<int64_t> shape, std::vector<double> parameters, bool transposed,

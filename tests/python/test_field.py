@@ -166,10 +166,10 @@ def test_seeds_draw_the_noise(tmp_path):
     assert once == again != other
 
 
-def test_a_comparison_has_a_row_with_a_looser_tolerance(tmp_path):
+def test_a_comparison_has_rows_of_the_direct_solver_and_a_looser_tolerance(tmp_path):
     path = small_field(tmp_path, ("\nupdates = 30", "\nupdates = 4"))
     rows = compare.rows_of(scenes.load(path))
-    labels = ["converged", "rtol_0.001", "auto", "prdp", "constant_10", "constant_15", "constant_20"]
+    labels = ["converged", "direct", "rtol_0.001", "auto", "prdp", "constant_10", "constant_15", "constant_20"]
     assert [row.label for row in rows] == labels
     command = [sys.executable, "-c", "from prdp_torch.cli import main; main()", "compare", path, "--seeds", "2"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)

@@ -1,13 +1,13 @@
 #pragma once
 #include <Eigen/Dense>
-#include <Eigen/Sparse>
-#include <Eigen/SparseLU>
 #include <functional>
 #include <memory>
 #include <numbers>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/laplacian.h"
 #include "prdp/kernels/matrix.h"
+#include "prdp/kernels/sparse_factors.h"
 
 /// The exact methods of each operator, made once and used for any number of right-hand sides. Each
 /// has solve(r, d): d = A⁻¹ r in the kernel's padded layout; false where A is singular.
@@ -142,25 +142,19 @@ class DenseFactors {
   Eigen::PartialPivLU<Matrix> lu_;
 };
 
-/// Sparse LU by Eigen, whose ordering and factorisation may not return from an empty row or column.
+/// Eigen's sparse factors, whose ordering and factorisation may not return from an empty row or column.
 template <class T>
 class CsrFactors {
  public:
   explicit CsrFactors(const Csr<T>& a) : n_(a.unknowns()), singular_(has_empty_line(a)) {
     if (singular_) return;
-    std::vector<Eigen::Triplet<T>> entries;
-    entries.reserve(a.stored());
-    a.for_each_entry([&](int64_t i, int64_t j, T value) {
-      entries.emplace_back(static_cast<int>(i), static_cast<int>(j), value);
-    });
-    Eigen::SparseMatrix<T> m(n_, n_);
-    m.setFromTriplets(entries.begin(), entries.end());
-    lu_.compute(m);
+    sparse_ = factor_cache::find_or_make<SparseFactors<T>>(
+        a.key(), [&] { return std::make_shared<SparseFactors<T>>(a, n_); });
   }
   bool solve(const T* r, T* d) const {
-    if (singular_ || lu_.info() != Eigen::Success) return false;
+    if (singular_ || !sparse_->is_regular()) return false;
     using Vector = Eigen::Matrix<T, Eigen::Dynamic, 1>;
-    const Vector x = lu_.solve(Eigen::Map<const Vector>(r, n_));
+    const Vector x = sparse_->solve(Eigen::Map<const Vector>(r, n_));
     std::copy(x.data(), x.data() + n_, d);
     return all_finite(d, n_);
   }
@@ -175,7 +169,7 @@ class CsrFactors {
 
   int64_t n_;
   bool singular_;
-  Eigen::SparseLU<Eigen::SparseMatrix<T>> lu_;
+  std::shared_ptr<const SparseFactors<T>> sparse_;
 };
 
 /// The direct method that belongs to a kernel.

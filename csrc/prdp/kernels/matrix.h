@@ -1,8 +1,10 @@
 #pragma once
 #include <algorithm>
+#include <array>
 #include <utility>
 #include <vector>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/vector.h"
 
 namespace prdp::kernels {
@@ -146,6 +148,15 @@ class Csr : public MatrixBase<T, Csr<T>> {
         transposed_ ? body(col_[k], i, values_[k]) : body(i, col_[k], values_[k]);
   }
   int64_t stored() const { return stored_; }
+  /// All that the matrix is, for the factor cache.
+  std::string key() const {
+    std::string key;
+    factor_cache::append(key, std::array{n_, stored_, int64_t{transposed_}}.data(), 3);
+    factor_cache::append(key, crow_, n_ + 1);
+    factor_cache::append(key, col_, stored_);
+    factor_cache::append(key, values_, stored_);
+    return key;
+  }
   double norm() const {
     double largest = 0;
     for (int64_t i = 0; i < n_; ++i) {

@@ -15,7 +15,7 @@ class NavierStokesFactors {
     if (!lu_.is_regular()) return false;
     const auto n = static_cast<int64_t>(values_.size());
     kernel_.store(r, T(1), values_.data());
-    DoubleSparseLU::Vector x = values_.template cast<double>();
+    Eigen::VectorXd x = values_.template cast<double>();
     auto pressure = x.tail(n / 3);
     pressure.array() -= pressure.mean();
     x.head(n - 1) = lu_.solve(x.head(n - 1)).eval();
@@ -29,7 +29,7 @@ class NavierStokesFactors {
  private:
   const NavierStokes<T>& kernel_;
   mutable Eigen::Matrix<T, Eigen::Dynamic, 1> values_;  // one object a thread
-  DoubleSparseLU lu_;
+  SparseFactors<double> lu_;
 };
 
 template <class T>

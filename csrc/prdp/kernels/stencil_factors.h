@@ -1,5 +1,7 @@
 #pragma once
 #include "prdp/kernels/direct_factors.h"
+#include "prdp/kernels/factor_cache.h"
+#include "prdp/kernels/sparse_factors.h"
 #include "prdp/kernels/stencil.h"
 
 /// The exact methods of stencils. All factorise and solve in double, whatever T is.
@@ -78,33 +80,6 @@ class CyclicThomas {
   double border_first_, border_last_, inverse_corner_;
 };
 
-/// Sparse LU by Eigen in double.
-class DoubleSparseLU {
- public:
-  using Vector = Eigen::VectorXd;
-
-  /// The first n rows and columns of the kernel's matrix.
-  template <class Kernel>
-  DoubleSparseLU(const Kernel& kernel, int64_t n) {
-    std::vector<Eigen::Triplet<double>> entries;
-    kernel.for_each_entry([&](int64_t i, int64_t j, auto value) {
-      if (i < n && j < n)
-        entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<double>(value));
-    });
-    Eigen::SparseMatrix<double> m(n, n);
-    m.setFromTriplets(entries.begin(), entries.end());
-    lu_.compute(m);
-  }
-  bool is_regular() const { return lu_.info() == Eigen::Success; }
-  template <class Rhs>
-  Vector solve(const Rhs& rhs) const {
-    return lu_.solve(rhs);
-  }
-
- private:
-  Eigen::SparseLU<Eigen::SparseMatrix<double>> lu_;
-};
-
 /// One factorisation for all channels.
 template <class T>
 class StencilFactors {
@@ -112,15 +87,17 @@ class StencilFactors {
   explicit StencilFactors(const Stencil<T>& kernel) : kernel_(kernel), values_(kernel.unknowns()) {
     const auto& a = kernel.coefficients();
     if (a.pattern().nearest && a.rows() == 1) thomas_.emplace(a);
-    if (!thomas_ || !thomas_->is_dominant()) lu_.emplace(a, kernel.unknowns() / kernel.channels());
+    if (thomas_ && thomas_->is_dominant()) return;
+    sparse_ = factor_cache::find_or_make<SparseFactors<double>>(
+        a.key(), [&] { return std::make_shared<SparseFactors<double>>(a, kernel.unknowns() / kernel.channels()); });
   }
   bool solve(const T* r, T* d) const {
-    if (lu_ && !lu_->is_regular()) return false;
+    if (sparse_ && !sparse_->is_regular()) return false;
     kernel_.store(r, T(1), values_.data());
     const int64_t n = static_cast<int64_t>(values_.size()), points = n / kernel_.channels();
     for (int64_t at = 0; at < n; at += points) {
       Eigen::VectorXd x = values_.segment(at, points).template cast<double>();
-      if (lu_) x = lu_->solve(x);
+      if (sparse_) x = sparse_->solve(x);
       else thomas_->solve(x.data());
       values_.segment(at, points) = x.template cast<T>();
     }
@@ -132,7 +109,7 @@ class StencilFactors {
   const Stencil<T>& kernel_;
   mutable Eigen::Matrix<T, Eigen::Dynamic, 1> values_;  // one object a thread
   std::optional<CyclicThomas> thomas_;
-  std::optional<DoubleSparseLU> lu_;
+  std::shared_ptr<const SparseFactors<double>> sparse_;
 };
 
 template <class T>

@@ -1,8 +1,10 @@
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <memory>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/stencil_pattern.h"
 #include "prdp/kernels/vector.h"
 
@@ -72,6 +74,17 @@ class StencilRows {
   NeighbourStencil<T> neighbours() const {
     const auto& n = grid().shape;
     return {n[0], n[1], nx_, row_, coefficients_, coupled_ ? coupled(0) : nullptr};
+  }
+
+  /// All that the matrix is, for the factor cache.
+  std::string key() const {
+    const auto& g = grid();
+    std::string key;
+    factor_cache::append(key, std::array{g.shape[0], g.shape[1], g.shape[2], int64_t{g.periodic[0]},
+                                         int64_t{g.periodic[1]}, int64_t{g.periodic[2]}, count_}.data(), 7);
+    factor_cache::append(key, pattern_->offsets.data(), count_);
+    factor_cache::append(key, coefficients_, rows() * (stride() + coupled_));
+    return key;
   }
 
   /// max_i Σ_j |A_ij|

@@ -1,0 +1,133 @@
+"""`Direct` on sparse matrices: one factorisation for all samples, steps and adjoint solves of one matrix."""
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch import _C, operators
+
+FIVE = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+SHAPE = (6, 5)
+
+
+def stencil(symmetric, seed=0, requires_grad=False):
+    """I - ∇·(κ ∇) with κ on the cells, or any dominant coefficients."""
+    torch.manual_seed(seed)
+    c = torch.rand(1, 5, *SHAPE, dtype=torch.float64)
+    if symmetric:
+        faces = [c[:, k] + c[:, k].roll(-1, axis) for k, axis in ((1, -1), (2, -2))]
+        x, y = faces[0], faces[1]
+        before = x.roll(1, -1), y.roll(1, -2)
+        c = torch.stack([1 + x + y + sum(before), -before[0], -x, -before[1], -y], 1)
+    else:
+        c[:, 0] += 5
+    return operators.Stencil(c.requires_grad_(requires_grad), FIVE, "periodic")
+
+
+def csr(symmetric, seed=0, requires_grad=False):
+    m = stencil(symmetric, seed).dense().to_sparse_csr()
+    values = m.values().clone().requires_grad_(requires_grad)
+    return operators.Matrix.csr(m.crow_indices(), m.col_indices(), values, m.shape)
+
+
+def rhs(a, batch, seed=1):
+    torch.manual_seed(seed)
+    shape = (batch, 30) if isinstance(a, operators.Matrix) else (batch, 1, *SHAPE)
+    return torch.randn(shape, dtype=torch.float64)
+
+
+def factorisations(work):
+    _C.clear_factorisations()
+    before = _C.count_factorisations()
+    work()
+    return _C.count_factorisations() - before
+
+
+@pytest.mark.parametrize("make", [stencil, csr])
+@pytest.mark.parametrize("symmetric", [True, False], ids=["symmetric", "not symmetric"])
+def test_a_rollout_factorises_its_operator_once(make, symmetric):
+    a = make(symmetric, requires_grad=True)
+    step = prdp.ImplicitStep(a, solver=prdp.Direct())
+    u = rhs(a, 3)
+    made = factorisations(lambda: step.rollout(u, 4).square().sum().backward())
+    assert made == (1 if symmetric and make is stencil else 2)  # the transpose, where it is not known to be the same
+
+    (values,) = (t for t in a.tensors if t.requires_grad)
+    states = [u.reshape(3, 30)]
+    for _ in range(4):
+        states.append(solved(dense(a, values), states[-1]))
+    torch.testing.assert_close(step.rollout(u, 4).reshape(3, 5, 30), torch.stack(states, 1))
+    (expected,) = torch.autograd.grad(torch.stack(states).square().sum(), values)
+    torch.testing.assert_close(values.grad, expected)
+
+
+def solved(matrix, b):
+    return torch.linalg.solve(matrix, b.reshape(-1, 30).mT).mT
+
+
+def dense(a, values):
+    """The matrix of `a` with these values, recorded by autograd."""
+    if isinstance(a, operators.Matrix):
+        crow, col = a.tensors[0], a.tensors[1]
+        row = torch.repeat_interleave(torch.arange(30), crow.diff())
+        return torch.zeros(30, 30, dtype=values.dtype).index_put((row, col), values)
+    units = torch.eye(30, dtype=values.dtype).reshape(30, 1, *SHAPE)
+    shifted = [units.roll((-dy, -dx), (-2, -1)) for dy, dx in FIVE]
+    return sum(values[:, k : k + 1] * v for k, v in enumerate(shifted)).reshape(30, 30).mT
+
+
+@pytest.mark.parametrize("make", [stencil, csr])
+@pytest.mark.parametrize("symmetric", [True, False], ids=["symmetric", "not symmetric"])
+def test_kept_factors_change_no_bit(make, symmetric):
+    """Alone or in a batch, with new factors or kept ones."""
+    a = make(symmetric)
+    b = rhs(a, 3)
+    _C.clear_factorisations()
+    u = prdp.linear_solve(a, b, prdp.Direct())[0]
+    assert torch.equal(prdp.linear_solve(a, b, prdp.Direct())[0], u)
+    for s in range(3):
+        _C.clear_factorisations()
+        assert torch.equal(prdp.linear_solve(a, b[s : s + 1], prdp.Direct())[0][0], u[s])
+
+
+@pytest.mark.parametrize("make", [stencil, csr])
+@pytest.mark.parametrize("symmetric", [True, False], ids=["symmetric", "not symmetric"])
+def test_a_changed_matrix_is_factorised_anew(make, symmetric):
+    """In place too, where torch counts no version."""
+    a = make(symmetric)
+    b = rhs(a, 2)
+    u = prdp.linear_solve(a, b, prdp.Direct())[0]
+    a.tensors[-1].data.mul_(2.0)
+    torch.testing.assert_close(prdp.linear_solve(a, b, prdp.Direct())[0], u / 2)
+    with torch.no_grad():
+        a.tensors[-1].copy_(make(symmetric, seed=3).tensors[-1])
+    expected = solved(dense(a, a.tensors[-1]), b)
+    torch.testing.assert_close(prdp.linear_solve(a, b, prdp.Direct())[0].reshape(2, 30), expected)
+
+
+def test_only_the_last_two_are_kept():
+    """A batch of matrices is factorised again: nobody's memory grows with it."""
+    one, two, three = (stencil(True, seed) for seed in range(3))
+    b = rhs(one, 1)
+
+    def solve(a):
+        return prdp.linear_solve(a, b, prdp.Direct())
+
+    assert factorisations(lambda: [solve(a) for a in (one, two, one, two)]) == 2
+    assert factorisations(lambda: [solve(a) for a in (one, two, three, one)]) == 4
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_symmetric_matrices_of_either_sign_and_indefinite_ones(sign):
+    """Cholesky's factors serve definite matrices; an indefinite one needs pivoting."""
+    a = stencil(True)
+    for shift in (0.0, 4.0):  # within the spectrum
+        c = sign * a.tensors[0].clone()
+        c[:, 0] -= sign * shift
+        moved = operators.Stencil(c, FIVE, "periodic")
+        assert torch.equal(moved.dense(), moved.dense().mT)
+        values = torch.linalg.eigvalsh(moved.dense()) * sign
+        assert (values > 0).all() if shift == 0 else (values < 0).any() and (values > 0).any()
+        b = rhs(moved, 2)
+        expected = solved(moved.dense(), b)
+        torch.testing.assert_close(prdp.linear_solve(moved, b, prdp.Direct())[0].reshape(2, 30), expected)
