@@ -71,13 +71,13 @@ def train(path, folder, intervals, resume=False, stop=None):
     scene = scenes.load(path)
     scene.training.intervals = intervals
 
-    def on_interval(done, metric, k):
-        if done == stop and not resume:
+    def end(interval):
+        if interval.number == stop:
             distributed.barrier()
             os._exit(0)
 
     environment = records.environment()
-    compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume, on_interval)
+    compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume, [end])
 
 
 def result(folder):
