@@ -3,6 +3,7 @@
 import io
 import json
 import pickle
+import warnings
 
 import torch
 
@@ -37,8 +38,11 @@ class Checkpoint(_C.Checkpoint):
         self.write(content.getvalue())
 
     def load(self):
-        """The state last saved, None where there is none of these settings. ValueError for a damaged file."""
+        """The state last saved, None where there is none of these settings. Where the last one is damaged, a warning,
+        and the one before; ValueError where there is none before it."""
         content = processes.from_first(self.read)
+        if self.notice:
+            warnings.warn(self.notice, stacklevel=3)
         if content is None:
             return None
         try:

@@ -4,6 +4,7 @@ import functools
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +50,8 @@ def command(function):
         try:
             if processes.launched() > 1 and function.__name__ != "train":
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
-            with processes.joined():
+            with processes.joined(), warnings.catch_warnings():
+                warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
                 function(*args, **kwargs)
         except KeyboardInterrupt:
             kept = "--resume keeps finished trainings and goes on from the last checkpoint"

@@ -154,7 +154,9 @@ def _finished(path, scene, checkpoint):
     intervals = record["settings"].pop("intervals")
     if record["settings"] != records.identity(scene):
         return None
-    if intervals != scene.training.intervals:
+    if intervals == scene.training.intervals:
+        checkpoint.remove_before(path)
+    else:
         if checkpoint.read() is None:
             _C.refuse_finished(path, intervals, scene.training.intervals)
         return None

@@ -263,6 +263,7 @@ def as_launched(rank, port, arguments, errors):
     """`prdp` as a launcher starts it, without one that looks after the others."""
     os.environ.update(RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
     sys.argv = ["prdp", *arguments]
+    torch.set_num_threads(1)
     with open(os.devnull, "w") as nowhere, open(errors, "w") as kept:
         sys.stdout, sys.stderr = nowhere, kept
         cli.main()
