@@ -39,6 +39,7 @@ def check_options(
     adjoint_rtol: float | None,
     on_failure: str,
     checkpoint_every: int,
+    start: str = ...,
 ) -> None: ...
 def open_adjoint_log() -> int: ...
 def close_adjoint_log(log: int) -> None: ...
@@ -66,6 +67,7 @@ def solve_with_tensors(
     max_iter: int,
     rtol: float,
     restart: int = ...,
+    x0: Tensor | None = ...,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]: ...
 
 class Controller:
@@ -115,6 +117,7 @@ class Physics:
     direct_is_cheap: bool
 
 class Data:
+    file: str
     modes: int
     train: int
     valid: int
@@ -169,6 +172,7 @@ class Scene:
     rtol: float
     restart: int
     backward: str
+    start: str
     prdp: dict[str, float | int | None]
 
     def learning_rate(self, update: int) -> float: ...
@@ -222,6 +226,7 @@ def make_dataset(scene: Scene, on_progress: Callable[[int, int], None] | None = 
 def validation_trajectories(
     scene: Scene, steps: int, on_progress: Callable[[int, int], None] | None = ...
 ) -> Tensor: ...
+def all_trajectories(scene: Scene, steps: int, on_progress: Callable[[int, int], None] | None = ...) -> Tensor: ...
 def make_parameter_problem(scene: Scene) -> ParameterProblem: ...
 def make_field_problem(scene: Scene, seed: int) -> FieldProblem: ...
 def diffusion_stencil(kappa: Tensor, dt: float) -> tuple[Tensor, list[list[int]]]: ...

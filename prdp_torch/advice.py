@@ -6,7 +6,7 @@ from statistics import median
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, datasets
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 from prdp_torch.solvers import GMRES, Direct
@@ -35,31 +35,25 @@ class Advice:
     recommendation: str
 
     def table(self):
-        """The rows as a `rich.table.Table`."""
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        for i, name in enumerate(("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")):
-            table.add_column(name, justify="right" if 2 < i < 7 else "left", no_wrap=True)
+        """The rows as lines of aligned text."""
+        lines = [("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")]
         for row in self.rows:
             costs = ["", ""] * 2
             for i, solve in enumerate(row.solves):
                 costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
-            table.add_row(row.name, _power(row.rtol), _name(row.dtype), *costs, row.status)
-        return table
+            lines.append((row.name, _power(row.rtol), _name(row.dtype), *costs, row.status))
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        align = (str.ljust,) * 3 + (str.rjust,) * 4 + (str.ljust,)
+        lines.insert(1, tuple("─" * width for width in widths))
+        cells = ([put(cell, width) for put, cell, width in zip(align, line, widths, strict=True)] for line in lines)
+        return "\n".join("  ".join(line).rstrip() for line in cells)
 
     def words(self):
         """What stands below the table."""
         return "\n".join([*self.notes, "", self.recommendation])
 
     def __str__(self):
-        from rich.console import Console
-
-        console = Console(width=100, color_system=None, highlight=False)
-        with console.capture() as text:
-            console.print(self.table())
-        return text.get() + self.words()
+        return f"{self.table()}\n\n{self.words()}"
 
 
 @dataclass
@@ -125,7 +119,7 @@ def advise_scene(scene, seconds=5.0):
         problem = _C.make_parameter_problem(scene)
         sample = (problem.start @ problem.modes)[None, None]
     else:
-        states = _C.validation_trajectories(scene, 0)[:, 0]
+        states = datasets.reference(scene, 0)[:, 0]
         sample = states[torch.arange(scene.training.batch) % len(states)]
         network = make_network(scene, 0)
         # A corrector's first solve starts from data, which need no gradient.

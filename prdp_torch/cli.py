@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, advice, processes, records, report, trajectories
+from prdp_torch import _C, advice, datasets, processes, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
 from prdp_torch.tensorboard import TensorBoard
@@ -189,6 +189,22 @@ def compare(
 
 
 @command
+def export(
+    scene: SceneName,
+    out: Annotated[Path | None, typer.Option(help="The file; default SCENE.h5.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
+    ] = None,
+):
+    """Write the trajectories of a scene as HDF5, in PDEBench's layout."""
+    loaded = scene_files.load(scene)
+    path = out or Path(f"{loaded.name}.h5")
+    with _progress() as progress:
+        samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))
+    console.print(f"{samples} trajectories of {states} states: {path}", soft_wrap=True)
+
+
+@command
 def advise(
     scene: SceneName,
     seconds: Annotated[float, typer.Option(metavar="S", help="The limit for each solver.")] = 5.0,
@@ -197,8 +213,7 @@ def advise(
     loaded = scene_files.load(scene)
     with console.status("trying the solvers"):
         advised = advice.advise_scene(loaded, seconds)
-    console.print(advised.table())
-    console.print(advised.words(), soft_wrap=True)
+    console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
 
 
 @command

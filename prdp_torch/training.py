@@ -1,13 +1,14 @@
 """The Python trainer. Data, losses and metrics come from the library, the network may be any
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
+import functools
 import math
 import time
 from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, field_task, fields, processes
+from prdp_torch import _C, datasets, field_task, fields, processes
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -100,7 +101,7 @@ class Interval(NamedTuple):
     """Whether the interval was done earlier, and read from a checkpoint."""
 
 
-def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None):
+def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None, data=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update where there is no network. "metric" starts before the first interval, and so does "error", the
     relative error that a user knows; "budget" is K times the solves, of which an update of the task "corrector"
@@ -114,7 +115,8 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         scene: from `prdp_torch.scenes.load`.
         refinement: a `Refinement`.
         seed: of the network's weights and of the shuffling, or of a field's noise; the other data stay the same.
-        network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
+        network: any module from (batch, channels, *shape) to the same shape; the scene's own where None. One that
+            does not fit raises ValueError or TypeError before any work.
         callbacks: functions that are called after each interval with an `Interval`. If one returns True, the
             training stops there, and its checkpoint is saved. A training that goes on from a checkpoint first calls
             them with the intervals that are done already (`resumed`). No call is made for a diverged interval.
@@ -123,6 +125,10 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
             the same machine with as many threads, and to keep the training in whenever it is due. It holds torch's
             global random state as well, for a network with dropout. ValueError for a state that does not fit the
             scene and the network, or has more intervals than the scene.
+        data: trajectories in place of the scene's data: (samples, times, channels, *shape), spaced by the scene's
+            dt, as a tensor, an array or a dataset of trajectories. The first `data.train` of them train, the next
+            `data.valid` validate; or give a pair (training, validation). Every state of a training trajectory
+            that two more follow is a sample. ValueError or TypeError where they do not fit the scene.
 
     Where torch.distributed is initialised, every process calls this with the same arguments. They share each batch and
     the validation samples, return the same curves, and the first one keeps the checkpoint. The result is that of one
@@ -134,11 +140,14 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     for callback in callbacks:
         if not callable(callback):
             raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
+    if not scene.trains_network and (data is not None or network is not None):
+        raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene.training.intervals, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
-        task = _network(scene, steppers, seed, network, on_data)
+        data = processes.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
+        task = _network(scene, steppers, seed, network, data)
     else:
         task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
     try:
@@ -308,11 +317,13 @@ def error(scene, u, reference):
     return float(_C.normalised_mse(u[:, of], reference[:, of]))
 
 
-def _network(scene, steppers, seed, network, on_data):
+def _network(scene, steppers, seed, network, data):
     """An interval is an epoch, the metric that of validation."""
-    data = processes.first_before_others(lambda: _C.make_dataset(scene, on_data))
     processes.check_batches(len(data.train_start), scene.training.batch)
-    network = make_network(scene, seed) if network is None else network
+    if network is None:
+        network = make_network(scene, seed)
+    else:
+        datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
     loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)

@@ -110,11 +110,13 @@ def test_the_files_and_targets_of_the_shell_blocks_exist(block):
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=lambda block: f"{block.page}:{block.line}")
 def test_the_scenes_are_read(block, tmp_path):
-    """A block without a title is a part of a scene: its keys are put into heat_1d."""
+    """A block without a title is a part of a scene: its keys are put into heat_1d. Data from a file replace its own."""
     path = tmp_path / "scene.toml"
     content = tomllib.loads(block.code)
     if "title" not in content:
         whole = tomllib.loads(scenes.available()["heat_1d"].read_text())
+        if "file" in content.get("data", {}):
+            del whole["data"]
         for name, value in content.items():
             whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value
         content = whole

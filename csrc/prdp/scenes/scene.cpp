@@ -52,24 +52,30 @@ void read_solver(TomlSection s, Scene& scene) {
   scene.solver.rtol = s.at_least("rtol", 0.0);
   if (scene.solver.method == Method::kGmres) scene.solver.restart = s.count("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
+  if (s.has("start")) scene.start = start_from_name(s.choice("start", {"zero", "state"}));
   s.finish();
 }
 
 Scene::Data read_data(TomlSection s, const Scene& scene) {
   Scene::Data d;
-  if (scene.task == Task::kEmulator) {
-    d.modes = s.whole("modes", 1);
+  const bool corrector = scene.task == Task::kCorrector;
+  if (s.has("file")) {
+    d.file = s.text("file");
   } else {
-    d.reference_shape = s.wholes("reference_shape", 1);
-    auto finer = scene.physics.shape;
-    for (auto& n : finer) n = 2 * n + 1;
-    if (d.reference_shape != finer)
-      s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
-    d.valid_max_iter = s.count("valid_max_iter", 1);
+    if (corrector) {
+      d.reference_shape = s.wholes("reference_shape", 1);
+      auto finer = scene.physics.shape;
+      for (auto& n : finer) n = 2 * n + 1;
+      if (d.reference_shape != finer)
+        s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
+    } else {
+      d.modes = s.whole("modes", 1);
+    }
+    d.seed = s.whole("seed", 0);
   }
+  if (corrector) d.valid_max_iter = s.count("valid_max_iter", 1);
   d.train = s.whole("train", 1);
   d.valid = s.whole("valid", 1);
-  d.seed = s.whole("seed", 0);
   d.valid_steps = s.whole("valid_steps", 1);
   s.finish();
   return d;
@@ -182,7 +188,9 @@ Stepper Scene::stepper(Solver with) const {
   return {std::move(equation), options(std::move(with))};
 }
 
-SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, OnFailure::kReturn}; }
+SolveOptions Scene::options(Solver with) const {
+  return {std::move(with), backward, {}, {}, OnFailure::kReturn, 0, 0, start};
+}
 
 void Scene::set_backward(const std::string& name) {
   const auto known = backwards(task);
