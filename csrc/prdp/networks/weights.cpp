@@ -1,10 +1,10 @@
 #include "prdp/networks/weights.h"
 
 #include <caffe2/serialize/inline_container.h>
-#include <torch/csrc/jit/serialization/pickle.h>
 #include <torch/csrc/jit/serialization/pickler.h>
 
 #include "prdp/scenes/files.h"
+#include "prdp/scenes/pickled.h"
 
 namespace prdp {
 
@@ -15,8 +15,7 @@ using Dict = c10::impl::GenericDict;
 /// The tensors in the bytes, by name.
 Dict read(const std::string& bytes) {
   try {
-    // This reader knows no classes and has no interpreter, unlike torch::jit::load and torch::serialize.
-    return torch::jit::pickle_load({bytes.begin(), bytes.end()}).toGenericDict();
+    return read_pickled(bytes).toGenericDict();
   } catch (const std::exception&) {
     TORCH_CHECK_VALUE(false, "weights: expected the state_dict of a network");
   }
