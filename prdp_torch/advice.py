@@ -91,7 +91,8 @@ def advise(step, sample, seconds=5.0):
         forward and adjoint. Its `notes` name the solvers that the operator does not allow. Its
         `recommendation` is one choice with the reason for it.
 
-    Raises TypeError or ValueError where step and sample do not fit each other, before any measurement.
+    Raises:
+        TypeError, ValueError: step and sample do not fit each other. This is checked before any measurement.
 
     >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
     >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
@@ -112,8 +113,9 @@ def advise(step, sample, seconds=5.0):
 
 
 def advise_scene(scene, seconds=5.0):
-    """Advise on a scene of `prdp_torch.scenes.load`, with the share of its network: from a batch of the scene's
-    initial states, and a forward and backward pass of the untrained network. Arguments, returns: as `advise`."""
+    """Advise on a scene from `prdp_torch.scenes.load`, as `advise` does on a step.
+
+    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
     seconds, step, update = _limit(seconds), make_stepper(scene), _Update()
     if scene.task == "parameters":
         problem = _C.make_parameter_problem(scene)

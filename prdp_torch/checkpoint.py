@@ -1,4 +1,4 @@
-"""Checkpoints: a training kept while it runs, so that a killed one goes on from its last interval."""
+"""Checkpoints: the state of a running training, so that it can continue after it was killed."""
 
 import io
 import json
@@ -11,12 +11,11 @@ from prdp_torch import _C, processes
 
 
 class Checkpoint(_C.Checkpoint):
-    """The file of one training. csrc/prdp/scenes/checkpoint.h says when one is due and what makes it valid. Of several
-    processes that train together the first one writes and reads it.
+    """The checkpoint file of one training.
 
     Args:
-        path: of the file; it is written to a temporary name first.
-        settings: all that the training depends on; a file of other settings is not read.
+        path: the file. It is written to a temporary name first, so it is never half written.
+        settings: everything that the training depends on. A file with other settings is ignored.
     """
 
     def __init__(self, path, **settings):
@@ -30,7 +29,7 @@ class Checkpoint(_C.Checkpoint):
             super().remove()
 
     def save(self, state):
-        """Replace the file by this state: tensors, state_dicts and plain values. ValueError if it cannot be written."""
+        """Save a state made of tensors, state_dicts and plain values. ValueError if it cannot be written."""
         if not processes.is_first():
             return
         content = io.BytesIO()
@@ -38,8 +37,8 @@ class Checkpoint(_C.Checkpoint):
         self.write(content.getvalue())
 
     def load(self):
-        """The state last saved, None where there is none of these settings. Where the last one is damaged, a warning,
-        and the one before; ValueError where there is none before it."""
+        """Return the state that was saved last, or None if there is none with these settings. If the file is damaged,
+        warn and return the state before it. ValueError if there is none before it either."""
         content = processes.from_first(self.read)
         if self.notice:
             warnings.warn(self.notice, stacklevel=3)
