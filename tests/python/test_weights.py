@@ -50,7 +50,7 @@ def test_weights_pass_from_cpp_to_python_and_back(tmp_path, kind):
     assert on["metric"][0] == pytest.approx(trained.curves["metric"][-1], rel=1e-5)
 
     # C++ begins with the network that Python has gone on with.
-    torch.save(trained.network.state_dict(), tmp_path / "python.pt")
+    torch.save(dict(trained.network.state_dict()), tmp_path / "python.pt")
     again = (path, "--out", tmp_path / "again", "--intervals", 1, "--weights")
     for file in (tmp_path / "python.pt", tmp_path / "cpp/prdp/seed_1.pt"):
         assert prdp_train(*again, file)[0] == 0
@@ -80,8 +80,8 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
         (renamed, "weights: there is no tensor 'layers.0.weight'"),
         (wide, "weights: 'layers.0.weight' must be Float of sizes [64, 30]"),
         (less, "weights: the network has 8 tensors, the file 7"),
-        (bomb, "weights: expected the state_dict of a network"),
-        (None, "weights: expected the state_dict of a network"),
+        (bomb, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
+        (None, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
     ]:
         saved = io.BytesIO()
         torch.save(content, saved)

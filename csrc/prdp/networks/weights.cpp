@@ -17,7 +17,7 @@ Dict read(const std::string& bytes) {
   try {
     return read_pickled(bytes).toGenericDict();
   } catch (const std::exception&) {
-    TORCH_CHECK_VALUE(false, "weights: expected the state_dict of a network");
+    TORCH_CHECK_VALUE(false, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it");
   }
 }
 
