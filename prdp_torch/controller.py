@@ -152,8 +152,10 @@ class PRDPController(_C.PRDPController, _Attached):
             `step` is a collective call. Every process calls it with the metric of its own samples, all of them see the
             mean, and they refine in the same interval. On a single process it has no effect.
 
-    K is not raised while every solve of the steppers meets its tolerance. `warning` is None, or says in words that
-    the solves stop so far from the solution that their error dominates what is trained. Every controller has it.
+    K is not raised while every solve of the steppers meets its tolerance. `warning`, which every controller
+    has, is None or says in words what is wrong: the solves stop so far from the solution that their error dominates
+    what is trained; the metric grows (more than twice its least value, three times in a row); or the last `step`
+    refused it. K is raised for a metric that grows as it is on a plateau.
 
     Raises:
         ValueError, TypeError: a setting or a metric is out of range or of a wrong type.

@@ -3,6 +3,7 @@
 
 import functools
 import math
+import sys
 import time
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from prdp_torch import _C, datasets, field_task, fields, processes
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
-from prdp_torch.solve import SolveStatus
+from prdp_torch.solve import SolveStatus, detach_failed
 from prdp_torch.task import Task
 
 
@@ -99,6 +100,8 @@ class Interval(NamedTuple):
     """Products with A per sample, summed over the updates, forward and adjoint."""
     adjoint_applications: float
     """Those of the adjoint solves."""
+    failed: int
+    """Samples whose forward or adjoint solve failed, over the updates."""
     seconds: float
     """Of the updates; the validation is not counted."""
     resumed: bool
@@ -136,6 +139,8 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         - "budget": K times the number of solves. The task "corrector" has two solves per update, "field" one per step.
         - "iterations", "operator_applications": per sample of a batch, summed over the solves. The products include
           those of the adjoint solves, which "adjoint_applications" counts alone.
+        - "failed": the samples whose forward or adjoint solve failed, over the updates. A line on stderr names them
+          after each interval. With the scene's on_failure = "zero_grad" they stay in the loss, without a gradient.
         - "seconds": of the updates.
         - "warning": only if the controller ends with one.
         - "diverged": only if the loss or the metric was no longer finite. It says where and why. The training stops
@@ -160,7 +165,7 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene.training.intervals, steppers, refinement, checkpoint, callbacks)
+    run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
         data = processes.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
         task = _network(scene, steppers, seed, network, data)
@@ -181,11 +186,13 @@ class _Run:
     """What the tasks share: the intervals, their costs, and when a training is lost."""
 
     COSTS = (
-        "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "seconds"
+        "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "failed", "seconds"
     )  # fmt: skip
 
-    def __init__(self, intervals, steppers, refinement, checkpoint, callbacks):
-        self.intervals = intervals
+    def __init__(self, scene, seed, steppers, refinement, checkpoint, callbacks):
+        self.who = f"{scene.name}, {refinement.label}, seed {seed}"
+        self.goes_on = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
+        self.intervals = scene.training.intervals
         self.steppers = steppers
         self.controller = refinement.attach(steppers)
         self.watches_error = refinement.watches_error
@@ -254,14 +261,20 @@ class _Run:
         k, rtol = self.controller.max_iter, self.steppers[0].rtol
         started, solves = time.perf_counter(), 0
         iterations = forward = adjoint = 0.0
-        for loss in task.updates(len(self.curves["update_loss"])):
+        failures = _C.Failures()
+        for loss, samples in task.updates(len(self.curves["update_loss"])):
             solves += sum(stepper.info.iterations[0].numel() for stepper in self.steppers)
             loss, refused, *spent = processes.mean([loss, self._refused(), *self._spent()], self._samples())
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
             iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
+            adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
+            failures.take([stepper.info.status for stepper in self.steppers], adjoints, samples)
         seconds = time.perf_counter() - started
-        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
+        failed = int(processes.sums([failures.count])[0])
+        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
+        if failures.count:
+            print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)
 
     def give_up(self, why):
         """The curves end with the interval that was lost."""
@@ -270,7 +283,7 @@ class _Run:
         for name in ("metric", "error"):
             self.curves[name] += [math.nan] * (lost + 1 - len(self.curves[name]))
         if self._done() < lost:
-            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0.0)
+            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0, 0.0)
 
     def _append(self, *costs):
         for name, value in zip(self.COSTS, costs, strict=True):
@@ -308,7 +321,7 @@ class _Run:
     def _check(self, loss, refused, done):
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
-        if refused:
+        if refused and not self.goes_on:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
@@ -354,7 +367,7 @@ def _network(scene, steppers, seed, network, data):
             loss, part = loss_of(batch)
             part.backward()
             optimiser.step()
-            yield float(loss.detach())
+            yield float(loss.detach()), processes.share(batch)
 
     def state():
         parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
@@ -409,6 +422,9 @@ def _corrector(scene, steppers, data, network):
     def loss(batch):
         u1 = _corrected(first, network, data.train_start[batch])
         u2 = _corrected(second, network, u1)
+        if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
+            worst = torch.minimum(first.info.status, second.info.status)
+            u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
         kind = scene.training.loss
         return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
 
@@ -431,7 +447,7 @@ def _parameters(scene, steppers, seed):
         with torch.no_grad():
             theta.sub_(gradient, alpha=scene.learning_rate(number))
         misfit = float(_C.relative_error(u.detach(), problem.solution))
-        yield float(loss.detach())
+        yield float(loss.detach()), None
 
     def metric():
         return float(_C.relative_error(theta.detach(), problem.reference))

@@ -1,11 +1,13 @@
 #include <gtest/gtest.h>
 
+#include <cmath>
 #include <filesystem>
 #include <fstream>
 #include <random>
 #include <sstream>
 
 #include "../fuzz/targets.h"
+#include "prdp/operators/operator.h"
 #include "prdp/scenes/scene.h"
 
 /// A short run of what `make fuzz` does at length: the corpus, and copies of it with bytes changed, moved or left out.
@@ -58,6 +60,13 @@ TEST(Fuzz, TheCorpusAndChangedCopiesOfItAreReadOrRefused) {
 TEST(Fuzz, AScenesNameOfATableOrItsNumbersMayHoldAnyLetter) {
   for (const auto* text : {"[(]\n", "[ (hysics]\n", "start = [3.0, 3.\xd0\x9b]\n", "a \xd0\x9b = 1\n"})
     EXPECT_THROW(prdp::parse_scene(text, "fuzz.toml"), c10::ValueError) << text;
+}
+
+TEST(Fuzz, AnOffsetOfAStencilIsAWholeNumber) {
+  const auto coefficients = at::ones({1, 1, 4}, at::kDouble);
+  for (const double offset : {double(NAN), double(INFINITY), -1e300, 0.5})
+    EXPECT_THROW(prdp::make_operator({"stencil", {4}, {0.0, offset}, {coefficients}}), c10::ValueError) << offset;
+  EXPECT_NO_THROW(prdp::make_operator({"stencil", {4}, {0.0, 1.0}, {coefficients}}));
 }
 
 }  // namespace

@@ -93,7 +93,12 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
   }
   for (size_t at = axes; at < p.size(); at += axes) {
     kernels::Offset offset{{0, 0, 0}};
-    for (size_t d = 0; d < axes; ++d) offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
+    for (size_t d = 0; d < axes; ++d) {
+      constexpr double exact = 1LL << 53;  // whole numbers of which a double has each
+      TORCH_CHECK_VALUE(std::abs(p[at + d]) <= exact && p[at + d] == std::trunc(p[at + d]),
+                        "Stencil: every entry of an offset must be a whole number, got ", p[at + d]);
+      offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
+    }
     for (const int64_t cells : offset.along)
       TORCH_CHECK_VALUE(std::abs(cells) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
                         " cells along each axis, got ", as_tuple(entries(offset, dim())));
