@@ -6,8 +6,10 @@ import sys
 
 
 def _refused(error):
-    """The exit status of a package that is not built, or built for another torch."""
-    print(f"prdp: {error}", file=sys.stderr)
+    """The exit status where a package is missing, not built, or built for another torch."""
+    missing = isinstance(error, ModuleNotFoundError) and not error.name.startswith("prdp_torch")
+    hint = "; the command needs pip install 'prdp_torch[experiments]'" if missing else ""
+    print(f"prdp: {error}{hint}", file=sys.stderr)
     return 2
 
 

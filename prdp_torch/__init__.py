@@ -6,11 +6,13 @@ Differentiable PDE steps whose linear solves may stop early, and a controller th
 for the discretisation, the derivatives and what a solve says when it fails.
 """
 
+import importlib
+
 from prdp_torch import _load
 
 _load.check_torch()
 
-from prdp_torch import _C, fields, operators  # noqa: E402
+from prdp_torch import _C, fields, networks, operators, scenes  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
@@ -45,5 +47,23 @@ __all__ = [
     "check_operator",
     "fields",
     "linear_solve",
+    "load_trained",
+    "networks",
     "operators",
+    "scenes",
 ]
+
+# What only trainings need is imported when it is first used.
+_LAZY = {name: name for name in ("checkpoint", "tensorboard", "training")}
+_LAZY["load_trained"] = "trained"
+
+
+def __getattr__(name):
+    if name not in _LAZY:
+        raise AttributeError(f"module 'prdp_torch' has no attribute '{name}'")
+    module = importlib.import_module(f"prdp_torch.{_LAZY[name]}")
+    return module if name == _LAZY[name] else getattr(module, name)
+
+
+def __dir__():
+    return sorted({*globals(), *_LAZY})

@@ -35,31 +35,25 @@ class Advice:
     recommendation: str
 
     def table(self):
-        """The rows as a `rich.table.Table`."""
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        for i, name in enumerate(("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")):
-            table.add_column(name, justify="right" if 2 < i < 7 else "left", no_wrap=True)
+        """The rows as lines of aligned text."""
+        lines = [("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")]
         for row in self.rows:
             costs = ["", ""] * 2
             for i, solve in enumerate(row.solves):
                 costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
-            table.add_row(row.name, _power(row.rtol), _name(row.dtype), *costs, row.status)
-        return table
+            lines.append((row.name, _power(row.rtol), _name(row.dtype), *costs, row.status))
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        align = (str.ljust,) * 3 + (str.rjust,) * 4 + (str.ljust,)
+        lines.insert(1, tuple("─" * width for width in widths))
+        cells = ([put(cell, width) for put, cell, width in zip(align, line, widths, strict=True)] for line in lines)
+        return "\n".join("  ".join(line).rstrip() for line in cells)
 
     def words(self):
         """What stands below the table."""
         return "\n".join([*self.notes, "", self.recommendation])
 
     def __str__(self):
-        from rich.console import Console
-
-        console = Console(width=100, color_system=None, highlight=False)
-        with console.capture() as text:
-            console.print(self.table())
-        return text.get() + self.words()
+        return f"{self.table()}\n\n{self.words()}"
 
 
 @dataclass

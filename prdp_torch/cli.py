@@ -16,6 +16,7 @@ from rich.table import Table
 from prdp_torch import _C, advice, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
+from prdp_torch.tensorboard import TensorBoard
 from prdp_torch.training import Refinement
 
 app = typer.Typer(
@@ -55,7 +56,7 @@ def command(function):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         except (typer.Exit, typer.Abort):  # RuntimeErrors, too
             raise
-        except (ValueError, TypeError, OSError, RuntimeError, OverflowError, MemoryError) as error:
+        except (ValueError, TypeError, OSError, ImportError, RuntimeError, OverflowError, MemoryError) as error:
             words = "std::bad_alloc" if isinstance(error, MemoryError) else str(error)
             print(f"prdp: {_C.sentence(words)}", file=sys.stderr)
             raise typer.Exit(2) from None
@@ -84,6 +85,7 @@ def train(
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write the curves for TensorBoard.")] = False,
 ):
     """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
     loaded = _load(scene, backward, intervals)
@@ -114,9 +116,13 @@ def train(
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
-            def show(done, metric, k, task=task):
-                progress.update(task, completed=done, note=f"metric {metric:.3e}  K {k}")
+            def show(interval, task=task):
+                note = f"metric {interval.metric:.3e}  K {interval.max_iter}"
+                progress.update(task, completed=interval.number, note=note)
 
+            callbacks = [show]
+            if tensorboard:
+                callbacks.append(TensorBoard(folder / refinement.label / f"seed_{seed}.tensorboard"))
             curves = comparison.run_one(
                 loaded,
                 refinement.label,
@@ -125,9 +131,10 @@ def train(
                 folder,
                 environment,
                 resume,
-                show,
+                callbacks,
                 _bar(progress, "data, steps"),
             )
+            progress.update(task, completed=loaded.training.intervals, note=f"metric {curves['metric'][-1]:.3e}")
             if "diverged" in curves:
                 diverged[seed] = curves["diverged"]
             if "warning" in curves:
@@ -185,8 +192,7 @@ def advise(
     loaded = scene_files.load(scene)
     with console.status("trying the solvers"):
         advised = advice.advise_scene(loaded, seconds)
-    console.print(advised.table())
-    console.print(advised.words(), soft_wrap=True)
+    console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
 
 
 @command

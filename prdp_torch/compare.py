@@ -111,23 +111,18 @@ def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
     with records.alone_in([folder / row.label for row in rows]):
         for row in rows:
             for seed in range(seeds):
+
+                def show(interval, row=row, seed=seed):
+                    report(row, seed, interval.number)
+
                 row.curves.append(
-                    run_one(
-                        scene,
-                        row.label,
-                        row.refinement,
-                        seed,
-                        folder,
-                        environment,
-                        resume,
-                        lambda done, metric, k, row=row, seed=seed: report(row, seed, done),
-                        on_data,
-                    )
+                    run_one(scene, row.label, row.refinement, seed, folder, environment, resume, [show], on_data)
                 )
+                report(row, seed, scene.training.intervals)
     return rows
 
 
-def run_one(scene, label, refinement, seed, folder, environment, resume, on_interval, on_data=None):
+def run_one(scene, label, refinement, seed, folder, environment, resume=False, callbacks=(), on_data=None):
     """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
     the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
     a record of the same settings and another number of intervals, which would be lost."""
@@ -141,11 +136,9 @@ def run_one(scene, label, refinement, seed, folder, environment, resume, on_inte
         checkpoint.remove()
     curves = _finished(path, scene, checkpoint) if resume else None
     if curves is not None:
-        on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
         return curves
     network = make_network(scene, seed) if scene.trains_network else None
-    curves = train(scene, refinement, seed, network, on_interval, on_data, checkpoint)
-    on_interval(scene.training.intervals, curves["metric"][-1], curves["max_iter"][-1])
+    curves = train(scene, refinement, seed, network, callbacks, on_data, checkpoint)
     record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
     records.write_training(path, record, network)
     checkpoint.remove()

@@ -3,6 +3,7 @@
 
 import math
 import time
+from typing import NamedTuple
 
 import torch
 
@@ -70,7 +71,36 @@ class Refinement:
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
 
 
-def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=None, checkpoint=None):
+class Interval(NamedTuple):
+    """What a callback of `train` is told: one epoch, or one update where there is no network."""
+
+    number: int
+    """Counted from 1."""
+    intervals: int
+    """How many the training has."""
+    loss: float
+    """The mean over the updates."""
+    metric: float
+    """The validation metric after the interval."""
+    error: float
+    """The relative error of what is trained, as a user knows it."""
+    max_iter: int
+    """K during the interval."""
+    rtol: float
+    """The tolerance during the interval."""
+    iterations: float
+    """Solver iterations per sample, summed over the updates."""
+    operator_applications: float
+    """Products with A per sample, summed over the updates, forward and adjoint."""
+    adjoint_applications: float
+    """Those of the adjoint solves."""
+    seconds: float
+    """Of the updates; the validation is not counted."""
+    resumed: bool
+    """Whether the interval was done earlier, and read from a checkpoint."""
+
+
+def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None):
     """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
     an update where there is no network. "metric" starts before the first interval, and so does "error", the
     relative error that a user knows; "budget" is K times the solves, of which an update of the task "corrector"
@@ -85,23 +115,28 @@ def train(scene, refinement, seed=0, network=None, on_interval=None, on_data=Non
         refinement: a `Refinement`.
         seed: of the network's weights and of the shuffling, or of a field's noise; the other data stay the same.
         network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
-        on_interval: called after each interval with (how many are done, the metric, K), and where a
-            checkpoint is gone on from.
+        callbacks: functions that are called after each interval with an `Interval`. If one returns True, the
+            training stops there, and its checkpoint is saved. A training that goes on from a checkpoint first calls
+            them with the intervals that are done already (`resumed`). No call is made for a diverged interval.
         on_data: called while data are made that are not on disk yet, with (steps of a sample done, all of them).
         checkpoint: a `prdp_torch.checkpoint.Checkpoint` to go on from where it has a state, bit for bit on
             the same machine with as many threads, and to keep the training in whenever it is due. It holds torch's
             global random state as well, for a network with dropout. ValueError for a state that does not fit the
             scene and the network, or has more intervals than the scene.
     """
+    callbacks = list(callbacks)
+    for callback in callbacks:
+        if not callable(callback):
+            raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene.training.intervals, steppers, refinement, checkpoint)
+    run = _Run(scene.training.intervals, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
         task = _network(scene, steppers, seed, network, on_data)
     else:
         task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
     try:
-        run.go(task, saved, on_interval or (lambda *report: None))
+        run.go(task, saved)
     except _Diverged as divergence:
         run.give_up(str(divergence))
     return run.curves
@@ -118,28 +153,51 @@ class _Run:
         "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "seconds"
     )  # fmt: skip
 
-    def __init__(self, intervals, steppers, refinement, checkpoint):
+    def __init__(self, intervals, steppers, refinement, checkpoint, callbacks):
         self.intervals = intervals
         self.steppers = steppers
         self.controller = refinement.attach(steppers)
         self.watches_error = refinement.watches_error
         self.checkpoint = checkpoint
+        self.callbacks = callbacks
         self.curves = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
 
-    def go(self, task, saved, on_interval):
+    def go(self, task, saved):
+        stopped = False
         if saved is None:
             self._observe(task, 0)
         else:
             self._restore(task, saved)
-            on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
-        while self._done() < self.intervals:
+            for number in range(1, self._done() + 1):
+                stopped = self._tell(number, resumed=True)
+        while not stopped and self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
             self._observe(task, self._done())
-            if self.checkpoint is not None and self._done() < self.intervals and self.checkpoint.due():
+            unfinished = self.checkpoint is not None and self._done() < self.intervals
+            kept = unfinished and self.checkpoint.due()
+            if kept:
                 self._keep(task)
-            on_interval(self._done(), self.curves["metric"][-1], self.controller.max_iter)
+            stopped = self._tell(self._done())
+            if stopped and unfinished and not kept:
+                self._keep(task)
         if self.controller.warning is not None:
             self.curves["warning"] = self.controller.warning
+
+    def _tell(self, number, resumed=False):
+        """Call the callbacks with an interval. True if one of them stops the training."""
+        curves, updates = self.curves, len(self.curves["update_loss"]) // self._done()
+        losses = curves["update_loss"][(number - 1) * updates : number * updates]
+        costs = {name: curves[name][number - 1] for name in self.COSTS if name != "budget"}
+        interval = Interval(
+            number=number,
+            intervals=self.intervals,
+            loss=sum(losses) / updates,
+            metric=curves["metric"][number],
+            error=curves["error"][number],
+            resumed=resumed,
+            **costs,
+        )
+        return any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
 
     def _done(self):
         return len(self.curves["seconds"])

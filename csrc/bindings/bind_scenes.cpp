@@ -86,6 +86,7 @@ void bind_scenes(py::module_& m) {
       .def("learning_rate", &Scene::learning_rate, py::arg("update"));
 
   m.def("read_scene", &read_scene, py::arg("path"));
+  m.def("parse_scene", &parse_scene, py::arg("text"), py::arg("path"));
 
   py::class_<Dataset>(m, "Dataset")
       .def_readonly("train_start", &Dataset::train_start)

@@ -147,11 +147,11 @@ class Stopped(Exception):
 
 
 def stop_after(interval):
-    def on_interval(done, metric, k):
-        if done == interval:
+    def callback(done):
+        if done.number == interval:
             raise Stopped
 
-    return on_interval
+    return callback
 
 
 class Linear(torch.nn.Module):
@@ -180,9 +180,9 @@ def test_every_kind_of_training_goes_on_from_any_interval(tmp_path, task, refine
     scene = scenes.load(scene_of(task, tmp_path))
     scene.training.intervals = 12
 
-    def curves(checkpoint=None, on_interval=None):
+    def curves(checkpoint=None, *callbacks):
         network = make_network() if make_network else None
-        return train(scene, refine(scene), network=network, on_interval=on_interval, checkpoint=checkpoint)
+        return train(scene, refine(scene), network=network, callbacks=callbacks, checkpoint=checkpoint)
 
     alone = curves()
     checkpoint = Checkpoint(tmp_path / "kept")
@@ -190,36 +190,38 @@ def test_every_kind_of_training_goes_on_from_any_interval(tmp_path, task, refine
     for interval in (1, 2, 6, 11):
         with pytest.raises(Stopped):
             curves(checkpoint, stop_after(interval))
-    assert without_seconds(curves(checkpoint, lambda *report: reports.append(report))) == without_seconds(alone)
-    assert [done for done, _, _ in reports] == [11, 12] and reports[0][1] == alone["metric"][11]
+    assert without_seconds(curves(checkpoint, reports.append)) == without_seconds(alone)
+    assert [report.number for report in reports] == list(range(1, 13))
+    assert [report.resumed for report in reports] == [True] * 11 + [False]
+    assert [report.metric for report in reports] == alone["metric"][1:]
 
 
-def recorded(scene, folder, resume, on_interval=lambda *report: None, seed=0):
+def recorded(scene, folder, resume, *callbacks, seed=0):
     environment = records.environment()
-    return compare.run_one(scene, "prdp", Refinement.prdp(scene), seed, folder, environment, resume, on_interval)
+    return compare.run_one(scene, "prdp", Refinement.prdp(scene), seed, folder, environment, resume, callbacks)
 
 
 def test_only_resume_with_the_same_settings_goes_on(tmp_path):
     folder, scene = tmp_path / "here", scenes.load("heat_1d")
     scene.training.intervals = 8
 
-    def first_report(**changes):
-        """The interval that a training starts with that follows a stopped one."""
+    def already_done(**changes):
+        """How many intervals a training finds done that follows a stopped one."""
         scene.training.intervals = 8
         with pytest.raises(Stopped):
             recorded(scene, folder, False, stop_after(5))
         scene.training.intervals = changes.pop("intervals", 8)
         reports = []
-        recorded(scene, folder, changes.pop("resume", True), lambda done, *_: reports.append(done), **changes)
+        recorded(scene, folder, changes.pop("resume", True), reports.append, **changes)
         checkpoint = folder / "prdp/seed_0.checkpoint"
         assert checkpoint.exists() == ("seed" in changes)  # another training's is left alone
         (folder / "prdp/seed_0.json").unlink(missing_ok=True)
-        return reports[0]
+        return sum(report.resumed for report in reports)
 
-    assert first_report() == first_report(intervals=9) == 5
-    assert first_report(resume=False) == first_report(seed=1) == 1
+    assert already_done() == already_done(intervals=9) == 5
+    assert already_done(resume=False) == already_done(seed=1) == 0
     with pytest.raises(ValueError, match="of a training that has done 5 intervals, more than the 4 asked for"):
-        first_report(intervals=4)
+        already_done(intervals=4)
 
 
 def test_a_finished_record_needs_no_checkpoint(tmp_path):

@@ -58,7 +58,7 @@ def short(intervals=2):
 
 def trained(scene, folder, resume=False):
     environment = records.environment()
-    return compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume, lambda *report: None)
+    return compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume)
 
 
 def damages(whole, count):
@@ -212,12 +212,12 @@ def test_a_network_with_dropout_goes_on_bit_for_bit(tmp_path):
     alone = train(scene, Refinement.prdp(scene), network=Dropout())
     checkpoint = Checkpoint(tmp_path / "kept")
 
-    def stop(done, metric, k):
-        if done == 3:
+    def stop(interval):
+        if interval.number == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint, on_interval=stop)
+        train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint, callbacks=[stop])
     torch.rand(17)
     rest = train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint)
     assert rest["update_loss"] == alone["update_loss"] and rest["metric"] == alone["metric"]

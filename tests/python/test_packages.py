@@ -111,3 +111,34 @@ print(prdp.__file__, *map(str, scenes.available().values()))
     assert len(found) > 5 and all(path.startswith(str(packages)) for path in found)
     listed = run(tmp_path / "fresh" / "bin" / "prdp", "scenes", folder=tmp_path).stdout
     assert "heat_1d" in listed and "navier_stokes" in listed
+
+
+WITHOUT_EXPERIMENTS = """
+import sys
+for name in ("h5py", "jinja2", "matplotlib", "rich", "tensorboard", "typer"):
+    sys.modules[name] = None
+"""
+
+
+def test_the_library_needs_torch_alone():
+    """The other packages are for the experiments: the command, charts and reports."""
+    solved = """
+import torch, prdp_torch as prdp
+from prdp_torch.training import Refinement, train
+heat = prdp.Heat((30,), 1e-3, 1.0, prdp.CG(1))
+controller = prdp.PRDPController([heat])
+heat(torch.randn(2, 1, 30, requires_grad=True)).sum().backward()
+print(prdp.advise(heat, torch.randn(2, 1, 30), seconds=0.02).recommendation)
+scene = prdp.scenes.load("heat_1d")
+scene.training.intervals = 1
+print(train(scene, Refinement.auto())["metric"])
+"""
+    assert "Direct" in run(sys.executable, "-c", WITHOUT_EXPERIMENTS + solved).stdout
+
+
+def test_the_command_names_what_it_misses():
+    command = [sys.executable, "-c", WITHOUT_EXPERIMENTS + "import prdp_command; prdp_command.main()"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 2
+    assert "the command needs pip install 'prdp_torch[experiments]'" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -200,8 +200,9 @@ double Scene::learning_rate(int64_t update) const {
   return training.learning_rate * std::pow(training.decay, periods);
 }
 
-Scene read_scene(const std::string& path) {
-  const auto text = read_whole("scene", path);
+Scene read_scene(const std::string& path) { return parse_scene(read_whole("scene", path), path); }
+
+Scene parse_scene(const std::string& text, const std::string& path) {
   // toml++ ends the process on tables nested a hundred thousand deep; a file of this size cannot hold so many.
   constexpr size_t kLongest = 65536;
   TORCH_CHECK_VALUE(text.size() <= kLongest, "scene: '", path, "' has ", text.size(), " bytes; a scene has at most ",

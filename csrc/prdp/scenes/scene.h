@@ -116,5 +116,7 @@ struct Scene {
 
 /// Reads a scene file. Raises ValueError naming file, line and what is allowed.
 Scene read_scene(const std::string& path);
+/// The same for a text, such as the one that a record holds. `path` stands for the file in errors and gives the name.
+Scene parse_scene(const std::string& text, const std::string& path);
 
 }  // namespace prdp

@@ -1,0 +1,1 @@
+"""Studies: trainings of scenes with one thing varied, such as the number of samples."""

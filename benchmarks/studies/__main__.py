@@ -1,0 +1,29 @@
+"""`python -m benchmarks.studies NAME`: run a study, or go on with it; write its table, chart and record."""
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+STUDIES = ("data", "inference", "precision", "unroll", "widths")
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.studies", description=__doc__)
+    parser.add_argument("study", choices=STUDIES)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path("runs/studies"))
+    parser.add_argument("--quick", action="store_true", help="the smallest part, to see that it runs")
+    options = parser.parse_args()
+    from benchmarks.studies.trainings import Study
+
+    module = importlib.import_module(f"benchmarks.studies.{options.study}")
+    study = Study(options.out / options.study, lambda text: print(text, file=sys.stderr, flush=True))
+    module.run(study, options.seeds, options.quick)
+    study.write(options.out / f"{options.study}.json")
+    module.chart(study.rows).savefig(options.out / f"{options.study}.png", dpi=110)
+    print(module.table(study.rows))
+
+
+if __name__ == "__main__":
+    main()

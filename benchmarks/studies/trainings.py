@@ -1,0 +1,87 @@
+"""One training of a scene with some of its keys changed, kept as a small record."""
+
+import json
+import re
+import tempfile
+from pathlib import Path
+
+import torch
+
+from benchmarks.studies import evaluation
+from prdp_torch import records, scenes
+from prdp_torch.networks import make_network
+from prdp_torch.training import Refinement, train
+
+
+def variant(name, changes):
+    """The scene `name` with the keys of `changes` ("section.key": value) replaced or added."""
+    text = scenes.available()[name].read_text()
+    for path, value in changes.items():
+        section, key = path.split(".")
+        line = f"{key} = {json.dumps(value)}"
+        start = text.index(f"[{section}]")
+        end = text.find("\n[", start)
+        body = text[start : end if end >= 0 else len(text)]
+        changed, found = re.subn(rf"(?m)^{key} = .*$", line, body)
+        text = text.replace(body, changed if found else body.rstrip() + f"\n{line}\n")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.toml"
+        path.write_text(text)
+        return scenes.load(path)
+
+
+REFINEMENTS = {
+    "converged": lambda scene: Refinement.constant(scene.max_iter),
+    "prdp": Refinement.prdp,
+    "auto": lambda scene: Refinement.auto(),
+    "direct": lambda scene: Refinement.exact(),
+}
+
+
+class Study:
+    """Trainings that are kept in a folder; one that is there already is not run again."""
+
+    def __init__(self, folder, report):
+        self.folder = records.prepare_folder(folder)
+        self.report = report
+        self.rows = []
+
+    def train(self, name, how, seed, changes):
+        scene = variant(name, changes)
+        label = "_".join([name, how, *(f"{key.split('.')[1]}{value}" for key, value in changes.items()), f"seed{seed}"])
+        path = self.folder / f"{label}.json"
+        row = records.read(path)
+        if row is None or row["text"] != scene.text:
+            row = self._row(scene, how, seed, changes)
+            records.write_training(path, row)
+        self.report(f"{label}: {row['error']:.3e}")
+        self.rows.append(row)
+        return row
+
+    def _row(self, scene, how, seed, changes):
+        network = make_network(scene, seed)
+        curves = train(scene, REFINEMENTS[how](scene), seed=seed, network=network)
+        errors = evaluation.validation_errors(scene, network)
+        return {
+            "scene": scene.name,
+            "how": how,
+            "seed": seed,
+            "changes": changes,
+            "text": scene.text,
+            "error": float(torch.tensor(errors).mean()),
+            "errors": errors,
+            "loss": float(torch.tensor(curves["update_loss"][-20:]).mean()),
+            "updates": len(curves["update_loss"]),
+            "products": sum(curves["operator_applications"]),
+            "iterations": sum(curves["iterations"]),
+            "last_k": curves["max_iter"][-1],
+            "seconds": sum(curves["seconds"]),
+            "warning": curves.get("warning"),
+            "diverged": curves.get("diverged"),
+            **records.environment(),
+        }
+
+    def write(self, path):
+        """The rows without the texts of their scenes, which the changes give."""
+        rows = [{key: value for key, value in row.items() if key != "text"} for row in self.rows]
+        records.write(path, {**records.environment(), "rows": rows})

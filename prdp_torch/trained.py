@@ -1,0 +1,81 @@
+"""`load_trained`: a network that `prdp train` or `prdp compare` has trained."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from prdp_torch import _C, fields, records, training
+from prdp_torch.networks import make_network
+
+
+class Trained(NamedTuple):
+    """A trained network, ready to use. Call it to make one time step."""
+
+    network: torch.nn.Module
+    """With its trained weights, in evaluation mode."""
+    step: object
+    """One time step u → u_next, both (batch, channels, *shape): the network itself, or for the task `corrector` the
+    coarse solver with the network on top."""
+    scene: object
+    """The scene as it was trained."""
+    curves: dict
+    """The curves of the record, as `training.train` returns them."""
+
+    def __call__(self, u):
+        """Make one time step."""
+        return self.step(u)
+
+    def rollout(self, u, steps):
+        """Repeat the step. Returns all states, u included: (batch, steps + 1, channels, *shape)."""
+        return fields.rollout(self.step, u, steps)
+
+
+def load_trained(run_folder, seed=0):
+    """Load a trained network from the folder of its training.
+
+    Args:
+        run_folder: the folder with the records, such as "runs/heat_1d-train/prdp". The folder above it
+            will do if it holds a single way of choosing K.
+        seed: which of the trainings.
+
+    Returns:
+        A `Trained`. Call it for one time step, or use its `rollout(u, steps)`. Wrap the call in
+        `torch.no_grad()` if you need no gradient.
+
+    Raises:
+        ValueError: no record or no weights are there, they are damaged or do not belong together, or the
+            training diverged.
+
+    >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
+    >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
+    """
+    path = _record_in(Path(run_folder), f"seed_{seed}.json")
+    record = records.read(path)
+    settings = record["settings"]
+    scene = _C.parse_scene(settings["text"], f"{settings['scene']}.toml")
+    scene.backward, scene.training.intervals = settings["backward"], settings["intervals"]
+    if not scene.trains_network:
+        raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
+    if "diverged" in record["curves"]:
+        raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
+    network = records.read_weights(path, make_network(scene, seed))
+    if network is None:
+        raise ValueError(
+            f"load_trained: '{records.weights_of(path)}' is missing; prdp_train, the C++ trainer, writes no weights"
+        )
+    return Trained(network.eval(), training.propagator(scene, network), scene, record["curves"])
+
+
+def _record_in(folder, name):
+    """The path of a record in a folder of records, or in the only such folder inside it."""
+    if (folder / name).exists():
+        return folder / name
+    found = sorted(folder.glob(f"*/{name}"))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        labels = ", ".join(path.parent.name for path in found)
+        raise ValueError(f"load_trained: '{folder}' holds several trainings; add one of {labels} to the path")
+    others = ", ".join(sorted(str(path.relative_to(folder)) for path in folder.rglob("seed_*.json"))) or "no record"
+    raise ValueError(f"load_trained: no '{name}' in '{folder}'; it holds {others}")
