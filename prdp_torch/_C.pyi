@@ -39,6 +39,7 @@ def check_options(
     adjoint_rtol: float | None,
     on_failure: str,
     checkpoint_every: int,
+    start: str = ...,
 ) -> None: ...
 def open_adjoint_log() -> int: ...
 def close_adjoint_log(log: int) -> None: ...
@@ -66,6 +67,7 @@ def solve_with_tensors(
     max_iter: int,
     rtol: float,
     restart: int = ...,
+    x0: Tensor | None = ...,
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]: ...
 
 class Controller:
@@ -169,6 +171,7 @@ class Scene:
     rtol: float
     restart: int
     backward: str
+    start: str
     prdp: dict[str, float | int | None]
 
     def learning_rate(self, update: int) -> float: ...

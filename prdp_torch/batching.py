@@ -23,13 +23,19 @@ _DIMS = {
 @torch.library.register_vmap("prdp::linear_solve")
 def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
     size, op = info.batch_size, torch.ops.prdp.linear_solve
-    whole = b.expand(size, *b.shape) if in_dims[0] is None else b.movedim(in_dims[0], 0)
+
+    def in_batch(t, dim):
+        return (t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)).flatten(0, 1)
+
+    samples = b.shape[0 if in_dims[0] is None else int(in_dims[0] == 0)]
     mapped = [dim is not None for dim in in_dims[1]]
     in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
-    folded = _fold(in_front, mapped, kind, len(shape), size, whole.shape[1])
+    folded = _fold(in_front, mapped, kind, len(shape), size, samples)
     if folded is None:
         return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, *rest))
-    results = op(whole.flatten(0, 1), folded, kind, shape, *rest)
+    if isinstance(rest[-1], torch.Tensor):  # x0, the last argument where there is one
+        rest = *rest[:-1], in_batch(rest[-1], in_dims[-1])
+    results = op(in_batch(b, in_dims[0]), folded, kind, shape, *rest)
     return [t.unflatten(0, (size, -1)) for t in results], [0] * len(results)
 
 

@@ -37,6 +37,7 @@ def make_stepper(scene, direct=False, max_iter=None):
         "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
         "on_failure": "return",
+        "start": scene.start,
     }
     if physics.equation == "diffusion":
         return field_task.make_stepper(scene, **options)

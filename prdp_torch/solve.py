@@ -84,6 +84,7 @@ def linear_solve(
     adjoint_rtol=None,
     on_failure="raise",
     checkpoint_every=None,
+    x0=None,
 ):
     """Solve A u = b, differentiably. Returns (u, info); u has the shape of b.
 
@@ -101,6 +102,11 @@ def linear_solve(
         checkpoint_every: for "unrolled" alone: of the K iterates that the backward pass needs it keeps one
             in so many and computes those between again; "sqrt" for ⌈√K⌉, None for all. The gradient is
             the same to the last bit (docs/derivatives.md has the memory and the time).
+        x0: a guess of u, of b's shape, dtype and device. Each sample starts from α x0, where
+            α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least: never worse than from zero, and only the
+            direction of x0 counts. It costs one product. rtol stays relative to ‖b‖. A start has no gradient:
+            the unrolled derivative is that of the iterations from a fixed α x0. The adjoint solve starts
+            from zero, and `Direct` ignores x0.
 
     Raises:
         ValueError, TypeError: bad arguments, before any work.
@@ -116,6 +122,8 @@ def linear_solve(
     log = None
     if not torch.compiler.is_compiling():
         _check.dense("linear_solve", "b", b)
+        if x0 is not None:
+            _check.dense("linear_solve", "x0", x0)
         check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
         log = AdjointLog()
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
@@ -136,5 +144,6 @@ def linear_solve(
         on_failure,
         0 if log is None else log.number,
         checkpoint_number(checkpoint_every),
+        x0.unsqueeze(0) if lone_vector and x0 is not None else x0,
     )
     return u.squeeze(0) if lone_vector else u, SolveInfo(*report, log)

@@ -1,8 +1,8 @@
 """Solvers: which iteration, how many at most, to which tolerance.
 
-All start from zero and stop, sample by sample, at the first of ‖b - A u‖ <= rtol ‖b‖ (the true
-residual) or `max_iter` iterations; rtol = 0 runs exactly `max_iter`. Arguments out of range raise
-ValueError.
+All start from zero unless they are given a start, and stop, sample by sample, at the first of
+‖b - A u‖ <= rtol ‖b‖ (the true residual) or `max_iter` iterations; rtol = 0 runs exactly `max_iter`.
+Arguments out of range raise ValueError.
 """
 
 from dataclasses import dataclass, field
@@ -115,7 +115,7 @@ def checkpoint_number(checkpoint_every):
     return {None: 0, "sqrt": _C.CHECKPOINT_SQRT}.get(checkpoint_every, checkpoint_every)
 
 
-def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every):
+def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every, start="zero"):
     """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
         raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
@@ -132,4 +132,5 @@ def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_fail
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
         _check.string(who, "on_failure", on_failure),
         checkpoint_number(checkpoint_every),
+        _check.string(who, "start", start),
     )

@@ -10,17 +10,20 @@ from prdp_torch.solvers import check_options, checkpoint_number
 
 class Stepper(torch.nn.Module):
     """u → u_next, both (batch, channel, *shape) in float32 or float64 and of any strides, by a linear
-    solve A(u) u_next = b(u) that starts from zero. Derivatives as `linear_solve` describes them.
+    solve A(u) u_next = b(u). Derivatives as `linear_solve` describes them.
 
     Args of every stepper beside its physics:
         solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
+        start: where the solves start: "zero", or "state", the state before the step, as the x0 of
+            `linear_solve`. It saves iterations where a step changes the state little.
 
     Attributes:
         max_iter: K, the solver's budget; set it at any time, by hand or by a controller. A change
             costs nothing, under `torch.compile` neither.
         rtol, adjoint_rtol: the tolerances; set them at any time as well. Under `torch.compile` every new value
             compiles once more, up to `torch._dynamo.config.recompile_limit` of them.
+        start: as above; set it at any time.
         info: `SolveInfo` of the last forward or rollout; None before the first.
         adjoint_info: `SolveInfo` of the last adjoint solve, or rollout of them; None before the first
             backward.
@@ -39,6 +42,7 @@ class Stepper(torch.nn.Module):
         adjoint_rtol=None,
         on_failure="raise",
         checkpoint_every=None,
+        start="zero",
     ):
         super().__init__()
         who = type(self).__name__
@@ -47,7 +51,7 @@ class Stepper(torch.nn.Module):
                 f"{who}: a subclass of Stepper must define operator(u), and rhs(u) where b is not the state; "
                 "ImplicitStep(operator, rhs, solver) takes the two as functions"
             )
-        check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
+        check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every, start)
         self.method = solver.method
         self.rtol = float(solver.rtol)
         self.restart = solver.restart
@@ -56,6 +60,7 @@ class Stepper(torch.nn.Module):
         self.adjoint_rtol = adjoint_rtol
         self.on_failure = on_failure
         self.checkpoint_every = checkpoint_every
+        self.start = start
         # A tensor, because torch.compile takes a module's plain numbers for constants.
         self._max_iter = torch.tensor(solver.max_iter)
         self._adjoint_log = AdjointLog()
@@ -126,8 +131,9 @@ class Stepper(torch.nn.Module):
                     f"{who}: rhs must return the shape and dtype of the state, {tuple(u.shape)} in {u.dtype}, "
                     f"got {tuple(b.shape)} in {b.dtype}"
                 )
+        x0 = u if self.start == "state" else None
         return torch.ops.prdp.linear_solve(
-            b, a.tensors, a.kind, a.shape, a.parameters, False, *self._options(log.number)
+            b, a.tensors, a.kind, a.shape, a.parameters, False, *self._options(log.number), x0
         )
 
     def _options(self, log_number):

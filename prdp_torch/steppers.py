@@ -61,7 +61,7 @@ class EquationStepper(Stepper):
     def forward(self, u):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
-        u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._options(self._adjoint_log.number))
+        u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
         self._keep(report, self._adjoint_log)
         return u_next
 
@@ -75,14 +75,16 @@ class EquationStepper(Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-        options = self._options(self._adjoint_log.number)
-        states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *options)
+        states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
         self._keep(report, self._adjoint_log)
         return states
 
     def _equation(self):
         e = self.equation
         return self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps
+
+    def _step_options(self):
+        return *self._options(self._adjoint_log.number), self.start == "state"
 
     def _tensors(self):
         """What the operator is made of beside the state: nu as it is now."""

@@ -81,6 +81,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("restart", [](const Scene& s) { return s.solver.restart; })
       .def_property(
           "backward", [](const Scene& s) { return name(s.backward); }, &Scene::set_backward)
+      .def_property_readonly("start", [](const Scene& s) { return name(s.start); })
       .def_property_readonly("prdp",
                              [](const Scene& s) { return as_dict(s.prdp); })
       .def("learning_rate", &Scene::learning_rate, py::arg("update"));

@@ -139,19 +139,20 @@ void bind_solvers(py::module_& m) {
       "check_options",
       [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
          std::string backward, std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
-         std::string on_failure, int64_t checkpoint_every) {
+         std::string on_failure, int64_t checkpoint_every, std::string start) {
         SolveOptions{{method_from_name(method), max_iter, rtol, restart},
                      backward_from_name(backward),
                      adjoint_max_iter,
                      adjoint_rtol,
                      on_failure_from_name(on_failure),
                      /*adjoint_log=*/0,
-                     checkpoint_every}
+                     checkpoint_every,
+                     start_from_name(start)}
             .check(who.c_str());
       },
       py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
       py::arg("backward"), py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"),
-      py::arg("checkpoint_every"));
+      py::arg("checkpoint_every"), py::arg("start") = "zero");
 
   m.def("open_adjoint_log", &adjoint_log::open);
   m.def("close_adjoint_log", &adjoint_log::close, py::arg("log"));
@@ -188,17 +189,19 @@ void bind_solvers(py::module_& m) {
   m.def("solve_with_tensors",
         [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,
            std::vector<int64_t> shape, std::vector<double> parameters, bool transposed,
-           std::string solver, int64_t max_iter, double rtol, int64_t restart) {
+           std::string solver, int64_t max_iter, double rtol, int64_t restart, std::optional<at::Tensor> x0) {
           auto a = spec(kind, shape, parameters, tensors);
           a.transposed = transposed;
           const auto result = [&] {
             const py::gil_scoped_release no_gil;
-            return solve_with_tensors(*make_operator(a), b, {method_from_name(solver), max_iter, rtol, restart});
+            return solve_with_tensors(*make_operator(a), b,
+                                      {method_from_name(solver), max_iter, rtol, restart, {}, true,
+                                       x0.value_or(at::Tensor())});
           }();
           return py::make_tuple(result.u, as_tuple(result.info));
         },
         "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.",
         py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"),
         py::arg("transposed"), py::arg("solver"), py::arg("max_iter"), py::arg("rtol"),
-        py::arg("restart") = kDefaultRestart);
+        py::arg("restart") = kDefaultRestart, py::arg("x0") = py::none());
 }

@@ -49,6 +49,42 @@ TEST(Heat, BudgetMayChangeAtAnyTime) {
   EXPECT_THROW(heat.set_max_iter(-1), c10::ValueError);
 }
 
+TEST(Start, FromTheStateIsALinearSolveThatIsGivenTheState) {
+  for (const auto backward : {prdp::Backward::kImplicit, prdp::Backward::kUnrolled}) {
+    const auto nu = at::scalar_tensor(1e-2, at::kDouble).requires_grad_();
+    const prdp::Solver jacobi = prdp::Jacobi{.max_iter = 3};
+    auto burgers = prdp::Burgers({9}, nu, 0.1, jacobi, backward);
+    auto own = prdp::ImplicitStep(
+        [&](const at::Tensor& u) { return prdp::OperatorSpec{"burgers", {9}, {0.1}, {u, nu}}; }, nullptr, jacobi, backward);
+    const auto u = prdp_test::random_field({9}, 2).requires_grad_();
+    const auto from_zero = burgers(u);
+    burgers.options().start = own.options().start = prdp::Start::kState;
+    const prdp::SolveOptions options{jacobi, backward};
+    const auto first = prdp::linear_solve(burgers.operator_at(u), u, options, u).u;
+    const auto second = prdp::linear_solve(burgers.operator_at(first), first, options, first).u;
+    const auto expected = at::stack({u, first, second}, 1);
+    EXPECT_FALSE(at::equal(first, from_zero));
+    const auto truth = torch::autograd::grad({expected.square().sum()}, {u, nu});
+    for (const auto& states : {burgers.rollout(u, 2), own.rollout(u, 2)}) {
+      EXPECT_TRUE(at::equal(states, expected));
+      const auto found = torch::autograd::grad({states.square().sum()}, {u, nu});
+      EXPECT_TRUE(at::allclose(found[0], truth[0], 1e-12) && at::allclose(found[1], truth[1], 1e-12));
+    }
+  }
+}
+
+TEST(Start, IsNeverWorseThanZeroAndConvergesWithoutIterationsWhereItIsTheSolution) {
+  auto heat = prdp::Heat({12}, 1e-3, 1.0, prdp::CG{.max_iter = 50, .rtol = 1e-9});
+  const auto u = prdp_test::random_field({12}, 2), exact = heat(u);
+  const prdp::SolveOptions options{prdp::CG{.max_iter = 50, .rtol = 1e-8}};
+  const auto again = prdp::linear_solve(heat.operator_at(u), u, options, -3 * exact);
+  EXPECT_TRUE(again.info.iterations.eq(0).all().item<bool>() && again.info.status.eq(1).all().item<bool>());
+  const prdp::SolveOptions none{prdp::CG{.max_iter = 0}};
+  const auto poor = prdp::linear_solve(heat.operator_at(u), u, none, prdp_test::random_field({12}, 2).flip(0));
+  EXPECT_TRUE(poor.info.residual.le(1).all().item<bool>());
+  EXPECT_THROW(prdp::linear_solve(heat.operator_at(u), u, none, u.narrow(2, 0, 5)), c10::ValueError);
+}
+
 TEST(Heat, CopiesReportToTheSameAdjointLog) {
   auto heat = prdp::Heat({5}, 1e-3, 1.0, prdp::Direct{});
   auto copy = heat;

@@ -19,72 +19,84 @@ using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::T
 
 constexpr const char* kSchema =
     "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
-    PRDP_OPTIONS_SCHEMA ") -> "
+    PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> "
     "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 
 /// The arguments of the op but b.
 struct Call {
   OperatorSpec a;
   SolveOptions options;
+  at::Tensor x0;
 };
 
-using Signature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                      at::ArrayRef<double>, bool)>;
+using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                           at::ArrayRef<double>, bool)>;
 
-Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o) {
+Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   static const auto op = c10::Dispatcher::singleton()
                              .findSchemaOrThrow("prdp::linear_solve", "")
                              .typed<Signature>();
-  return call_with_options(op, o, b, at::TensorList(a.tensors), c10::string_view(a.kind),
-                           at::IntArrayRef(a.shape), at::ArrayRef<double>(a.parameters), a.transposed);
+  return call_with_x0(op, o, x0, b, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
+                      at::ArrayRef<double>(a.parameters), a.transposed);
 }
 
 /// The op's arguments as structures; raises for names that do not exist.
 template <class... Options>
 Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
             at::ArrayRef<double> parameters, bool transposed, Options... options) {
-  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
-          unflatten(std::move(options)...)};
+  auto [solve, x0] = unflatten_with_x0(std::move(options)...);
+  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed}, std::move(solve), std::move(x0)};
 }
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
 
 std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b,
-                                           const SolveOptions& options) {
+                                           const SolveOptions& options, const at::Tensor& x0) {
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);
+  TORCH_CHECK_VALUE(!x0.defined() || (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() &&
+                                      x0.device() == b.device()),
+                    role_of(spec), ": x0 must have the shape, dtype and device of b, ", b.sym_sizes(), " in ",
+                    b.scalar_type(), " on ", b.device(), ", got ", x0.sym_sizes(), " in ", x0.scalar_type(), " on ",
+                    x0.device());
   return a;
 }
 
 template <class... Args>
 Outputs solve_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options] = unpack(std::move(args)...);
-  const auto [u, info] = linear_solve_kernel(a, b, options);
+  const auto [a, options, x0] = unpack(std::move(args)...);
+  const auto [u, info] = linear_solve_kernel(a, b, options, x0);
   return {u, info.iterations, info.residual, info.status, info.operator_applications};
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
 Outputs fake_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options] = unpack(std::move(args)...);
-  checked_operator(a, b, options);
+  const auto [a, options, x0] = unpack(std::move(args)...);
+  checked_operator(a, b, options, x0);
   const auto counts = [&] { return at::empty_symint({b.sym_size(0)}, b.options().dtype(at::kLong)); };
   return {at::empty_symint(b.sym_sizes(), b.options()), counts(),
           at::empty_symint({b.sym_size(0)}, b.options()), counts(), counts()};
 }
 
 /// The op below autograd.
-Outputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o) {
+Outputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
-  if (!is_plain(b) || !all_plain(a.tensors)) return call_op(b, a, o);
-  const auto [u, info] = linear_solve_kernel(a, b, o);
+  if (!is_plain(b) || !all_plain(a.tensors) || (x0.defined() && !is_plain(x0))) return call_op(b, a, o, x0);
+  const auto [u, info] = linear_solve_kernel(a, b, o, x0);
   return {u, info.iterations, info.residual, info.status, info.operator_applications};
+}
+
+/// A start is a constant of the derivatives.
+at::Tensor without_derivative(const at::Tensor& x0) {
+  if (!x0.defined()) return x0;
+  return (has_tangent(x0) ? x0._fw_primal(/*level=*/0) : x0).detach();
 }
 
 template <class... Args>
 Outputs autograd_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options] = unpack(args...);
+  const auto [a, options, x0] = unpack(args...);
   const bool differentiable = options.backward != Backward::kNone;
   if (differentiable && at::GradMode::is_enabled() && a.kind == "function" && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
@@ -92,9 +104,9 @@ Outputs autograd_kernel(const at::Tensor& b, Args... args) {
                        (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? c10::make_intrusive<SolveNode>(b, a, options) : nullptr;
-  const auto out = call_below(b, a, options);
+  const auto out = call_below(b, a, options, x0);
   const auto& [u, iterations, residual, status, applications] = out;
-  const Solved solved{b, u, iterations, status, residual};
+  const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
   if (reverse) torch::autograd::set_history(u, node);
   if (forward) u._set_fw_grad(solve_jvp(b, solved, a, options), /*level=*/0, /*is_inplace_op=*/false);
   if (reverse) node->save(b, solved);
@@ -115,21 +127,23 @@ struct Kernels<Outputs(const at::Tensor&, Args...)> {
 
 }  // namespace
 
-SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options) {
+SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
+                         const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
   auto [u, iterations, residual, status, applications] =
-      call_op(lone_vector ? b.unsqueeze(0) : b, a, options);
+      call_op(lone_vector ? b.unsqueeze(0) : b, a, options, lone_vector && x0.defined() ? x0.unsqueeze(0) : x0);
   return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications}};
 }
 
-SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options) {
-  const auto a = checked_operator(spec, b, options);
+SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
+                                const at::Tensor& x0) {
+  const auto a = checked_operator(spec, b, options, x0);
   a->check_parameters();
   const auto& s = options.solver;
-  auto result = solve(*a, b, {s.method, s.max_iter.expect_int(), s.rtol, s.restart});
+  auto result = solve(*a, b, {s.method, s.max_iter.expect_int(), s.rtol, s.restart, {}, true, x0});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
-  report_failures(*a, b, info, options.on_failure, role_of(spec));
+  report_failures(*a, b, info, options.on_failure, role_of(spec), x0);
   if (!b.is_cpu())
     for (auto* part : {&info.iterations, &info.residual, &info.status, &info.operator_applications})
       *part = part->to(b.device());

@@ -13,12 +13,17 @@ namespace prdp {
 ///   implicit: Aᵀ λ = ū by the same method and budget; b̄ = λ, ḡ = -λᵀ ∂(A(g) u)/∂g
 ///   unrolled: the exact derivative of the iterations that each sample really took
 ///   none:     none
+/// `x0`, of b's shape and dtype, is where the iterations start, and a constant of the derivatives. They start from
+/// α x0 with α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ per sample, which is never worse than zero; that takes one product. The
+/// tolerance stays relative to ‖b‖. Direct ignores x0, and so does the adjoint solve.
 /// Raises ValueError or TypeError for bad arguments before any work, and torch.linalg.LinAlgError
 /// for failed samples unless options.on_failure says otherwise.
-SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options);
+SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
+                         const at::Tensor& x0 = {});
 
 /// The same below autograd and the dispatcher, for the kernels of ops: solves, logs and reports.
-SolveResult linear_solve_kernel(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options);
+SolveResult linear_solve_kernel(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
+                                const at::Tensor& x0 = {});
 
 /// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator.
 OperatorSpec matrix(const at::Tensor& values);

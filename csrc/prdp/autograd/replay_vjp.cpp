@@ -56,14 +56,31 @@ class Replay {
       if (needed_[i] || i == 0) add_to(gradients[i], found[next++]);
   }
 
-  std::vector<at::Tensor> gradients;  // of b and the tensors of A
+  /// From the cotangent of the right-hand side, b - A start, to those of b and A.
+  void finish() {
+    gradients[0] = solve_.bar_of_b(*make_(tensors()), gradients[0]);
+    if (!solve_.start().defined()) return;
+    std::vector<at::Tensor> inputs = tensors(), leaves;
+    for (size_t i = 0; i < inputs.size(); ++i)
+      if (needed_[i + 1]) leaves.push_back(inputs[i] = inputs[i].detach().requires_grad_());
+    if (leaves.empty()) return;
+    const auto found = with_autograd([&] {
+      const auto product = make_(inputs)->apply(solve_.start());
+      if (!product.requires_grad()) return std::vector<at::Tensor>(leaves.size());
+      return torch::autograd::grad({product}, leaves, {gradients[0].neg()}, false, false, /*allow_unused=*/true);
+    });
+    for (size_t i = 0, next = 0; i < inputs.size(); ++i)
+      if (needed_[i + 1]) add_to(gradients[i + 1], found[next++]);
+  }
+
+  std::vector<at::Tensor> gradients;  // of the right-hand side and the tensors of A
 
  private:
   std::vector<at::Tensor> tensors() const { return {inputs_.begin() + 1, inputs_.end()}; }
 
   MakeOperator make_;
   StepwiseSolve& solve_;
-  std::vector<at::Tensor> inputs_;  // b and the tensors of A
+  std::vector<at::Tensor> inputs_;  // the right-hand side and the tensors of A
   at::IntArrayRef needed_;
   State now_;
   int64_t done_ = 0;
@@ -88,13 +105,17 @@ UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const U
     auto a = make_operator(spec);
     return part ? a->select(here) : std::move(a);
   };
-  std::vector<at::Tensor> inputs{part ? b.index_select(0, here) : b};
+  const auto of_part = [&](const at::Tensor& t, const at::Tensor& at) {
+    return part && t.defined() ? t.index_select(0, at) : t;
+  };
+  const auto a = make(solve.a.tensors);
+  StepwiseSolve stepwise(*a, solve.solver, of_part(b, here), of_part(solve.x0, here), of_part(solve.iterations, index));
+  std::vector<at::Tensor> inputs{stepwise.rhs()};
   inputs.insert(inputs.end(), solve.a.tensors.begin(), solve.a.tensors.end());
-  const auto caps = part ? solve.iterations.index_select(0, index) : solve.iterations;
-  StepwiseSolve stepwise(solve.solver, inputs[0], caps);
-  Replay replay(make, stepwise, inputs, needed, part ? cotangent.index_select(0, here) : cotangent);
+  Replay replay(make, stepwise, inputs, needed, of_part(cotangent, here));
   run_back(replay, {stepwise.iterations(), solve.checkpoint_every});
 
+  replay.finish();
   found.gradients = std::move(replay.gradients);
   auto applications = at::tensor(at::IntArrayRef(stepwise.applications()), at::kLong);
   if (part) {

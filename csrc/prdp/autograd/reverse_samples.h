@@ -11,8 +11,8 @@
 /// The CPU's way back through the iterations of a batch: sample after sample, each to its start.
 namespace prdp {
 
-/// b, the cotangent and the results as plain arrays: b, the cotangent, b_bar and diagonal_bar contiguous
-/// (batch, unknowns), iterations and applications (batch,).
+/// b, the start x0, the cotangent and the results as plain arrays: b, x0, the cotangent, b_bar and diagonal_bar
+/// contiguous (batch, unknowns), iterations and applications (batch,). Null for x0: all start from zero.
 template <class T>
 struct ReverseBatch {
   Method method;
@@ -21,6 +21,7 @@ struct ReverseBatch {
   int64_t checkpoint_every;
   const int64_t* iterations;
   const T* b;
+  const T* x0;
   const T* cotangent;
   T* b_bar;
   T* diagonal_bar;  // Jacobi's cotangent of the diagonal; null: not wanted
@@ -61,16 +62,13 @@ class SweepSpace : public SampleSpace<Kernel> {
     T lambda_scale, v_scale;
   };
   SweepSpace(const Kernel& a, const Kernel& transpose, kernels::Workspace<T>& workspace,
-             SampleState& state, KeptIterates<T>& kept, Gradient gradient)
-      : Base(a, workspace), a_(a), transpose_(transpose), state_(state), kept_(kept), gradient_(gradient) {}
+             SampleState& state, KeptIterates<T>& kept, Gradient gradient, bool starts)
+      : Base(a, workspace, starts), a_(a), transpose_(transpose), state_(state), kept_(kept), gradient_(gradient) {}
 
   void axpy(T alpha, const T* x, T* y) { loops_.axpy(alpha, x, y, a_.length()); }
   void apply_transpose(const T* v, T* out) {
     ++state_.applications;
     transpose_.apply(v, out);
-  }
-  void project([[maybe_unused]] T* v) {
-    if constexpr (kernels::kHasNullSpace<Kernel>) a_.project(v);
   }
   /// out -= t (x - y), by elements.
   void subtract_products(const T* t, const T* x, const T* y, T* out) {
@@ -104,7 +102,7 @@ inline int64_t sweep_vectors_of(Method method, int64_t restart) {
 
 /// Runs the sweep of `method` with x̄ in the vector `x_bar`; returns where b̄ is.
 template <class Space, class T>
-T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpoints& plan,
+T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpoints& plan, double b2,
              T** diagonal_bar) {
   const auto run = [&](auto sweep) -> T* {
     run_back(sweep, plan);
@@ -114,9 +112,9 @@ T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpo
   switch (batch.method) {
     case Method::kJacobi: return run(JacobiSweep<Space>(space, x_bar));
     case Method::kSteepestDescent:
-      return run(SteepestDescentSweep<Space>(space, x_bar, {batch.rtol, plan.iterations}));
+      return run(SteepestDescentSweep<Space>(space, x_bar, {batch.rtol, plan.iterations, b2}));
     case Method::kConjugateGradient:
-      return run(ConjugateGradientSweep<Space>(space, x_bar, {batch.rtol, plan.iterations}));
+      return run(ConjugateGradientSweep<Space>(space, x_bar, {batch.rtol, plan.iterations, b2}));
     default: return run(GmresSweep<Space>(space, x_bar, batch.restart));
   }
 }
@@ -136,16 +134,20 @@ void reverse_sample(const NearOne<Kernel>& near, const Kernel& transpose, kernel
   if (batch.rows) rows.emplace(batch.rows(s));
   // With A' = factor A and b' = scale b, u = factor/scale u'.
   const T lambda_scale = bar_scale / near.factor(), v_scale = scale / near.factor();
-  SweepSpace<Kernel> space(a, transpose, workspace, state, kept, {rows ? &*rows : nullptr, lambda_scale, v_scale});
+  SweepSpace<Kernel> space(a, transpose, workspace, state, kept, {rows ? &*rows : nullptr, lambda_scale, v_scale},
+                           batch.x0 != nullptr);
   a.load(b, scale, space.b());
   space.project(space.b());
   space.begin(state);
+  const double b2 = space.b2();
+  if (batch.x0) space.start_from(batch.x0 + s * n);
   T* x_bar = space.vector();
   a.load(cotangent, bar_scale, x_bar);
   space.project(x_bar);
   T* diagonal_bar = nullptr;
-  T* result = run_sweep(space, x_bar, batch, {batch.iterations[s], batch.checkpoint_every}, &diagonal_bar);
+  T* result = run_sweep(space, x_bar, batch, {batch.iterations[s], batch.checkpoint_every}, b2, &diagonal_bar);
   space.project(result);
+  if (const T* start = space.started_from()) space.differentiate(-1, result, start);  // r₀ = b - A start
   a.store(result, T(1) / lambda_scale, b_bar);
   if (batch.diagonal_bar) {
     a.store(diagonal_bar, T(1) / lambda_scale, batch.diagonal_bar + s * n);
@@ -174,7 +176,8 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
   }
   for (int64_t s = begin; s < end; ++s) {
     // Zeros for the cotangents, and nothing left of a sample before that was not finite.
-    workspace.prepare(2 + vectors_of(batch.method, restart) + sweep_vectors_of(batch.method, restart),
+    workspace.prepare(SweepSpace<Kernel>::vectors(batch.x0 != nullptr) + vectors_of(batch.method, restart) +
+                          sweep_vectors_of(batch.method, restart),
                       a.length(), a.halo());
     if (batch.iterations[s] == 0) {
       std::fill_n(batch.b_bar + s * n, n, T(0));

@@ -22,6 +22,7 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);
+    x0_ = SavedVariable(solved.x0, /*is_output=*/false);
     iterations_ = SavedVariable(solved.iterations, /*is_output=*/false);
     residual_ = SavedVariable(solved.residual, /*is_output=*/false);
   } else if (any_requires_grad(a_.tensors)) {
@@ -35,7 +36,7 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
 
 void SolveNode::release_variables() {
   const std::lock_guard lock(mutex_);
-  for (auto* saved : {&b_, &u_, &iterations_, &status_, &residual_}) saved->reset_data();
+  for (auto* saved : {&b_, &x0_, &u_, &iterations_, &status_, &residual_}) saved->reset_data();
   for (auto& saved : tensors_) saved.reset_data();
 }
 
@@ -51,7 +52,7 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
       return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
     };
     solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_),
-              unpack(residual_)};
+              unpack(residual_), unpack(x0_)};
     for (const auto& saved : tensors_) a.tensors.push_back(unpack(saved));
   }
   const WithoutAutocast full_precision;

@@ -29,7 +29,7 @@ class SolveNode final : public torch::autograd::Node {
   std::shared_ptr<const RegisteredProducts> products_;  // of a Function, kept alive
   std::pair<int64_t, int64_t> step_ = FailuresOfStep::now();  // of a rollout, for what the backward pass reports
   std::vector<torch::autograd::SavedVariable> tensors_;
-  torch::autograd::SavedVariable b_, u_, iterations_, status_, residual_;
+  torch::autograd::SavedVariable b_, x0_, u_, iterations_, status_, residual_;
 };
 
 }  // namespace prdp

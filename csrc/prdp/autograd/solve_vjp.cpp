@@ -47,7 +47,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   auto o = options;
   o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
   o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
-  auto [lambda, info] = adjoint_solve(transpose, cotangent, o);
+  auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
 
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;

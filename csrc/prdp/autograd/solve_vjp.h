@@ -7,6 +7,7 @@ namespace prdp {
 /// unrolled one all else, and the status both where a failed sample may have passed.
 struct Solved {
   at::Tensor b, u, iterations, status, residual;
+  at::Tensor x0{};  // undefined: from zero
 };
 
 /// The product of the cotangent ū with the derivative of (b, tensors of A) → u, as options.backward

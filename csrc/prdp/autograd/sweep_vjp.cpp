@@ -63,6 +63,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
   auto transposed = solve.a;
   transposed.transposed = !transposed.transposed;
   const auto parameters = a->kernel(b), transpose = make_operator(transposed)->kernel(b);
+  const auto x0 = solve.x0.defined() ? solve.x0.contiguous() : at::Tensor();
   const auto rhs = b.contiguous(), bar = cotangent.contiguous(), iterations = solve.iterations.contiguous();
   const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   const bool for_diagonal = for_a && solve.solver.method == Method::kJacobi;
@@ -80,6 +81,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
                           solve.checkpoint_every,
                           iterations.const_data_ptr<int64_t>(),
                           rhs.const_data_ptr<T>(),
+                          x0.defined() ? x0.const_data_ptr<T>() : nullptr,
                           bar.const_data_ptr<T>(),
                           b_bar.mutable_data_ptr<T>(),
                           for_diagonal ? diagonal_bar.mutable_data_ptr<T>() : nullptr,

@@ -71,14 +71,14 @@ class RecursiveSweep : public SweepBase<Method, Space> {
   using Vector = typename Space::Vector;
   using Scalar = typename Space::Scalar;
 
-  /// The method's rtol, and the iterations that it ran.
+  /// The method's rtol, the iterations that it ran, and ‖b‖².
   struct Run {
     double rtol;
     int64_t iterations;
+    double b2;
   };
   RecursiveSweep(Space& space, Vector x_bar, Run run)
-      : Base(space, x_bar), r_bar_(space.vector()), b_bar_(space.vector()), t_(space.vector()), run_(run),
-        b2_(space.b2()) {}
+      : Base(space, x_bar), r_bar_(space.vector()), b_bar_(space.vector()), t_(space.vector()), run_(run) {}
 
   void start() {
     Method::start();
@@ -122,7 +122,7 @@ class RecursiveSweep : public SweepBase<Method, Space> {
     std::vector<Scalar> x, residual;
   };
   void claim() {
-    const bool claims = run_.rtol > 0.0 && detail::is_within(this->rr_, run_.rtol, b2_);
+    const bool claims = run_.rtol > 0.0 && detail::is_within(this->rr_, run_.rtol, run_.b2);
     if (!claims || done_ == run_.iterations) return;
     this->recompute_residual();
     auto& s = this->sweep_space_;
@@ -139,7 +139,6 @@ class RecursiveSweep : public SweepBase<Method, Space> {
   }
 
   Run run_;
-  double b2_;
   int64_t done_ = 0, furthest_ = 0;  // iterations behind the state at hand; and ever
   std::vector<Correction> corrections_;
 };

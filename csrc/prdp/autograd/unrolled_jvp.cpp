@@ -14,9 +14,10 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] needed, "
-    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, " PRDP_OPTIONS_SCHEMA ") -> Tensor";
+    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
+    ") -> Tensor";
 using Signature =
-    WithOptions<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+    WithOptionsAndX0<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                            const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef,
                            at::ArrayRef<double>, bool)>;
 
@@ -27,11 +28,11 @@ at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Te
                       at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                       at::ArrayRef<double> parameters, bool transposed, Options... flat) {
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
-  auto options = unflatten(std::move(flat)...);
+  auto [options, x0] = unflatten_with_x0(std::move(flat)...);
   options.adjoint_log = 0;
   return with_autograd([&] {
     const auto leaf = [](const at::Tensor& t, bool wanted) { return t.detach().requires_grad_(wanted); };
-    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual};
+    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual, x0.defined() ? x0.detach() : x0};
     for (size_t i = 0; i < tensors.size(); ++i) a.tensors.push_back(leaf(tensors[i], needed[i + 1]));
     const auto cotangent = at::ones_like(b).requires_grad_();  // any: the map is linear
     const auto found = unrolled_vjp_recorded(cotangent, solved, a, options, needed);
@@ -91,7 +92,7 @@ at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const Ope
                         const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
-  return call_with_options(op, options, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
+  return call_with_x0(op, options, solved.x0, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
                            at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
                            at::ArrayRef<double>(a.parameters), a.transposed);
 }

@@ -19,11 +19,11 @@ namespace {
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
     "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
-    PRDP_OPTIONS_SCHEMA ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
+    PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
     "Tensor operator_applications)";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 using Signature =
-    WithOptions<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+    WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                         const at::Tensor&, at::IntArrayRef, at::TensorList,
                         c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool)>;
 
@@ -93,7 +93,7 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
   const int64_t unknowns = solved.b.numel() / batch;
   if (is_conjugate_gradient(solver.method) &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
-    const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart});
+    const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
     leave_out(unknowns, within_rounding(a, before, [&] { return one_less.u; }));
   }
@@ -114,7 +114,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     auto silent = options;
     silent.on_failure = OnFailure::kReturn;
     silent.adjoint_log = 0;
-    if (!u.defined()) u = any_solve(spec, solved.b, silent).u;
+    if (!u.defined()) u = any_solve(spec, solved.b, silent, solved.x0).u;
     return u;
   };
   const auto exact = solved_to_rounding(*a, solved, options.solver, make_u), sound = finite_rows(cotangent);
@@ -144,8 +144,9 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
       if (rows[i] && !exact[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
     std::vector<int64_t> applications(batch, 0);
     if (caps.any().item<bool>()) {
-      auto found = of_iterations(bar, solved.b, {spec, options.solver, caps.to(solved.iterations.device()),
-                                                 options.checkpoint_every}, needed);
+      auto found = of_iterations(bar, solved.b, {spec, solved.x0, options.solver,
+                                                 caps.to(solved.iterations.device()), options.checkpoint_every},
+                                 needed);
       sum = std::move(found.gradients);
       applications = to_host<int64_t>(found.operator_applications, batch);
     }
@@ -222,7 +223,7 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
   const auto rhs = at::alias(b);
   auto a = solve.a;
   for (auto& t : a.tensors) t = at::alias(t);
-  const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.solver, solve.iterations);
+  const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.x0, solve.solver, solve.iterations);
   UnrolledVjp found{std::vector<at::Tensor>(needed.size()), 2 * applications};
   std::vector<at::Tensor> inputs;
   for (size_t i = 0; i < needed.size(); ++i)
@@ -243,9 +244,9 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
   make_operator(a)->check_parameters();
-  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual}, a,
-                                    unflatten(std::move(flat)...), needed, run_iterations_back,
-                                    linear_solve_kernel);
+  const auto [options, x0] = unflatten_with_x0(std::move(flat)...);
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
+                                    run_iterations_back, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);
@@ -275,8 +276,8 @@ SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const O
                       const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
-  const auto [gradients, iterations, residual, status, applications] = call_with_options(
-      op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
+  const auto [gradients, iterations, residual, status, applications] = call_with_x0(
+      op, options, solved.x0, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
       at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
       at::ArrayRef<double>(a.parameters), a.transposed);
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());

@@ -31,6 +31,7 @@ at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const Ope
 /// The iterations that are differentiated as they ran: so many of each sample, of some none.
 struct UnrolledSolve {
   OperatorSpec a;
+  at::Tensor x0;  // undefined: from zero
   Solver solver;
   at::Tensor iterations;         // (batch,)
   int64_t checkpoint_every = 0;  // as SolveOptions has it

@@ -52,6 +52,7 @@ void read_solver(TomlSection s, Scene& scene) {
   scene.solver.rtol = s.at_least("rtol", 0.0);
   if (scene.solver.method == Method::kGmres) scene.solver.restart = s.count("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
+  if (s.has("start")) scene.start = start_from_name(s.choice("start", {"zero", "state"}));
   s.finish();
 }
 
@@ -182,7 +183,9 @@ Stepper Scene::stepper(Solver with) const {
   return {std::move(equation), options(std::move(with))};
 }
 
-SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, OnFailure::kReturn}; }
+SolveOptions Scene::options(Solver with) const {
+  return {std::move(with), backward, {}, {}, OnFailure::kReturn, 0, 0, start};
+}
 
 void Scene::set_backward(const std::string& name) {
   const auto known = backwards(task);

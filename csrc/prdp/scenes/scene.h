@@ -89,6 +89,7 @@ struct Scene {
   Physics physics;
   Solver solver;  // converged: max_iter is K_ε
   Backward backward;
+  Start start = Start::kZero;
   Data data;
   Network network;
   Training training;

@@ -38,6 +38,7 @@ class GmresMethod {
     exhausted_ = space_.is_zero(residual2_);
     scale_ = residual2_ * 0;
     ready_ = true;
+    confirmed_ = !space_.started();
   }
   void step() {
     residual2();
@@ -47,6 +48,7 @@ class GmresMethod {
     minimise(columns_);
     space_.add_combination(y_, v_, columns_, x, preconditioner_);
     ready_ = false;
+    confirmed_ = true;
   }
   /// ‖b - A x‖². A cycle that made it grow was rounding errors and is taken back.
   auto residual2() {
@@ -60,7 +62,11 @@ class GmresMethod {
     ready_ = true;
     return residual2_;
   }
-  auto recompute_residual() { return residual2(); }
+  auto recompute_residual() {
+    if (confirmed_) return residual2();
+    confirmed_ = true;
+    return residual2_ = space_.residual(x, r_);
+  }
   /// Not zero where the last cycle's Krylov space could not be extended: it holds all that A reaches.
   const Scalar& exhausted() const { return exhausted_; }
 
@@ -183,6 +189,7 @@ class GmresMethod {
   Scalar scale_{};  // largest ‖A v‖ so far: what is rounding beside it is zero
   int64_t columns_ = 0;  // of the last cycle
   bool ready_ = false;   // r_ and residual2_ belong to x
+  bool confirmed_ = true;  // and were computed from it: those of a start were not
 };
 
 }  // namespace prdp

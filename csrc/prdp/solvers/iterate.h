@@ -114,7 +114,7 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
                             const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
-  const auto u2 = space.lanes(space.dot(method.x, method.x));
+  const auto u2 = space.lanes(space.solution2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : 1.0;
@@ -255,7 +255,8 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
 
 }  // namespace detail
 
-/// Solves every sample that `states` holds active, from zero; the result is method.x. A sample that
+/// Solves every sample that `states` holds active, from zero or the space's start; the result is method.x, but for
+/// that start. A sample that
 /// overflows or diverges is run again for as many iterations as gave its smallest residual, unless the
 /// iterations are wanted as they come.
 template <class Space, class Method>

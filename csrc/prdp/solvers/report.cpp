@@ -22,12 +22,16 @@ std::string position(const std::vector<int64_t>& index) {
   return text.str();
 }
 
-/// Where in b or in A the trouble of this sample sits.
-std::string whereabouts(const Operator& a, const at::Tensor& b, SolveStatus status, int64_t sample) {
+/// Where in b, in the start or in A the trouble of this sample sits.
+std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor& x0, SolveStatus status,
+                        int64_t sample) {
   std::ostringstream text;
-  if (status == SolveStatus::kNonfiniteInput)
-    text << " at index " << position(first_true(nonfinite(b.select(0, sample))));
-  else if (status == SolveStatus::kZeroDiagonal)
+  if (status == SolveStatus::kNonfiniteInput) {
+    const auto of_b = nonfinite(b.select(0, sample));
+    const bool in_b = !x0.defined() || of_b.any().item<bool>();
+    text << (in_b ? "" : " in x0") << " at index " << position(first_true(in_b ? of_b : nonfinite(x0.select(0, sample))));
+  }
+  if (status == SolveStatus::kZeroDiagonal)
     text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
   else if (status == SolveStatus::kNonfiniteOperator)
     text << " at index " << position(a.first_nonfinite(sample));
@@ -45,7 +49,7 @@ FailuresOfStep::~FailuresOfStep() {
 std::pair<int64_t, int64_t> FailuresOfStep::now() { return {step_now, steps_in_all}; }
 
 void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
-                     OnFailure on_failure, const char* role) {
+                     OnFailure on_failure, const char* role, const at::Tensor& x0) {
   if (on_failure == OnFailure::kReturn) return;
   const int64_t batch = info.status.size(0);
   const auto* status = info.status.const_data_ptr<int64_t>();
@@ -62,7 +66,7 @@ void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& in
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);
     text << (k ? "; " : ": ") << "sample " << i << " " << describe(what).name
-         << whereabouts(a, b, what, i);
+         << whereabouts(a, b, x0, what, i);
     if (!is_refused(what))
       text << " (the iterate handed out has relative residual " << info.residual[i].item<double>()
            << " after " << info.iterations[i].item<int64_t>() << " iterations)";

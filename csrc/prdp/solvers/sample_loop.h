@@ -10,8 +10,8 @@
 /// The CPU's way through a batch: sample after sample, each to its end.
 namespace prdp {
 
-/// Right-hand sides and results as plain arrays: b and u contiguous (batch, unknowns), the others
-/// (batch,). `caps` gives each sample its own max_iter; null: all have `max_iter`.
+/// Right-hand sides and results as plain arrays: b, x0 and u contiguous (batch, unknowns), the others
+/// (batch,). `caps` gives each sample its own max_iter; null: all have `max_iter`. Null for x0: all start from zero.
 template <class T>
 struct SampleBatch {
   Method method;
@@ -21,6 +21,7 @@ struct SampleBatch {
   const int64_t* caps;
   bool guarded;
   const T* b;
+  const T* x0;
   T* u;
   int64_t* iterations;
   T* residual;
@@ -54,7 +55,8 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
     finish(status, 0, residual);
   };
   const T magnitude = kernels::largest_magnitude(b, n);
-  if (!std::isfinite(magnitude))
+  const T* x0 = batch.method == Method::kDirect || !batch.x0 ? nullptr : batch.x0 + s * n;
+  if (!std::isfinite(magnitude) || (x0 && !std::isfinite(kernels::largest_magnitude(x0, n))))
     return hand_out_zeros(SolveStatus::kNonfiniteInput, std::numeric_limits<double>::infinity());
   if (!operator_is_finite)
     return hand_out_zeros(SolveStatus::kNonfiniteOperator, std::numeric_limits<double>::infinity());
@@ -75,7 +77,9 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
   }
   space.begin(state);
   state.b2 = space.b2();
+  if (x0) space.start_from(x0);
   iterate(space, method, states, batch.rtol, batch.guarded);
+  if (x0) space.add_start(method.x);
   if constexpr (kernels::kHasNullSpace<Kernel>) kernel.project(method.x);
   kernel.store(method.x, T(1) / scale, u);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
@@ -93,8 +97,10 @@ template <class Kernel, class T>
 void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
   auto& workspace = kernels::Workspace<T>::local();
   const int64_t restart = std::min(batch.restart, kernel.unknowns());
-  workspace.prepare(2 + vectors_of(batch.method, restart), kernel.length(), kernel.halo());
-  SampleSpace<Kernel> space(kernel, workspace);
+  const bool starts = batch.x0 != nullptr;
+  workspace.prepare(SampleSpace<Kernel>::vectors(starts) + vectors_of(batch.method, restart), kernel.length(),
+                    kernel.halo());
+  SampleSpace<Kernel> space(kernel, workspace, starts);
   with_method(batch.method, restart, space, [&](auto method) {
     const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
       const bool finite = a.operator_is_finite();

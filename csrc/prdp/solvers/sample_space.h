@@ -25,7 +25,11 @@ class SampleSpace {
   using Scalar = T;
   using States = std::array<SampleState, 1>;
 
-  SampleSpace(const Kernel& kernel, kernels::Workspace<T>& workspace) : kernel_(&kernel), workspace_(workspace) {}
+  /// Vectors that the space itself keeps; two more where samples may have a start.
+  static constexpr int64_t vectors(bool starts) { return starts ? 4 : 2; }
+
+  SampleSpace(const Kernel& kernel, kernels::Workspace<T>& workspace, bool starts = false)
+      : kernel_(&kernel), workspace_(workspace), own_(vectors(starts)), used_(own_) {}
 
   /// The operator of the samples that follow, with its direct method where that is wanted.
   void set_operator(const Kernel& kernel, const Factors* factors) {
@@ -35,9 +39,46 @@ class SampleSpace {
   /// Takes over a sample, whose b the caller has put into b().
   void begin(SampleState& state) {
     state_ = &state;
-    broken_ = false;
+    broken_ = started_ = false;
     b2_ = dot(b(), b());
   }
+  void project([[maybe_unused]] Vector v) {
+    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_->project(v);
+  }
+  /// Starts the sample from α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better
+  /// than zero. From here on b() is the residual of the start, and what the method looks for is added to it.
+  void start_from(const T* x0) {
+    const T magnitude = kernels::largest_magnitude(x0, unknowns());
+    if (magnitude == T(0)) return;
+    Vector x = start(), product = scratch(), r = whole_b();
+    kernel_->load(x0, kernels::power_of_two_scale(magnitude), x);
+    project(x);
+    apply(x, product);
+    project(product);
+    const T largest = loops_.largest_magnitude(product, length());
+    if (std::isfinite(largest) && largest > T(0)) {
+      const T scale = kernels::power_of_two_scale(largest);
+      loops_.scale(scale, product, product, length());
+      const T alpha = dot(b(), product) / dot(product, product);
+      std::copy(b(), b() + length(), r);
+      loops_.axpy(-alpha, product, r, length());
+      loops_.scale(scale, x, x, length());
+      loops_.scale(alpha, x, x, length());
+      const T left2 = dot(r, r);
+      started_ = left2 < b2_ && std::isfinite(loops_.largest_magnitude(x, length()));
+      if (started_) {
+        std::swap_ranges(b(), b() + length(), r);
+        b2_ = left2;
+      }
+    }
+    fill_zero(product);
+  }
+  void add_start(Vector x) {
+    if (started_) add(start(), x);
+  }
+  bool started() const { return started_; }
+  /// What the start is; null without one.
+  const T* started_from() { return started_ ? start() : nullptr; }
 
   Vector vector() { return workspace_.vector(used_++); }
   Vector scratch() { return workspace_.vector(1); }
@@ -121,12 +162,17 @@ class SampleSpace {
   }
   /// Whether the norms of Jacobi's residuals are a convex sequence on a logarithmic scale.
   static constexpr bool sweeps_contract() { return kernels::kHasSpectrum<Kernel>; }
-  /// r = b - A x, within the range of A; returns ‖r‖².
+  /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
-    apply(x, r);
-    loops_.xpby(b(), T(-1), r, length());
-    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_->project(r);
+    apply(solution(x), r);
+    loops_.xpby(started_ ? whole_b() : b(), T(-1), r, length());
+    project(r);
     return dot(r, r);
+  }
+  /// ‖u‖²
+  Scalar solution2(const T* x) {
+    const T* u = solution(x);
+    return dot(u, u);
   }
   void solve_directly(const T* r, Vector d) {
     if (factors_->solve(r, d)) return;
@@ -209,7 +255,8 @@ class SampleSpace {
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void restart() {
     broken_ = false;
-    clear(1);
+    workspace_.clear(1);
+    clear(own_);
   }
   /// Zeroes the vectors from number `first` on, with their padding.
   void clear(int64_t first = 0) {
@@ -223,6 +270,13 @@ class SampleSpace {
   static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
 
   int64_t length() const { return kernel_->length(); }
+  Vector start() { return workspace_.vector(2); }
+  Vector whole_b() { return workspace_.vector(3); }
+  const T* solution(const T* x) {
+    if (!started_) return x;
+    std::transform(x, x + length(), start(), scratch(), std::plus<T>());
+    return scratch();
+  }
   /// Of a product with A.
   int64_t work() const {
     if constexpr (requires { kernel_->stored(); }) return kernel_->stored() + kernel_->unknowns();
@@ -239,9 +293,10 @@ class SampleSpace {
   const Factors* factors_ = nullptr;
   kernels::Workspace<T>& workspace_;
   SampleState* state_ = nullptr;
-  int64_t used_ = 2;
+  int64_t own_, used_;
   T b2_ = 0;
   bool broken_ = false;
+  bool started_ = false;  // from start(), and then whole_b() is what b() was
 };
 
 }  // namespace prdp

@@ -27,6 +27,7 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
   SolveResult result{at::empty_like(rhs), empty_info(rhs)};
   const int64_t size = rhs.size(0);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
+  const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
   const SampleBatch<T> batch{request.method,
                              request.max_iter,
                              request.rtol,
@@ -34,6 +35,7 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
                              request.guarded,
                              rhs.const_data_ptr<T>(),
+                             x0.defined() ? x0.const_data_ptr<T>() : nullptr,
                              result.u.mutable_data_ptr<T>(),
                              result.info.iterations.mutable_data_ptr<int64_t>(),
                              result.info.residual.mutable_data_ptr<T>(),

@@ -11,7 +11,8 @@ struct SolveResult {
 };
 
 /// A solve without derivatives. `caps` (int64, (batch,)) gives each sample its own max_iter. Not guarded, u
-/// is what the iterations make of b, however large: no better iterate and no zeros in its place.
+/// is what the iterations make of b, however large: no better iterate and no zeros in its place. `x0`, like b, is
+/// where the iterations start, once it is scaled as linear_solve() says; undefined: from zero.
 struct SolveRequest {
   Method method;
   int64_t max_iter;
@@ -19,6 +20,7 @@ struct SolveRequest {
   int64_t restart;
   std::optional<at::Tensor> caps{};
   bool guarded = true;
+  at::Tensor x0{};
 };
 
 /// A u = b by the CPU loops, or by plain tensor operations where there are none for the operator or
@@ -33,11 +35,12 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart);
 
 /// u after exactly `caps` iterations of each sample, as `solver` took them on the way to its rtol, recorded
-/// by autograd where b or the tensors of `a` require it: the map whose derivative the unrolled mode takes.
+/// by autograd where b or the tensors of `a` require it: the map whose derivative the unrolled mode takes. The
+/// start is a constant of that map.
 struct RecordedSolve {
   at::Tensor u, operator_applications;
 };
-RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::Tensor& x0, const Solver& solver,
                              const at::Tensor& caps);
 
 /// The same iteration by iteration, in plain tensor operations. Of samples with caps > 0 alone.
@@ -46,24 +49,32 @@ class StepwiseSolve {
   /// What one iteration hands to the next, x first; empty: the start.
   using State = std::vector<at::Tensor>;
 
-  StepwiseSolve(const Solver& solver, const at::Tensor& b, const at::Tensor& caps);
+  StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
+                const at::Tensor& caps);
+  /// What the iterations solve for, scaled: b, or what the start leaves of it.
+  const at::Tensor& rhs() const { return rhs_; }
   /// The state after iteration `done` + 1 out of the one before it. A sample past its cap stays.
-  State step(const Operator& a, const at::Tensor& b, const State& before, int64_t done);
-  /// x to u, and ū to x̄: u = P x / scale.
+  State step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done);
+  /// What x adds to u, and ū to x̄: u = start + P x / scale.
   at::Tensor scaled_back(const Operator& a, const at::Tensor& x) const { return a.project(x) / scale_; }
+  /// The cotangent of b for that of rhs(): b̄ = P r̄ scale.
+  at::Tensor bar_of_b(const Operator& a, const at::Tensor& rhs_bar) const { return a.project(rhs_bar) * scale_; }
+  /// Undefined without one.
+  const at::Tensor& start() const { return start_; }
   int64_t iterations() const;  // of the sample that takes most
   const std::vector<int64_t>& applications() const { return applications_; }
 
  private:
   Solver solver_;
-  at::Tensor scale_;
+  at::Tensor scale_, rhs_, start_;
+  std::vector<double> b2_;  // of b, scaled
   std::vector<int64_t> caps_, applications_;
 };
 
 /// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples, naming them with
 /// what happened. `role` is "linear_solve" or "adjoint solve".
 void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
-                     OnFailure on_failure, const char* role);
+                     OnFailure on_failure, const char* role, const at::Tensor& x0 = {});
 
 /// While it lives, what is reported on this thread is said of this step, counted from 1, of a rollout.
 class FailuresOfStep {

@@ -10,8 +10,8 @@ namespace prdp {
 namespace {
 
 /// Says of each sample whether it is settled before iterating, and how; MAX_ITER: it is not.
-std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
-                                           const at::Tensor& magnitude) {
+std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method, const at::Tensor& magnitude,
+                                           const at::Tensor& start_magnitude) {
   const int64_t batch = magnitude.size(0);
   std::vector<SolveStatus> status(batch, SolveStatus::kMaxIter);
   const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
@@ -28,6 +28,7 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method,
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
   mark(a.norm().isfinite().logical_not(), SolveStatus::kNonfiniteOperator);
+  if (start_magnitude.defined()) mark(start_magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
   mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
   return status;
 }
@@ -65,6 +66,38 @@ ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::
 at::Tensor largest_magnitude(const at::Tensor& b) {
   return b.detach().abs().flatten(1).amax(1);
 }
+
+/// Where the iterations of a batch start, and whether that took a product.
+struct TensorStart {
+  at::Tensor x, r;     // r = b - A x
+  at::Tensor applied;  // (batch, 1, …)
+};
+
+/// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
+/// operator keeps what it computes first, for later products as well.
+TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
+  const auto of_order_one = [](const at::Tensor& v) {
+    const auto magnitude = largest_magnitude(v);
+    const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
+    return scale_rhs(v, magnitude, usable);
+  };
+  const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
+  const auto y = of_order_one(x0.detach()).b;
+  const auto [product, scale] = of_order_one(a.project(a.apply(a.project(y))));
+  const auto product2 = dot(product, product);
+  const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
+  const auto x = a.project(y) * scale * alpha, r = b - alpha * product;
+  const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
+  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
+          per_sample(y.flatten(1).ne(0).any(1), b)};
+}
+
+/// The same recorded, of b and the tensors of A, for a start that is a constant.
+at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& start) {
+  return start.defined() ? b - a.project(a.apply(start)) : b;
+}
+
+bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && method != Method::kDirect; }
 
 /// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
 std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
@@ -104,7 +137,9 @@ void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& stat
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
   const auto magnitude = largest_magnitude(b);
-  const auto status = settle_beforehand(a, request.method, magnitude);
+  const bool starts = takes_start(request.method, request.x0);
+  const auto status = settle_beforehand(a, request.method, magnitude,
+                                        starts ? largest_magnitude(request.x0) : at::Tensor());
   const auto is_open = [](SolveStatus s) { return s == SolveStatus::kMaxIter; };
   const bool iterates = request.max_iter > 0 && std::any_of(status.begin(), status.end(), is_open);
   if (request.method == Method::kGmresStokes && !iterates && b.size(0) > 0) a.precondition(at::zeros_like(b), false);
@@ -125,10 +160,16 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   TensorSpace space(a, rhs, states);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
+  if (starts) {
+    const auto made = make_start(a, rhs, at::where(per_sample(takes_part.to(b.device()), b), request.x0, at::zeros_like(rhs)));
+    const auto applied = made.applied.to(at::kCPU);
+    for (size_t i = 0; i < states.size(); ++i) states[i].applications = applied.const_data_ptr<bool>()[i];
+    space.start_from(made.x, made.r);
+  }
 
   auto u = with_method(request.method, request.restart, space, [&](auto method) {
     iterate(space, method, states, request.rtol, request.guarded);
-    return a.project(method.x);
+    return a.project(space.solution(method.x));
   });
   for (size_t i = 0; i < states.size(); ++i)
     if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
@@ -146,7 +187,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   return {u.contiguous(), info_of(states, b.options())};
 }
 
-RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solver& solver,
+RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::Tensor& x0, const Solver& solver,
                              const at::Tensor& caps) {
   // Samples of no iterations return zero and have no derivative. They are left out: an operator that
   // was refused would send NaN backwards even from behind a mask.
@@ -156,7 +197,9 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solve
     if (index.numel() == 0) return {zeros, none};
     if (const auto part = a.select(index)) {
       const auto there = index.to(caps.device());
-      const auto some = solve_recorded(*part, b.index_select(0, index), solver, caps.index_select(0, there));
+      const auto x0_there = x0.defined() ? x0.index_select(0, index) : x0;
+      const auto some =
+          solve_recorded(*part, b.index_select(0, index), x0_there, solver, caps.index_select(0, there));
       return {zeros.index_copy(0, index, some.u), none.index_copy(0, there, some.operator_applications)};
     }
   }
@@ -165,22 +208,38 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const Solve
                                          host_caps.const_data_ptr<int64_t>() + host_caps.numel());
   std::vector<SampleState> states(b.size(0));
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
-  TensorSpace space(a, a.project(rhs), states, /*recording=*/true);
+  const auto whole = a.project(rhs);
+  TensorSpace space(a, whole, states, /*recording=*/true);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
     states[i].b2 = b2[i];
   }
+  if (takes_start(solver.method, x0)) {
+    const auto start = make_start(a, whole.detach(), x0).x;
+    space.start_from(start, rest_of(a, whole, start));
+  }
   const auto u = with_method(solver.method, solver.restart, space, [&](auto m) {
     m.start();
     for (int64_t done = 0; done < most; ++done) iterate_again(space, m, states, solver.rtol, done);
-    return a.project(m.x) / scale;
+    return a.project(space.solution(m.x)) / scale;
   });
   return {u, info_of(states, b.options()).operator_applications.to(caps.device())};
 }
 
-StepwiseSolve::StepwiseSolve(const Solver& solver, const at::Tensor& b, const at::Tensor& caps)
-    : solver_(solver), scale_(scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool)).scale) {
+StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
+                             const at::Tensor& caps)
+    : solver_(solver) {
+  const auto [scaled, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
+  scale_ = scale;
+  rhs_ = a.project(scaled);
+  const auto b2 = rhs_.square().flatten(1).sum(1).to(at::kCPU, at::kDouble);
+  b2_.assign(b2.const_data_ptr<double>(), b2.const_data_ptr<double>() + b2.numel());
+  if (takes_start(solver.method, x0)) {
+    const auto made = make_start(a, rhs_, x0);
+    start_ = made.x / scale_;
+    rhs_ = made.r;
+  }
   const auto host = caps.to(at::kCPU).contiguous();
   caps_.assign(host.const_data_ptr<int64_t>(), host.const_data_ptr<int64_t>() + host.numel());
   applications_.resize(caps_.size());
@@ -188,14 +247,13 @@ StepwiseSolve::StepwiseSolve(const Solver& solver, const at::Tensor& b, const at
 
 int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin(), caps_.end()); }
 
-StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& b, const State& before,
+StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rhs, const State& before,
                                          int64_t done) {
   std::vector<SampleState> states(caps_.size());
-  TensorSpace space(a, a.project(b * scale_), states, /*recording=*/true);
-  const auto b2 = space.lanes(space.b2());
+  TensorSpace space(a, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = caps_[i];
-    states[i].b2 = b2[i];
+    states[i].b2 = b2_[i];
   }
   State after;
   with_method(solver_.method, solver_.restart, space, [&](auto method) {

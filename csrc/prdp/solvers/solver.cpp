@@ -27,6 +27,8 @@ constexpr Names<OnFailure, 3> kOnFailures{{{OnFailure::kRaise, "raise"},
                                            {OnFailure::kWarn, "warn"},
                                            {OnFailure::kReturn, "return"}}};
 
+constexpr Names<Start, 2> kStarts{{{Start::kZero, "zero"}, {Start::kState, "state"}}};
+
 template <class Enum, size_t N>
 std::string_view to_name(const Names<Enum, N>& names, Enum value) {
   for (const auto& [known, text] : names)
@@ -49,11 +51,13 @@ Enum from_name(const Names<Enum, N>& names, std::string_view wanted, const char*
 std::string_view name(Method method) { return to_name(kMethods, method); }
 std::string_view name(Backward backward) { return to_name(kBackwards, backward); }
 std::string_view name(OnFailure on_failure) { return to_name(kOnFailures, on_failure); }
+std::string_view name(Start start) { return to_name(kStarts, start); }
 Method method_from_name(std::string_view name) { return from_name(kMethods, name, "solver"); }
 Backward backward_from_name(std::string_view name) { return from_name(kBackwards, name, "backward"); }
 OnFailure on_failure_from_name(std::string_view name) {
   return from_name(kOnFailures, name, "on_failure");
 }
+Start start_from_name(std::string_view name) { return from_name(kStarts, name, "start"); }
 
 namespace {
 

@@ -38,8 +38,8 @@ inline constexpr double kDefaultRtol = 1e-5;
 /// Products in a cycle of GMRES.
 inline constexpr int64_t kDefaultRestart = 10;
 
-/// A solver and its budget. All start from zero and stop at the first of ‖b - A u‖ <= rtol ‖b‖ or
-/// max_iter iterations; rtol = 0 runs exactly max_iter.
+/// A solver and its budget. All start from zero, unless they are given a start, and stop at the first of
+/// ‖b - A u‖ <= rtol ‖b‖ or max_iter iterations; rtol = 0 runs exactly max_iter.
 struct Solver {
   Method method;
   c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
@@ -97,6 +97,10 @@ enum class Backward {
   kNone,      // u carries no gradient
 };
 
+/// Where the solves of a step start: from zero, or from the state before the step as linear_solve() scales
+/// a start.
+enum class Start { kZero, kState };
+
 /// What a failed sample does: raise an error, warn, or only say so in its status.
 enum class OnFailure { kRaise, kWarn, kReturn };
 
@@ -104,9 +108,11 @@ enum class OnFailure { kRaise, kWarn, kReturn };
 std::string_view name(Method method);
 std::string_view name(Backward backward);
 std::string_view name(OnFailure on_failure);
+std::string_view name(Start start);
 Method method_from_name(std::string_view name);
 Backward backward_from_name(std::string_view name);
 OnFailure on_failure_from_name(std::string_view name);
+Start start_from_name(std::string_view name);
 
 /// What a solve says of itself, one value per sample, each tensor of shape (batch,).
 struct SolveInfo {
@@ -129,6 +135,7 @@ struct SolveOptions {
   int64_t adjoint_log = 0;  // where the adjoint solve leaves its SolveInfo (adjoint_log.h); 0: nowhere
   /// Unrolled mode keeps every so many iterates and runs those between again; 0: keeps all.
   int64_t checkpoint_every = 0;
+  Start start = Start::kZero;  // of steps and rollouts; linear_solve() itself takes x0
 
   /// Raises ValueError for a budget, tolerance or interval out of range, naming it.
   void check(const char* who) const;

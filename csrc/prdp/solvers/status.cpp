@@ -21,7 +21,7 @@ const std::vector<StatusText>& solve_statuses() {
       {S::kZeroDiagonal, "ZERO_DIAGONAL", "this method divides by the diagonal; take another one"},
       {S::kInconsistent, "INCONSISTENT",
        "the right-hand side lies outside the range of a singular operator"},
-      {S::kNonfiniteInput, "NONFINITE_INPUT", "the right-hand side holds NaN or Inf"},
+      {S::kNonfiniteInput, "NONFINITE_INPUT", "the right-hand side, or the start, holds NaN or Inf"},
       {S::kNonfiniteOperator, "NONFINITE_OPERATOR", "the operator holds NaN or Inf"},
   };
   return texts;

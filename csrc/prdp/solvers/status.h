@@ -16,7 +16,7 @@ enum class SolveStatus : int64_t {
   kBreakdown = -5,           // no search direction left: r·Ar = 0, or a singular matrix
   kZeroDiagonal = -6,        // Jacobi on an operator with a zero on its diagonal
   kInconsistent = -7,        // b lies outside the range of a singular operator
-  kNonfiniteInput = -8,      // NaN or Inf in b
+  kNonfiniteInput = -8,      // NaN or Inf in b or in the start
   kNonfiniteOperator = -9,   // NaN or Inf in A
 };
 

@@ -1,6 +1,7 @@
 #include "prdp/solvers/tensor_space.h"
 
 #include <limits>
+#include <utility>
 
 #include "prdp/operators/tensors.h"
 
@@ -31,6 +32,12 @@ TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states, bool r
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
+}
+
+void TensorSpace::start_from(at::Tensor x, at::Tensor r) {
+  start_ = std::move(x);
+  whole_b_ = std::exchange(b_, std::move(r));
+  b2_ = dot(b_, b_);
 }
 
 double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }

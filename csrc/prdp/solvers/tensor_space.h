@@ -22,6 +22,8 @@ class TensorSpace {
 
   /// b must be finite and scaled to the order of one, or zero.
   TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording = false);
+  /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
+  void start_from(at::Tensor x, at::Tensor r);
 
   Vector vector() const { return at::zeros_like(b_); }
   Vector scratch() const { return vector(); }
@@ -82,9 +84,15 @@ class TensorSpace {
   static constexpr bool sweeps_contract() { return false; }  // not known of the operator
   Scalar residual(const Vector& x, Vector& r) {
     Vector product;
-    apply(x, product);
-    r = keep_frozen(a_.project(b_ - product), r);
+    apply(solution(x), product);
+    r = keep_frozen(a_.project((start_.defined() ? whole_b_ : b_) - product), r);
     return dot(r, r);
+  }
+  bool started() const { return start_.defined(); }
+  Vector solution(const Vector& x) const { return start_.defined() ? start_ + x : x; }
+  Scalar solution2(const Vector& x) const {
+    const auto u = solution(x);
+    return dot(u, u);
   }
   void solve_directly(const Vector& r, Vector& d);
 
@@ -162,6 +170,7 @@ class TensorSpace {
 
   const Operator& a_;
   at::Tensor b_, b2_, diagonal_;
+  at::Tensor start_, whole_b_;  // undefined: from zero
   States& states_;
   std::vector<int64_t> all_but_batch_;
   std::vector<bool> active_;

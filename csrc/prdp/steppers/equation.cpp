@@ -7,6 +7,7 @@
 
 #include "prdp/autograd/flat_options.h"
 #include "prdp/grid/grid.h"
+#include "prdp/steppers/solving.h"
 
 namespace prdp {
 
@@ -60,10 +61,11 @@ at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& b
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
   const auto b = equation_rhs(equation, u);
-  auto result = linear_solve(equation_operator(equation, u), b, options);
+  auto result = linear_solve(equation_operator(equation, u), b, options, start_of_step(options, u));
   for (int64_t k = 1; k < equation.picard_steps; ++k) {
     const auto last = std::move(result.info);
-    result = linear_solve(equation_operator(equation, result.u), b, options);
+    const auto winds = result.u;
+    result = linear_solve(equation_operator(equation, winds), b, options, start_of_step(options, winds));
     auto& info = result.info;
     info.iterations = info.iterations + last.iterations;
     info.operator_applications = info.operator_applications + last.operator_applications;
@@ -100,7 +102,7 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-        PRDP_OPTIONS_SCHEMA ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
+        PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
         "Tensor operator_applications)",
         static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);

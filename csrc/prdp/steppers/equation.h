@@ -26,8 +26,8 @@ at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
 /// ū for b̄: b is linear in u, and this is its transpose.
 at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar);
 
-/// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step. Over several
-/// Picard steps the info counts all iterations and holds the worst status; its residual is the last.
+/// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step. Its solves start as
+/// options.start says, those of later Picard steps from the last solution. Over several Picard steps the info counts all iterations and holds the worst status; its residual is the last.
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options);
 
 }  // namespace prdp

@@ -26,7 +26,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
                     ", got ", b.sizes(), " in ", b.scalar_type());
   auto options = options_;
   options.adjoint_log = adjoint_log;
-  return linear_solve(a, b, options);
+  return linear_solve(a, b, options, start_of_step(options, u));
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {

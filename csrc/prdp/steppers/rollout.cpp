@@ -14,6 +14,7 @@
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/solving.h"
 
 namespace prdp {
 
@@ -27,12 +28,12 @@ using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::T
 // right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
 constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-    "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> "
+    "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> "
     "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 constexpr const char* kVjpSchema =
     "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
     "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
-    ") -> Tensor[]";
+    PRDP_FROM_STATE_SCHEMA ") -> Tensor[]";
 
 using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
                                             at::IntArrayRef, at::ArrayRef<double>, int64_t, c10::SymInt)>;
@@ -82,7 +83,8 @@ Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_v
     interruption::Watch::local().spend(unknowns);
     const auto& last = solutions.back();
     if (s % picard_steps == 0) b = equation_rhs(equation, last);
-    auto [next, info] = linear_solve_kernel(equation_operator(equation, last), b, options);
+    auto [next, info] =
+        linear_solve_kernel(equation_operator(equation, last), b, options, start_of_step(options, last));
     solutions.push_back(std::move(next));
     reports.push(info);
   }
@@ -283,7 +285,7 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kSolvesSchema, {at::Tag::pt2_compliant_tag});
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
   m.def("rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-        "SymInt steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor states, Tensor iterations, Tensor residual, "
+        "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor states, Tensor iterations, Tensor residual, "
         "Tensor status, Tensor operator_applications)",
         static_cast<SolvesSignature*>(rollout_kernel));
 }

@@ -7,6 +7,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/steppers/solving.h"
 
 namespace prdp {
 
@@ -61,8 +62,10 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     Solved solved{
         {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s),
         at_solve(kept.residual, s)};
-    if (options.backward == Backward::kUnrolled)
+    if (options.backward == Backward::kUnrolled) {
       solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
+      solved.x0 = start_of_step(options, at_solve(kept.solutions, s));
+    }
     std::vector<int64_t> wanted(needed.begin(), needed.end());
     wanted[0] = needed[0] || first > 0;
     if (flow) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);

@@ -16,6 +16,11 @@ AdjointLog open_adjoint_log();
 /// any. A step on which the loss does not depend had none: it counts as solved in no iterations.
 std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs);
 
+/// What linear_solve() takes for x0 in a step from `state`; undefined: nothing.
+inline at::Tensor start_of_step(const SolveOptions& options, const at::Tensor& state) {
+  return options.start == Start::kState ? state : at::Tensor();
+}
+
 /// What every stepper has: the options of its solves and their reports. Copies share the adjoint reports.
 class Solving {
  public:

@@ -1,0 +1,76 @@
+"""The parts of auto one by one, beside PRDP and converged solves: `python -m benchmarks.refinement SCENE`.
+
+Writes a record for each training and a summary, as `prdp compare` does, and prints the table of docs/refinement.md.
+With --resume, finished trainings are kept.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from prdp_torch import compare, records, scenes
+from prdp_torch.compare import Row
+from prdp_torch.controller import PRDPController, ToleranceController
+from prdp_torch.training import Refinement
+
+
+def rows_of(scene):
+    converged = scene.max_iter
+    return [
+        Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged),
+        Row("prdp", "PRDP, tuned", "prdp", Refinement.prdp(scene)),
+        Row("prdp_defaults", "PRDP, defaults", "prdp", Refinement("prdp_defaults", PRDPController)),
+        _tolerance("tolerance", "tolerance", adjoint_ratio=1.0),
+        _tolerance("tolerance_adjoint", "tolerance, adjoint 10 times looser"),
+        Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
+    ]
+
+
+def _tolerance(label, title, **settings):
+    attach = lambda steppers: ToleranceController(steppers, **settings)  # noqa: E731
+    return Row(label, title, "auto", Refinement(label, attach, watches_error=True))
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.refinement")
+    parser.add_argument("scene")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--rows", nargs="*", help="labels of rows; all where none is given")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--resume", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    scene = scenes.load(options.scene)
+    folder = records.prepare_folder(options.out or Path("runs") / f"{scene.name}-refinement")
+    rows = [row for row in rows_of(scene) if not options.rows or row.label in options.rows]
+    environment = records.environment()
+    for row in rows:
+        for seed in range(options.seeds):
+            silent = lambda done, metric, k: None  # noqa: E731
+            run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, silent)
+            row.curves.append(run)
+        table = compare.summarise(scene, rows[: rows.index(row) + 1])
+        print(_line(table[-1]), flush=True)
+    summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, "rows": table}
+    records.write(folder / "summary.json", summary)
+
+
+def _line(entry):
+    forward = entry["operator_applications"] - entry["adjoint_applications"]
+    spread = f" ± {entry['metric_std']:.1e}" if entry["seeds"] > 1 else ""
+    after = f" after {entry['intervals']:.0f}" if entry["reaches_target"] else ""
+    warns = f", warns in {entry['warnings']} of {entry['seeds']}" if entry["warnings"] else ""
+    cells = (
+        f"{entry['title']}{warns}",
+        f"{entry['metric']:.2e}{spread}{after}",
+        f"{forward:,.0f}",
+        f"{entry['adjoint_applications']:,.0f}",
+        f"{entry['operator_applications']:,.0f}",
+        f"{entry['seconds']:.1f}",
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()
