@@ -7,7 +7,8 @@ from matplotlib.ticker import NullFormatter
 
 # One colour a method, whoever runs it; Okabe and Ito's, which colour-blind readers can tell apart.
 COLOURS = {"Jacobi": "#0072B2", "Chebyshev": "#009E73", "steepest descent": "#CC79A7", "CG": "#E69F00",
-           "GMRES": "#D55E00", "Stokes": "#56B4E9", "direct": "#222222", "LU": "#999999"}  # fmt: skip
+           "GMRES": "#D55E00", "Stokes": "#56B4E9", "direct": "#222222", "LU": "#999999",
+           "diagonal": "#009E73", "Function": "#CC79A7", "CSR": "#D55E00"}  # fmt: skip
 MARKS = {"torch eager": "s", "torch.compile": "P", "JAX jit": "^", "lineax": "v", "SciPy": "D"}
 
 

@@ -3,6 +3,8 @@
 from typing import NamedTuple
 
 import prdp_torch as prdp
+from benchmarks.problems import gradient_of
+from prdp_torch import _C
 
 
 class Entry(NamedTuple):
@@ -33,6 +35,9 @@ def methods(problem):
             "steepest descent": (lambda k: prdp.SteepestDescent(k, rtol=0.0), budgets(problem.k)),
             "CG": (lambda k: prdp.CG(k, rtol=0.0), few),
         } | exact
+    if problem.kappa is not None:
+        scaled = lambda k: prdp.CG(k, rtol=0.0, preconditioner="diagonal")  # noqa: E731
+        return {"CG": (problem.solver, budgets(problem.k)), "CG, diagonal": (scaled, budgets(problem.k))} | exact
     if problem.name.startswith("burgers"):
         jacobi = {"Jacobi": (lambda k: prdp.Jacobi(k, rtol=0.0), budgets(2 * problem.k))}
         return {"GMRES(2)": (problem.solver, budgets(problem.k))} | jacobi | exact
@@ -46,8 +51,8 @@ def methods(problem):
 def entries(problem, modes=("implicit", "unrolled")):
     for label, (solver, ks) in methods(problem).items():
         for mode in modes:
-            if mode == "unrolled" and label == "direct":
-                continue  # the same computation as implicit
+            if mode == "unrolled" and (label == "direct" or problem.kappa is not None):
+                continue  # the same computation as implicit; and the field is there for that one
 
             def prepare(k, solver=solver, mode=mode):
                 return calls(problem, solver(k), mode)
@@ -56,21 +61,53 @@ def entries(problem, modes=("implicit", "unrolled")):
                 return products(problem, solver(k), mode)
 
             yield Entry(label, mode, ks, prepare, applications)
+    if problem.kappa is not None:
+        yield from through_function(problem)
 
 
-def calls(problem, solver, mode):
-    leaf = problem.b.clone().requires_grad_()
+def through_function(problem):
+    """CG on `operators.Function`, products of torch operations: what a user writes without a Stencil."""
+    from benchmarks.peers import stencils, torch_eager
+
+    def product(v, kappa):
+        return stencils.diffusion(kappa, problem.dt, torch_eager.Backend).apply(v)
+
+    def operator_of(b, kappa):
+        return prdp.operators.Function(product, tensors=(kappa,), symmetric=True)
+
+    yield Entry(
+        "CG, Function", "implicit", [problem.k],
+        lambda k: calls(problem, problem.solver(k), "implicit", operator_of),
+        lambda k: products(problem, problem.solver(k), "implicit"),
+    )  # fmt: skip
+
+
+def calls(problem, solver, mode, operator_of=None):
+    leaves = problem.leaves()
+    operator_of = operator_of or problem.operator_of
+    operator = operator_of(*(leaf.detach() for leaf in leaves))
+    # Only a field is differentiated for besides b: without one the operator stays.
+    operator_of_leaves = (lambda *_: operator) if problem.kappa is None else operator_of
 
     def forward():
-        return prdp.linear_solve(problem.operator, problem.b, solver, backward="none", on_failure="return")[0]
+        forget(solver)
+        return prdp.linear_solve(operator, problem.b, solver, backward="none", on_failure="return")[0]
 
     def both():
-        leaf.grad = None
-        u, _ = prdp.linear_solve(problem.operator, leaf, solver, backward=mode, on_failure="return")
+        forget(solver)
+        for leaf in leaves:
+            leaf.grad = None
+        u, _ = prdp.linear_solve(operator_of_leaves(*leaves), leaves[0], solver, backward=mode, on_failure="return")
         u.backward(problem.g)
-        return u.detach(), leaf.grad
+        return u.detach(), gradient_of(*leaves)
 
     return forward, both
+
+
+def forget(solver):
+    """The factors of the call before: what is timed is a solve with a new matrix."""
+    if solver.method == "direct":
+        _C.clear_factorisations()
 
 
 def products(problem, solver, mode):

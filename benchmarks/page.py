@@ -7,7 +7,7 @@ from pathlib import Path
 import jinja2
 
 from benchmarks import charts, memory
-from benchmarks.problems import PROBLEMS
+from benchmarks.problems import DIFFUSION, PROBLEMS
 from prdp_torch import records
 
 
@@ -24,8 +24,8 @@ def write(results, environment, folder):
 
 
 def sections(results):
-    for name, found in results.get("accuracy", {}).items():
-        title, points = PROBLEMS[name]().title, found["points"]
+    for name, found in (results.get("accuracy", {}) | results.get("diffusion", {})).items():
+        title, points = (PROBLEMS | DIFFUSION)[name]().title, found["points"]
         failed = "".join(f" {label} failed: {error}." for label, error in found["failures"].items())
         yield {
             "name": f"accuracy_{name}", "title": f"{title}: accuracy against cost",

@@ -1,4 +1,5 @@
-"""The systems that are solved: one implicit step of each equation of the paper, from smooth random states."""
+"""The systems that are solved: one implicit step of each equation of the paper and of a diffusion with a field of
+coefficients, from smooth random states."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,14 +8,15 @@ import numpy as np
 import torch
 
 import prdp_torch as prdp
-from prdp_torch import fields, operators
+from prdp_torch import _C, fields, operators
 
 SMOOTHING = 3e-3  # nu dt of the heat step that turns noise into a state
 
 
 @dataclass
 class Problem:
-    """A u = b for a batch, and the gradient Aᵀλ = g of a loss gᵀu."""
+    """A u = b for a batch, and the gradient of a loss gᵀu: λ with Aᵀλ = g, that for b; where A is made of a field κ,
+    the pair of it and that for κ."""
 
     name: str
     title: str
@@ -26,6 +28,7 @@ class Problem:
     nu: float
     dt: float
     winds: torch.Tensor | None = None
+    kappa: torch.Tensor | None = None
 
     @property
     def shape(self):
@@ -38,12 +41,20 @@ class Problem:
 
     @cached_property
     def exact(self):
-        """(u, λ) in float64 by the direct solver."""
-        a = make_operator(self, torch.float64)
-        b = self.b.double().requires_grad_()
-        u, _ = prdp.linear_solve(a, b, prdp.Direct(2))
+        """(u, gradient) in float64 by the direct solver."""
+        leaves = self.leaves(torch.float64)
+        u, _ = prdp.linear_solve(self.operator_of(*leaves), leaves[0], prdp.Direct(2))
         u.backward(self.g.double())
-        return u.detach(), b.grad
+        return u.detach(), gradient_of(*leaves)
+
+    def leaves(self, dtype=torch.float32):
+        """[b], or [b, κ], to be differentiated for."""
+        of = [self.b] if self.kappa is None else [self.b, self.kappa]
+        return [t.to(dtype, copy=True).requires_grad_() for t in of]
+
+    def operator_of(self, b, kappa=None):
+        """The operator that belongs to leaves."""
+        return make_operator(self, b.dtype) if kappa is None else diffusion_operator(kappa, self.dt)
 
     def errors(self, u, gradient=None):
         """Largest over the batch: the true residual of u and the error of the gradient, both relative.
@@ -53,8 +64,13 @@ class Problem:
         residual = _largest(b - make_operator(self, torch.float64).apply(u), b)
         if gradient is None:
             return residual, None
-        gradient = _as_double(gradient).reshape(self.b.shape)
-        return residual, _largest(gradient - self.exact[1], self.exact[1])
+        found, exact = ([one] if self.kappa is None else one for one in (gradient, self.exact[1]))
+        pairs = [(_as_double(f).reshape(e.shape), e) for f, e in zip(found, exact, strict=True)]
+        return residual, max(_largest(f - e, e) for f, e in pairs)
+
+
+def gradient_of(b, kappa=None):
+    return b.grad if kappa is None else (b.grad, kappa.grad)
 
 
 def _as_double(array):
@@ -62,10 +78,14 @@ def _as_double(array):
 
 
 def _largest(error, of):
+    """Over the batch; a field without one, (Ny, Nx), counts as a single sample."""
+    error, of = (t if t.dim() > 2 else t[None] for t in (error, of))
     return float((error.flatten(1).norm(dim=1) / of.flatten(1).norm(dim=1)).max())
 
 
 def make_operator(problem, dtype):
+    if problem.kappa is not None:
+        return diffusion_operator(problem.kappa.to(dtype), problem.dt)
     winds = None if problem.winds is None else problem.winds.to(dtype)
     return _operator(problem.name, problem.shape, problem.nu, problem.dt, winds)
 
@@ -74,6 +94,11 @@ def _operator(name, shape, nu, dt, winds):
     if name.startswith("heat"):
         return operators.Heat(shape, nu, dt)
     return (operators.Burgers if name.startswith("burgers") else operators.NavierStokes)(winds, nu, dt)
+
+
+def diffusion_operator(kappa, dt):
+    """I - dt ∇·(κ ∇) on a periodic grid, κ (Ny, Nx) at its points."""
+    return operators.Stencil(*_C.diffusion_stencil(kappa, dt), "periodic")
 
 
 def smooth_states(shape, batch, channels=1, seed=0):
@@ -113,10 +138,24 @@ def navier_stokes(shape=(48, 48), k=15, batch=25, nu=1e-4, dt=0.1):
     )  # fmt: skip
 
 
+def diffusion(shape, k, batch=25, mean=0.01, contrast=1.0, dt=0.01):
+    """κ = mean·exp(contrast·s) with s of unit deviation, one field for all samples."""
+    b, g = smooth_states(shape, batch), smooth_states(shape, batch, seed=1)
+    kappa = mean * torch.exp(contrast * smooth_states(shape, 1, seed=2)[0, 0])
+    return Problem(
+        f"diffusion_{shape[0]}", f"variable diffusion, {shape[0]} × {shape[1]}", diffusion_operator(kappa, dt), b, g,
+        lambda k: prdp.CG(k, rtol=0.0), k, mean, dt, kappa=kappa,
+    )  # fmt: skip
+
+
 PROBLEMS = {
     "heat_1d": lambda: heat((30,), 25),
     "heat_2d": lambda: heat((30, 30), 43),
     "heat_3d": lambda: heat((20, 20, 20), 50),
     "burgers_1d": burgers,
     "navier_stokes": navier_stokes,
+}
+DIFFUSION = {
+    "diffusion_64": lambda: diffusion((64, 64), 40),
+    "diffusion_256": lambda: diffusion((256, 256), 150),
 }

@@ -59,6 +59,42 @@ class StepOfRollout:
     def __enter__(self) -> None: ...
     def __exit__(self, *args: object) -> None: ...
 
+class SolveOptions:
+    def __init__(
+        self,
+        method: str,
+        rtol: float,
+        restart: int,
+        backward: str,
+        adjoint_max_iter: int | None,
+        adjoint_rtol: float | None,
+        on_failure: str,
+        checkpoint_every: int,
+        from_state: bool,
+    ) -> None: ...
+
+class Equation:
+    def __init__(self, kind: str, shape: Sequence[int], parameters: Sequence[float], picard_steps: int) -> None: ...
+
+def step(
+    u: Tensor,
+    tensors: list[Tensor],
+    equation: Equation,
+    options: SolveOptions,
+    max_iter: Tensor | int,
+    adjoint_log: int,
+) -> tuple[Tensor, ...] | None: ...
+def linear_solve(
+    b: Tensor,
+    tensors: list[Tensor],
+    kind: str,
+    shape: list[int],
+    parameters: list[float],
+    options: SolveOptions,
+    max_iter: Tensor | int,
+    adjoint_log: int,
+    x0: Tensor | None,
+) -> tuple[Tensor, ...] | None: ...
 def count_factorisations() -> int: ...
 def clear_factorisations() -> None: ...
 def solve_with_tensors(

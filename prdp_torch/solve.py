@@ -1,6 +1,5 @@
 """`linear_solve`, and the reports of solves."""
 
-import weakref
 from collections import Counter
 from enum import IntEnum
 from typing import NamedTuple
@@ -8,10 +7,13 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import check_options, checkpoint_number
+from prdp_torch.solvers import Kept, check_options, checkpoint_number
 
 SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
 SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
+
+
+_last_options = Kept(_C.SolveOptions)
 
 
 class AdjointLog:
@@ -19,7 +21,9 @@ class AdjointLog:
 
     def __init__(self):
         self.number = _C.open_adjoint_log()
-        weakref.finalize(self, _C.close_adjoint_log, self.number)
+
+    def __del__(self, close=_C.close_adjoint_log):
+        close(self.number)
 
     def read(self):
         entry = _C.read_adjoint_log(self.number)
@@ -156,31 +160,51 @@ def linear_solve(
         A = operators.Matrix(A)
     if not isinstance(A, operators.Operator):
         raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}")
-    log = None
-    if not torch.compiler.is_compiling():
+    compiling, log, found = torch.compiler.is_compiling(), None, None
+    if not compiling:
         _check.dense("linear_solve", "b", b)
         if x0 is not None:
             _check.dense("linear_solve", "x0", x0)
         check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
         log = AdjointLog()
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
-    u, *report = torch.ops.prdp.linear_solve(
-        b.unsqueeze(0) if lone_vector else b,
-        A.tensors,
-        A.kind,
-        A.shape,
-        A.parameters,
-        False,
-        solver.method,
-        solver.max_iter,
-        solver.rtol,
-        solver.restart,
-        backward,
-        adjoint_max_iter,
-        adjoint_rtol,
-        on_failure,
-        0 if log is None else log.number,
-        checkpoint_number(checkpoint_every),
-        x0.unsqueeze(0) if lone_vector and x0 is not None else x0,
-    )
+    rhs = b.unsqueeze(0) if lone_vector else b
+    start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
+    every = checkpoint_number(checkpoint_every)
+    if not compiling:
+        options = _last_options.of(
+            solver.method,
+            solver.rtol,
+            solver.restart,
+            backward,
+            adjoint_max_iter,
+            adjoint_rtol,
+            on_failure,
+            every,
+            False,
+        )
+        found = _C.linear_solve(
+            rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
+        )
+    if found is None:
+        found = torch.ops.prdp.linear_solve(
+            rhs,
+            A.tensors,
+            A.kind,
+            A.shape,
+            A.parameters,
+            False,
+            solver.method,
+            solver.max_iter,
+            solver.rtol,
+            solver.restart,
+            backward,
+            adjoint_max_iter,
+            adjoint_rtol,
+            on_failure,
+            0 if log is None else log.number,
+            every,
+            start,
+        )
+    u, *report = found
     return u.squeeze(0) if lone_vector else u, SolveInfo(*report, log)

@@ -127,6 +127,26 @@ class Direct(Solver):
     method: ClassVar[str] = "direct"
 
 
+class Kept:
+    """An object of the compiled library, made anew by `make` where the values that it is made of have changed.
+    Copies and pickles begin without one."""
+
+    def __init__(self, make):
+        self.make, self._last = make, (None, None)
+
+    def of(self, *values):
+        last = self._last
+        if last[0] != values:
+            last = self._last = values, self.make(*values)
+        return last[1]
+
+    def __deepcopy__(self, memo):
+        return Kept(self.make)
+
+    def __reduce__(self):
+        return Kept, (self.make,)
+
+
 def checkpoint_number(checkpoint_every):
     """`checkpoint_every` as the compiled library takes it."""
     return {None: 0, "sqrt": _C.CHECKPOINT_SQRT}.get(checkpoint_every, checkpoint_every)

@@ -5,7 +5,7 @@ import torch
 from prdp_torch import _C, _check, operators
 from prdp_torch.batching import outlive_transforms
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
-from prdp_torch.solvers import check_options, checkpoint_number
+from prdp_torch.solvers import Kept, check_options, checkpoint_number
 
 
 class Stepper(torch.nn.Module):
@@ -66,6 +66,7 @@ class Stepper(torch.nn.Module):
         self._max_iter = int(solver.max_iter)
         self._adjoint_log = AdjointLog()
         self._last_log = self._adjoint_log
+        self._kept_options = Kept(_C.SolveOptions)
         self.info = None
 
     def operator(self, u):
@@ -116,7 +117,11 @@ class Stepper(torch.nn.Module):
 
     def _keep(self, report, log):
         report = outlive_transforms(report)
-        self.info = None if report is None else SolveInfo(*report, log)
+        info = None if report is None else SolveInfo(*report, log)
+        if torch.compiler.is_compiling():
+            self.info = info
+        else:  # past __setattr__ of modules, which takes as long as a small solve
+            self.__dict__["info"] = info
 
     def _solve(self, u, log):
         """One step: u_next and its report."""
@@ -134,8 +139,28 @@ class Stepper(torch.nn.Module):
                     f"got {tuple(b.shape)} in {b.dtype}"
                 )
         x0 = u if self.start == "state" else None
+        if not compiling:
+            found = _C.linear_solve(
+                b, a.tensors, a.kind, a.shape, a.parameters, self._options_kept(), self._max_iter, log.number, x0
+            )
+            if found is not None:
+                return found
         return torch.ops.prdp.linear_solve(
             b, a.tensors, a.kind, a.shape, a.parameters, False, *self._options(log.number), x0
+        )
+
+    def _options_kept(self):
+        """The options as the compiled library takes them past the dispatcher."""
+        return self._kept_options.of(
+            self.method,
+            self.rtol,
+            self.restart,
+            self.backward,
+            self.adjoint_max_iter,
+            self.adjoint_rtol,
+            self.on_failure,
+            checkpoint_number(self.checkpoint_every),
+            self.start == "state",
         )
 
     def _options(self, log_number):

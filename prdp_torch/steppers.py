@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import torch
 
-from prdp_torch import _check, operators
+from prdp_torch import _C, _check, operators
+from prdp_torch.solvers import Kept
 from prdp_torch.stepper import Stepper
 
 
@@ -37,6 +38,7 @@ class EquationStepper(Stepper):
             self._keep_nu(nu)
             parameters.insert(0, _check.real(who, "dt", dt))
         self.equation = Equation(self.kind, shape, parameters, _check.whole(who, "picard_steps", picard_steps))
+        self._kept_equation = Kept(_C.Equation)
         torch.ops.prdp.check_equation(*self._equation())
 
     def _keep_nu(self, nu):
@@ -59,9 +61,14 @@ class EquationStepper(Stepper):
                 )
 
     def forward(self, u):
+        found = None
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
-        u_next, *report = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
+            log = self._adjoint_log.number
+            found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
+        if found is None:
+            found = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
+        u_next, *report = found
         self._keep(report, self._adjoint_log)
         return u_next
 
@@ -82,6 +89,10 @@ class EquationStepper(Stepper):
     def _equation(self):
         e = self.equation
         return self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps
+
+    def _equation_kept(self):
+        e = self.equation
+        return self._kept_equation.of(e.kind, tuple(e.shape), tuple(e.parameters), e.picard_steps)
 
     def _step_options(self):
         return *self._options(self._adjoint_log.number), self.start == "state"

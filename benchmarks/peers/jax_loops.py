@@ -32,6 +32,24 @@ def jacobi(stencil, transposed, b, k):
     return jax.lax.fori_loop(1, k, lambda _, u: (b - stencil.off_diagonal(u)) * scale, b * scale)
 
 
+def cg(stencil, b, k):
+    """Of a symmetric operator."""
+
+    def step(_, state):
+        x, r, p, rr = state
+        q = stencil.apply(p)
+        alpha = rr / _dot(p, q)
+        x, r = x + alpha * p, r - alpha * q
+        after = _dot(r, r)
+        return x, r, r + after / rr * p, after
+
+    return jax.lax.fori_loop(0, k, step, (jnp.zeros_like(b), b, b, _dot(b, b)))[0]
+
+
+def _dot(v, w):
+    return (v * w).sum((1, 2, 3), keepdims=True)
+
+
 def _dots(basis, w):
     return jnp.stack([(v * w).reshape(len(w), -1).sum(1) for v in basis])
 
@@ -101,7 +119,45 @@ def compiled(stencil, loop, k, *extra):
     return jax.jit(solve), jax.jit(both)
 
 
+def diffusion_calls(problem, solve):
+    """(forward, both), jitted, of a solve(stencil, b) that is not differentiated itself."""
+    b, g, kappa = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g, problem.kappa))
+    make = lambda kappa: stencils.diffusion(kappa, problem.dt, Backend)  # noqa: E731
+
+    @jax.custom_vjp
+    def solution(b, kappa):
+        return solve(make(kappa), b)
+
+    def forward(b, kappa):
+        u = solution(b, kappa)
+        return u, (u, kappa)
+
+    def back(kept, g):
+        u, kappa = kept
+        found = solve(make(kappa), g)
+        _, pull = jax.vjp(lambda kappa: make(kappa).apply(u), kappa)
+        return found, pull(-found)[0]
+
+    solution.defvjp(forward, back)
+    return run_jitted(solution, b, g, kappa)
+
+
+def run_jitted(solution, b, g, kappa):
+    """(forward, both) of solution(b, κ)."""
+
+    def both(b, kappa, g):
+        u, pull = jax.vjp(solution, b, kappa)
+        return u, pull(g)
+
+    solve, differentiate = jax.jit(solution), jax.jit(both)
+    return lambda: solve(b, kappa).block_until_ready(), lambda: jax.block_until_ready(differentiate(b, kappa, g))
+
+
 def entries(problem):
+    if problem.kappa is not None:
+        prepare = lambda k: diffusion_calls(problem, lambda stencil, b: cg(stencil, b, k))  # noqa: E731
+        yield ours.Entry("JAX jit, CG", "implicit", [problem.k], prepare, same_as="CG")
+        return
     stencil = stencils.make(problem, Backend, jnp.asarray)
     b, g = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g))
 

@@ -23,7 +23,7 @@ def heat_matrix(problem):
     return matrix.tocsc()
 
 
-def upwind_matrix(stencil, sample):
+def upwind_matrix(stencil, sample=...):
     """Of one sample and channel: the stencil's coefficients at the places that rolling takes them from."""
     fields = {axis: [np.asarray(c)[sample].squeeze() for c in (stencil.lower[axis], stencil.upper[axis])]
               for axis in stencil.lower}  # fmt: skip
@@ -42,6 +42,8 @@ def matrices(problem):
     if problem.name.startswith("heat"):
         return [heat_matrix(problem)]
     stencil = stencils.make(problem, Backend, lambda array: array)
+    if problem.kappa is not None:
+        return [upwind_matrix(stencil)]
     samples = range(len(problem.b))
     if problem.name.startswith("burgers"):
         return [upwind_matrix(stencil, i) for i in samples]
@@ -58,7 +60,39 @@ def navier_stokes_matrix(stencil, sample):
     return sp.block_array([[c1, None, -d1.T], [None, c2, -d2.T], [d1, d2, pin]]).tocsc()
 
 
+def of_field(problem, u, found):
+    """κ̄: between two neighbours flows dt n² κ (u_after - u), κ the mean of both."""
+    shape = (-1, *problem.shape)
+    u, found, total = u.reshape(shape), found.reshape(shape), 0.0
+    for axis in (-1, -2):
+        step = lambda v: np.roll(v, -1, axis) - v  # noqa: B023, E731
+        of_face = -0.5 * problem.dt * problem.shape[axis] ** 2 * (step(found) * step(u)).sum(0)
+        total = total + of_face + np.roll(of_face, 1, axis)
+    return total
+
+
 def entries(problem):
+    if problem.kappa is not None:
+        return [ours.Entry("SciPy, sparse LU", "implicit", [None], lambda _: diffusion_calls(problem))]
+    return entries_of_gradients_for_b(problem)
+
+
+def diffusion_calls(problem):
+    b, g = (np.asarray(v).astype(np.float64).reshape(len(v), -1).T for v in (problem.b, problem.g))
+
+    def run(gradient):
+        (matrix,) = matrices(problem)
+        lu = splu(matrix)
+        u = lu.solve(b).T
+        if not gradient:
+            return u
+        found = lu.solve(g, "T").T
+        return u, (found, of_field(problem, u, found))
+
+    return lambda: run(False), lambda: run(True)
+
+
+def entries_of_gradients_for_b(problem):
     assembled = matrices(problem)
     b, g = (np.asarray(v).astype(np.float64).reshape(len(v), -1) for v in (problem.b, problem.g))
 

@@ -73,6 +73,17 @@ def burgers(problem, backend, array):
     return upwind(faces, problem.shape, problem.nu, problem.dt, 1.0, backend, array)
 
 
+def diffusion(kappa, dt, backend):
+    """I - dt ∇·(κ ∇) for κ (Ny, Nx), an array of the backend's library; means of κ on the faces."""
+    diagonal, lower, upper = 1.0, {}, {}
+    for axis in (-1, -2):
+        after = (kappa + backend.roll(kappa, -1, axis)) * (0.5 * dt * kappa.shape[axis] ** 2)
+        before = backend.roll(after, 1, axis)
+        lower[axis], upper[axis] = -before, -after
+        diagonal = diagonal + before + after
+    return Upwind(diagonal, lower, upper, backend)
+
+
 class NavierStokes:
     """[[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]], channels u₁, u₂, p."""
 
@@ -110,4 +121,6 @@ def make(problem, backend, array):
     """The problem's stencil; `array` brings a numpy array into the library."""
     if problem.name.startswith("heat"):
         return Heat(problem, backend, array)
+    if problem.kappa is not None:
+        return diffusion(array(problem.kappa.numpy()), problem.dt, backend)
     return (burgers if problem.name.startswith("burgers") else NavierStokes)(problem, backend, array)

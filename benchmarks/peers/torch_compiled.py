@@ -1,5 +1,7 @@
 """torch.compile of the plain loops: one graph for one K."""
 
+from functools import partial
+
 import torch
 
 from benchmarks import ours
@@ -7,6 +9,8 @@ from benchmarks.peers import stencils, torch_eager
 
 
 def entries(problem):
+    if problem.kappa is not None and problem.k < 100:  # more iterations would compile for minutes
+        yield ours.Entry("torch.compile, CG", "implicit", [problem.k], partial(compiled_cg, problem), same_as="CG")
     if not problem.name.startswith("heat"):
         return  # the cycles of GMRES unroll into a graph that takes minutes to compile
     stencil = stencils.make(problem, torch_eager.Backend, torch.from_numpy)
@@ -17,3 +21,18 @@ def entries(problem):
         return torch_eager.calls(problem, lambda b, transposed: solve(b.detach()))
 
     yield ours.Entry("torch.compile, Jacobi", "implicit", [problem.k], prepare, same_as="Jacobi")
+
+
+def compiled_cg(problem, k):
+    torch._dynamo.reset()
+
+    @partial(torch.compile, dynamic=False)
+    def solve(diagonal, lower, upper, b):
+        stencil = stencils.Upwind(diagonal, lower, upper, torch_eager.Backend)
+        return torch_eager.cg(stencil, False, b, k)
+
+    def of(stencil, b):
+        return solve(stencil.diagonal.detach(), stencil.lower, stencil.upper, b.detach())
+
+    make = lambda kappa: stencils.diffusion(kappa.detach(), problem.dt, torch_eager.Backend)  # noqa: E731
+    return torch_eager.diffusion_calls(problem, make, of)

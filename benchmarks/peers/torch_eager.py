@@ -1,9 +1,14 @@
 """Plain torch: the same iterations as batched tensor operations, implicit derivative by a second solve."""
 
+import importlib.util
+import warnings
+from functools import partial
+
 import torch
 
 from benchmarks import ours
 from benchmarks.peers import stencils
+from benchmarks.problems import gradient_of
 
 
 class Backend:
@@ -50,6 +55,40 @@ def gmres(stencil, transposed, b, cycles, m):
     return x
 
 
+def cg(stencil, transposed, b, k):
+    """Of a symmetric operator."""
+    x, r, p = torch.zeros_like(b), b, b
+    rr = dots(r, r)
+    for _ in range(k):
+        q = stencil.apply(p)
+        alpha = rr / dots(p, q)
+        x, r = x + alpha * p, r - alpha * q
+        rr, before = dots(r, r), rr
+        p = r + rr / before * p
+    return x
+
+
+def dots(v, w):
+    return (v * w).sum(tuple(range(1, v.dim())), keepdim=True)
+
+
+class Sparse:
+    """A stencil as a CSR matrix; its values get no gradient, which would be a dense matrix in torch."""
+
+    def __init__(self, problem):
+        from benchmarks.peers.scipy_direct import matrices
+
+        (matrix,) = (m.tocsr().astype("float32") for m in matrices(problem))
+        with warnings.catch_warnings(action="ignore"):  # torch calls its CSR tensors a beta
+            self.matrix = torch.sparse_csr_tensor(
+                torch.from_numpy(matrix.indptr), torch.from_numpy(matrix.indices), torch.from_numpy(matrix.data),
+                matrix.shape,
+            )  # fmt: skip
+
+    def apply(self, v):
+        return (self.matrix @ v.flatten(1).mT).mT.reshape(v.shape)
+
+
 class Implicit(torch.autograd.Function):
     @staticmethod
     def forward(ctx, b, solve):
@@ -59,6 +98,56 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def backward(ctx, g):
         return ctx.solve(g, True), None
+
+
+class ImplicitDiffusion(torch.autograd.Function):
+    """b̄ = λ, κ̄ = -∂⟨λ, A(κ) u⟩/∂κ."""
+
+    @staticmethod
+    def forward(ctx, b, kappa, dt, make, solve):
+        ctx.dt, ctx.solve, ctx.stencil = dt, solve, make(kappa)
+        u = solve(ctx.stencil, b)
+        ctx.save_for_backward(kappa, u)
+        return u
+
+    @staticmethod
+    def backward(ctx, g):
+        kappa, u = ctx.saved_tensors
+        found = ctx.solve(ctx.stencil, g)
+        with torch.enable_grad():
+            leaf = kappa.detach().requires_grad_()
+            (bar,) = torch.autograd.grad(stencils.diffusion(leaf, ctx.dt, Backend).apply(u), leaf, -found)
+        return found, bar, None, None, None
+
+
+def diffusion_calls(problem, make, solve):
+    """make(κ): what solve(it, b) takes."""
+    leaves = problem.leaves()
+    made = make(problem.kappa)
+
+    def forward():
+        with torch.no_grad():
+            return solve(made, problem.b)
+
+    def both():
+        for leaf in leaves:
+            leaf.grad = None
+        u = ImplicitDiffusion.apply(*leaves, problem.dt, make, solve)
+        u.backward(problem.g)
+        return u.detach(), gradient_of(*leaves)
+
+    return forward, both
+
+
+def diffusion_entries(problem):
+    def prepare(k, make=lambda kappa: stencils.diffusion(kappa, problem.dt, Backend)):
+        return diffusion_calls(problem, make, lambda stencil, b: cg(stencil, False, b, k))
+
+    yield ours.Entry("torch eager, CG", "implicit", [problem.k], prepare, same_as="CG")
+    if importlib.util.find_spec("scipy"):
+        matrix = Sparse(problem)
+        prepare_sparse = partial(prepare, make=lambda kappa: matrix)
+        yield ours.Entry("torch eager CSR, CG", "implicit", [problem.k], prepare_sparse, same_as="CG")
 
 
 def calls(problem, solve):
@@ -78,6 +167,9 @@ def calls(problem, solve):
 
 
 def entries(problem):
+    if problem.kappa is not None:
+        yield from diffusion_entries(problem)
+        return
     stencil = stencils.make(problem, Backend, torch.from_numpy)
     if problem.name.startswith("heat"):
         loop, label, extra = jacobi, "Jacobi", ()

@@ -17,6 +17,7 @@ PYBIND11_MODULE(_C, m) {
   });
   m.attr("VERSION") = PRDP_VERSION;
   bind_solvers(m);
+  bind_steps(m);
   bind_controllers(m);
   bind_scenes(m);
 }

@@ -21,15 +21,30 @@ SMALL = {
     "heat_3d": lambda: problems.heat((3, 4, 5), 5, batch=2),
     "burgers_1d": lambda: problems.burgers((9,), 4, batch=2),
     "navier_stokes": lambda: problems.navier_stokes((6, 4), 3, batch=2),
+    "diffusion_6": lambda: problems.diffusion((6, 7), 5, batch=2, mean=0.1),
 }
 small = pytest.mark.parametrize("name", SMALL)
 
 
 def dense(problem, sample):
+    if problem.kappa is not None:
+        return dense_diffusion(problem.kappa.double().numpy(), problem.dt)
     winds = None if problem.winds is None else problem.winds[sample].double().numpy()
     if problem.name.startswith("heat"):
         return prdp.operators.Heat(problem.shape, problem.nu, problem.dt).dense().numpy()
     return (dense_burgers if problem.name == "burgers_1d" else dense_navier_stokes)(winds, problem.nu, problem.dt)
+
+
+def dense_diffusion(kappa, dt):
+    """I - dt ∇·(κ ∇), periodic, neighbour by neighbour."""
+    index = np.arange(kappa.size).reshape(kappa.shape)
+    matrix = np.eye(kappa.size)
+    for axis, n in enumerate(kappa.shape):
+        for at, after in zip(np.ndindex(kappa.shape), np.roll(index, -1, axis).ravel(), strict=True):
+            here, weight = index[at], dt * n**2 * (kappa[at] + kappa.ravel()[after]) / 2
+            matrix[[here, after], [here, after]] += weight
+            matrix[[here, after], [after, here]] -= weight
+    return matrix
 
 
 @small
@@ -39,8 +54,10 @@ def test_the_exact_answers_solve_the_dense_systems(name):
     for i in range(2):
         a = dense(problem, i)
         np.testing.assert_allclose(a @ u[i].flatten().numpy(), problem.b[i].flatten().double().numpy(), atol=1e-6)
-        np.testing.assert_allclose(a.T @ gradient[i].flatten().numpy(), problem.g[i].flatten().numpy(), atol=1e-6)
-    residual, error = problem.errors(u.float(), 1.01 * gradient)
+        of_b = gradient[i] if problem.kappa is None else gradient[0][i]
+        np.testing.assert_allclose(a.T @ of_b.flatten().numpy(), problem.g[i].flatten().numpy(), atol=1e-6)
+    further = 1.01 * gradient if problem.kappa is None else (gradient[0], 1.01 * gradient[1])
+    residual, error = problem.errors(u.float(), further)
     assert residual < 1e-5 and error == pytest.approx(0.01, rel=1e-6)
 
 
@@ -58,14 +75,25 @@ def test_the_stencils_of_the_peers_are_the_operators(name):
 @small
 def test_torch_eager_runs_the_same_iteration(name):
     problem = SMALL[name]()
-    (entry,) = torch_eager.entries(problem)
+    entry = next(torch_eager.entries(problem))
     solver, _ = ours.methods(problem)[entry.same_as]
     forward, both = entry.prepare(problem.k)
     u, gradient = both()
     expected_u, expected_gradient = ours.calls(problem, solver(problem.k), "implicit")[1]()
-    torch.testing.assert_close(u, expected_u, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(gradient, expected_gradient, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close((u, gradient), (expected_u, expected_gradient), rtol=1e-3, atol=1e-3)
     assert torch.equal(forward(), u)
+
+
+def test_the_gradient_for_a_field_is_that_of_differences():
+    problem = SMALL["diffusion_6"]()
+    of_kappa = problem.exact[1][1]
+    kappa, direction, h = problem.kappa.double(), torch.randn(6, 7, dtype=torch.float64), 1e-6
+    losses = []
+    for sign in (1, -1):
+        a = torch.from_numpy(dense_diffusion((kappa + sign * h * direction).numpy(), problem.dt))
+        solved = torch.linalg.solve(a, problem.b.double().flatten(1).mT).mT
+        losses.append((problem.g.double().flatten(1) * solved).sum())
+    torch.testing.assert_close((of_kappa * direction).sum(), (losses[0] - losses[1]) / (2 * h), rtol=1e-6, atol=1e-9)
 
 
 def test_readings_are_taken_in_turn():
@@ -96,4 +124,4 @@ def test_all_suites_run_and_leave_a_page(tmp_path):
 def test_an_unknown_suite_is_refused():
     done = subprocess.run([sys.executable, "-m", "prdp_torch.cli", "bench", "speed"], cwd=ROOT, capture_output=True,
                           text=True)  # fmt: skip
-    assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, size" in done.stderr
+    assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, diffusion, size" in done.stderr

@@ -94,9 +94,9 @@ at::Tensor without_derivative(const at::Tensor& x0) {
   return (has_tangent(x0) ? x0._fw_primal(/*level=*/0) : x0).detach();
 }
 
-template <class... Args>
-Outputs autograd_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options, x0] = unpack(args...);
+/// The op's autograd kernel.
+Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                         const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
   if (differentiable && at::GradMode::is_enabled() && a.kind == "function" && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
@@ -113,6 +113,12 @@ Outputs autograd_kernel(const at::Tensor& b, Args... args) {
   return out;
 }
 
+/// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
+Outputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
+  const bool plain = nobody_watches() && is_plain(b) && all_plain(a.tensors) && (!x0.defined() || is_plain(x0));
+  return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
+}
+
 /// A function pointer with the op's signature out of a template over its arguments.
 template <class>
 struct Kernels;
@@ -121,7 +127,8 @@ struct Kernels<Outputs(const at::Tensor&, Args...)> {
   static Outputs solve(const at::Tensor& b, Args... args) { return solve_kernel<Args...>(b, args...); }
   static Outputs fake(const at::Tensor& b, Args... args) { return fake_kernel<Args...>(b, args...); }
   static Outputs autograd(const at::Tensor& b, Args... args) {
-    return autograd_kernel<Args...>(b, args...);
+    const auto [a, options, x0] = unpack(args...);
+    return solve_and_record(b, a, options, x0);
   }
 };
 
@@ -131,7 +138,7 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
                          const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
   auto [u, iterations, residual, status, applications] =
-      call_op(lone_vector ? b.unsqueeze(0) : b, a, options, lone_vector && x0.defined() ? x0.unsqueeze(0) : x0);
+      call(lone_vector ? b.unsqueeze(0) : b, a, options, lone_vector && x0.defined() ? x0.unsqueeze(0) : x0);
   return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications}};
 }
 

@@ -81,6 +81,10 @@ struct Loops {
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
   /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself.
   T (*descend)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
+  /// The same with Σ w_i r_i² besides; y = w∘x + beta y; and Σ w_i x_i². w∘x is entry by entry.
+  T (*weighted_descend)(T alpha, const T* p, const T* q, const T* w, T* x, T* r, int64_t n, T* weighted);
+  void (*weighted_xpby)(const T* w, const T* x, T beta, T* y, int64_t n);
+  T (*weighted_square)(const T* w, const T* x, int64_t n);
   /// h_j = v_j·w for `count` vectors; and w += sign·Σ alpha_j v_j, which returns ‖w‖². Any count.
   void (*multi_dot)(const T* const* v, int64_t count, const T* w, T* h, int64_t n);
   T (*multi_axpy)(T sign, const T* alpha, const T* const* v, int64_t count, T* w, int64_t n);

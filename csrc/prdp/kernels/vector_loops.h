@@ -113,6 +113,38 @@ T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
   return sum_lanes<T>(squares);
 }
 
+template <class T>
+T weighted_descend(T alpha, const T* p, const T* q, const T* w, T* x, T* r, int64_t n, T* weighted) {
+  Register<T> squares = {}, parts = {};
+  for (int64_t i = 0; i < n; i += kWidth<T>) {
+    store(x + i, load(x + i) + alpha * load(p + i));
+    const Register<T> ri = load(r + i) - alpha * load(q + i), square = ri * ri;
+    store(r + i, ri);
+    squares += square;
+    parts += load(w + i) * square;
+  }
+  *weighted = sum_lanes<T>(parts);
+  return sum_lanes<T>(squares);
+}
+
+template <class T>
+void weighted_xpby(const T* w, const T* x, T beta, T* y, int64_t n) {
+  for (int64_t i = 0; i < n; i += kWidth<T>) store<T>(y + i, load(w + i) * load(x + i) + beta * load(y + i));
+}
+
+template <class T>
+T weighted_square(const T* w, const T* x, int64_t n) {
+  Register<T> sums[2] = {};
+  int64_t i = 0;
+  for (; i + 2 * kWidth<T> <= n; i += 2 * kWidth<T>)
+    for (int k = 0; k < 2; ++k) {
+      const auto xk = load(x + i + k * kWidth<T>);
+      sums[k] += load(w + i + k * kWidth<T>) * (xk * xk);
+    }
+  if (i < n) sums[0] += load(w + i) * (load(x + i) * load(x + i));
+  return sum_lanes<T>(sums[0] + sums[1]);
+}
+
 /// Rows of at least a register end with one that reaches back over the one before.
 template <class T>
 void copy_rows(T factor, const T* from, int64_t from_stride, T* to, int64_t to_stride, int64_t rows, int64_t n) {

@@ -2,6 +2,8 @@
 #include <ATen/LegacyVmapTransforms.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/functorch/DynamicLayer.h>
+#include <ATen/record_function.h>
+#include <c10/core/impl/LocalDispatchKeySet.h>
 
 #include <algorithm>
 #include <vector>
@@ -17,6 +19,14 @@ inline bool is_plain(const at::Tensor& t) {
   return !at::isTensorSubclassLike(t) && !t.key_set().has_any(lazy);
 }
 inline bool all_plain(at::TensorList tensors) { return std::all_of(tensors.begin(), tensors.end(), is_plain); }
+
+/// Whether an op that this thread calls with plain tensors comes to its autograd kernel and nowhere else: no mode,
+/// transform, trace, autocast or profiler is on.
+inline bool nobody_watches() {
+  const auto here = c10::impl::tls_local_dispatch_key_set();
+  return here.included_ == c10::default_included_set && here.excluded_ == c10::default_excluded_set &&
+         !at::hasCallbacks();
+}
 
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }

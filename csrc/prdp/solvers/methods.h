@@ -11,7 +11,7 @@ namespace prdp {
 
 /// Vectors that a method keeps at most, beside b and one of scratch.
 inline int64_t vectors_of(Method method, int64_t restart) {
-  return is_gmres(method) ? restart + 5 : method == Method::kConjugateGradientDiagonal ? 6 : 4;
+  return is_gmres(method) ? restart + 5 : method == Method::kConjugateGradientDiagonal ? 5 : 4;
 }
 
 /// Calls body(method object) for the method that runs in this space.

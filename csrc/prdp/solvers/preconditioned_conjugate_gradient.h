@@ -14,32 +14,31 @@ class PreconditionedConjugateGradientMethod {
 
   explicit PreconditionedConjugateGradientMethod(Space& space)
       : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()),
-        z_(space.vector()), weights_(space.vector()) {}
+        weights_(space.vector()) {}
 
   void start() {
     space_.fill_zero(x);
     space_.inverse_diagonal(weights_);
     space_.copy(space_.b(), r_);
+    space_.weigh(weights_, r_, p_);
     rr_ = space_.b2();
-    rz_ = pp_ = space_.weigh(weights_, r_, z_);
-    space_.copy(z_, p_);
+    rz_ = pp_ = space_.weighted_square(weights_, r_);
   }
   void step() {
-    space_.apply(p_, q_);
-    const auto qq = space_.weigh(weights_, q_, z_);
-    alpha_ = space_.step_length(rz_, space_.dot(p_, q_), pp_, qq);
-    rr_ = space_.descend(alpha_, p_, q_, x, r_);
-    const auto rz = space_.weigh(weights_, r_, z_);
+    const auto [pq, qq] = space_.apply_with_dots(p_, q_);
+    alpha_ = space_.step_length(rz_, pq, pp_, weights_, q_, qq);
+    const auto [rr, rz] = space_.descend(alpha_, p_, q_, weights_, x, r_);
     beta_ = space_.ratio(rz, rz_);
-    space_.xpby(z_, beta_, p_);
+    space_.xpby(weights_, r_, beta_, p_);
     pp_ = rz + beta_ * beta_ * pp_;  // r and p before are orthogonal
+    rr_ = rr;
     rz_ = rz;
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
     rr_ = space_.residual(x, r_);
-    rz_ = space_.weigh(weights_, r_, z_);
-    space_.copy(z_, p_);
+    rz_ = space_.weighted_square(weights_, r_);
+    space_.weigh(weights_, r_, p_);
     space_.assign(rz_, pp_);
     return rr_;
   }
@@ -52,8 +51,8 @@ class PreconditionedConjugateGradientMethod {
 
  private:
   Space& space_;
-  typename Space::Vector r_, p_, q_, z_, weights_;  // residual; direction; A p; |D|⁻¹ r; |D|⁻¹, scaled
-  typename Space::Scalar rr_{}, rz_{}, pp_{};       // r·r, r·z, p·|D|p
+  typename Space::Vector r_, p_, q_, weights_;  // residual; direction; A p; |D|⁻¹, scaled
+  typename Space::Scalar rr_{}, rz_{}, pp_{};   // r·r, r·z, p·|D|p
   typename Space::Scalar alpha_{}, beta_{};
 };
 

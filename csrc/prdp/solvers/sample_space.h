@@ -117,7 +117,7 @@ class SampleSpace {
     apply(scratch(), out);
   }
   void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
-  /// w = |D|⁻¹, times the power of two that brings its largest entry to the order of one.
+  /// w = |D|⁻¹, times the power of two that brings its largest entry into [1, 2).
   void inverse_diagonal(Vector w) {
     std::fill_n(scratch(), kernel_->unknowns(), T(1));
     kernel_->load(scratch(), T(1), w);
@@ -126,11 +126,19 @@ class SampleSpace {
     std::transform(w, w + length(), w, [](T d) { return std::abs(d); });
     loops_.scale(kernels::power_of_two_scale(loops_.largest_magnitude(w, length())), w, w, length());
   }
-  /// z = w v, entry by entry; returns v·z.
-  Scalar weigh(const T* w, const T* v, Vector z) const {
-    std::transform(w, w + length(), v, z, std::multiplies<T>());
-    return dot(v, z);
+  /// The same with weights w: z = w∘v, entry by entry; Σ w_i v_i²; x += α p and r -= α q, with ‖r‖² and its
+  /// weighted one; p = w∘r + β p.
+  void weigh(const T* w, const T* v, Vector z) {
+    fill_zero(z);
+    loops_.weighted_xpby(w, v, T(0), z, length());
   }
+  Scalar weighted_square(const T* w, const T* v) const { return loops_.weighted_square(w, v, length()); }
+  std::array<Scalar, 2> descend(Scalar alpha, const T* p, const T* q, const T* w, Vector x, Vector r) {
+    Scalar weighted;
+    const Scalar plain = loops_.weighted_descend(alpha, p, q, w, x, r, length(), &weighted);
+    return {plain, weighted};
+  }
+  void xpby(const T* w, const T* r, Scalar beta, Vector p) { loops_.weighted_xpby(w, r, beta, p, length()); }
   /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
   /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
   void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
@@ -182,6 +190,12 @@ class SampleSpace {
       return 0;
     }
     return num / den;
+  }
+  /// The same where b2 = Σ w_i q_i². Of that, 2‖q‖² is a bound, which mostly says enough.
+  Scalar step_length(Scalar num, Scalar den, Scalar a2, const T* w, const T* q, Scalar plain2) {
+    const T bound2 = 2 * plain2;
+    const bool clear = std::abs(den) > std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(bound2);
+    return step_length(num, den, a2, clear && std::isfinite(bound2) ? bound2 : weighted_square(w, q));
   }
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
 

@@ -1,5 +1,7 @@
 #include "prdp/solvers/solve.h"
 
+#include <ATen/EmptyTensor.h>
+
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve_cpu.h"
 
@@ -7,11 +9,12 @@ namespace prdp {
 
 namespace {
 
+/// Past the dispatcher: small solves take no longer than a few of its calls.
+at::Tensor empty(at::IntArrayRef sizes, at::ScalarType dtype) { return at::detail::empty_cpu(sizes, dtype); }
+
 SolveInfo empty_info(const at::Tensor& b) {
-  const auto counts = at::TensorOptions().dtype(at::kLong).device(at::kCPU);
   const int64_t batch = b.size(0);
-  return {at::empty({batch}, counts), at::empty({batch}, b.options().device(at::kCPU)),
-          at::empty({batch}, counts), at::empty({batch}, counts)};
+  return {empty(batch, at::kLong), empty(batch, b.scalar_type()), empty(batch, at::kLong), empty(batch, at::kLong)};
 }
 
 /// What an iteration takes of a core for each unknown, in nanoseconds; in GMRES a product of a cycle.
@@ -24,7 +27,7 @@ double cost_per_unknown(Method method) {
 template <class T, class Parameters>
 SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
   const auto rhs = b.contiguous();
-  SolveResult result{at::empty_like(rhs), empty_info(rhs)};
+  SolveResult result{empty(rhs.sizes(), rhs.scalar_type()), empty_info(rhs)};
   const int64_t size = rhs.size(0);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();

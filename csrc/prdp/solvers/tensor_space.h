@@ -60,10 +60,14 @@ class TensorSpace {
   }
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
   void inverse_diagonal(Vector& w);
-  Scalar weigh(const Vector& w, const Vector& v, Vector& z) const {
-    z = w * v;
-    return dot(v, z);
+  void weigh(const Vector& w, const Vector& v, Vector& z) const { z = keep_frozen(w * v, z); }
+  Scalar weighted_square(const Vector& w, const Vector& v) const { return dot(v, w * v); }
+  std::array<Scalar, 2> descend(const Scalar& alpha, const Vector& p, const Vector& q, const Vector& w, Vector& x,
+                                Vector& r) {
+    const auto plain = descend(alpha, p, q, x, r);
+    return {plain, weighted_square(w, r)};
   }
+  void xpby(const Vector& w, const Vector& r, const Scalar& beta, Vector& p) { xpby(w * r, beta, p); }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
     for (int64_t s = 0; s < n; ++s) {
       next = swept(x, jacobi_change(c, x), next, omega ? omega + s : nullptr);
@@ -93,6 +97,10 @@ class TensorSpace {
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
+  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Vector& w, const Vector& q,
+                     const Scalar&) {
+    return step_length(num, den, a2, weighted_square(w, q));
+  }
   Scalar ratio(const Scalar& num, const Scalar& den) const;
 
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.

@@ -1,0 +1,94 @@
+#include <ATen/PythonTorchFunctionTLS.h>
+#include <torch/csrc/autograd/python_variable.h>
+
+#include <variant>
+
+#include "bindings.h"
+#include "prdp/autograd/flat_options.h"
+#include "prdp/operators/disguises.h"
+#include "prdp/steppers/equation.h"
+
+/// The ops step and linear_solve without the arguments that they are flattened into: a call of an op with twenty of
+/// them costs more than a small solve. None where somebody watches; then the op is to be called.
+namespace py = pybind11;
+using namespace prdp;
+
+namespace {
+
+/// Whether Python keeps out of calls with this tensor: a subclass may have a __torch_function__.
+bool is_exact(py::handle t) { return THPVariable_CheckExact(t.ptr()); }
+
+bool nobody_in_python_watches(const py::object& b, const std::vector<py::object>& tensors) {
+  return nobody_watches() && !at::impl::torch_function_mode_enabled() && is_exact(b) &&
+         std::all_of(tensors.begin(), tensors.end(), is_exact);
+}
+
+std::vector<at::Tensor> unwrapped(const std::vector<py::object>& tensors) {
+  std::vector<at::Tensor> found;
+  for (const auto& t : tensors) found.push_back(THPVariable_Unpack(t.ptr()));
+  return found;
+}
+
+/// A number, or the tensor in which a stepper keeps it.
+using Budget = std::variant<at::Tensor, int64_t>;
+
+SolveOptions with(SolveOptions options, const Budget& max_iter, int64_t adjoint_log) {
+  const auto* tensor = std::get_if<at::Tensor>(&max_iter);
+  options.solver.max_iter = tensor ? tensor->item<int64_t>() : std::get<int64_t>(max_iter);
+  options.adjoint_log = adjoint_log;
+  return options;
+}
+
+template <class Solve>
+py::object report(const Solve& solve) {
+  const auto [u, info] = [&] {
+    const py::gil_scoped_release no_gil;
+    return solve();
+  }();
+  return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications);
+}
+
+py::object call_step(const py::object& u, const std::vector<py::object>& tensors, const Equation& equation,
+                     const SolveOptions& options, const Budget& max_iter, int64_t adjoint_log) {
+  HANDLE_TH_ERRORS
+  if (!nobody_in_python_watches(u, tensors)) return py::none();
+  auto whole = equation;
+  whole.tensors = unwrapped(tensors);
+  return report([&, state = THPVariable_Unpack(u.ptr())] {
+    return step(whole, state, with(options, max_iter, adjoint_log));
+  });
+  END_HANDLE_TH_ERRORS_PYBIND
+}
+
+py::object call_linear_solve(const py::object& b, const std::vector<py::object>& tensors, std::string kind,
+                             std::vector<int64_t> shape, std::vector<double> parameters, const SolveOptions& options,
+                             const Budget& max_iter, int64_t adjoint_log, const std::optional<py::object>& x0) {
+  HANDLE_TH_ERRORS
+  if (!nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0))) return py::none();
+  const OperatorSpec a{std::move(kind), std::move(shape), std::move(parameters), unwrapped(tensors)};
+  return report([&, rhs = THPVariable_Unpack(b.ptr()), start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
+    return linear_solve(a, rhs, with(options, max_iter, adjoint_log), start);
+  });
+  END_HANDLE_TH_ERRORS_PYBIND
+}
+
+}  // namespace
+
+void bind_steps(py::module_& m) {
+  py::class_<SolveOptions>(m, "SolveOptions", "The options of a solve but for max_iter and the log.")
+      .def(py::init([](const std::string& method, double rtol, int64_t restart, const std::string& backward,
+                       std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
+                       const std::string& on_failure, int64_t checkpoint_every, bool from_state) {
+        return unflatten(method, 0, rtol, restart, backward, adjoint_max_iter, adjoint_rtol, on_failure,
+                         /*adjoint_log=*/0, checkpoint_every, from_state);
+      }));
+  py::class_<Equation>(m, "Equation", "An equation but for its tensors.")
+      .def(py::init([](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
+                       int64_t picard_steps) {
+        return Equation{std::move(kind), std::move(shape), std::move(parameters), {}, picard_steps};
+      }));
+  m.def("step", &call_step, py::arg("u"), py::arg("tensors"), py::arg("equation"), py::arg("options"),
+        py::arg("max_iter"), py::arg("adjoint_log"));
+  m.def("linear_solve", &call_linear_solve, py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
+        py::arg("parameters"), py::arg("options"), py::arg("max_iter"), py::arg("adjoint_log"), py::arg("x0"));
+}
