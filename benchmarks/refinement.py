@@ -27,8 +27,12 @@ def rows_of(scene):
     ]
 
 
-def _tolerance(label, title, **settings):
-    attach = lambda steppers: ToleranceController(steppers, **settings)  # noqa: E731
+def _tolerance(label, title, start="zero", **settings):
+    def attach(steppers):
+        for stepper in steppers:
+            stepper.start = start
+        return ToleranceController(steppers, **settings)
+
     return Row(label, title, "auto", Refinement(label, attach, watches_error=True))
 
 

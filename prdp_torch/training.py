@@ -34,7 +34,13 @@ class Refinement:
     @classmethod
     def auto(cls):
         """What fits every scene with nothing chosen for it; docs/refinement.md says why."""
-        return cls("auto", ToleranceController, watches_error=True)
+
+        def attach(steppers):
+            for stepper in steppers:
+                stepper.start = "state"
+            return ToleranceController(steppers)
+
+        return cls("auto", attach, watches_error=True)
 
     @classmethod
     def prdp(cls, scene, growth=None):
