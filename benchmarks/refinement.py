@@ -21,8 +21,8 @@ def rows_of(scene):
         Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged),
         Row("prdp", "PRDP, tuned", "prdp", Refinement.prdp(scene)),
         Row("prdp_defaults", "PRDP, defaults", "prdp", Refinement("prdp_defaults", PRDPController)),
-        _tolerance("tolerance", "tolerance", adjoint_ratio=1.0),
-        _tolerance("tolerance_adjoint", "tolerance, adjoint 10 times looser"),
+        _tolerance("tolerance", "tolerance", adjoint_ratio=1.0, adjoint_floor=1e-5),
+        _tolerance("tolerance_adjoint", "tolerance, adjoint looser"),
         Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
     ]
 

@@ -12,7 +12,7 @@ from prdp_torch import _load
 
 _load.check_torch()
 
-from prdp_torch import _C, fields, networks, operators, scenes  # noqa: E402
+from prdp_torch import _C, datasets, fields, networks, operators, scenes  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
@@ -45,6 +45,7 @@ __all__ = [
     "ToleranceController",
     "advise",
     "check_operator",
+    "datasets",
     "fields",
     "linear_solve",
     "load_trained",

@@ -6,7 +6,7 @@ from statistics import median
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, datasets
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
 from prdp_torch.solvers import GMRES, Direct
@@ -91,7 +91,8 @@ def advise(step, sample, seconds=5.0):
         forward and adjoint. Its `notes` name the solvers that the operator does not allow. Its
         `recommendation` is one choice with the reason for it.
 
-    Raises TypeError or ValueError where step and sample do not fit each other, before any measurement.
+    Raises:
+        TypeError, ValueError: step and sample do not fit each other. This is checked before any measurement.
 
     >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
     >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
@@ -112,14 +113,15 @@ def advise(step, sample, seconds=5.0):
 
 
 def advise_scene(scene, seconds=5.0):
-    """Advise on a scene of `prdp_torch.scenes.load`, with the share of its network: from a batch of the scene's
-    initial states, and a forward and backward pass of the untrained network. Arguments, returns: as `advise`."""
+    """Advise on a scene from `prdp_torch.scenes.load`, as `advise` does on a step.
+
+    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
     seconds, step, update = _limit(seconds), make_stepper(scene), _Update()
     if scene.task == "parameters":
         problem = _C.make_parameter_problem(scene)
         sample = (problem.start @ problem.modes)[None, None]
     else:
-        states = _C.validation_trajectories(scene, 0)[:, 0]
+        states = datasets.reference(scene, 0)[:, 0]
         sample = states[torch.arange(scene.training.batch) % len(states)]
         network = make_network(scene, 0)
         # A corrector's first solve starts from data, which need no gradient.

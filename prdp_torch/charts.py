@@ -1,5 +1,7 @@
 """The pictures of a comparison, each as a matplotlib figure."""
 
+from itertools import pairwise
+
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
@@ -137,30 +139,67 @@ def pareto_front(cost, error):
     return front
 
 
+_NEAR = 10  # errors within so many times the best are what a chart is about
+
 _COSTS = (
     ("operator_applications", "products with A per sample,\nadjoint solves included"),
     ("seconds", "wall time of the training in s"),
 )
 
 
-def _cost_panels(scene, draw):
-    """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one."""
-    figure, panels = make_figure(panels=2, height=4.8)
-    for axes, (cost, label) in zip(panels, _COSTS, strict=True):
-        draw(axes, cost)
-        axes.set(yscale="log", xlabel=label, xlim=(0, None))
-        axes.xaxis.set_major_locator(MaxNLocator(5))
+def _cost_panels(scene, draw, limits=None):
+    """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one. With `limits`, (lowest, highest)
+    of the y axis from below, the axis is broken between them."""
+    limits = limits or [(None, None)]
+    figure = Figure(figsize=(WIDTH, 4.8 if len(limits) == 1 else 6.0), layout="constrained")
+    heights = [1.0, 2.2][-len(limits) :]
+    panels = figure.subplots(len(limits), 2, sharex="col", squeeze=False, height_ratios=heights)
+    for column, (cost, label) in zip(panels.T, _COSTS, strict=True):
+        for axes, limit in zip(column[::-1], limits, strict=True):
+            draw(axes, cost)
+            axes.set(yscale="log", xlim=(0, None), ylim=limit)
+            axes.grid(alpha=0.3, which="both", lw=0.4)
+        for upper, lower in pairwise(column):
+            _break(upper, lower)
+        column[-1].set_xlabel(label)
+        column[-1].xaxis.set_major_locator(MaxNLocator(5))
         if cost == "operator_applications":
-            axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
-        axes.grid(alpha=0.3, which="both", lw=0.4)
-    panels[0].set_ylabel(_metric_name(scene))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+            column[-1].xaxis.set_major_formatter(EngFormatter(sep=" "))
+    panels[-1, 0].set_ylabel(_metric_name(scene))
+    figure.legend(*panels[-1, 0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
     return figure
+
+
+def _break(upper, lower):
+    """Two axes as one whose y axis is broken between them."""
+    upper.spines["bottom"].set_visible(False)
+    lower.spines["top"].set_visible(False)
+    upper.tick_params(axis="x", which="both", bottom=False)
+    mark = {"marker": [(-1, -0.6), (1, 0.6)], "ms": 9, "ls": "none", "color": "black", "mew": 1, "clip_on": False}
+    upper.plot([0, 1], [0, 0], transform=upper.transAxes, **mark)
+    lower.plot([0, 1], [1, 1], transform=lower.transAxes, **mark)
+
+
+def _zoom(errors, spreads):
+    """Limits of a y axis on which errors within ten times the best are told apart: those around them, and above a
+    break those of the rest. None where all are that close."""
+    known = np.isfinite(errors)
+    if not known.any() or errors[known].min() <= 0:
+        return None
+    best = errors[known].min()
+    near, far = known & (errors <= _NEAR * best), known & (errors > _NEAR * best)
+    if not far.any():
+        return None
+    lowest = max(best / _NEAR, (errors - spreads)[near].min())
+    highest = (errors + spreads)[near].max()
+    margin = 1.15
+    return [(lowest / margin, highest * margin), (max(highest * margin, errors[far].min() / 2), errors[far].max() * 2)]
 
 
 def accuracy_against_cost(scene, rows):
     """Final metric against what the training cost, one point a row, with the Pareto front as stairs."""
     error = np.array([row.final().mean() for row in rows])
+    spread = np.array([row.final().std(ddof=1) if len(row.curves) > 1 else 0.0 for row in rows])
 
     def draw(axes, name):
         cost = np.array([row.total(name).mean() for row in rows])
@@ -190,7 +229,7 @@ def accuracy_against_cost(scene, rows):
             )  # fmt: skip
             axes.set_xlim(right=right)
 
-    return _cost_panels(scene, draw)
+    return _cost_panels(scene, draw, _zoom(error, spread))
 
 
 def error_against_cost(scene, rows):
@@ -229,6 +268,8 @@ def all_charts(scene, rows, table):
             accuracy_against_cost(scene, rows),
             "Accuracy against cost; lower left is better, the grey stairs join the runs that no other beats in both.",
         )
+        if len(cost[0].axes) > len(_COSTS):
+            cost = (cost[0], f"{cost[1]} The error axis is broken above {_NEAR} times the best error.")
     else:
         cost = (error_against_cost(scene, rows), "The error against the cost so far; lower left is better.")
     return [
@@ -243,7 +284,7 @@ def all_charts(scene, rows, table):
         (
             "accuracy_against_cost",
             cost[0],
-            f"{cost[1]} Products with A are those of the forward and the adjoint solves (the reverse sweeps of the "
-            "unrolled mode are not counted); wall time holds the network and the optimiser as well.",
+            f"{cost[1]} Products with A are those of the forward and the adjoint solves; in unrolled mode, those of "
+            "the sweeps back through the iterations. Wall time includes the network and the optimiser.",
         ),
     ]

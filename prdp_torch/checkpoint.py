@@ -1,4 +1,4 @@
-"""Checkpoints: a training kept while it runs, so that a killed one goes on from its last interval."""
+"""Checkpoints: the state of a running training, so that it can continue after it was killed."""
 
 import io
 import json
@@ -10,24 +10,25 @@ from prdp_torch import _C
 
 
 class Checkpoint(_C.Checkpoint):
-    """The file of one training. csrc/prdp/scenes/checkpoint.h says when one is due and what makes it valid.
+    """The checkpoint file of one training.
 
     Args:
-        path: of the file; it is written to a temporary name first.
-        settings: all that the training depends on; a file of other settings is not read.
+        path: the file. It is written to a temporary name first, so it is never half written.
+        settings: everything that the training depends on. A file with other settings is ignored.
     """
 
     def __init__(self, path, **settings):
         super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
     def save(self, state):
-        """Replace the file by this state: tensors, state_dicts and plain values. ValueError if it cannot be written."""
+        """Save a state made of tensors, state_dicts and plain values. ValueError if it cannot be written."""
         content = io.BytesIO()
         torch.save(state, content)
         self.write(content.getvalue())
 
     def load(self):
-        """The state last saved, None where there is none of these settings. ValueError for a damaged file."""
+        """Return the state that was saved last, or None if there is none with these settings. ValueError if the file
+        is damaged."""
         content = self.read()
         if content is None:
             return None

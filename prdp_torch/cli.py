@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, advice, records, report, trajectories
+from prdp_torch import _C, advice, datasets, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
 from prdp_torch.tensorboard import TensorBoard
@@ -181,6 +181,22 @@ def compare(
     _print_table(loaded, table)
     said = [report.headline(loaded, table), *report.failures(loaded, table), f"report: {folder / 'report.html'}"]
     console.print("\n" + "\n".join(said), soft_wrap=True)
+
+
+@command
+def export(
+    scene: SceneName,
+    out: Annotated[Path | None, typer.Option(help="The file; default SCENE.h5.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
+    ] = None,
+):
+    """Write the trajectories of a scene as HDF5, in PDEBench's layout."""
+    loaded = scene_files.load(scene)
+    path = out or Path(f"{loaded.name}.h5")
+    with _progress() as progress:
+        samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))
+    console.print(f"{samples} trajectories of {states} states: {path}", soft_wrap=True)
 
 
 @command

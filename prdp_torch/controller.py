@@ -1,4 +1,4 @@
-"""Controllers: how far the solver goes, from one training interval to the next."""
+"""Controllers: they choose K or the tolerance of the solves after each training interval."""
 
 import math
 from collections.abc import Iterable
@@ -72,11 +72,11 @@ class _Attached:
         return max((r for r in residuals if math.isfinite(r)), default=None)
 
     def state_dict(self):
-        """What `load_state_dict` needs to continue exactly, as plain values."""
+        """Return the state as plain values, for `load_state_dict`."""
         return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
 
     def load_state_dict(self, state):
-        """Continue exactly where `state_dict()` was taken. ValueError for anything else."""
+        """Restore a state from `state_dict()` exactly. ValueError for anything else."""
         wanted = self.state_dict().keys()
         if not isinstance(state, dict) or state.keys() != wanted:
             raise ValueError(f"{type(self).__name__}: expected a state of {', '.join(wanted)}, got {state!r:.80}")
@@ -115,25 +115,32 @@ def _checked(who, settings, defaults):
 
 
 class PRDPController(_C.PRDPController, _Attached):
-    """Progressively Refined Differentiable Physics: raise K when the metric stops improving, until
-    raising it no longer pays (paper, section 3).
+    """Progressively Refined Differentiable Physics: raise K when the metric stops improving, until raising it no
+    longer helps.
 
     Args:
-        steppers: whose `max_iter` follows K: set to `initial` now, raised with K later; may be empty,
-            then read `.max_iter`.
-        tau_step: τ_step, plateau where L̃[-1]/L̃[-δ] > tau_step.
-        tau_stop: τ_stop, refine on a plateau where L̃[-1] < tau_stop · (L̃ at the last refinement), or
-            where the metric has grown since.
-        delta: δ >= 2, how many values back the plateau is judged.
-        window: of the exponential mean L̃, α = 2/(window + 1); 1 smooths nothing.
-        initial, increment, maximum: K₀, ΔK, and a bound (None: none).
-        growth: refine to K ← growth·K where that is more than K + increment.
-        adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations; None: what the stepper says.
+        steppers: the steppers whose `max_iter` is set to K, now and after each refinement. It may be empty; then
+            read `.max_iter` yourself.
+        tau_step: τ_step. The metric is on a plateau where L̃[-1]/L̃[-δ] > tau_step. L̃ is its exponential mean.
+        tau_stop: τ_stop. On a plateau K is raised if L̃[-1] < tau_stop · (L̃ at the last refinement), or if the
+            metric has grown since then.
+        delta: δ >= 2, how many values the plateau test looks back.
+        window: length of the exponential mean L̃, with α = 2/(window + 1). 1 does not smooth.
+        initial, increment: K at the start, and how much a refinement adds.
+        maximum: K is never raised beyond it. None sets no limit.
+        growth: a refinement raises K to growth·K where that is more than K + increment.
+        adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations. None leaves them to the stepper.
 
-    K stays where every solve of the attached steppers already meets its tolerance.
-    `warning`, of every controller: None, or in words what is wrong if the training ends here, with solves
-    that stop so far from the solution that their own error makes up what is trained.
-    Raises ValueError for a setting or a metric out of range, TypeError for one of a wrong type.
+    K is not raised while every solve of the steppers meets its tolerance. `warning` is None, or says in words that
+    the solves stop so far from the solution that their error dominates what is trained. Every controller has it.
+
+    Raises:
+        ValueError, TypeError: a setting or a metric is out of range or of a wrong type.
+
+    >>> controller = prdp.PRDPController([heat], tau_stop=0.9)
+    >>> refined = controller.step(validation_metric)  # after each epoch
+
+    Source: paper, section 3.
     """
 
     def __init__(self, steppers=(), **settings):
@@ -141,11 +148,13 @@ class PRDPController(_C.PRDPController, _Attached):
         self._take(steppers)
 
     def step(self, metric, converged=None, error=None):
-        """Take the metric (finite, >= 0; smaller is better) of an interval. True if K was raised.
+        """Decide after an interval. Returns True if K was raised.
 
-        converged: that the solves meet their tolerance; asked of the steppers where None.
-        error: the relative error of what is trained, as `ToleranceController.step` takes it, where you
-            know it. `warning` compares it with the residual of the solves.
+        Args:
+            metric: of the interval; finite, >= 0, and smaller is better.
+            converged: whether the solves meet their tolerance. None asks the steppers.
+            error: the relative error of what is trained, if you know it, as in `ToleranceController.step`.
+                `warning` compares it with the residual of the solves.
         """
         error = None if error is None else _number("PRDPController", "error", error)
         return self._decide(_number("PRDPController", "metric", metric), converged, error)
@@ -162,29 +171,31 @@ class PRDPController(_C.PRDPController, _Attached):
 
 
 class ToleranceController(_C.ToleranceController, _Attached):
-    """Tie the tolerance of the solves to the error of what is trained: nothing to tune, no K to choose.
+    """Tie the tolerance of the solves to the error of what is trained. There is nothing to tune.
 
-    While a network is wrong by a fifth, a solve that is right to a fiftieth serves it; as the error falls,
-    the solves follow. Take this one unless you have tuned `PRDPController` for your problem
-    (docs/refinement.md compares them).
+    While a network is wrong by a fifth, a solve with a relative residual of a fiftieth is accurate enough. As the
+    error falls, the tolerance follows. Use this controller unless you have tuned `PRDPController` for your problem.
 
     Args:
-        steppers: their `rtol`, `adjoint_rtol`, `max_iter` and `adjoint_max_iter` are set now and after
-            every step; may be empty, then read `.rtol`, `.adjoint_rtol` and `.max_iter`.
+        steppers: the steppers whose `rtol`, `adjoint_rtol`, `max_iter` and `adjoint_max_iter` are set, now and
+            after every step. It may be empty; then read `.rtol`, `.adjoint_rtol` and `.max_iter` yourself.
         ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1).
-        adjoint_ratio: the adjoint solve's rtol is rtol / adjoint_ratio, at most 1/2, and its K is
+        adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
             ⌈adjoint_ratio·K⌉; in (0, 1].
-        floor: no rtol is smaller; > 0. In float32 about 1e-5 is what can be reached.
-        maximum: K, a cap that a solve should never meet; >= 1.
+        floor: the smallest rtol; > 0. In float32 solves reach about 1e-5.
+        adjoint_floor: the smallest rtol of the adjoint solve; > 0. That rtol is relative to a cotangent that shrinks
+            with the error, and a descent needs no better gradient late than early.
+        maximum: K >= 1. It is only a limit, which the solves should not reach.
 
-    Under `torch.compile` a step compiles again for each new rtol, and goes on uncompiled after
-    `torch._dynamo.config.recompile_limit` of them (8): raise it, or leave this step uncompiled.
+    Under `torch.compile` a step compiles again for each new rtol. After `torch._dynamo.config.recompile_limit` (8)
+    of them it runs uncompiled. Raise that limit, or do not compile the step.
 
-    Raises ValueError for a setting or an error out of range, TypeError for one of a wrong type.
+    Raises:
+        ValueError, TypeError: a setting or an error is out of range or of a wrong type.
 
-        heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
-        controller = prdp.ToleranceController([heat])
-        # after each epoch: controller.step(relative_error)
+    >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
+    >>> controller = prdp.ToleranceController([heat])
+    >>> tightened = controller.step(relative_error)  # after each epoch
 
     Source: the forcing term of inexact Newton methods (Eisenstat and Walker, SIAM J. Sci. Comput. 17, 1996)
     and of optimisation with approximate gradients (Pedregosa, ICML 2016).
@@ -195,13 +206,14 @@ class ToleranceController(_C.ToleranceController, _Attached):
         self._take(steppers)
 
     def step(self, error, converged=None):
-        """Take the relative error of what is trained (finite, >= 0) after an interval. True if rtol became
-        smaller.
+        """Decide after an interval. Returns True if rtol became smaller.
 
-        error: ‖u - u_ref‖ / ‖u_ref‖ on validation data after one step, which is the square root of a
-            normalised squared metric. Of an error after n steps take the n-th part, since errors add up. In
-            an inverse problem the relative misfit, ‖simulated - observed‖ / ‖observed‖.
-        converged: not looked at; for the interface of `PRDPController`.
+        Args:
+            error: the relative error of what is trained; finite, >= 0. For a network this is
+                ‖u - u_ref‖ / ‖u_ref‖ on validation data after one step, the square root of a normalised squared
+                metric. Divide an error after n steps by n, since errors add up. In an inverse problem it is the
+                relative misfit, ‖simulated - observed‖ / ‖observed‖.
+            converged: ignored; `PRDPController` takes it.
         """
         return self._decide(_number("ToleranceController", "error", error), converged, None)
 
@@ -220,9 +232,9 @@ class ToleranceController(_C.ToleranceController, _Attached):
 
 
 class LinearSchedule(_C.LinearSchedule, _Attached):
-    """The manual schedule: K = initial + increment·(calls of step), at most `maximum`; increment = 0
-    is a constant K. The same interface as `PRDPController`; the metric is not looked at. `adjoint_ratio`
-    as there."""
+    """A manual schedule: K = initial + increment·(calls of step), at most `maximum`. increment = 0 keeps K constant.
+
+    It has the interface of `PRDPController` and ignores the metric. `adjoint_ratio` has the same meaning."""
 
     def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None):
         settings = {"initial": initial, "increment": increment, "maximum": maximum}
@@ -232,7 +244,7 @@ class LinearSchedule(_C.LinearSchedule, _Attached):
         self._take(steppers)
 
     def step(self, metric=0.0, converged=None, error=None):
-        """Go one step of the schedule. True if K was raised."""
+        """Advance the schedule. Returns True if K was raised."""
         error = None if error is None else _number("LinearSchedule", "error", error)
         return self._decide(_number("LinearSchedule", "metric", metric), converged, error)
 

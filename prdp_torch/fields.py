@@ -1,4 +1,4 @@
-"""Periodic velocity fields on the staggered grid of `NavierStokes`, in plain differentiable torch.
+"""Functions of periodic velocity fields on the staggered grid of `NavierStokes`. All are differentiable.
 
 Fields are (batch, 2 or 3, Ny, Nx) on the unit square, dx = 1/N: channel 0 is u₁ along x, the last axis, on
 the left face of a cell, channel 1 is u₂ along y on its lower face, and a third channel, the pressure in
@@ -30,8 +30,8 @@ def curl(u):
 
 
 def project(u):
-    """u with the nearest velocity of zero discrete divergence, u - G φ with D G φ = D u by Fourier
-    transform; mean velocity and pressure stay as they are."""
+    """Remove the divergence of a velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
+    This is the nearest field without discrete divergence. The mean velocity and the pressure do not change."""
     u1, u2 = _velocity("project", u)
     ny, nx = u.shape[-2:]
     ky, kx = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (ny, nx // 2 + 1))
@@ -43,8 +43,8 @@ def project(u):
 
 
 def downsample(u):
-    """Every second point along both axes, at the indices 1, 3, …: (Ny, Nx) odd to ((Ny - 1)/2, (Nx - 1)/2),
-    such as 97 to 48 (paper, appendix C.6)."""
+    """Take every second point along both axes, at the indices 1, 3, …. Ny and Nx must be odd; (Ny, Nx) becomes
+    ((Ny - 1)/2, (Nx - 1)/2), for example 97 becomes 48 (paper, appendix C.6)."""
     _velocity("downsample", u)
     if any(n % 2 == 0 for n in u.shape[-2:]):
         raise ValueError(f"downsample: Ny and Nx must be odd, got {tuple(u.shape[-2:])}")
@@ -52,9 +52,10 @@ def downsample(u):
 
 
 def rollout(stepper, u, steps):
-    """The states u, stepper(u), stepper(stepper(u)), …, `steps` steps on, the start included:
-    (batch, steps + 1, channel, *shape). `stepper` is any callable; one of this library takes them in one
-    op, by `Stepper.rollout`."""
+    """Repeat a step. Returns all states, u included: (batch, steps + 1, channel, *shape).
+
+    `stepper` may be any callable, such as a network. For steppers of this library `Stepper.rollout` is called.
+    """
     if isinstance(stepper, Stepper) and type(stepper).forward in (Stepper.forward, EquationStepper.forward):
         return stepper.rollout(u, steps)
     if _check.whole("rollout", "steps", steps) < 0:

@@ -9,19 +9,20 @@ from prdp_torch.stepper import Stepper
 
 
 class ImplicitStep(Stepper):
-    """Solve A(u) u_next = b(u) for an equation of your own, with all that the built-in steppers have.
+    """Make a stepper of your own equation: it solves A(u) u_next = b(u) and does all that the built-in ones do.
 
     Args:
-        operator: a function u → operator of `prdp_torch.operators` (of any kind, `Matrix` and `Function`
-            included), or one operator for all u. The state u is (batch, ...), as the operator's vectors.
-        rhs: a function u → b of the shape and dtype of u; b is the state itself where None.
+        operator: a function that takes u and returns an operator of `prdp_torch.operators` of any kind, or one
+            operator for all u. The state u has the shape of the operator's vectors, (batch, ...).
+        rhs: a function that takes u and returns b, with the shape and dtype of u. None takes u itself.
         solver, backward and the other options: as in `Stepper`.
 
-    Gradients reach u and every tensor that A(u) and b(u) are made of. An `nn.Module` among the two becomes a
-    submodule, so that its Parameters are trained, moved and saved with the stepper; so do the tensors of a
-    constant operator. What a plain function closes over belongs to its owner.
+    Gradients reach u and every tensor that A(u) and b(u) are made of. If `operator` or `rhs` is an `nn.Module`, it
+    becomes a submodule, so its Parameters are trained, moved and saved with the stepper. The same holds for the
+    tensors of a constant operator. It does not hold for variables that a plain function captures.
 
-    Raises TypeError or ValueError where A(u), b(u) and u do not fit each other, before any work.
+    Raises:
+        TypeError, ValueError: A(u), b(u) and u do not fit each other. This is checked before any work.
 
     >>> nu, dt = torch.nn.Parameter(torch.tensor(1e-3)), 0.1
     >>> step = prdp.ImplicitStep(

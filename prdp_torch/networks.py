@@ -7,8 +7,13 @@ import torch
 
 
 class MLP(torch.nn.Module):
-    """Multilayer perceptron with ReLU between its layers, from a field (batch, channels, *shape) to
-    one of the same shape: unknowns → hidden[0] → … → unknowns."""
+    """A multilayer perceptron with ReLU between its layers. It maps a field (batch, channels, *shape) to one of the
+    same shape.
+
+    Args:
+        unknowns: channels times the number of grid points, the width of the first and the last layer.
+        hidden: widths of the layers between.
+    """
 
     def __init__(self, unknowns, hidden):
         super().__init__()
@@ -23,11 +28,21 @@ class MLP(torch.nn.Module):
 
 
 class ResNet(torch.nn.Module):
-    """Residual network (He et al. 2016, without normalisation) from a field (batch, channels, *shape) of
-    any extents to one of the same shape: a convolution lifts channels → width point by point, `blocks`
-    times x ← relu(x + conv(relu(conv(x)))) with three-wide kernels, and a last convolution projects
-    width → channels point by point. Beyond the grid the blocks see the other end of the field where it
-    is periodic, else zeros. `dim` axes in `shape`; ValueError unless 1, 2 or 3."""
+    """A residual convolution network without normalisation. It maps a field (batch, channels, *shape) on any grid to
+    one of the same shape.
+
+    A pointwise convolution lifts the channels to `width`. Each of the `blocks` computes
+    x ← relu(x + conv(relu(conv(x)))) with kernels of width three. A pointwise convolution projects back.
+
+    Args:
+        dim: number of axes in shape: 1, 2 or 3, else ValueError.
+        channels: of the field.
+        blocks: number of residual blocks.
+        width: channels of the blocks.
+        periodic: whether the convolutions continue at the other end of the grid; otherwise they see zeros.
+
+    Source: He et al. 2016.
+    """
 
     def __init__(self, dim, channels, blocks, width, periodic):
         super().__init__()
@@ -50,7 +65,7 @@ class ResNet(torch.nn.Module):
 
 
 def make_network(scene, seed):
-    """The scene's network with the weights that belong to the seed, in every language."""
+    """Make the network of a scene. The same seed gives the same weights in Python and in C++."""
     physics, network = scene.physics, scene.network
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -8,20 +8,30 @@ _UNIT_VECTORS = 256
 
 
 def check_operator(A, example):
-    """Compare the parts of an operator with each other, and name those that are wrong. Meant for
-    `operators.Function`; takes any operator.
+    """Check that the parts of an operator fit each other. It takes any operator; `operators.Function` needs it most.
 
     Args:
         A: an operator of `prdp_torch.operators`, or a tensor as `linear_solve` takes it.
-        example: a right-hand side, (batch, ...) in float32 or float64; its shape and dtype count. In
-            float64 the comparison is sharp, in float32 it finds coarse mistakes.
+        example: a right-hand side (batch, ...) in float32 or float64, of which only shape and dtype are used. In
+            float64 the comparison is sharp; in float32 it finds only large mistakes.
 
-    Checked are: A is linear; samples do not influence each other; nothing that requires grad is used without
-    being among the operator's tensors; ⟨A v, w⟩ = ⟨v, Aᵀ w⟩; the diagonal, where
-    there is one, against products with unit vectors (all of them, or 256); and the gradient of ⟨w, A v⟩ for
-    each tensor of A against finite differences, in one random direction.
+    It checks that:
 
-    Returns True. Raises ValueError that lists what is wrong.
+    - A is linear, and samples do not influence each other;
+    - every tensor that requires grad is among the tensors of the operator;
+    - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
+    - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
+    - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction.
+
+    Returns:
+        True.
+
+    Raises:
+        ValueError: lists what is wrong.
+
+    >>> A = prdp.operators.Function(lambda v, k: k * v, tensors=torch.rand(30, dtype=torch.float64))
+    >>> prdp.check_operator(A, torch.zeros(2, 30, dtype=torch.float64))
+    True
     """
     who = "check_operator"
     A = operators.as_operator(who, "A", A)

@@ -1,8 +1,8 @@
-"""Linear operators A on batches of vectors, matrix-free; also a torch tensor as one.
+"""Linear operators A on batches of vectors.
 
-A vector is (batch, channel, *shape) for the stencils, with one channel unless an operator says
-otherwise, and (batch, n) for matrices. The tensors that an operator is made of (nu, winds, a matrix) get
-gradients through `apply` and through `linear_solve`.
+A vector is (batch, channel, *shape) for operators on grids, with one channel unless an operator says otherwise, and
+(batch, n) for matrices. The tensors of an operator (nu, winds, a matrix) get gradients through `apply` and through
+`linear_solve`.
 """
 
 import warnings
@@ -13,8 +13,7 @@ from prdp_torch import _C, _check, batching
 
 
 class Operator:
-    """What `linear_solve` takes. `kind`, `shape`, `parameters` and `tensors` describe it to the
-    compiled library."""
+    """The base of all operators. `kind`, `shape`, `parameters` and `tensors` describe it to the compiled library."""
 
     kind: str
 
@@ -30,27 +29,28 @@ class Operator:
         return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
 
     def apply(self, v):
-        """A v, differentiable; v as a right-hand side."""
+        """Return A v, with gradients. v has the shape of a right-hand side."""
         return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
 
     def apply_transpose(self, v):
-        """Aᵀ v, differentiable."""
+        """Return Aᵀ v, with gradients."""
         return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
 
     def diagonal(self):
-        """The diagonal of A, in a shape that broadcasts against a batch of vectors."""
+        """Return the diagonal of A, in a shape that broadcasts against a batch of vectors."""
         return torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
 
     def dense(self, dtype=torch.float64):
-        """A as a matrix (n, n), or (batch, n, n) where it differs between samples; for small n."""
+        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n."""
         return torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
 
 
 class Poisson(Operator):
-    """The Laplacian with homogeneous Dirichlet boundaries on `shape` unknowns, dx = length/(N + 1):
-    Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Negative definite.
+    """The Laplacian with zero boundary values: Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². It is negative definite.
 
-    length: the side of the domain, one number or one per axis in the order of `shape`.
+    Args:
+        shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+        length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
     """
 
     kind = "poisson"
@@ -61,8 +61,13 @@ class Poisson(Operator):
 
 
 class Heat(Operator):
-    """One implicit Euler step of the heat equation, I - nu dt L with the Laplacian L of `Poisson`.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`."""
+    """The operator of an implicit Euler step of the heat equation: I - nu dt L, with the Laplacian L of `Poisson`.
+
+    Args:
+        shape, length: as in `Poisson`.
+        nu: diffusivity >= 0, length²/time; a number or a 0-dimensional tensor, which gets a gradient.
+        dt: time step > 0.
+    """
 
     kind = "heat"
 
@@ -73,14 +78,20 @@ class Heat(Operator):
 
 
 class Burgers(Operator):
-    """One implicit Euler step of Burgers' equation on a periodic grid, dx = length/N,
-    linearised about `winds`: I + dt Γ - nu dt L on each velocity channel, with first-order upwind
-    advection Γ = Σ_d max(w⁻, 0) B_d + min(w⁺, 0) F_d by the winds w∓ averaged to the faces of a cell
-    (paper, appendix C.5). Row sums are 1 and off-diagonal entries <= 0.
+    """The operator of an implicit Euler step of Burgers' equation on a periodic grid: I + dt Γ - nu dt L on each
+    velocity channel.
 
-    winds: (batch, 1, N) or (batch, 2, Ny, Nx), with batch 1 for all samples alike; channel 0 is the
-        velocity along x, the last axis, channel 1 along y. float32 or float64, as the vectors.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`.
+    Γ = Σ_d max(w⁻, 0) B_d + min(w⁺, 0) F_d is first-order upwind advection. B and F are backward and forward
+    differences, and w∓ are the winds at the lower and upper face of a cell. Rows sum to 1, and entries off the
+    diagonal are <= 0.
+
+    Args:
+        winds: (batch, 1, N) or (batch, 2, Ny, Nx); batch 1 is for all samples alike. Channel 0 is the velocity
+            along x, the last axis, and channel 1 that along y. The dtype is that of the vectors.
+        nu, dt: as in `Heat`.
+        length: as in `Poisson`, but dx = length/N.
+
+    Source: paper, appendix C.5.
     """
 
     kind = "burgers"
@@ -90,18 +101,23 @@ class Burgers(Operator):
 
 
 class NavierStokes(Operator):
-    """One implicit Euler step of the incompressible Navier-Stokes equations on a periodic staggered grid
-    (Ny, Nx), dx = length/N, linearised about `velocity`. Vectors are (batch, 3, Ny, Nx),
-    the channels u₁ along x on the left face of a cell, u₂ along y on its lower face, p in its centre:
+    """The operator of an implicit Euler step of the incompressible Navier-Stokes equations on a periodic staggered
+    grid, linearised about `velocity`.
+
+    Vectors are (batch, 3, Ny, Nx). Their channels are u₁ along x on the left face of each cell, u₂ along y on its
+    lower face, and p in its centre:
 
         A = [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]],    C_k = I/dt + Γ_k - nu L
 
-    with divergence D by forward and gradient G = -Dᵀ by backward differences, and first-order upwind
-    advection Γ_k by the velocity at the points of u_k (paper, appendix C.6). A and Aᵀ have one null
-    vector, constant pressure.
+    The divergence D uses forward differences, and the gradient G = -Dᵀ backward differences. Γ_k is first-order
+    upwind advection with the velocity at the points of u_k. Constant pressure is the null vector of A and of Aᵀ.
 
-    velocity: (batch or 1, 2 or 3, Ny, Nx); a third channel, the pressure, has no influence.
-    nu >= 0, a number or a 0-dimensional tensor; dt > 0; length as in `Poisson`.
+    Args:
+        velocity: (batch or 1, 2 or 3, Ny, Nx). A third channel, the pressure, has no influence.
+        nu, dt: as in `Heat`.
+        length: as in `Poisson`, but dx = length/N.
+
+    Source: paper, appendix C.6.
     """
 
     kind = "navier_stokes"
@@ -111,13 +127,13 @@ class NavierStokes(Operator):
 
 
 class Stencil(Operator):
-    """An operator of your own by its coefficients at every point of a grid of 1 to 3 axes, the same for every
-    channel of v:
+    """An operator of your own on a grid of 1 to 3 axes, given by its coefficients at every point. It is the same for
+    every channel of v:
 
         (A v)[i] = Σ_k coefficients[k, i] · v[i + offsets[k]]
 
-    A stencil has everything that the built-in operators have: CPU loops, every solver but `Chebyshev`, both
-    derivatives. It is fastest where `offsets` are nearest neighbours, such as
+    It has everything that the built-in operators have: CPU loops, every solver except `Chebyshev`, and both kinds of
+    gradients. It is fastest if `offsets` are nearest neighbours, such as
     [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)] in two dimensions.
 
     Args:
@@ -128,7 +144,7 @@ class Stencil(Operator):
         boundary: "zero" (v is 0 outside the grid) or "periodic", one for all axes or one for each.
 
     Raises:
-        ValueError, TypeError: what does not fit together, before any work.
+        ValueError, TypeError: the arguments do not fit together. This is checked before any work.
 
     Example:
         A = operators.Stencil(torch.stack([1 + a + b, -a, -b], 1), [(0,), (-1,), (1,)], boundary="periodic")
@@ -162,20 +178,20 @@ class Stencil(Operator):
 
 
 class Function(Operator):
-    """An operator of your own, by its product `matvec(v, *tensors)` = A v on batches of vectors (batch, ...).
+    """An operator of your own, given by a function for its product with a batch of vectors (batch, ...).
 
     Args:
-        matvec: made of torch operations; returns a new tensor of the shape and dtype of v, and is linear in
-            v. Samples may differ through `tensors` alone.
-        transpose: the same for Aᵀ v; torch's own derivative of matvec where None.
-        tensors: what A is made of, a tuple of tensors or a single one; they get gradients. A tensor that
-            requires grad and reaches matvec in another way is refused.
-        diagonal: `diagonal(*tensors)`, the diagonal of A in a shape that broadcasts against the vectors;
+        matvec: `matvec(v, *tensors)` returns A v as a new tensor with the shape and dtype of v. It is made of torch
+            operations and linear in v. Samples may differ only through `tensors`.
+        transpose: the same for Aᵀ v. None takes torch's own derivative of matvec.
+        tensors: what A is made of, a tuple of tensors or a single one. They get gradients. A tensor that requires
+            grad and reaches matvec in another way is refused.
+        diagonal: `diagonal(*tensors)` returns the diagonal of A in a shape that broadcasts against the vectors.
             `Jacobi` and `preconditioner="diagonal"` need it.
-        symmetric: A = Aᵀ, so that matvec serves for both.
+        symmetric: whether A = Aᵀ. Then matvec is used for both.
 
-    `Direct` probes A with unit vectors, for small systems. `prdp.check_operator` compares all of these with
-    each other. Not under `torch.compile`.
+    `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
+    the functions with each other. A `Function` cannot be created inside `torch.compile`.
     """
 
     kind = "function"
@@ -208,8 +224,8 @@ class Function(Operator):
 
 
 class Matrix(Operator):
-    """A tensor (n, n) or (batch, n, n), dense or sparse CSR. Gradients of a sparse one live on its
-    pattern; `Matrix.csr` takes them to its values without torch's dense detour."""
+    """A matrix: a tensor (n, n) or (batch, n, n), dense or sparse CSR. A sparse one gets gradients on its pattern; if
+    you need them, use `Matrix.csr`, because torch may make the gradient of a CSR tensor dense."""
 
     def __init__(self, matrix):
         if not isinstance(matrix, torch.Tensor):

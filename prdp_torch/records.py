@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, datasets
 
 
 def environment():
@@ -38,7 +38,7 @@ def _commit():
     folder = Path(__file__).resolve().parent
     try:
         answer = subprocess.run(
-            ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"],
+            ["git", "--no-optional-locks", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"],
             capture_output=True,
             text=True,
             check=True,
@@ -50,7 +50,8 @@ def _commit():
 
 def identity(scene):
     """What a training must agree on to be the same one, however many intervals it goes on for."""
-    return {"scene": scene.name, "text": scene.text, "backward": scene.backward}
+    same = {"scene": scene.name, "text": scene.text, "backward": scene.backward}
+    return {**same, "data": datasets.fingerprint(scene)} if scene.data.file else same
 
 
 def settings(scene):

@@ -12,7 +12,7 @@ _SOLVERS = {solver.method: solver for solver in solvers.Solver.__subclasses__()}
 
 
 def available():
-    """Paths of the scenes that come with the project, by name."""
+    """Return the scenes that come with the project, as a dict from name to path."""
     for folder in _FOLDERS:
         if folder.is_dir():
             return {path.stem: path for path in sorted(folder.glob("*.toml"))}
@@ -20,7 +20,8 @@ def available():
 
 
 def load(scene):
-    """Read a scene by name or by path. ValueError says file, line and what is allowed."""
+    """Read a scene by its name, or by the path of a .toml file. The ValueError for a mistake names the file, the line
+    and what is allowed."""
     if str(scene).endswith(".toml"):
         return _C.read_scene(str(scene))
     known = available()
@@ -30,8 +31,15 @@ def load(scene):
 
 
 def make_stepper(scene, direct=False, max_iter=None):
-    """The scene's step, with its solver, its budget K or another one, or with the exact method. A failed
-    sample is only reported: coarse physics may well diverge early in a training."""
+    """Make the stepper of a scene.
+
+    Args:
+        scene: from `load`.
+        direct: whether to use the exact solver in place of the scene's.
+        max_iter: K in place of the scene's.
+
+    A failed sample is only reported in the status, because poorly converged steps may diverge early in a training.
+    """
     physics = scene.physics
     options = {
         "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),

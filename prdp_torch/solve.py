@@ -1,4 +1,4 @@
-"""`linear_solve`, and what a solve says of itself."""
+"""`linear_solve`, and the reports of solves."""
 
 import weakref
 from collections import Counter
@@ -44,17 +44,17 @@ class AdjointLogs(list):
 
 
 class SolveInfo(NamedTuple):
-    """What a solve says of itself, one value per sample: tensors of shape (batch,). Of a rollout, one value
-    per sample and step: (batch, steps)."""
+    """The report of a solve, with one value per sample: tensors of shape (batch,). The report of a rollout has one
+    value per sample and step: (batch, steps)."""
 
     iterations: torch.Tensor
-    """Iterations that made the returned u (int64)."""
+    """Iterations that produced the returned u (int64)."""
     residual: torch.Tensor
     """‖b - A u‖ / ‖b‖, recomputed from the returned u (dtype of u)."""
     status: torch.Tensor
-    """Why it stopped: `SolveStatus(int(info.status[0])).name` (int64)."""
+    """Why the solve stopped (int64). `SolveStatus(int(info.status[0])).name` is its name."""
     operator_applications: torch.Tensor
-    """Products with A, all told (int64)."""
+    """Number of products with A (int64)."""
     log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self):
@@ -69,9 +69,10 @@ class SolveInfo(NamedTuple):
 
     @property
     def adjoint(self):
-        """The same of the adjoint solve, after `backward()`; None before. In unrolled mode, of the sweeps back
-        through the iterations: those, the solve's status, and NaN for a residual; the products are all that
-        the backward pass took."""
+        """The report of the adjoint solve, or None before `backward()`.
+
+        Unrolled mode has no adjoint solve. Its report then has the iterations and the status of the solve itself,
+        NaN as the residual, and the number of products in the whole backward pass."""
         return None if self.log is None else self.log.read()
 
 
@@ -86,31 +87,39 @@ def linear_solve(
     checkpoint_every=None,
     x0=None,
 ):
-    """Solve A u = b, differentiably. Returns (u, info); u has the shape of b.
+    """Solve A u = b, with gradients for A and b.
 
     Args:
         A: an operator of `prdp_torch.operators`, or a tensor (n, n) or (batch, n, n), dense or sparse CSR.
         b: (batch, channel, *shape) for stencil operators, (n,) or (batch, n) for matrices; float32 or
             float64, any strides.
         solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
-        backward: "implicit", one adjoint solve with the same method: b̄ = λ with Aᵀλ = ū truncated like
-            the primal, ḡ = -λᵀ ∂(A u)/∂g; "unrolled", the exact derivative of the iterations that ran;
-            "none".
-        adjoint_max_iter, adjoint_rtol: budget of the adjoint solve; the primal's where None.
-        on_failure: "raise" (torch.linalg.LinAlgError naming the samples), "warn" or "return" where a
-            sample diverges, overflows, breaks down or is not finite. Reaching max_iter is no failure.
-        checkpoint_every: for "unrolled" alone: of the K iterates that the backward pass needs it keeps one
-            in so many and computes those between again; "sqrt" for ⌈√K⌉, None for all. The gradient is
-            the same to the last bit (docs/derivatives.md has the memory and the time).
-        x0: a guess of u, of b's shape, dtype and device. Each sample starts from α x0, where
-            α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least: never worse than from zero, and only the
-            direction of x0 counts. It costs one product. rtol stays relative to ‖b‖. A start has no gradient:
-            the unrolled derivative is that of the iterations from a fixed α x0. The adjoint solve starts
-            from zero, and `Direct` ignores x0.
+        backward: how the gradient is computed.
+            "implicit" solves one adjoint system, Aᵀλ = ū, with the same method. Then b̄ = λ, and a tensor g
+            in A gets ḡ = -λᵀ ∂(A u)/∂g. "unrolled" differentiates the iterations that ran. "none" gives no
+            gradient.
+        adjoint_max_iter, adjoint_rtol: limits of the adjoint solve. None takes those of the solver.
+        on_failure: what happens if a sample diverges, overflows, breaks down or is not finite: "raise" a
+            torch.linalg.LinAlgError that names the samples, "warn", or "return". Reaching max_iter is not a
+            failure.
+        checkpoint_every: for "unrolled" only. The backward pass needs all K iterates. With a number n it
+            stores every n-th one and recomputes the others; "sqrt" stands for n = ⌈√K⌉, and None stores all.
+            The gradient is the same bit for bit.
+        x0: a guess of u, with the shape, dtype and device of b. Each sample starts from α x0, where
+            α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ minimises the residual. So the start is never worse than zero, and the
+            length of x0 does not matter. It costs one product. rtol stays relative to ‖b‖. x0 gets no
+            gradient: the unrolled derivative is that of the iterations from a fixed α x0. The adjoint solve
+            starts from zero, and `Direct` ignores x0.
+
+    Returns:
+        (u, info): u with the shape of b, and a `SolveInfo`.
 
     Raises:
-        ValueError, TypeError: bad arguments, before any work.
-        torch.linalg.LinAlgError: a failed sample, with on_failure="raise"; in backward too.
+        ValueError, TypeError: an argument is wrong. This is checked before any work.
+        torch.linalg.LinAlgError: a sample failed, in the forward or the backward pass, and on_failure is "raise".
+
+    >>> A = prdp.operators.Heat((30,), nu=1e-3, dt=1.0)
+    >>> u, info = prdp.linear_solve(A, b, prdp.CG(max_iter=20))  # b: (batch, 1, 30)
 
     Source of the derivatives: Bhatia, Koehler, Thuerey, "Progressively Refined Differentiable
     Physics", ICLR 2025, section 2.1.

@@ -1,4 +1,4 @@
-"""Solvers: which iteration, how many at most, to which tolerance.
+"""Solvers: a method, its maximum number of iterations and its tolerance.
 
 All start from zero unless they are given a start, and stop, sample by sample, at the first of
 ‖b - A u‖ <= rtol ‖b‖ (the true residual) or `max_iter` iterations; rtol = 0 runs exactly `max_iter`.
@@ -15,7 +15,13 @@ from prdp_torch import _C, _check
 
 @dataclass
 class Solver:
-    """What every solver is: a method and its budget K = max_iter. CG and GMRES take a `preconditioner`."""
+    """The base of all solvers.
+
+    Args:
+        max_iter: K, the maximum number of iterations.
+        rtol: a sample stops at ‖b - A u‖ <= rtol ‖b‖.
+        preconditioner: only for `CG` and `GMRES`.
+    """
 
     max_iter: int
     rtol: float = _C.DEFAULT_RTOL
@@ -47,33 +53,41 @@ class Solver:
 
 @dataclass
 class Jacobi(Solver):
-    """u ← D⁻¹(b - (L + U) u). Converges where the spectral radius of D⁻¹(L + U) is below 1."""
+    """Jacobi's method, u ← D⁻¹(b - (L + U) u), where A = D + L + U and D is the diagonal. It converges if the
+    spectral radius of D⁻¹(L + U) is below 1."""
 
     method: ClassVar[str] = "jacobi"
 
 
 @dataclass
 class Chebyshev(Solver):
-    """Chebyshev's semi-iteration on Jacobi's (Golub and Varga 1961): two to three times fewer iterations at
-    the same cost each, by weights from the spectrum, which is known of Heat and Poisson alone."""
+    """Chebyshev's semi-iteration over Jacobi's method. It takes two to three times fewer iterations than `Jacobi`,
+    and an iteration costs the same. Its weights need the spectrum of A, which is known for `Heat` and `Poisson`
+    only.
+
+    Source: Golub and Varga 1961.
+    """
 
     method: ClassVar[str] = "chebyshev"
 
 
 @dataclass
 class SteepestDescent(Solver):
-    """α = r·r / r·Ar; u += α r; r -= α A r. Fits definite operators of either sign."""
+    """Steepest descent for definite operators: α = r·r / r·Ar; u += α r; r -= α A r."""
 
     method: ClassVar[str] = "steepest_descent"
 
 
 @dataclass
 class CG(Solver):
-    """Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators.
+    """Conjugate gradients, for symmetric definite operators.
 
-    `preconditioner="diagonal"` divides by the magnitude of the diagonal: several times fewer iterations where
-    it varies much, as with a diffusivity that varies in space; none where it is constant. It refuses an
-    operator with a zero there (ZERO_DIAGONAL)."""
+    `preconditioner="diagonal"` divides by the magnitude of the diagonal. Where the diagonal varies much, as with a
+    diffusivity that varies in space, this saves most of the iterations. If the diagonal is constant, it saves
+    none. A zero on the diagonal is refused (ZERO_DIAGONAL).
+
+    Source: Hestenes and Stiefel 1952.
+    """
 
     method: ClassVar[str] = "cg"
     preconditioners: ClassVar[tuple[str, ...]] = ("diagonal",)
@@ -81,13 +95,16 @@ class CG(Solver):
 
 @dataclass(kw_only=True)
 class GMRES(Solver):
-    """Restarted GMRES(m) with m = `restart` products a cycle, for any operator (Saad and Schultz 1986);
-    `max_iter` counts cycles. The residual never grows. In float32 unrolled derivatives can be far off:
-    prefer implicit ones.
+    """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, and `max_iter` counts cycles.
 
-    Preconditioned from the right: by "diagonal", for operators without a zero there (else ZERO_DIAGONAL), or
-    by "stokes", for NavierStokes alone: the same step without winds, solved with FFTs; it meets 1e-5 in few
-    products."""
+    The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit ones.
+
+    Two preconditioners are applied from the right. "diagonal" divides by the diagonal, which must have no zero
+    (ZERO_DIAGONAL). "stokes", for `NavierStokes` only, solves the same step without winds by FFTs; GMRES then
+    reaches 1e-5 in few products.
+
+    Source: Saad and Schultz 1986.
+    """
 
     restart: int = _C.DEFAULT_RESTART
 

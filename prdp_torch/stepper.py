@@ -9,29 +9,31 @@ from prdp_torch.solvers import check_options, checkpoint_number
 
 
 class Stepper(torch.nn.Module):
-    """u → u_next, both (batch, channel, *shape) in float32 or float64 and of any strides, by a linear
-    solve A(u) u_next = b(u). Derivatives as `linear_solve` describes them.
+    """The base of all steppers. A stepper maps a state u to the next one by solving A(u) u_next = b(u).
 
-    Args of every stepper beside its physics:
+    States are (batch, channel, *shape) in float32 or float64, with any strides. Gradients are computed as
+    `linear_solve` describes.
+
+    Every stepper takes these arguments beside its physics:
         solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
         start: where the solves start: "zero", or "state", the state before the step, as the x0 of
             `linear_solve`. It saves iterations where a step changes the state little.
 
     Attributes:
-        max_iter: K, the solver's budget; set it at any time, by hand or by a controller. A change
-            costs nothing, under `torch.compile` neither.
-        rtol, adjoint_rtol: the tolerances; set them at any time as well. Under `torch.compile` every new value
-            compiles once more, up to `torch._dynamo.config.recompile_limit` of them.
-        start: as above; set it at any time.
-        info: `SolveInfo` of the last forward or rollout; None before the first.
-        adjoint_info: `SolveInfo` of the last adjoint solve, or rollout of them; None before the first
-            backward.
+        max_iter: K, the maximum number of iterations. You or a controller may set it at any time. Under
+            `torch.compile` this does not compile again, except for the second value.
+        rtol, adjoint_rtol: the tolerances. They may be set at any time as well, but under `torch.compile`
+            each new value compiles again, up to `torch._dynamo.config.recompile_limit` times.
+        start: as above. It may be set at any time.
+        info: the `SolveInfo` of the last forward pass or rollout; None before the first.
+        adjoint_info: the `SolveInfo` of the last backward pass; None before the first.
 
-    A subclass defines `operator(u)` and, where b(u) is not the state, `rhs(u)`; `ImplicitStep` takes the two
+    A subclass defines `operator(u)`, and `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two
     as functions instead.
 
-    Raises ValueError or TypeError for arguments out of range, before any work.
+    Raises:
+        ValueError, TypeError: an argument is wrong. This is checked before any work.
     """
 
     def __init__(
@@ -61,8 +63,7 @@ class Stepper(torch.nn.Module):
         self.on_failure = on_failure
         self.checkpoint_every = checkpoint_every
         self.start = start
-        # A tensor, because torch.compile takes a module's plain numbers for constants.
-        self._max_iter = torch.tensor(solver.max_iter)
+        self._max_iter = int(solver.max_iter)
         self._adjoint_log = AdjointLog()
         self._last_log = self._adjoint_log
         self.info = None
@@ -83,9 +84,10 @@ class Stepper(torch.nn.Module):
         return u_next
 
     def rollout(self, u, steps):
-        """The states u, step(u), step(step(u)), …, `steps` steps on, the start included: (batch, steps + 1,
-        channel, *shape). `info` and `adjoint_info` then hold tensors of shape (batch, steps); a failure says
-        in which step, counted from 1. Each step is a node of autograd and keeps what a single one keeps."""
+        """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
+
+        `info` and `adjoint_info` then hold tensors of shape (batch, steps). If a step fails, the error gives its
+        number, counted from 1. For the backward pass each step stores what a single step stores."""
         compiling = torch.compiler.is_compiling()
         if not compiling:
             _check.dense(type(self).__name__, "u", u)
@@ -139,7 +141,7 @@ class Stepper(torch.nn.Module):
     def _options(self, log_number):
         return (
             self.method,
-            self._max_iter.item(),
+            self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self),
             self.rtol,
             self.restart,
             self.backward,
@@ -152,13 +154,13 @@ class Stepper(torch.nn.Module):
 
     @property
     def max_iter(self):
-        return int(self._max_iter)
+        return self._max_iter
 
     @max_iter.setter
     def max_iter(self, k):
         who = type(self).__name__
         _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol, self.restart)
-        self._max_iter.fill_(k)
+        self._max_iter = int(k)
 
     @property
     def adjoint_info(self):
@@ -166,9 +168,16 @@ class Stepper(torch.nn.Module):
 
     @property
     def converged(self):
-        """Whether all samples of the last forward met rtol, and of the last adjoint solve if any."""
+        """Whether all samples met the tolerance, in the last forward pass and in the last backward pass if any."""
         reports = [report for report in (self.info, self.adjoint_info) if report is not None]
         return self.info is not None and all(bool((report.status > 0).all()) for report in reports)
 
     def extra_repr(self):
         return f"solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
+
+
+def _as_graph_input(stepper):
+    """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
+    each of them."""
+    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
+        return stepper._max_iter + 0  # the number is read where it is used first, which must be here

@@ -19,10 +19,10 @@ class Equation:
 
 
 class EquationStepper(Stepper):
-    """A stepper whose equation the compiled library knows, so that a rollout is one op.
+    """A stepper of a built-in equation, whose rollout is a single operation.
 
-    nu is a Parameter of the module where it was given as one, a buffer where it was given as a tensor, and
-    a plain number else.
+    If nu is given as a Parameter, it becomes a Parameter of the module. A tensor becomes a buffer, and a number
+    stays a number.
     """
 
     def __init__(self, shape, solver, backward, length, nu_and_dt=None, picard_steps=1, **options):
@@ -66,12 +66,12 @@ class EquationStepper(Stepper):
         return u_next
 
     def rollout(self, u, steps):
-        """The states u, step(u), step(step(u)), …, `steps` steps on, the start included: (batch, steps + 1,
-        channel, *shape). The same values and gradients as by calling the stepper, to the last bit, but in
-        one op with one backward pass, which saves the fixed cost of a call and of its node in every step.
-        `info` and `adjoint_info` then hold tensors of shape (batch, steps); a failure says in which step,
-        counted from 1. Kept for the backward pass are the states (nothing for `Poisson`, or `Heat` with a
-        plain nu, in implicit mode)."""
+        """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
+
+        Values and gradients equal those of single calls bit for bit. A rollout is faster, because it is one
+        operation with one backward pass. `info` and `adjoint_info` then hold tensors of shape (batch, steps). If
+        a step fails, the error gives its number, counted from 1. The backward pass needs the states; in implicit
+        mode `Poisson`, and `Heat` with a number as nu, need nothing."""
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
@@ -107,10 +107,17 @@ class EquationStepper(Stepper):
 
 
 class Poisson(EquationStepper):
-    """Δu = -p with u = 0 on the boundary; maps p to u. Second-order differences (paper, appendix C.1).
+    """Solve the Poisson equation Δu = -p with u = 0 on the boundary. Maps p to u.
 
-    shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-    length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
+    Args:
+        shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+        solver, backward and the other options: as in `Stepper`.
+        length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
+
+    >>> poisson = prdp.Poisson((30, 30), solver=prdp.CG(max_iter=100))
+    >>> u = poisson(p)  # (batch, 1, 30, 30)
+
+    Source: second-order differences (paper, appendix C.1).
     """
 
     kind = "poisson"
@@ -127,14 +134,22 @@ class Poisson(EquationStepper):
 
 
 class Heat(EquationStepper):
-    """One implicit Euler step of u_t = nu Δu with u = 0 on the boundary: (I - nu dt L) u_next = u (paper,
-    appendix C.2 to C.4).
+    """Make one implicit Euler step of the heat equation u_t = nu Δu with u = 0 on the boundary.
 
-    nu: >= 0 (length²/time), a number or a 0-dimensional tensor, which then gets a gradient; a Parameter is
-        the module's (in `parameters()`), another tensor a buffer of it.
-    dt: > 0 (time). Only nu dt/dx² matters: Jacobi's iteration count grows with it.
-    shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
-    length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
+    It solves (I - nu dt L) u_next = u, where L is the discrete Laplacian.
+
+    Args:
+        shape: the grid of unknowns, (N,), (Ny, Nx) or (Nz, Ny, Nx).
+        nu: diffusivity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of
+            the module, and another tensor a buffer.
+        dt: time step > 0. The larger nu dt/dx² is, the more iterations a solve takes.
+        solver, backward and the other options: as in `Stepper`.
+        length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
+
+    >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=10))
+    >>> u1 = heat(u0)  # (batch, 1, 30)
+
+    Source: paper, appendix C.2 to C.4.
     """
 
     kind = "heat"
@@ -149,14 +164,24 @@ class Heat(EquationStepper):
 
 
 class Burgers(EquationStepper):
-    """One implicit Euler step of u_t + (u·∇)u = nu Δu on a periodic grid, dx = length/N:
-    (I + dt Γ(u) - nu dt L) u_next = u, first-order upwind, linearised about the state u (paper, appendix
-    C.5). shape (N,) with u of (batch, 1, N), or (Ny, Nx) with u of (batch, 2, Ny, Nx): channel 0 is the
-    velocity along x, the last axis, channel 1 along y.
+    """Make one implicit Euler step of Burgers' equation u_t + (u·∇)u = nu Δu on a periodic grid.
 
-    nu, dt, length: as in `Heat`.
-    picard_steps: solves a step, each linearised about the solution of the one before; `info` then counts
-    all their iterations and holds the worst status and the last residual.
+    It solves (I + dt Γ(u) - nu dt L) u_next = u, where Γ is first-order upwind advection, linearised about the
+    state u. In 1D u is (batch, 1, N). In 2D u is (batch, 2, Ny, Nx): channel 0 is the velocity along x, the last
+    axis, and channel 1 the velocity along y.
+
+    Args:
+        shape: (N,) or (Ny, Nx).
+        nu, dt: as in `Heat`.
+        solver, backward and the other options: as in `Stepper`.
+        picard_steps: how many solves one step makes. Each is linearised about the solution of the previous one.
+            `info` then has the sum of their iterations, the worst status and the last residual.
+        length: as in `Heat`, but dx = length/N.
+
+    >>> burgers = prdp.Burgers((256,), nu=1e-3, dt=1e-2, solver=prdp.GMRES(max_iter=20))
+    >>> states = burgers.rollout(u0, 50)  # (batch, 1, 256) -> (batch, 51, 1, 256)
+
+    Source: paper, appendix C.5.
     """
 
     kind = "burgers"
@@ -170,12 +195,22 @@ class Burgers(EquationStepper):
 
 
 class NavierStokes(EquationStepper):
-    """One implicit Euler step of u_t + (u·∇)u + ∇p = nu Δu with ∇·u = 0 on a periodic staggered grid
-    (Ny, Nx), dx = length/N, linearised about the state (paper, appendix C.6). The state is
-    (batch, 3, Ny, Nx): u₁ along x on the left face of a cell, u₂ along y on its lower face, p of mean
-    zero in its centre; the step does not depend on its pressure. `operators.NavierStokes` is A(u).
+    """Make one implicit Euler step of the Navier-Stokes equations u_t + (u·∇)u + ∇p = nu Δu, ∇·u = 0.
 
-    nu, dt, length: as in `Heat`; picard_steps: as in `Burgers`.
+    The grid is periodic and staggered. The step is linearised about the state, which is (batch, 3, Ny, Nx): u₁
+    along x on the left face of each cell, u₂ along y on its lower face, and the pressure p of mean zero in its
+    centre. The pressure of the state has no influence on the step. `operators.NavierStokes` describes A(u).
+
+    Args:
+        shape: (Ny, Nx).
+        nu, dt: as in `Heat`.
+        solver, backward and the other options: as in `Stepper`.
+        picard_steps, length: as in `Burgers`.
+
+    >>> flow = prdp.NavierStokes((48, 48), nu=1e-4, dt=0.1, solver=prdp.GMRES(max_iter=40, restart=8))
+    >>> u1 = flow(u0)  # (batch, 3, 48, 48)
+
+    Source: paper, appendix C.6.
     """
 
     kind = "navier_stokes"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, field_task, fields
+from prdp_torch import _C, datasets, field_task, fields
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -16,13 +16,13 @@ from prdp_torch.task import Task
 
 
 class Refinement:
-    """How a training decides how far the solver goes.
+    """How a training chooses K and the tolerance. Use one of the class methods below.
 
     Args:
-        label: for the records.
-        attach: called with the steppers; sets them up and returns their controller.
-        direct: the exact solver in place of the scene's.
-        watches_error: whether the controller's `step` takes the relative error, not the metric.
+        label: name of the folder of the records.
+        attach: a function that takes the steppers and returns their controller.
+        direct: whether the exact solver replaces that of the scene.
+        watches_error: whether the controller's `step` takes the relative error instead of the metric.
     """
 
     def __init__(self, label, attach, direct=False, watches_error=False):
@@ -33,7 +33,7 @@ class Refinement:
 
     @classmethod
     def auto(cls):
-        """What fits every scene with nothing chosen for it; docs/refinement.md says why."""
+        """A tolerance that follows the error (`ToleranceController`), and starts from the state: nothing to choose."""
 
         def attach(steppers):
             for stepper in steppers:
@@ -44,6 +44,7 @@ class Refinement:
 
     @classmethod
     def prdp(cls, scene, growth=None):
+        """PRDP with the settings of the scene, or with another `growth` (`PRDPController`)."""
         settings = dict(scene.prdp)
         if growth is not None:
             settings["growth"] = growth
@@ -52,11 +53,12 @@ class Refinement:
 
     @classmethod
     def constant(cls, k):
+        """The same K throughout."""
         return cls.schedule(k, 0, k, label=f"constant_{k}")
 
     @classmethod
     def tolerance(cls, rtol, k):
-        """The same rtol throughout; K is a cap."""
+        """The same tolerance rtol throughout, with at most k iterations."""
 
         def attach(steppers):
             for stepper in steppers:
@@ -67,6 +69,7 @@ class Refinement:
 
     @classmethod
     def schedule(cls, start, step, maximum, label=None):
+        """K starts at `start` and grows by `step` after each interval, up to `maximum`."""
         return cls(
             label or f"schedule_{start}_{step}",
             lambda steppers: LinearSchedule(steppers, initial=start, increment=step, maximum=maximum),
@@ -74,6 +77,7 @@ class Refinement:
 
     @classmethod
     def exact(cls):
+        """The exact solver."""
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
 
 
@@ -106,39 +110,57 @@ class Interval(NamedTuple):
     """Whether the interval was done earlier, and read from a checkpoint."""
 
 
-def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None):
-    """Train the scene once. Returns the curves as a dict of lists, one entry an interval: an epoch, or
-    an update where there is no network. "metric" starts before the first interval, and so does "error", the
-    relative error that a user knows; "budget" is K times the solves, of which an update of the task "corrector"
-    has two and one of "field" one a step; iterations and operator applications are per sample of a batch, summed
-    over the solves, the applications over the adjoint solves as well, whose own are "adjoint_applications".
-    "warning" is there where the controller ends with one.
-    A training whose loss or metric is no longer finite stops there: "diverged" says where and why, and the
-    curves end with the interval that was lost, with a metric of NaN and no costs.
+def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None, data=None):
+    """Train a scene once.
 
     Args:
         scene: from `prdp_torch.scenes.load`.
-        refinement: a `Refinement`.
-        seed: of the network's weights and of the shuffling, or of a field's noise; the other data stay the same.
-        network: any module from (batch, channels, *shape) to the same shape; the scene's own where None.
+        refinement: a `Refinement`, which chooses K and the tolerance.
+        seed: sets the initial weights of the network and the order of the batches; for the task "field", the noise.
+            The data of a scene do not depend on it.
+        network: any module that maps (batch, channels, *shape) to the same shape. None makes that of the scene.
         callbacks: functions that are called after each interval with an `Interval`. If one returns True, the
-            training stops there, and its checkpoint is saved. A training that goes on from a checkpoint first calls
-            them with the intervals that are done already (`resumed`). No call is made for a diverged interval.
-        on_data: called while data are made that are not on disk yet, with (steps of a sample done, all of them).
-        checkpoint: a `prdp_torch.checkpoint.Checkpoint` to go on from where it has a state, bit for bit on
-            the same machine with as many threads, and to keep the training in whenever it is due. It holds torch's
-            global random state as well, for a network with dropout. ValueError for a state that does not fit the
-            scene and the network, or has more intervals than the scene.
+            training stops and its checkpoint is saved. If a training continues from a checkpoint, they are first
+            called with the intervals that were done before (`resumed`). A diverged interval makes no call.
+        on_data: called while data are made with (steps done, all steps), where steps are counted per sample.
+        checkpoint: a `prdp_torch.checkpoint.Checkpoint`. The training continues from its state, and saves its own
+            there whenever one is due. On the same machine, with as many threads, the result is the same bit for
+            bit, also for a network with dropout.
+        data: trajectories in place of the scene's data: (samples, times, channels, *shape), spaced by the scene's
+            dt, as a tensor, an array or a dataset of trajectories. The first `data.train` of them train, the next
+            `data.valid` validate; or give a pair (training, validation). Every state of a training trajectory
+            that two more states follow is a sample.
+
+    Returns:
+        The curves, a dict of lists with one entry per interval: an epoch, or an update if there is no network.
+
+        - "update_loss": one entry per update.
+        - "metric", "error": the validation metric and the relative error. They begin with a value from before the
+          first interval.
+        - "max_iter", "rtol": K and the tolerance during the interval.
+        - "budget": K times the number of solves. The task "corrector" has two solves per update, "field" one per step.
+        - "iterations", "operator_applications": per sample of a batch, summed over the solves. The products include
+          those of the adjoint solves, which "adjoint_applications" counts alone.
+        - "seconds": of the updates.
+        - "warning": only if the controller ends with one.
+        - "diverged": only if the loss or the metric was no longer finite. It says where and why. The training stops
+          there, and the curves end with that interval, with a metric of NaN and no costs.
+
+    Raises:
+        ValueError, TypeError: network, data or checkpoint do not fit the scene. Network and data are checked before
+            any work.
     """
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):
             raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
+    if not scene.trains_network and (data is not None or network is not None):
+        raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene.training.intervals, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
-        task = _network(scene, steppers, seed, network, on_data)
+        task = _network(scene, steppers, seed, network, datasets.of_scene(scene, data, on_data))
     else:
         task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
     try:
@@ -278,8 +300,8 @@ def _per_sample(counts):
 
 
 def propagator(scene, network):
-    """A trained network as a step u → u_next: the network itself, or (task "corrector") a converged step
-    of the coarse solver with the network on top."""
+    """Return a trained network as a function that makes one time step. This is the network itself; for the task
+    "corrector" it is a converged step of the coarse solver, corrected by the network."""
     if scene.task == "emulator":
         return network
     converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
@@ -287,16 +309,18 @@ def propagator(scene, network):
 
 
 def error(scene, u, reference):
-    """The mean over the samples of (‖u - reference‖ / ‖reference‖)², of a corrector of the velocity along
-    x: what the validation metric says at its step."""
+    """Return the validation error of states u: the mean over the samples of (‖u - reference‖ / ‖reference‖)². For a
+    corrector only the velocity along x counts."""
     of = slice(0, 1) if scene.task == "corrector" else slice(None)
     return float(_C.normalised_mse(u[:, of], reference[:, of]))
 
 
-def _network(scene, steppers, seed, network, on_data):
+def _network(scene, steppers, seed, network, data):
     """An interval is an epoch, the metric that of validation."""
-    data = _C.make_dataset(scene, on_data)
-    network = make_network(scene, seed) if network is None else network
+    if network is None:
+        network = make_network(scene, seed)
+    else:
+        datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
     loss_of = objective(scene, steppers, data, network)
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from prdp_torch import _C, fields, records
+from prdp_torch import datasets, fields, records
 from prdp_torch.networks import make_network
 from prdp_torch.training import error, propagator
 
@@ -29,7 +29,7 @@ class Course:
 @dataclass
 class Trajectories:
     reference: torch.Tensor
-    """(samples, steps + 1, channels, *shape), as `_C.validation_trajectories` makes them."""
+    """(samples, steps + 1, channels, *shape), as `datasets.reference` makes them."""
     courses: list
     missing: list
     """Titles of the trainings that left no weights, or diverged."""
@@ -47,7 +47,7 @@ def collect(scene, rows, folder, on_data=None):
     networks = {row.label: _networks(scene, row, folder) for row in rows}
     if not any(networks.values()):
         return None
-    reference = _C.validation_trajectories(scene, _FURTHER * scene.data.valid_steps, on_data)
+    reference = datasets.reference(scene, _FURTHER * scene.data.valid_steps, on_data)
     courses = [
         _follow(scene, row.title, row.kind, networks[row.label], reference) for row in rows if networks[row.label]
     ]

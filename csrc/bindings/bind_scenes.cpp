@@ -25,6 +25,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("periodic", &Scene::Physics::periodic)
       .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);
   py::class_<Scene::Data>(m, "Data")
+      .def_readonly("file", &Scene::Data::file)
       .def_readonly("modes", &Scene::Data::modes)
       .def_readonly("train", &Scene::Data::train)
       .def_readonly("valid", &Scene::Data::valid)
@@ -98,6 +99,8 @@ void bind_scenes(py::module_& m) {
   m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress(),
         py::call_guard<py::gil_scoped_release>());
   m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
+        py::arg("on_progress") = OnProgress(), py::call_guard<py::gil_scoped_release>());
+  m.def("all_trajectories", &all_trajectories, py::arg("scene"), py::arg("steps"),
         py::arg("on_progress") = OnProgress(), py::call_guard<py::gil_scoped_release>());
   py::class_<ParameterProblem>(m, "ParameterProblem")
       .def_readonly("modes", &ParameterProblem::modes)

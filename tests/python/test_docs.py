@@ -1,7 +1,9 @@
 """The README and the pages of docs/: every Python block runs, and what the others name exists."""
 
+import inspect
 import re
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +12,7 @@ import pytest
 import torch
 import typer.main
 
+import prdp_torch as prdp
 from prdp_torch import cli, scenes
 
 ROOT = Path(__file__).parents[2]
@@ -110,11 +113,13 @@ def test_the_files_and_targets_of_the_shell_blocks_exist(block):
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=lambda block: f"{block.page}:{block.line}")
 def test_the_scenes_are_read(block, tmp_path):
-    """A block without a title is a part of a scene: its keys are put into heat_1d."""
+    """A block without a title is a part of a scene: its keys are put into heat_1d. Data from a file replace its own."""
     path = tmp_path / "scene.toml"
     content = tomllib.loads(block.code)
     if "title" not in content:
         whole = tomllib.loads(scenes.available()["heat_1d"].read_text())
+        if "file" in content.get("data", {}):
+            del whole["data"]
         for name, value in content.items():
             whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value
         content = whole
@@ -150,9 +155,25 @@ SECTIONS = {
 }
 
 
+# What the page calls the values that a function of the reader takes.
+TYPES = {
+    "whole": "whole number >=",
+    "count": "whole number >=",
+    "wholes": "whole numbers",
+    "above": "number >",
+    "at_least": "number >=",
+    "numbers": "numbers",
+    "text": "text",
+    "flag": "`true`, `false`",
+    "section": "table",
+    "choice": "`",
+}
+
+
 @pytest.mark.parametrize("section", SECTIONS)
 def test_the_key_tables_hold_what_the_reader_asks_for(section):
-    """Keys both ways; the names to choose from and the lower bounds that the reader gives as literals."""
+    """Keys both ways, their types and whether they have a default; the names to choose from and the lower bounds that
+    the reader gives as literals."""
     functions = re.search(SECTIONS[section], READER, re.MULTILINE | re.DOTALL)
     source = "".join(functions.groups())
     text = re.search(rf"^### {re.escape(section)}\n(.*?)(?=^##|\Z)", PAGES["docs/command_line.md"], re.M | re.S)[1]
@@ -162,7 +183,11 @@ def test_the_key_tables_hold_what_the_reader_asks_for(section):
     assert set(rows) == {key for call, key, _ in asked if call != "fail"}
     chosen = set(re.findall(r'"([a-z]\w*)"', source)) - {key for _, key, _ in asked}
     assert all(f"`{name}`" in text for name in chosen)
+    optional = {key for call, key, _ in asked if call in ("has", "flag")}
     for call, key, bound in asked:
+        if call != "fail":
+            value, default, *_ = re.split(r"(?<!\\)\|", rows[key])
+            assert TYPES.get(call, "") in value and bool(default.strip()) == (key in optional), key
         if bound:
             assert f"{'>' if call == 'above' else '>='} {float(bound):g}" in rows[key], key
 
@@ -196,3 +221,33 @@ def test_the_links_to_files_lead_somewhere(page):
 def test_every_page_is_in_the_navigation():
     named = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
     assert named == {Path(page).name for page in PAGES if page.startswith("docs/")}
+
+
+def documented():
+    """What docs/api.md renders: {path: the names that it is limited to, or None}."""
+    entries = re.split(r"^::: ", PAGES["docs/api.md"], flags=re.MULTILINE)[1:]
+    limits = (re.search(r"^ +members: \[(.*)\]$", entry, re.MULTILINE) for entry in entries)
+    return {
+        entry.split()[0]: limit and set(re.split(", *", limit[1])) for entry, limit in zip(entries, limits, strict=True)
+    }
+
+
+def public_names():
+    """(module, name) of all that `import prdp_torch` offers: its own names and those of its modules."""
+    for name in [*prdp.__all__, *prdp._LAZY]:
+        value = getattr(prdp, name)
+        if not inspect.ismodule(value):
+            yield "prdp_torch", name
+            continue
+        for inner, content in vars(value).items():
+            if not inner.startswith("_") and getattr(content, "__module__", None) == value.__name__:
+                yield value.__name__, inner
+
+
+@pytest.mark.parametrize("module, name", list(public_names()))
+def test_the_reference_has_every_public_name(module, name):
+    rendered = documented()
+    home = getattr(getattr(sys.modules[module], name), "__module__", module)
+    whole = [path for path in (module, home) if path in rendered and (rendered[path] is None or name in rendered[path])]
+    assert whole or f"{module}.{name}" in rendered
+    assert inspect.getdoc(getattr(sys.modules[module], name))

@@ -259,7 +259,8 @@ def test_a_compiled_rollout_follows_k_and_compiles_at_most_twice(name, backward)
             gradients.append(u.grad)
             assert eager.info.iterations.tolist() == [[k] * 3] * 2
         assert torch.equal(*gradients)
-    assert counter.frame_count <= 2
+    # For the first K and for all others; and dynamo repeats the first, when it finds that rtol is a constant.
+    assert counter.frame_count <= 3
 
 
 def test_a_compiled_rollout_follows_the_number_of_steps():

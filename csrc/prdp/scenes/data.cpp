@@ -67,6 +67,7 @@ namespace {
 /// Initial states of all samples, on the grid of the reference; those of the training come first.
 at::Tensor starts(const Scene& scene) {
   const auto& d = scene.data;
+  TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5; run prdp train ", scene.path);
   const int64_t samples = d.train + d.valid;
   if (scene.task == Scene::Task::kCorrector) return random_flow(d.reference_shape, samples, d.seed);
   return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
@@ -114,15 +115,28 @@ Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
 
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto make = [&] { return compute_dataset(scene, on_progress); };
-  return scene.physics.direct_is_cheap() ? make() : cached_dataset(scene, make);
+  return scene.physics.direct_is_cheap() || !scene.data.file.empty() ? make() : cached_dataset(scene, make);
 }
 
+namespace {
+
+/// Of so many samples, the `first` one on.
+at::Tensor trajectories_of(const char* who, const Scene& scene, int64_t first, int64_t samples, int64_t steps,
+                           const OnProgress& on_progress) {
+  TORCH_CHECK_VALUE(scene.trains_network(), who, ": the task trains no network and has no samples");
+  TORCH_CHECK_VALUE(steps >= 0, who, ": steps must be >= 0, got ", steps);
+  return follow(scene, starts(scene).narrow(0, first, samples), steps, counted(steps * samples, on_progress));
+}
+
+}  // namespace
+
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress) {
-  TORCH_CHECK_VALUE(scene.trains_network(), "validation_trajectories: the task trains no network and has no "
-                    "validation samples");
-  TORCH_CHECK_VALUE(steps >= 0, "validation_trajectories: steps must be >= 0, got ", steps);
   const auto& d = scene.data;
-  return follow(scene, starts(scene).narrow(0, d.train, d.valid), steps, counted(steps * d.valid, on_progress));
+  return trajectories_of("validation_trajectories", scene, d.train, d.valid, steps, on_progress);
+}
+
+at::Tensor all_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress) {
+  return trajectories_of("all_trajectories", scene, 0, scene.data.train + scene.data.valid, steps, on_progress);
 }
 
 ParameterProblem make_parameter_problem(const Scene& scene) {

@@ -35,6 +35,8 @@ Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 /// (samples, steps + 1, channels, *shape): at step data.valid_steps what `make_dataset` gives, and as far
 /// beyond as wanted. Raises ValueError for a task that trains no network, which has no samples, and for steps < 0.
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
+/// The same of all samples, the training's first.
+at::Tensor all_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
 
 /// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).
 struct ParameterProblem {

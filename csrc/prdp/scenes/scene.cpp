@@ -58,19 +58,24 @@ void read_solver(TomlSection s, Scene& scene) {
 
 Scene::Data read_data(TomlSection s, const Scene& scene) {
   Scene::Data d;
-  if (scene.task == Task::kEmulator) {
-    d.modes = s.whole("modes", 1);
+  const bool corrector = scene.task == Task::kCorrector;
+  if (s.has("file")) {
+    d.file = s.text("file");
   } else {
-    d.reference_shape = s.wholes("reference_shape", 1);
-    auto finer = scene.physics.shape;
-    for (auto& n : finer) n = 2 * n + 1;
-    if (d.reference_shape != finer)
-      s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
-    d.valid_max_iter = s.count("valid_max_iter", 1);
+    if (corrector) {
+      d.reference_shape = s.wholes("reference_shape", 1);
+      auto finer = scene.physics.shape;
+      for (auto& n : finer) n = 2 * n + 1;
+      if (d.reference_shape != finer)
+        s.fail("reference_shape", "expected 2 N + 1 for each N of physics.shape");
+    } else {
+      d.modes = s.whole("modes", 1);
+    }
+    d.seed = s.whole("seed", 0);
   }
+  if (corrector) d.valid_max_iter = s.count("valid_max_iter", 1);
   d.train = s.whole("train", 1);
   d.valid = s.whole("valid", 1);
-  d.seed = s.whole("seed", 0);
   d.valid_steps = s.whole("valid_steps", 1);
   s.finish();
   return d;

@@ -44,6 +44,9 @@ struct Scene {
     // Of a corrector: the grid of the reference, which it never sees, and the converged K of the metric.
     std::vector<int64_t> reference_shape{};
     int64_t valid_max_iter = 0;
+    // HDF5 file of trajectories in place of random initial states, relative to the folder of the scene's file; empty:
+    // none. Only the Python trainer reads it.
+    std::string file{};
   };
   struct Network {
     std::string kind;             // "mlp" or "resnet"

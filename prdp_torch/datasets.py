@@ -1,0 +1,159 @@
+"""What a network is trained on: data that the scene makes, a file of trajectories, or your own tensors."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from prdp_torch import _C, pdebench
+
+TRAINED_STEPS = 2  # that the loss looks ahead
+
+
+class Data(NamedTuple):
+    """Training and validation states; each (samples, channels, *shape)."""
+
+    train_start: torch.Tensor
+    train_first: torch.Tensor
+    """One step later."""
+    train_end: torch.Tensor
+    """Two steps later."""
+    valid_start: torch.Tensor
+    valid_end: torch.Tensor
+    """`data.valid_steps` steps later."""
+
+
+def of_scene(scene, own=None, on_data=None):
+    """The data of a training.
+
+    Args:
+        scene: from `prdp_torch.scenes.load`.
+        own: trajectories in place of the scene's: a tensor, an array or a dataset of trajectories, whose first
+            `data.train` train and whose next `data.valid` validate; or a pair of them, for training and validation.
+            Every state of a training trajectory that two more follow is a start.
+        on_data: as in `training.train`.
+
+    Raises ValueError or TypeError, in words, if the trajectories do not fit the scene.
+    """
+    if own is None and not scene.data.file:
+        return _C.make_dataset(scene, on_data)
+    if own is None:
+        own = pdebench.read(path_of(scene), scene)
+    pair = own if isinstance(own, (tuple, list)) else _split(scene, _tensor(scene, "data", own))
+    if len(pair) != 2:
+        raise ValueError(f"train: data must be trajectories, or a pair (training, validation), got {len(pair)} of them")
+    train, valid = (_tensor(scene, name, part) for name, part in zip(("data[0]", "data[1]"), pair, strict=True))
+    _check_times("training", train, TRAINED_STEPS)
+    _check_times("validation", valid, scene.data.valid_steps)
+    starts, first, end = (
+        train[:, n : train.shape[1] - TRAINED_STEPS + n].flatten(0, 1) for n in range(TRAINED_STEPS + 1)
+    )
+    return Data(starts, first, end, valid[:, 0].contiguous(), valid[:, scene.data.valid_steps].contiguous())
+
+
+def reference(scene, steps, on_data=None):
+    """Validation trajectories of `steps` steps, or of as many as the scene's file has: (samples, steps + 1,
+    channels, *shape)."""
+    if not scene.data.file:
+        return _C.validation_trajectories(scene, steps, on_data)
+    return pdebench.read(path_of(scene), scene)[scene.data.train :, : steps + 1]
+
+
+def export(scene, path, steps=None, on_data=None):
+    """Write the trajectories of a scene to an HDF5 file that `[data] file` reads. Returns their shape.
+
+    Args:
+        scene: a scene that trains a network and makes its own data.
+        path: of the file, in PDEBench's layout (`prdp_torch.pdebench`).
+        steps: how many steps each has; by default what the training and the validation metric need.
+    """
+    steps = max(TRAINED_STEPS, scene.data.valid_steps) if steps is None else steps
+    trajectories = _C.all_trajectories(scene, steps, on_data)
+    pdebench.write(path, trajectories, scene)
+    return tuple(trajectories.shape)
+
+
+def path_of(scene):
+    """The file of a scene's data, which is relative to the scene's own."""
+    return Path(scene.path).parent / scene.data.file
+
+
+def fingerprint(scene):
+    """What tells the file of a scene's data from another one: its size and the bytes at both ends."""
+    path = path_of(scene)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(2**20)
+            size = file.seek(0, 2)
+            file.seek(max(0, size - 2**20))
+            return _C.fingerprint(head + file.read() + str(size).encode())
+    except OSError as error:
+        raise ValueError(f"data: cannot read '{path}': {error.strerror}") from None
+
+
+def check_network(scene, network, states):
+    """Raise TypeError or ValueError unless the network takes states of the scene to states, and can be trained."""
+    if not isinstance(network, torch.nn.Module):
+        raise TypeError(f"train: network must be a torch.nn.Module, got {type(network).__name__}")
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    if not trained:
+        raise ValueError("train: network has no parameters that require a gradient")
+    other = {str(p.dtype).removeprefix("torch.") for p in trained if p.dtype != scene.dtype}
+    if other:
+        wanted = str(scene.dtype)
+        raise ValueError(
+            f"train: the scene computes in {wanted.removeprefix('torch.')}, but network has parameters in "
+            f"{', '.join(sorted(other))}; call network.to({wanted})"
+        )
+    modes = [(module, module.training) for module in network.modules()]
+    network.eval()  # the trial leaves running means as they are
+    try:
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            answer = network(states)
+    except RuntimeError as error:
+        raise ValueError(f"train: network fails on states {tuple(states.shape)}: {_C.sentence(str(error))}") from error
+    finally:
+        for module, mode in modes:
+            module.training = mode
+    if not isinstance(answer, torch.Tensor) or answer.shape != states.shape:
+        got = tuple(answer.shape) if isinstance(answer, torch.Tensor) else type(answer).__name__
+        raise ValueError(f"train: network must keep the shape of its input, {tuple(states.shape)}, got {got}")
+
+
+def _split(scene, trajectories):
+    """Training and validation trajectories, by the numbers of the scene."""
+    train, valid = scene.data.train, scene.data.valid
+    if len(trajectories) < train + valid:
+        raise ValueError(
+            f"train: data has {len(trajectories)} trajectories; data.train + data.valid of the scene is "
+            f"{train + valid}; a pair (training, validation) may have any number"
+        )
+    return trajectories[:train], trajectories[train : train + valid]
+
+
+def _tensor(scene, name, own):
+    """Trajectories as a tensor of the scene's dtype, checked."""
+    if isinstance(own, torch.utils.data.Dataset):
+        items = [own[i] for i in range(len(own))]
+        own = torch.stack([item[0] if isinstance(item, (tuple, list)) and len(item) == 1 else item for item in items])
+    try:
+        own = torch.as_tensor(own)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"train: {name} must be trajectories as a tensor, got {type(own).__name__}") from None
+    shape = (scene.physics.channels, *scene.physics.shape)
+    if own.dim() != 2 + len(shape) or own.shape[2:] != shape or own.numel() == 0:
+        wanted = ", ".join(map(str, shape))
+        raise ValueError(f"train: {name} must have shape (samples, times, {wanted}), got {tuple(own.shape)}")
+    if not own.is_floating_point():
+        raise TypeError(f"train: {name} must hold floating-point numbers, got {own.dtype}")
+    own = own.detach().to("cpu", scene.dtype)
+    pdebench.check_finite(f"train: {name}", own)
+    return own
+
+
+def _check_times(what, trajectories, steps):
+    if trajectories.shape[1] <= steps:
+        raise ValueError(
+            f"train: {what} trajectories need {steps + 1} times, for {steps} steps, but the data have "
+            f"{trajectories.shape[1]}"
+        )

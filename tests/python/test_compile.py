@@ -1,0 +1,78 @@
+"""`torch.compile` as users call it, without fullgraph: one graph, no warning, whatever K becomes."""
+
+import logging
+
+import pytest
+import torch
+import torch._dynamo.testing
+from helpers import field
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+class Own(torch.nn.Module):
+    """A(u) of a trained number and a right-hand side, in a module of its own."""
+
+    def __init__(self):
+        super().__init__()
+        self.nu = torch.nn.Parameter(torch.tensor(1e-3, dtype=torch.float64))
+
+    def forward(self, u):
+        return operators.Burgers(u, self.nu, 1e-2)
+
+
+NETWORK = torch.nn.Conv1d(1, 1, 3, padding=1, dtype=torch.float64)
+STEPPERS = {
+    "heat": lambda: prdp.Heat((16,), 1e-3, 1.0, solver=prdp.Jacobi(1)),
+    "unrolled": lambda: prdp.Heat((16,), 1e-3, 1.0, solver=prdp.CG(1), backward="unrolled"),
+    "burgers": lambda: prdp.Burgers((16,), 1e-3, 1e-2, solver=prdp.GMRES(1, restart=2)),
+    "constant": lambda: prdp.ImplicitStep(operators.Heat((16,), 1e-3, 1.0), lambda u: u + 0.1 * u**2, prdp.CG(1)),
+    "own": lambda: prdp.ImplicitStep(Own(), solver=prdp.GMRES(1, restart=2)),
+}
+COUNTER = torch._dynamo.testing.CompileCounter()
+USES = {
+    "step": lambda step, u: step(NETWORK(u)),
+    "rollout": lambda step, u: step.rollout(NETWORK(u), 3),
+}
+
+
+class Warnings(logging.Handler):
+    def __init__(self):
+        super().__init__(logging.WARNING)
+        self.said = []
+
+    def emit(self, record):
+        self.said.append(record.getMessage())
+
+
+@pytest.fixture
+def no_log():
+    """Fails where torch.compile says anything at the level of a warning."""
+    torch._dynamo.reset()
+    torch._dynamo.variables.TensorVariable._warn_capture_scalar_outputs.cache_clear()  # it says so once a process
+    handler, log = Warnings(), logging.getLogger("torch._dynamo")
+    log.addHandler(handler)
+    yield
+    log.removeHandler(handler)
+    assert not handler.said
+
+
+@pytest.mark.parametrize("backend", [COUNTER, "aot_eager"], ids=["counter", "aot_eager"])
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("name", STEPPERS)
+def test_a_step_is_one_graph_without_a_warning_and_follows_k(no_log, name, use, backend):
+    step, eager = STEPPERS[name](), STEPPERS[name]()
+    assert torch._dynamo.explain(lambda u: USES[use](step, u))(field((16,))).graph_break_count == 0
+    torch._dynamo.reset()
+    COUNTER.clear()
+    compiled = torch.compile(lambda u: USES[use](step, u), backend=backend)
+    for k in (1, 2, 5, 9):
+        step.max_iter = eager.max_iter = k
+        u, v = (field((16,)).requires_grad_() for _ in range(2))
+        compiled(u).square().sum().backward()
+        USES[use](eager, v).square().sum().backward()
+        torch.testing.assert_close(u.grad, v.grad, rtol=1e-12, atol=0)
+        assert torch.equal(step.info.iterations, eager.info.iterations)
+    if backend is COUNTER:
+        assert COUNTER.frame_count <= 2  # as with fullgraph=True
