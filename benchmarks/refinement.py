@@ -51,8 +51,7 @@ def main():
     environment = records.environment()
     for row in rows:
         for seed in range(options.seeds):
-            silent = lambda done, metric, k: None  # noqa: E731
-            run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, silent)
+            run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, [])
             row.curves.append(run)
         table = compare.summarise(scene, rows[: rows.index(row) + 1])
         print(_line(table[-1]), flush=True)
