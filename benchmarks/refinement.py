@@ -21,14 +21,18 @@ def rows_of(scene):
         Row("converged", f"converged, K = {converged}", "converged", Refinement.constant(converged), converged),
         Row("prdp", "PRDP, tuned", "prdp", Refinement.prdp(scene)),
         Row("prdp_defaults", "PRDP, defaults", "prdp", Refinement("prdp_defaults", PRDPController)),
-        _tolerance("tolerance", "tolerance", adjoint_ratio=1.0),
-        _tolerance("tolerance_adjoint", "tolerance, adjoint 10 times looser"),
+        _tolerance("tolerance", "tolerance", adjoint_ratio=1.0, adjoint_floor=1e-5),
+        _tolerance("tolerance_adjoint", "tolerance, adjoint looser"),
         Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
     ]
 
 
-def _tolerance(label, title, **settings):
-    attach = lambda steppers: ToleranceController(steppers, **settings)  # noqa: E731
+def _tolerance(label, title, start="zero", **settings):
+    def attach(steppers):
+        for stepper in steppers:
+            stepper.start = start
+        return ToleranceController(steppers, **settings)
+
     return Row(label, title, "auto", Refinement(label, attach, watches_error=True))
 
 
@@ -47,8 +51,7 @@ def main():
     environment = records.environment()
     for row in rows:
         for seed in range(options.seeds):
-            silent = lambda done, metric, k: None  # noqa: E731
-            run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, silent)
+            run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, [])
             row.curves.append(run)
         table = compare.summarise(scene, rows[: rows.index(row) + 1])
         print(_line(table[-1]), flush=True)

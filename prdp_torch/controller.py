@@ -206,6 +206,8 @@ class ToleranceController(_C.ToleranceController, _Attached):
         adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
             ⌈adjoint_ratio·K⌉; in (0, 1].
         floor: the smallest rtol; > 0. In float32 solves reach about 1e-5.
+        adjoint_floor: the smallest rtol of the adjoint solve; > 0. That rtol is relative to a cotangent that shrinks
+            with the error, and a descent needs no better gradient late than early.
         maximum: K >= 1. It is only a limit, which the solves should not reach.
         process_group: as for `PRDPController`. The error is averaged over the processes.
 

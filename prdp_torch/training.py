@@ -35,8 +35,14 @@ class Refinement:
 
     @classmethod
     def auto(cls):
-        """A tolerance that follows the error, with nothing to choose (`ToleranceController`)."""
-        return cls("auto", ToleranceController, watches_error=True)
+        """A tolerance that follows the error (`ToleranceController`), and starts from the state: nothing to choose."""
+
+        def attach(steppers):
+            for stepper in steppers:
+                stepper.start = "state"
+            return ToleranceController(steppers)
+
+        return cls("auto", attach, watches_error=True)
 
     @classmethod
     def prdp(cls, scene, growth=None):

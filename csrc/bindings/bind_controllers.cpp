@@ -51,7 +51,7 @@ void bind_interface(py::module_& m) {
 
 py::dict as_dict(const ToleranceSettings& s) {
   return py::dict("ratio"_a = s.ratio, "adjoint_ratio"_a = s.adjoint_ratio, "floor"_a = s.floor,
-                  "maximum"_a = s.maximum);
+                  "adjoint_floor"_a = s.adjoint_floor, "maximum"_a = s.maximum);
 }
 
 }  // namespace
@@ -78,10 +78,10 @@ void bind_controllers(py::module_& m) {
       .def_property_readonly("settings", [](const PRDPController& c) { return as_dict(c.settings()); });
 
   py::class_<ToleranceController, Controller>(m, "ToleranceController")
-      .def(py::init([](double ratio, double adjoint_ratio, double floor, int64_t maximum) {
-             return ToleranceController({ratio, adjoint_ratio, floor, maximum});
+      .def(py::init([](double ratio, double adjoint_ratio, double floor, double adjoint_floor, int64_t maximum) {
+             return ToleranceController({ratio, adjoint_ratio, floor, adjoint_floor, maximum});
            }),
-           py::kw_only(), "ratio"_a, "adjoint_ratio"_a, "floor"_a, "maximum"_a)
+           py::kw_only(), "ratio"_a, "adjoint_ratio"_a, "floor"_a, "adjoint_floor"_a, "maximum"_a)
       .def_property_readonly("rtol", &ToleranceController::rtol)
       .def_property_readonly("adjoint_rtol", &ToleranceController::adjoint_rtol)
       .def("_rtol_for", &ToleranceController::rtol_for, "smallest"_a)

@@ -31,6 +31,7 @@ namespace prdp::train {
 Refinement automatic() {
   Refinement refinement{"auto", [] { return std::make_unique<ToleranceController>(); }};
   refinement.watches_error = true;
+  refinement.start = Start::kState;
   return refinement;
 }
 
@@ -88,6 +89,8 @@ class Run {
         controller_(refinement.controller()),
         checkpoint_(checkpoint),
         saved_(checkpoint.read()) {
+    if (refinement.start)
+      for (auto* stepper : steppers_) stepper->options().start = *refinement.start;
     take_budget();
   }
 

@@ -1,6 +1,7 @@
 #pragma once
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -18,6 +19,7 @@ struct Refinement {
   std::function<std::unique_ptr<Controller>()> controller;
   bool direct = false;
   bool watches_error = false;  // the controller is given the relative error, not the metric
+  std::optional<Start> start{};  // in place of the scene's
 };
 /// What fits every scene with nothing chosen for it; docs/refinement.md says why.
 Refinement automatic();

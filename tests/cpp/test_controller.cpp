@@ -119,6 +119,7 @@ TEST(ToleranceController, TiesTheToleranceToTheSmallestErrorSoFar) {
   EXPECT_DOUBLE_EQ(controller.rtol(), 0.04);
   EXPECT_TRUE(controller.step(0.0));
   EXPECT_DOUBLE_EQ(controller.rtol(), 1e-3);
+  EXPECT_DOUBLE_EQ(controller.adjoint_rtol(), 1e-2);  // its floor
   EXPECT_EQ(controller.max_iter(), 10000);
   EXPECT_EQ(controller.budget().adjoint_max_iter, 2000);
 }
@@ -138,6 +139,7 @@ TEST(ToleranceController, ABadErrorRaisesAndChangesNothing) {
   EXPECT_THROW(prdp::ToleranceController({.ratio = 1.0}), c10::ValueError);
   EXPECT_THROW(prdp::ToleranceController({.adjoint_ratio = 0.0}), c10::ValueError);
   EXPECT_THROW(prdp::ToleranceController({.floor = 0.0}), c10::ValueError);
+  EXPECT_THROW(prdp::ToleranceController({.adjoint_floor = 0.0}), c10::ValueError);
   EXPECT_THROW(prdp::ToleranceController({.maximum = 0}), c10::ValueError);
 }
 

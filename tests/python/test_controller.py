@@ -205,7 +205,7 @@ def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(erro
     for i in range(len(errors) + 1):
         expected = max(1e-3, 0.2 * min([1.0, *errors[:i]]))
         assert heat.rtol == controller.rtol == pytest.approx(expected)
-        assert heat.adjoint_rtol == controller.adjoint_rtol == pytest.approx(min(0.5, 4 * expected))
+        assert heat.adjoint_rtol == controller.adjoint_rtol == pytest.approx(max(1e-2, min(0.5, 4 * expected)))
         assert (heat.max_iter, heat.adjoint_max_iter) == (10000, 2500)
         if i < len(errors):
             assert controller.step(errors[i]) == (controller.rtol < expected)
@@ -254,7 +254,7 @@ def test_a_bad_error_raises_and_changes_nothing(bad):
         ({"floor": 0.0}, ValueError, "floor must be > 0 and < 1, got 0"),
         ({"maximum": 0}, ValueError, "maximum must be >= 1, got 0"),
         ({"maximum": 1.5}, TypeError, "maximum must be a whole number, got 1.5"),
-        ({"tau_step": 0.9}, TypeError, "unknown setting 'tau_step'; allowed: ratio, adjoint_ratio, floor, maximum"),
+        ({"tau_step": 0.9}, TypeError, "unknown setting 'tau_step'; allowed: ratio, adjoint_ratio, floor, adjoint_floor, maximum"),
     ],
 )
 def test_bad_settings_of_a_tolerance_raise_by_name(settings, error, message):

@@ -257,3 +257,20 @@ def test_spd_systems_never_fail():
     for solver in SOLVERS:
         _, info = prdp.linear_solve(m, b, solver(500))
         assert (info.status > 0).all()
+
+
+@pytest.mark.parametrize("method", [prdp.Jacobi, prdp.Chebyshev])
+@pytest.mark.parametrize("backward", ["implicit", "none"])
+def test_sweeps_notice_that_they_are_at_their_rounding(method, backward):
+    """Jacobi reaches 6e-6 of Poisson's load in float32, and then nothing less however long it goes on."""
+    x = torch.linspace(0, 1, 32)[1:-1]
+    loads = torch.stack([torch.sin(2 * torch.pi * k * x) for k in (1, 2, 3)])[:, None].requires_grad_()
+    poisson = prdp.Poisson((30,), method(100_000, rtol=1e-7), backward=backward)
+    u = poisson(loads)
+    assert statuses(poisson.info) == ["STAGNATED"] * 3
+    assert (poisson.info.iterations < 1500).all() and (poisson.info.residual < 3e-5).all()
+    if backward == "implicit":
+        u.backward(loads.detach())
+        assert statuses(poisson.adjoint_info) == ["STAGNATED"] * 3 and (poisson.adjoint_info.iterations < 1500).all()
+    exact = prdp.Poisson((30,), prdp.Direct())(loads.detach().double())
+    torch.testing.assert_close(u.double(), exact, rtol=0, atol=1e-4 * float(exact.abs().max()))

@@ -12,6 +12,8 @@ ToleranceController::ToleranceController(ToleranceSettings settings)
   const auto& s = settings_;
   TORCH_CHECK_VALUE(s.ratio > 0.0 && s.ratio < 1.0, "ToleranceController: ratio must be > 0 and < 1, got ", s.ratio);
   TORCH_CHECK_VALUE(s.floor > 0.0 && s.floor < 1.0, "ToleranceController: floor must be > 0 and < 1, got ", s.floor);
+  TORCH_CHECK_VALUE(s.adjoint_floor > 0.0 && s.adjoint_floor < 1.0,
+                    "ToleranceController: adjoint_floor must be > 0 and < 1, got ", s.adjoint_floor);
   TORCH_CHECK_VALUE(s.maximum >= 1, "ToleranceController: maximum must be >= 1, got ", s.maximum);
   budget();
 }
@@ -22,7 +24,8 @@ double ToleranceController::rtol_for(double smallest) const {
 
 double ToleranceController::adjoint_rtol() const {
   constexpr double loosest = 0.5;
-  return std::max(rtol(), std::min(loosest, rtol() / settings_.adjoint_ratio));
+  const double wanted = std::max(settings_.adjoint_floor, rtol() / settings_.adjoint_ratio);
+  return std::max(rtol(), std::min(loosest, wanted));
 }
 
 Budget ToleranceController::budget() const {

@@ -111,14 +111,14 @@ inline void judge_progress(SampleState& s, bool exhausted) {
 /// judged with some slack.
 template <class Space, class Method, class Predicate>
 void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
-                            const Predicate& doubtful) {
+                            const Predicate& doubtful, double slack = 1.0) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
   const auto u2 = space.lanes(space.solution2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : 1.0;
-    if (doubtful(s) && std::sqrt(s.residual2) <= slack * space.epsilon() * norm_a[i] * std::sqrt(u2[i]))
+    const double bound = s.status == SolveStatus::kBreakdown ? 100.0 : slack;
+    if (doubtful(s) && std::sqrt(s.residual2) <= bound * space.epsilon() * norm_a[i] * std::sqrt(u2[i]))
       s.stop(SolveStatus::kStagnated);
   }
 }
@@ -172,6 +172,13 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     s.active = true;
     s.claims = rtol > 0.0;
     any_claims = any_claims || s.claims;
+  }
+  if constexpr (kTakesStrides<Method>) {  // sweeps go on at their rounding for ever, and never claim what is below it
+    constexpr int64_t patience = 128;
+    const auto is_still = [rtol](const SampleState& s) {
+      return rtol > 0.0 && s.active && !s.claims && s.iterations - s.best > patience;
+    };
+    stop_at_rounding_floor(space, method, states, is_still, /*slack=*/4.0);
   }
   if (!any_claims) return;
 
