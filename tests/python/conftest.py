@@ -3,6 +3,11 @@
 import signal
 
 import pytest
+from hypothesis import settings
+
+# The same cases in every run; `pytest --hypothesis-profile default` draws new ones.
+settings.register_profile("fixed", derandomize=True)
+settings.load_profile("fixed")
 
 # A shell starts what it runs in the background with Ctrl-C ignored, and children inherit that: the tests
 # that interrupt a training would wait for ever.
