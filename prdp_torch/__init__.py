@@ -17,7 +17,7 @@ from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
-from prdp_torch.solve import SolveInfo, SolveStatus, linear_solve  # noqa: E402
+from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
 from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent  # noqa: E402
 from prdp_torch.stepper import Stepper  # noqa: E402
 from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson  # noqa: E402
@@ -46,6 +46,7 @@ __all__ = [
     "advise",
     "check_operator",
     "datasets",
+    "detach_failed",
     "fields",
     "linear_solve",
     "load_trained",

@@ -231,6 +231,26 @@ def bench(
         raise typer.Exit(done.returncode)
 
 
+@command
+def stability(
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="A map; give it again for more. All.")] = None,
+    out: out("runs/stability") = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A few points of each map, to see that all of it runs.")
+    ] = False,
+):
+    """Map where the methods work and where they break: a picture and a record for each question."""
+    from prdp_torch import atlas
+
+    folder = records.prepare_folder(out or Path("runs") / "stability")
+
+    def show(name, answer, seconds):
+        console.print(f"{name}: {atlas.MAPS[name].question} {answer} ({seconds:.0f} s)", soft_wrap=True)
+
+    atlas.run(folder, only or (), quick, show)
+    console.print(f"pictures and records: {folder}", soft_wrap=True)
+
+
 def _load(scene, backward, intervals):
     loaded = scene_files.load(scene)
     if backward is not None:

@@ -131,8 +131,10 @@ class PRDPController(_C.PRDPController, _Attached):
         growth: a refinement raises K to growth·K where that is more than K + increment.
         adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations. None leaves them to the stepper.
 
-    K is not raised while every solve of the steppers meets its tolerance. `warning` is None, or says in words that
-    the solves stop so far from the solution that their error dominates what is trained. Every controller has it.
+    K is not raised while every solve of the steppers meets its tolerance. `warning`, which every controller
+    has, is None or says in words what is wrong: the solves stop so far from the solution that their error dominates
+    what is trained; the metric grows (more than twice its least value, three times in a row); or the last `step`
+    refused it. K is raised for a metric that grows as it is on a plateau.
 
     Raises:
         ValueError, TypeError: a setting or a metric is out of range or of a wrong type.

@@ -6,6 +6,7 @@ import torch
 
 from prdp_torch import _C, operators
 from prdp_torch.implicit_step import ImplicitStep
+from prdp_torch.solve import detach_failed
 from prdp_torch.task import Task
 
 
@@ -33,6 +34,8 @@ def misfit(scene, stepper, problem, theta):
     """The mean over the states of (‖u - u_observed‖ / ‖u_observed‖)² over all snapshots."""
     stepper.operator_at.take(theta.exp())
     states = stepper.rollout(problem.start, scene.field.steps)
+    if scene.on_failure == "zero_grad":
+        states = detach_failed(states, stepper.info)
     return _C.normalised_mse(_C.observed(states, scene), problem.snapshots)
 
 
@@ -54,7 +57,7 @@ def make_task(scene, steppers, seed):
         loss.backward()
         optimiser.step()
         relative = math.sqrt(squared.detach())
-        yield float(loss.detach())
+        yield float(loss.detach()), None
 
     def metric():
         return float(_C.relative_error(theta.detach().exp(), problem.reference))

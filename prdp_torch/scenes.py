@@ -38,13 +38,14 @@ def make_stepper(scene, direct=False, max_iter=None):
         direct: whether to use the exact solver in place of the scene's.
         max_iter: K in place of the scene's.
 
-    A failed sample is only reported in the status, because poorly converged steps may diverge early in a training.
+    A failed sample does not raise, because poorly converged steps may diverge early in a training. The scene's
+    `on_failure` says whether it gets a gradient.
     """
     physics = scene.physics
     options = {
         "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
-        "on_failure": "return",
+        "on_failure": scene.on_failure,
         "start": scene.start,
     }
     if physics.equation == "diffusion":

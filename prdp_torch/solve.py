@@ -68,12 +68,39 @@ class SolveInfo(NamedTuple):
         return f"SolveInfo({statuses}; {ranges})"
 
     @property
+    def failed(self):
+        """Which samples failed (bool): their status is below STAGNATED."""
+        return self.status < SolveStatus.STAGNATED
+
+    @property
     def adjoint(self):
         """The report of the adjoint solve, or None before `backward()`.
 
         Unrolled mode has no adjoint solve. Its report then has the iterations and the status of the solve itself,
         NaN as the residual, and the number of products in the whole backward pass."""
         return None if self.log is None else self.log.read()
+
+
+def detach_failed(u, info):
+    """Take the failed samples out of the derivative: u with their values as constants.
+
+    A solve with on_failure="zero_grad" passes no gradient through a failed sample. A loss may reach the weights by
+    other ways as well, such as a network on top of the step; then take them from the loss with this function.
+
+    Args:
+        u: (batch, ...), or the states (batch, steps + 1, ...) of a rollout.
+        info: the `SolveInfo` of the solve or the rollout. Of a rollout, a sample is constant from the step on that
+            failed.
+
+    Returns:
+        A tensor of the shape and the values of u; u itself where no sample failed.
+
+    Raises:
+        ValueError: u and info of different batches or steps.
+
+    >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
+    """
+    return torch.ops.prdp.detach_failed(u, info.status)
 
 
 def linear_solve(
@@ -100,8 +127,9 @@ def linear_solve(
             gradient.
         adjoint_max_iter, adjoint_rtol: limits of the adjoint solve. None takes those of the solver.
         on_failure: what happens if a sample diverges, overflows, breaks down or is not finite: "raise" a
-            torch.linalg.LinAlgError that names the samples, "warn", or "return". Reaching max_iter is not a
-            failure.
+            torch.linalg.LinAlgError that names the samples, "warn", "return", or "zero_grad". The last returns as
+            "return" does, and b and A get no gradient from the samples whose forward or adjoint solve failed.
+            Reaching max_iter is not a failure.
         checkpoint_every: for "unrolled" only. The backward pass needs all K iterates. With a number n it
             stores every n-th one and recomputes the others; "sqrt" stands for n = ⌈√K⌉, and None stores all.
             The gradient is the same bit for bit.

@@ -7,7 +7,9 @@ from typing import NamedTuple
 class Task(NamedTuple):
     """What a task supplies."""
 
-    updates: Callable  # the number of the first → an iterator over the losses of an interval's updates
+    # the number of the first → an iterator over an interval's updates: the loss, and the numbers of the samples among
+    # the data where they have any
+    updates: Callable
     metric: Callable
     error: Callable  # the metric → the relative error of what is trained, as far as a user knows it
     state: Callable  # all that the updates change

@@ -32,6 +32,7 @@ class TensorBoard:
             "solver/iterations": interval.iterations,
             "solver/products": interval.operator_applications,
             "solver/adjoint_products": interval.adjoint_applications,
+            "solver/failed": interval.failed,
         }
         for name, value in values.items():
             self._writer.add_scalar(name, value, interval.number)

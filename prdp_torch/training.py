@@ -2,6 +2,7 @@
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
 import math
+import sys
 import time
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from prdp_torch import _C, datasets, field_task, fields
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
-from prdp_torch.solve import SolveStatus
+from prdp_torch.solve import SolveStatus, detach_failed
 from prdp_torch.task import Task
 
 
@@ -104,6 +105,8 @@ class Interval(NamedTuple):
     """Products with A per sample, summed over the updates, forward and adjoint."""
     adjoint_applications: float
     """Those of the adjoint solves."""
+    failed: int
+    """Samples whose forward or adjoint solve failed, over the updates."""
     seconds: float
     """Of the updates; the validation is not counted."""
     resumed: bool
@@ -141,6 +144,8 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         - "budget": K times the number of solves. The task "corrector" has two solves per update, "field" one per step.
         - "iterations", "operator_applications": per sample of a batch, summed over the solves. The products include
           those of the adjoint solves, which "adjoint_applications" counts alone.
+        - "failed": the samples whose forward or adjoint solve failed, over the updates. A line on stderr names them
+          after each interval. With the scene's on_failure = "zero_grad" they stay in the loss, without a gradient.
         - "seconds": of the updates.
         - "warning": only if the controller ends with one.
         - "diverged": only if the loss or the metric was no longer finite. It says where and why. The training stops
@@ -158,7 +163,7 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
     saved = None if checkpoint is None else checkpoint.load()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene.training.intervals, steppers, refinement, checkpoint, callbacks)
+    run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
         task = _network(scene, steppers, seed, network, datasets.of_scene(scene, data, on_data))
     else:
@@ -178,11 +183,13 @@ class _Run:
     """What the tasks share: the intervals, their costs, and when a training is lost."""
 
     COSTS = (
-        "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "seconds"
+        "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "failed", "seconds"
     )  # fmt: skip
 
-    def __init__(self, intervals, steppers, refinement, checkpoint, callbacks):
-        self.intervals = intervals
+    def __init__(self, scene, seed, steppers, refinement, checkpoint, callbacks):
+        self.who = f"{scene.name}, {refinement.label}, seed {seed}"
+        self.goes_on = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
+        self.intervals = scene.training.intervals
         self.steppers = steppers
         self.controller = refinement.attach(steppers)
         self.watches_error = refinement.watches_error
@@ -250,17 +257,22 @@ class _Run:
         k, rtol = self.controller.max_iter, self.steppers[0].rtol
         started, solves = time.perf_counter(), 0
         iterations = forward = adjoint = 0.0
-        for loss in task.updates(len(self.curves["update_loss"])):
+        failures = _C.Failures()
+        for loss, samples in task.updates(len(self.curves["update_loss"])):
             self._check(loss, number)
             self.curves["update_loss"].append(loss)
             for stepper in self.steppers:
                 solves += stepper.info.iterations[0].numel()
                 iterations += _per_sample(stepper.info.iterations)
                 forward += _per_sample(stepper.info.operator_applications)
-                if stepper.adjoint_info is not None:
-                    adjoint += _per_sample(stepper.adjoint_info.operator_applications)
+            reports = [stepper.adjoint_info for stepper in self.steppers]
+            reports = [report for report in reports if report is not None]
+            adjoint += sum(_per_sample(report.operator_applications) for report in reports)
+            failures.take([s.info.status for s in self.steppers], [report.status for report in reports], samples)
         seconds = time.perf_counter() - started
-        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, seconds)
+        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failures.count, seconds)
+        if failures.count:
+            print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)
 
     def give_up(self, why):
         """The curves end with the interval that was lost."""
@@ -269,7 +281,7 @@ class _Run:
         for name in ("metric", "error"):
             self.curves[name] += [math.nan] * (lost + 1 - len(self.curves[name]))
         if self._done() < lost:
-            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0.0)
+            self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0, 0.0)
 
     def _append(self, *costs):
         for name, value in zip(self.COSTS, costs, strict=True):
@@ -290,6 +302,8 @@ class _Run:
     def _check(self, loss, done):
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
+        if self.goes_on:
+            return
         if any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers):
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
@@ -335,7 +349,7 @@ def _network(scene, steppers, seed, network, data):
             loss = loss_of(batch)
             loss.backward()
             optimiser.step()
-            yield float(loss.detach())
+            yield float(loss.detach()), batch
 
     def state():
         parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
@@ -387,6 +401,9 @@ def _corrector(scene, steppers, data, network):
     def loss(batch):
         u1 = _corrected(first, network, data.train_start[batch])
         u2 = _corrected(second, network, u1)
+        if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
+            worst = torch.minimum(first.info.status, second.info.status)
+            u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
         kind = scene.training.loss
         return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
 
@@ -409,7 +426,7 @@ def _parameters(scene, steppers, seed):
         with torch.no_grad():
             theta.sub_(gradient, alpha=scene.learning_rate(number))
         misfit = float(_C.relative_error(u.detach(), problem.solution))
-        yield float(loss.detach())
+        yield float(loss.detach()), None
 
     def metric():
         return float(_C.relative_error(theta.detach(), problem.reference))

@@ -5,6 +5,7 @@
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/checkpoint.h"
 #include "prdp/scenes/data.h"
+#include "prdp/scenes/failures.h"
 #include "prdp/scenes/field_problem.h"
 #include "prdp/scenes/files.h"
 #include "prdp/scenes/loss.h"
@@ -76,6 +77,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("field", &Scene::field)
       .def_readonly("training", &Scene::training)
       .def_readonly("compare", &Scene::compare)
+      .def_property_readonly("on_failure", [](const Scene& s) { return name(s.on_failure); })
       .def_property_readonly("method", [](const Scene& s) { return name(s.solver.method); })
       .def_property_readonly("max_iter", [](const Scene& s) { return s.solver.max_iter.expect_int(); })
       .def_property_readonly("rtol", [](const Scene& s) { return s.solver.rtol; })
@@ -158,6 +160,11 @@ void bind_scenes(py::module_& m) {
       .def("release", &FolderLock::release);
 
   m.def("loss", &loss, py::arg("kind"), py::arg("u"), py::arg("reference"));
+  py::class_<Failures>(m, "Failures")
+      .def(py::init<>())
+      .def("take", &Failures::take, py::arg("forward"), py::arg("adjoint"), py::arg("samples"))
+      .def_property_readonly("count", &Failures::count)
+      .def("line", &Failures::line, py::arg("interval"));
   m.def("normalised_mse", &normalised_mse, py::arg("u"), py::arg("reference"));
   m.def("without_mean_pressure", &without_mean_pressure, py::arg("u"));
   m.def("half_mse", &half_mse, py::arg("u"), py::arg("reference"));

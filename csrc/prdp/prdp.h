@@ -1,5 +1,6 @@
 #pragma once
 /// Everything the library offers to C++.
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"

@@ -18,7 +18,7 @@ class FieldTraining {
   Task task();
 
  private:
-  void update(int64_t number, const std::function<void(double)>& on_update);
+  void update(int64_t number, const OnUpdate& on_update);
 
   const Scene& scene_;
   FieldProblem problem_;

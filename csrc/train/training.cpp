@@ -7,10 +7,12 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <cstdio>
 #include <limits>
 
 #include "field.h"
 #include "fused_adam.h"
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/tolerance_controller.h"
@@ -18,6 +20,7 @@
 #include "prdp/networks/resnet.h"
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
+#include "prdp/scenes/failures.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/solvers/status.h"
 #include "state.h"
@@ -68,14 +71,18 @@ struct Costs {
   double rtol;
   int64_t solves = 0;
   double iterations = 0.0, forward = 0.0, adjoint = 0.0, seconds = 0.0;
+  int64_t failed = 0;
 };
 
 /// What the tasks share: the intervals, their costs, and when a training is lost.
 class Run {
  public:
   /// `steppers`: of the solves of an update, one after the other.
-  Run(const Scene& scene, const Refinement& refinement, Checkpoint& checkpoint, std::vector<Solving*> steppers)
-      : intervals_(scene.training.intervals),
+  Run(const Scene& scene, const Refinement& refinement, int64_t seed, Checkpoint& checkpoint,
+      std::vector<Solving*> steppers)
+      : who_(scene.name + ", " + refinement.label + ", seed " + std::to_string(seed)),
+        goes_on_(scene.on_failure == OnFailure::kZeroGrad),
+        intervals_(scene.training.intervals),
         steppers_(std::move(steppers)),
         watches_error_(refinement.watches_error),
         controller_(refinement.controller()),
@@ -137,17 +144,26 @@ class Run {
   void run_interval(const Task& task, int64_t done) {
     Costs costs{.max_iter = controller_->max_iter(), .rtol = rtol()};
     const auto started = std::chrono::steady_clock::now();
-    task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss) {
+    Failures failures;
+    task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss, const auto& samples) {
       check(loss, done);
       curves_.update_loss.push_back(loss);
+      std::vector<at::Tensor> forward, backward;
       for (const auto* stepper : steppers_) {
         const auto& info = *stepper->info();
+        forward.push_back(info.status);
         costs.solves += info.iterations.numel() / info.iterations.size(0);
         costs.iterations += per_sample(info.iterations);
         costs.forward += per_sample(info.operator_applications);
-        if (const auto adjoint = stepper->adjoint_info()) costs.adjoint += per_sample(adjoint->operator_applications);
+        if (const auto adjoint = stepper->adjoint_info()) {
+          backward.push_back(adjoint->status);
+          costs.adjoint += per_sample(adjoint->operator_applications);
+        }
       }
+      failures.take(forward, backward, samples);
     });
+    costs.failed = failures.count();
+    if (costs.failed > 0) std::fprintf(stderr, "prdp_train: %s, %s\n", who_.c_str(), failures.line(done).c_str());
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
     costs.seconds = elapsed.count();
     append(costs);
@@ -160,6 +176,7 @@ class Run {
     curves_.operator_applications.push_back(costs.forward + costs.adjoint);
     curves_.adjoint_applications.push_back(costs.adjoint);
     curves_.rtol.push_back(costs.rtol);
+    curves_.failed.push_back(costs.failed);
     curves_.seconds.push_back(costs.seconds);
   }
 
@@ -179,6 +196,7 @@ class Run {
   void check(double loss, int64_t done) const {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
+    if (goes_on_) return;
     const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
     for (const auto* stepper : steppers_)
       if (stepper->info()->status.le(nonfinite).any().item<bool>())
@@ -195,6 +213,8 @@ class Run {
     if (curves_.seconds.size() < lost) append({.max_iter = controller_->max_iter(), .rtol = rtol()});
   }
 
+  std::string who_;
+  bool goes_on_;  // past solves that were given NaN or Inf
   int64_t intervals_;
   std::vector<Solving*> steppers_;
   bool watches_error_;
@@ -248,9 +268,15 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
     const auto coarse = without_mean_pressure(stepper(u));
     return coarse + network.forward(coarse);
   };
-  const auto loss_of = [&, corrected](const at::Tensor& batch) {
-    const auto u1 = corrected(steppers[0], data.train_start.index_select(0, batch));
-    const auto u2 = corrected(steppers[1], u1);
+  const bool zero_grad = scene.on_failure == OnFailure::kZeroGrad;
+  const auto loss_of = [&, corrected, zero_grad](const at::Tensor& batch) {
+    auto u1 = corrected(steppers[0], data.train_start.index_select(0, batch));
+    auto u2 = corrected(steppers[1], u1);
+    if (zero_grad) {  // the network's share of a prediction is no better than the coarse step below it
+      const auto &first = steppers[0].info()->status, &second = steppers[1].info()->status;
+      u1 = detach_failed(u1, first);
+      u2 = detach_failed(u2, at::minimum(first, second));
+    }
     return loss(scene.training.loss, u1, data.train_first.index_select(0, batch)) +
            loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
   };
@@ -273,7 +299,7 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
 
-  const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
+  const auto updates = [&](int64_t update, const OnUpdate& on_update) {
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
       optimiser.zero_grad();
@@ -281,7 +307,7 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
       error.backward();
       optimiser.step();
       ++update;
-      on_update(error.item<double>());
+      on_update(error.item<double>(), batch);
     }
   };
   const auto metric = [&] {
@@ -302,7 +328,7 @@ Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const On
   // What a user sees, who does not know θ; before the first solve nothing is explained yet.
   double misfit = 1.0;
 
-  const auto updates = [&](int64_t update, const std::function<void(double)>& on_update) {
+  const auto updates = [&](int64_t update, const OnUpdate& on_update) {
     const auto u = stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
     const auto error = half_mse(u, problem.solution);
     const auto gradient = torch::autograd::grad({error}, {theta})[0];
@@ -311,7 +337,7 @@ Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const On
       theta.sub_(gradient, scene.learning_rate(update));
     }
     misfit = relative_error(u.detach(), problem.solution).item<double>();
-    on_update(error.item<double>());
+    on_update(error.item<double>(), std::nullopt);
   };
   const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
   const auto save_theta = [&](TensorMap& tensors) { tensors["theta"] = theta; };
@@ -328,13 +354,13 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
   const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
   if (scene.task == Scene::Task::kField) {
     FieldTraining field(scene, solver, seed);
-    return Run(scene, refinement, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
+    return Run(scene, refinement, seed, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
   }
   Steppers steppers;
   for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene.stepper(solver));
   std::vector<Solving*> solves;
   for (auto& stepper : steppers) solves.push_back(&stepper);
-  Run run(scene, refinement, checkpoint, solves);
+  Run run(scene, refinement, seed, checkpoint, solves);
   return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, steppers[0], on_interval)
                                                 : train_network(scene, run, steppers, seed, on_interval, on_data);
 }

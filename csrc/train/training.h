@@ -39,6 +39,7 @@ struct Curves {
   // Per sample of a batch, summed over updates; the applications are those of both solves.
   std::vector<double> iterations, operator_applications, adjoint_applications;
   std::vector<double> rtol;  // of the forward solves
+  std::vector<int64_t> failed;  // samples whose forward or adjoint solve failed, over the updates
   std::vector<double> seconds;
   std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
   std::string warning;   // what the controller says in the end
@@ -56,6 +57,7 @@ void each_curve(AnyCurves& curves, const F& f) {
   f("operator_applications", curves.operator_applications);
   f("adjoint_applications", curves.adjoint_applications);
   f("rtol", curves.rtol);
+  f("failed", curves.failed);
   f("seconds", curves.seconds);
 }
 

@@ -190,6 +190,20 @@ TEST(Controller, WarnsOfAStalledMetricWhereNoErrorIsKnown) {
   EXPECT_FALSE(controller.warning().has_value());
 }
 
+TEST(Controller, SaysThatAMetricIsNoNumberOrGrows) {
+  PRDPController controller;
+  for (const double metric : {1.0, 0.1, 0.5, 0.6}) controller.step(metric);
+  EXPECT_FALSE(controller.warning().has_value());
+  controller.step(0.7);
+  EXPECT_NE(controller.warning()->find("PRDPController: the metric grows: 7.0e-01 after 1.0e-01 in interval 1"),
+            std::string::npos);
+  controller.step(0.1);
+  EXPECT_FALSE(controller.warning().has_value());
+  EXPECT_THROW(controller.step(std::nan("")), c10::ValueError);
+  EXPECT_NE(controller.warning()->find("the last metric was nan, and nothing was changed; K = "),
+            std::string::npos);
+}
+
 TEST(Controller, GoesOnFromAStateAsIfItHadNotStopped) {
   const auto goes_on = [](prdp::Controller& whole, prdp::Controller& rest) {
     for (int i = 0; i < 40; ++i) {

@@ -39,7 +39,7 @@ def test_compare_prints_a_table_and_writes_records_and_a_report(comparison):
     assert len(curves["metric"]) == 5 and len(curves["update_loss"]) == 32
     assert set(curves) == {
         "update_loss", "metric", "error", "max_iter", "budget", "iterations", "operator_applications",
-        "adjoint_applications", "rtol", "seconds", "warning",
+        "adjoint_applications", "rtol", "failed", "seconds", "warning",
     }  # fmt: skip
     summary = json.loads((folder / "runs/heat_1d/summary.json").read_text())
     by_label = {row["label"]: row for row in summary["rows"]}

@@ -210,6 +210,12 @@ def test_the_cpp_blocks_use_public_names(block):
         assert re.search(rf"\b(class|struct|namespace) {name}\b|\b{name}\(|TORCH_MODULE\({name}\)", public), name
 
 
+def test_the_tests_that_the_guarantees_name_exist():
+    named = re.findall(r"`(test_\w+)`", PAGES["docs/stability.md"])
+    tests = "".join(path.read_text() for path in (ROOT / "tests" / "python").glob("test_*.py"))
+    assert len(named) > 25 and [name for name in named if f"def {name}(" not in tests] == []
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_the_links_to_files_lead_somewhere(page):
     """mkdocs checks the pages of the site; this also covers the README."""

@@ -59,7 +59,10 @@ def test_matrix_and_right_hand_side_must_fit():
         (lambda: prdp.CG(3, rtol=-1e-5), "CG: rtol must be >= 0, got -1e-05"),
         (lambda: prdp.SteepestDescent(3, rtol=math.nan), "SteepestDescent: rtol must be >= 0, got nan"),
         (lambda: heat(backward="adjoint"), "backward: unknown name 'adjoint'; allowed: implicit, unrolled, none"),
-        (lambda: heat(on_failure="ignore"), "on_failure: unknown name 'ignore'; allowed: raise, warn, return"),
+        (
+            lambda: heat(on_failure="ignore"),
+            "on_failure: unknown name 'ignore'; allowed: raise, warn, return, zero_grad",
+        ),
         (lambda: heat(adjoint_max_iter=-2), "Heat: adjoint_max_iter must be >= 0, got -2"),
         (lambda: heat(adjoint_rtol=-1.0), "Heat: adjoint_rtol must be >= 0, got -1"),
         (lambda: prdp.Heat((30,), -1e-3, 1.0, prdp.Jacobi(1)), "Heat: nu must be finite and >= 0, got -0.001"),

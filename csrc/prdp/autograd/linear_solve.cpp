@@ -143,7 +143,7 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   auto result = solve(*a, b, {s.method, s.max_iter.expect_int(), s.rtol, s.restart, {}, true, x0});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
-  report_failures(*a, b, info, options.on_failure, role_of(spec), x0);
+  report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
   if (!b.is_cpu())
     for (auto* part : {&info.iterations, &info.residual, &info.status, &info.operator_applications})
       *part = part->to(b.device());

@@ -27,9 +27,12 @@ at::Tensor tangent_rhs(const at::Tensor& b, const at::Tensor& u, const OperatorS
 
 at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, SolveOptions options) {
   auto rhs = tangent_rhs(b, solved.u, a);
-  if (options.on_failure != OnFailure::kRaise) rhs = without_refused(rhs, solved.status);
+  rhs = without_lost(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
-  return linear_solve(primal(a), rhs, options).u;
+  const auto tangent = linear_solve(primal(a), rhs, options);
+  return options.on_failure == OnFailure::kZeroGrad
+             ? without_lost(tangent.u, tangent.info.status, options.on_failure)
+             : tangent.u;
 }
 
 at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
@@ -44,8 +47,8 @@ at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpe
   for (const auto& t : a.tensors) take(t);
   auto plain = solved;
   plain.b = primal(b);
-  const auto tangent = unrolled_jvp(tangents, plain, primal(a), options, needed);
-  return options.on_failure == OnFailure::kRaise ? tangent : without_refused(tangent, solved.status);
+  return without_lost(unrolled_jvp(tangents, plain, primal(a), options, needed), solved.status,
+                      options.on_failure);
 }
 
 }  // namespace

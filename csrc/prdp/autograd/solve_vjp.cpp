@@ -11,22 +11,28 @@
 
 namespace prdp {
 
-at::Tensor without_refused(const at::Tensor& derivative, const at::Tensor& status) {
+at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure) {
+  if (on_failure == OnFailure::kRaise) return derivative;
+  const bool all_failures = on_failure == OnFailure::kZeroGrad;
   if (status.is_cpu() && !at::isTensorSubclassLike(status)) {  // numbers that can be read
     const auto read = status.accessor<int64_t, 1>();
-    int64_t refused = 0;
-    for (int64_t i = 0; i < read.size(0); ++i) refused += is_refused(static_cast<SolveStatus>(read[i]));
-    if (refused == 0) return derivative;
+    bool any = false;
+    for (int64_t i = 0; i < read.size(0); ++i) {
+      const auto s = static_cast<SolveStatus>(read[i]);
+      any = any || (all_failures ? is_failure(s) : is_refused(s));
+    }
+    if (!any) return derivative;
   }
-  const auto refused = status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
-                           .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
-  return derivative.masked_fill(per_sample(refused, derivative), 0.0);
+  const auto lost = all_failures ? status.lt(static_cast<int64_t>(SolveStatus::kStagnated))
+                                 : status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
+                                       .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
+  return derivative.masked_fill(per_sample(lost, derivative), 0.0);
 }
 
 namespace {
 
 /// The report where ḡ of the samples that are not in `rows` left the range of the dtype.
-void report_overflow(SolveInfo& info, const Rows& rows, const Operator& a, const at::Tensor& cotangent,
+void report_overflow(SolveInfo& info, const Rows& rows, const OperatorSpec& transpose, const at::Tensor& cotangent,
                      const SolveOptions& options) {
   info.status = info.status.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true);
   auto* status = info.status.mutable_data_ptr<int64_t>();
@@ -34,7 +40,8 @@ void report_overflow(SolveInfo& info, const Rows& rows, const Operator& a, const
     if (!rows[i] && !is_failure(static_cast<SolveStatus>(status[i])))
       status[i] = static_cast<int64_t>(SolveStatus::kOverflow);
   if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
-  report_failures(a, cotangent, info, options.on_failure, "adjoint solve");
+  report_failures({transpose, options.solver, /*adjoint=*/true}, *make_operator(transpose), cotangent, info,
+                  options.on_failure);
 }
 
 }  // namespace
@@ -48,6 +55,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
   o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
   auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
+  if (o.on_failure == OnFailure::kZeroGrad) lambda = without_lost(lambda, info.status, o.on_failure);
 
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;
@@ -67,7 +75,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     products = finite_sum(rows, [&](const Rows& some) { return of_tensors(only(lambda, some)); });
     if (!all(rows)) {
       if (needed[0]) found.gradients[0] = only(lambda, rows);
-      report_overflow(found.info, rows, *op, cotangent, options);
+      report_overflow(found.info, rows, transpose, cotangent, o);
     }
   }
   std::copy(products.begin(), products.end(), found.gradients.begin() + 1);
@@ -77,7 +85,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
 SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
                    const SolveOptions& options, at::IntArrayRef needed,
                    decltype(linear_solve)& adjoint_solve) {
-  if (options.on_failure != OnFailure::kRaise) cotangent = without_refused(cotangent, solved.status);
+  cotangent = without_lost(cotangent, solved.status, options.on_failure);
   if (options.backward == Backward::kImplicit)
     return implicit_vjp(cotangent, solved.u, a, options, needed, adjoint_solve);
   // With create_graph=True the derivative is itself recorded; else it is one op, as a compiled graph and

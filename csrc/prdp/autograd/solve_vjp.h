@@ -22,8 +22,9 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
                    const SolveOptions& options, at::IntArrayRef needed,
                    decltype(linear_solve)& adjoint_solve = linear_solve);
 
-/// A cotangent or tangent with zeros for the refused samples, whose u is the constant zero.
-at::Tensor without_refused(const at::Tensor& derivative, const at::Tensor& status);
+/// A cotangent or tangent with zeros for the samples that carry none: the refused ones, whose u is the constant
+/// zero, and with kZeroGrad all that failed. With kRaise there are no such samples.
+at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure);
 /// The implicit one: Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Without u, b̄ alone. A sample whose share of ḡ
 /// leaves the range of the dtype fails: OVERFLOW, and zeros.
 SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,

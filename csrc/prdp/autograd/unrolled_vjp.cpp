@@ -122,6 +122,10 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   const auto bar = only(cotangent, sound);
   const auto counts = to_host<int64_t>(solved.iterations, batch), status = to_host<int64_t>(solved.status, batch);
 
+  Rows lost(batch, false);  // carry no gradient
+  if (options.on_failure == OnFailure::kZeroGrad)
+    for (int64_t i = 0; i < batch; ++i) lost[i] = is_failure(static_cast<SolveStatus>(status[i]));
+
   auto implicit = options;
   implicit.backward = Backward::kImplicit;
   implicit.checkpoint_every = implicit.adjoint_log = 0;
@@ -141,7 +145,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     std::vector<at::Tensor> sum(needed.size());
     auto caps = at::zeros({batch}, at::kLong);
     for (int64_t i = 0; i < batch; ++i)
-      if (rows[i] && !exact[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
+      if (rows[i] && !exact[i] && !lost[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
     std::vector<int64_t> applications(batch, 0);
     if (caps.any().item<bool>()) {
       auto found = of_iterations(bar, solved.b, {spec, solved.x0, options.solver,
@@ -173,6 +177,18 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   };
   auto rows = sound;
   SolveVjp found{finite_sum(rows, share), {}};
+  if (options.on_failure == OnFailure::kZeroGrad) {
+    auto good = rows;
+    for (int64_t i = 0; i < batch; ++i)
+      if (exact[i] && is_failure(static_cast<SolveStatus>(info.status.const_data_ptr<int64_t>()[i]))) good[i] = false;
+    if (good != rows) {  // their adjoint solve failed
+      auto said = info;
+      for (auto* part : {&said.iterations, &said.residual, &said.status, &said.operator_applications})
+        *part = part->clone();
+      found.gradients = share(good);
+      info = said;
+    }
+  }
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i] && !found.gradients[i].defined())
       found.gradients[i] = i == 0 ? only(cotangent, Rows(batch, false)) : at::zeros_like(spec.tensors[i - 1]);
@@ -190,7 +206,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   }
   info.residual = info.residual.to(solved.b.scalar_type());
   if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
-  report_failures(*a, cotangent, failures, options.on_failure, "adjoint solve");
+  report_failures({spec, options.solver, /*adjoint=*/true}, *a, cotangent, failures, options.on_failure);
   const auto device = solved.b.device();
   found.info = {info.iterations.to(device), info.residual.to(device), info.status.to(device),
                 info.operator_applications.to(device)};

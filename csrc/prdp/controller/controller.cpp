@@ -2,6 +2,7 @@
 
 #include <c10/util/Exception.h>
 
+#include <algorithm>
 #include <cmath>
 #include <iomanip>
 #include <sstream>
@@ -17,10 +18,50 @@ constexpr double kSmallResidual = 1e-4;
 constexpr double kShareOfError = 0.3;
 /// Too large for whatever the metric may be.
 constexpr double kLargeResidual = 0.1;
+/// A metric grows where the last `kGrown` of them are more than `kGrowth` times the least; not where all of them are
+/// rounding, next to the largest.
+constexpr size_t kGrown = 3;
+constexpr double kGrowth = 2.0, kRoundingOfMetric = 1e-3;
 
 }  // namespace
 
 std::optional<std::string> Controller::warning() const {
+  auto text = about_metric();
+  const auto residual = about_residual();
+  if (!text.empty() && !residual.empty()) text += ". ";
+  text += residual;
+  return text.empty() ? std::nullopt : std::optional(text);
+}
+
+void Controller::check_metric(double metric, const char* what) {
+  const bool good = std::isfinite(metric) && metric >= 0.0;
+  refused_ = good ? std::nullopt : std::optional(metric);
+  TORCH_CHECK_VALUE(good, name(), ": ", what, " must be finite and >= 0, got ", metric);
+}
+
+std::string Controller::about_metric() const {
+  const auto& history = state().history;
+  std::ostringstream text;
+  text << std::scientific << std::setprecision(1) << name() << ": ";
+  if (refused_) {
+    text << "the last metric was " << *refused_ << ", and nothing was changed; K = " << max_iter()
+         << " still. Go back to the weights before it, with a smaller learning rate";
+    return text.str();
+  }
+  if (history.size() <= kGrown) return {};
+  const auto [least, most] = std::minmax_element(history.begin(), history.end(), [](const Record& a, const Record& b) {
+    return a.metric < b.metric;
+  });
+  const double bound = std::max(kGrowth * least->metric, kRoundingOfMetric * most->metric);
+  const bool grows =
+      std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
+  if (!grows) return {};
+  text << "the metric grows: " << history.back().metric << " after " << least->metric << " in interval "
+       << least - history.begin() << "; lower the learning rate, or go back to the weights of then";
+  return text.str();
+}
+
+std::string Controller::about_residual() const {
   const auto& history = state().history;
   if (history.empty() || !history.back().residual) return {};
   const auto& last = history.back();

@@ -62,14 +62,24 @@ class Controller {
   /// Where the network gives v, the solve P_K v is trained to meet u₂ = P v_ref, and the loss is small, then
   /// v - v_ref is the residual of that solve: a residual as large as the error is the error. Where no error
   /// is known, a large residual counts once the metric has stalled.
+  /// Before that: a metric that step() has just refused, and one that grows, which more than doubles its least value
+  /// three times in a row.
   std::optional<std::string> warning() const;
 
  protected:
+  /// Raises ValueError unless the metric (`what`) is finite and >= 0, and remembers it for warning().
+  void check_metric(double metric, const char* what);
   virtual const char* name() const = 0;
   /// What to do about the warning, as the end of a sentence.
   virtual const char* remedy() const = 0;
   /// Whether the metric no longer falls.
   virtual bool stalled() const = 0;
+
+ private:
+  std::string about_metric() const;
+  std::string about_residual() const;
+
+  std::optional<double> refused_;  // the metric of the last step(), if it was no number to go by
 };
 
 /// ⌈ratio · K⌉, what an adjoint solve gets of K. Raises ValueError unless 0 < ratio <= 1.

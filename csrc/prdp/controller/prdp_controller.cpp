@@ -50,8 +50,7 @@ bool PRDPController::should_refine() const {
 }
 
 bool PRDPController::step(double metric, const Solves& solves) {
-  TORCH_CHECK_VALUE(std::isfinite(metric) && metric >= 0.0,
-                    "PRDPController: metric must be finite and >= 0, got ", metric);
+  check_metric(metric, "metric");
   const double alpha = 2.0 / (static_cast<double>(settings_.window) + 1.0);
   const auto& history = state_.history;
   const double smoothed =

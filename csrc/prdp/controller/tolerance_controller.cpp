@@ -33,8 +33,7 @@ Budget ToleranceController::budget() const {
 }
 
 bool ToleranceController::step(double error, const Solves& solves) {
-  TORCH_CHECK_VALUE(std::isfinite(error) && error >= 0.0,
-                    "ToleranceController: error must be finite and >= 0, got ", error);
+  check_metric(error, "error");
   const double before = rtol();
   state_.checkpoint = std::min(state_.checkpoint, error);
   const bool tightened = rtol() < before;

@@ -52,6 +52,7 @@ void read_solver(TomlSection s, Scene& scene) {
   scene.solver.rtol = s.at_least("rtol", 0.0);
   if (scene.solver.method == Method::kGmres) scene.solver.restart = s.count("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
+  if (s.has("on_failure")) scene.on_failure = on_failure_from_name(s.choice("on_failure", {"return", "zero_grad"}));
   if (s.has("start")) scene.start = start_from_name(s.choice("start", {"zero", "state"}));
   s.finish();
 }
@@ -189,7 +190,7 @@ Stepper Scene::stepper(Solver with) const {
 }
 
 SolveOptions Scene::options(Solver with) const {
-  return {std::move(with), backward, {}, {}, OnFailure::kReturn, 0, 0, start};
+  return {std::move(with), backward, {}, {}, on_failure, 0, 0, start};
 }
 
 void Scene::set_backward(const std::string& name) {

@@ -92,6 +92,7 @@ struct Scene {
   Physics physics;
   Solver solver;  // converged: max_iter is K_ε
   Backward backward;
+  OnFailure on_failure = OnFailure::kReturn;  // or kZeroGrad: a failed sample does not stop a training
   Start start = Start::kZero;
   Data data;
   Network network;
@@ -107,7 +108,7 @@ struct Scene {
   /// The converged solver of data and references: exact where that is cheap, else iterated until its error is
   /// below float32's rounding.
   Solver reference_solver() const;
-  /// The options of the scene's solves, with this solver; a failed sample does not stop a training.
+  /// The options of the scene's solves, with this solver.
   SolveOptions options(Solver solver) const;
   /// The scene's step with this solver; not of the task "field", whose equation changes from update to update.
   Stepper stepper(Solver solver) const;

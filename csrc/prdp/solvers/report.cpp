@@ -1,7 +1,7 @@
 #include <sstream>
 #include <utility>
 
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/diagnosis.h"
 
 namespace prdp {
 
@@ -48,9 +48,9 @@ FailuresOfStep::~FailuresOfStep() {
 }
 std::pair<int64_t, int64_t> FailuresOfStep::now() { return {step_now, steps_in_all}; }
 
-void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
-                     OnFailure on_failure, const char* role, const at::Tensor& x0) {
-  if (on_failure == OnFailure::kReturn) return;
+void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                     OnFailure on_failure) {
+  if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
   const int64_t batch = info.status.size(0);
   const auto* status = info.status.const_data_ptr<int64_t>();
   std::vector<int64_t> failed;
@@ -61,20 +61,20 @@ void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& in
   constexpr size_t named = 4;
   std::ostringstream text;
   if (step_now > 0) text << "step " << step_now << " of " << steps_in_all << ": ";
-  text << role << ": " << failed.size() << " of " << batch << " samples failed";
+  text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": " << failed.size() << " of " << batch << " samples failed";
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);
-    text << (k ? "; " : ": ") << "sample " << i << " " << describe(what).name
-         << whereabouts(a, b, x0, what, i);
+    text << (k ? "; " : ": ") << "sample " << i << " " << name(what) << whereabouts(a, b, role.x0, what, i);
     if (!is_refused(what))
       text << " (the iterate handed out has relative residual " << info.residual[i].item<double>()
            << " after " << info.iterations[i].item<int64_t>() << " iterations)";
-    text << ", " << describe(what).meaning;
+    text << ", " << diagnosis(role, a, b, what, i);
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
   if (on_failure == OnFailure::kRaise)
-    text << ". With on_failure = return, what there is comes back with the status of each sample";
+    text << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
+            "the failed ones have no gradient, and a training goes on";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, text.str());
   warning_sink()(text.str());
 }

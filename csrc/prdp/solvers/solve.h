@@ -71,10 +71,18 @@ class StepwiseSolve {
   std::vector<int64_t> caps_, applications_;
 };
 
-/// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples, naming them with
-/// what happened. `role` is "linear_solve" or "adjoint solve".
-void report_failures(const Operator& a, const at::Tensor& b, const SolveInfo& info,
-                     OnFailure on_failure, const char* role, const at::Tensor& x0 = {});
+/// Which solve is reported on.
+struct SolveRole {
+  const OperatorSpec& a;  // the adjoint solve's is transposed
+  const Solver& solver;
+  bool adjoint;
+  at::Tensor x0{};
+};
+
+/// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples: names them, the operator, the cause
+/// and the remedy (diagnosis.h).
+void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                     OnFailure on_failure);
 
 /// While it lives, what is reported on this thread is said of this step, counted from 1, of a rollout.
 class FailuresOfStep {

@@ -23,9 +23,10 @@ constexpr Names<Method, 9> kMethods{{{Method::kJacobi, "jacobi"},
 constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
                                          {Backward::kUnrolled, "unrolled"},
                                          {Backward::kNone, "none"}}};
-constexpr Names<OnFailure, 3> kOnFailures{{{OnFailure::kRaise, "raise"},
+constexpr Names<OnFailure, 4> kOnFailures{{{OnFailure::kRaise, "raise"},
                                            {OnFailure::kWarn, "warn"},
-                                           {OnFailure::kReturn, "return"}}};
+                                           {OnFailure::kReturn, "return"},
+                                           {OnFailure::kZeroGrad, "zero_grad"}}};
 
 constexpr Names<Start, 2> kStarts{{{Start::kZero, "zero"}, {Start::kState, "state"}}};
 

@@ -101,8 +101,9 @@ enum class Backward {
 /// a start.
 enum class Start { kZero, kState };
 
-/// What a failed sample does: raise an error, warn, or only say so in its status.
-enum class OnFailure { kRaise, kWarn, kReturn };
+/// What a failed sample does: raise an error, warn, or only say so in its status. kZeroGrad is kReturn without a
+/// derivative: nothing that the sample is made of gets a gradient from it, whether its solve failed or the adjoint one.
+enum class OnFailure { kRaise, kWarn, kReturn, kZeroGrad };
 
 /// Names as users write them; from_name raises ValueError naming the allowed ones.
 std::string_view name(Method method);

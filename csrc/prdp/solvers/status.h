@@ -22,13 +22,12 @@ enum class SolveStatus : int64_t {
 
 struct StatusText {
   SolveStatus status;
-  const char* name;     // "MAX_ITER"
-  const char* meaning;  // a sentence with the remedy
+  const char* name;  // "MAX_ITER"
 };
 
-/// Every status with its name and its meaning, in falling order of value.
+/// Every status with its name, in falling order of value.
 const std::vector<StatusText>& solve_statuses();
-const StatusText& describe(SolveStatus status);
+const char* name(SolveStatus status);
 
 /// A failure raises by default; MAX_ITER and STAGNATED hand out a usable iterate and do not.
 inline bool is_failure(SolveStatus status) {

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/grid/grid.h"
 #include "prdp/steppers/solving.h"
@@ -71,6 +72,8 @@ SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptio
     info.operator_applications = info.operator_applications + last.operator_applications;
     info.status = at::minimum(info.status, last.status);  // the least is the worst
   }
+  if (equation.picard_steps > 1 && options.on_failure == OnFailure::kZeroGrad)
+    result.u = detach_failed(result.u, result.info.status);  // whichever of its solves failed
   return result;
 }
 

@@ -1,0 +1,134 @@
+#include "prdp/solvers/diagnosis.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <cmath>
+#include <iomanip>
+#include <limits>
+#include <map>
+#include <sstream>
+
+namespace prdp {
+
+namespace {
+
+std::string name_of(const OperatorSpec& a) {
+  static const std::map<std::string, std::string> names{
+      {"poisson", "Poisson"}, {"heat", "Heat"},        {"burgers", "Burgers"}, {"navier_stokes", "NavierStokes"},
+      {"stencil", "Stencil"}, {"function", "Function"}, {"dense", "Matrix"},    {"csr", "Matrix"}};
+  const auto found = names.find(a.kind);
+  return found == names.end() ? a.kind : found->second;
+}
+
+std::string name_of(const Solver& solver) {
+  const auto gmres = "GMRES(" + std::to_string(solver.restart) + ")";
+  const std::string by_diagonal = " with preconditioner=\"diagonal\"";
+  switch (solver.method) {
+    case Method::kJacobi: return "Jacobi";
+    case Method::kChebyshev: return "Chebyshev";
+    case Method::kSteepestDescent: return "SteepestDescent";
+    case Method::kConjugateGradient: return "CG";
+    case Method::kConjugateGradientDiagonal: return "CG" + by_diagonal;
+    case Method::kGmres: return gmres;
+    case Method::kGmresDiagonal: return gmres + by_diagonal;
+    case Method::kGmresStokes: return gmres + " with preconditioner=\"stokes\"";
+    case Method::kDirect: return "Direct";
+  }
+  return std::string(name(solver.method));
+}
+
+std::string number(double x) {
+  std::ostringstream text;
+  text << std::setprecision(3) << x;
+  return text.str();
+}
+
+double norm_of(const at::Tensor& v) { return v.to(at::kDouble).norm().item<double>(); }
+
+double value_of_sample(const at::Tensor& t, int64_t sample) {
+  return (t.dim() == 0 || t.size(0) == 1 ? t.reshape({-1})[0] : t.reshape({-1})[sample]).to(at::kDouble).item<double>();
+}
+
+/// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample.
+double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto v = at::arange(1, b.numel() / b.size(0) + 1, b.options()).square().sin().view_as(b[0]).expand_as(b);
+  const auto product = a.apply(v).select(0, sample), other = a.apply_transpose(v).select(0, sample);
+  return norm_of(product - other) / norm_of(product);
+}
+
+bool is_krylov_for_definite(Method m) { return m == Method::kSteepestDescent || is_conjugate_gradient(m); }
+
+/// Why a method for symmetric definite operators fails on this one.
+std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const double rounding = 100.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
+                                                                 : std::numeric_limits<double>::epsilon());
+  const double share = asymmetry(a, b, sample);
+  if (share > rounding)
+    return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
+  return "A is symmetric but not definite; take GMRES";
+}
+
+std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (solver.method == Method::kJacobi)
+    return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
+  if (is_krylov_for_definite(solver.method))
+    return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
+  return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, or Direct";
+}
+
+std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const bool single = b.scalar_type() == at::kFloat;
+  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (‖A‖ is " +
+         number(value_of_sample(a.norm(), sample)) + ", ‖b‖ is " + number(norm_of(b.select(0, sample))) + "); " +
+         (single ? "take float64, or scale A and b" : "scale A and b");
+}
+
+std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (solver.method == Method::kDirect) return "A is singular; GMRES solves it for any b in the range of A";
+  if (is_krylov_for_definite(solver.method)) return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
+  return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
+         "take a b without that part, or add a multiple of the identity to A";
+}
+
+std::string zero_diagonal(const SolveRole& role) {
+  const std::string why = role.a.kind == "navier_stokes" ? "the pressure rows have a zero diagonal"
+                                                          : "it divides by the diagonal of A, which has a zero there";
+  return why + (role.solver.method == Method::kGmresDiagonal ? "; take GMRES without it" : "; take GMRES");
+}
+
+std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
+  const auto share = number(100.0 * outside) + " % of ";
+  if (role.a.kind != "navier_stokes") return share + "b lie in the null space of A; take a b without that part";
+  if (role.adjoint)
+    return share + "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
+                   "pressure that the loss is made of";
+  return share + "b are a mean of its pressure channel, which no flow can have; take it off";
+}
+
+}  // namespace
+
+std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor& b, SolveStatus status,
+                      int64_t sample) {
+  const at::NoGradGuard no_grad;
+  const auto why = [&]() -> std::string {
+    switch (status) {
+      case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
+      case SolveStatus::kOverflow: return overflow(a, b, sample);
+      case SolveStatus::kBreakdown: return breakdown(role.solver, a, b, sample);
+      case SolveStatus::kZeroDiagonal: return zero_diagonal(role);
+      case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);
+      case SolveStatus::kNonfiniteInput:
+        if (!b.select(0, sample).isfinite().all().item<bool>())
+          return role.adjoint ? "the cotangent is NaN or Inf there; look at the loss, or at the steps after this one"
+                              : "the right-hand side is NaN or Inf there; look at the state that it is made of";
+        return "the start is NaN or Inf there; take another one, or none";
+      case SolveStatus::kNonfiniteOperator:
+        return "A is made of a NaN or Inf there; look at the state, the weights or the file that it comes from";
+      default: return "it did not reach its tolerance; raise max_iter or rtol";
+    }
+  }();
+  return name_of(role.solver) + " on " + name_of(role.a) + ": " + why;
+}
+
+}  // namespace prdp

@@ -1,0 +1,8 @@
+"""The failure atlas: maps of where methods work and where they break, measured and drawn by `prdp stability`.
+
+`problems` makes operators and right-hand sides, `solves` and `gradients` measure maps, `pictures` draws them.
+"""
+
+from prdp_torch.atlas.maps import MAPS, Map, run
+
+__all__ = ["MAPS", "Map", "run"]
