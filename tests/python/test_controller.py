@@ -254,7 +254,11 @@ def test_a_bad_error_raises_and_changes_nothing(bad):
         ({"floor": 0.0}, ValueError, "floor must be > 0 and < 1, got 0"),
         ({"maximum": 0}, ValueError, "maximum must be >= 1, got 0"),
         ({"maximum": 1.5}, TypeError, "maximum must be a whole number, got 1.5"),
-        ({"tau_step": 0.9}, TypeError, "unknown setting 'tau_step'; allowed: ratio, adjoint_ratio, floor, adjoint_floor, maximum"),
+        (
+            {"tau_step": 0.9},
+            TypeError,
+            "unknown setting 'tau_step'; allowed: ratio, adjoint_ratio, floor, adjoint_floor, maximum",
+        ),
     ],
 )
 def test_bad_settings_of_a_tolerance_raise_by_name(settings, error, message):
