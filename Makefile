@@ -1,6 +1,8 @@
 # make demo   set everything up, then compare PRDP with constant K on the 1D heat equation
 # make test   set everything up, then run all C++ and Python tests
 # make docs   build the documentation as a site, site/index.html
+# make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
+# make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -9,7 +11,7 @@ STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
 
-.PHONY: demo test docs bench-peers clean
+.PHONY: demo test docs sanitize fuzz bench-peers clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -29,6 +31,29 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	.venv-peers/bin/python -m prdp_torch.cli bench
+
+# ThreadSanitizer watches what has threads; csrc/prdp/solvers/interruption.h says what it cannot see of OpenMP.
+sanitize: $(STAMPS)/configure
+	$(BIN)/cmake -S . -B build-address -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=address,undefined > build/sanitize.log
+	$(BIN)/cmake --build build-address --parallel $$(nproc) --target prdp_tests
+	UBSAN_OPTIONS=print_stacktrace=1 build-address/prdp_tests --gtest_brief=1
+	$(BIN)/cmake -S . -B build-thread -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=thread > build/sanitize.log
+	$(BIN)/cmake --build build-thread --parallel $$(nproc) --target prdp_tests
+	build-thread/prdp_tests --gtest_brief=1 --gtest_filter='Threads.*'
+
+# Leaks and the memory that torch's reader of archives takes for damaged ones are torch's.
+FUZZ_SECONDS ?= 60
+CLANG ?= clang++
+fuzz: $(STAMPS)/configure
+	$(BIN)/cmake --build build --parallel $$(nproc) --target prdp
+	$(BIN)/cmake -S tests/fuzz -B build-fuzz -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DCMAKE_CXX_COMPILER=$(CLANG) > build/fuzz.log
+	$(BIN)/cmake --build build-fuzz
+	for target in scene files operators; do \
+	  mkdir -p build-fuzz/found/$$target; corpus=tests/fuzz/corpus/$$target; [ $$target = scene ] && corpus=examples/scenes; \
+	  PRDP_FUZZ_TARGET=$$target OMP_NUM_THREADS=1 build-fuzz/prdp_fuzz -fork=1 -ignore_ooms=1 -detect_leaks=0 -malloc_limit_mb=8000 \
+	    -max_len=4096 -max_total_time=$(FUZZ_SECONDS) -artifact_prefix=build-fuzz/$$target- \
+	    build-fuzz/found/$$target $$corpus || exit 1; \
+	done
 
 # An environment of its own: it reads the sources and needs neither torch nor a build.
 docs: $(STAMPS)/docs
@@ -70,4 +95,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-docs .venv-peers .stamps build runs site prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-docs .venv-peers .stamps build build-address build-thread build-fuzz runs site prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info

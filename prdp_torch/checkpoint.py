@@ -3,10 +3,11 @@
 import io
 import json
 import pickle
+import warnings
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch import _C, processes
 
 
 class Checkpoint(_C.Checkpoint):
@@ -20,16 +21,27 @@ class Checkpoint(_C.Checkpoint):
     def __init__(self, path, **settings):
         super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
+    def due(self):
+        return processes.is_first() and super().due()
+
+    def remove(self):
+        if processes.is_first():
+            super().remove()
+
     def save(self, state):
         """Save a state made of tensors, state_dicts and plain values. ValueError if it cannot be written."""
+        if not processes.is_first():
+            return
         content = io.BytesIO()
         torch.save(state, content)
         self.write(content.getvalue())
 
     def load(self):
-        """Return the state that was saved last, or None if there is none with these settings. ValueError if the file
-        is damaged."""
-        content = self.read()
+        """Return the state that was saved last, or None if there is none with these settings. If the file is damaged,
+        warn and return the state before it. ValueError if there is none before it either."""
+        content = processes.from_first(self.read)
+        if self.notice:
+            warnings.warn(self.notice, stacklevel=3)
         if content is None:
             return None
         try:

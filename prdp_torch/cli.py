@@ -4,6 +4,7 @@ import functools
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, advice, datasets, records, report, trajectories
+from prdp_torch import _C, advice, datasets, processes, records, report, trajectories
 from prdp_torch import compare as comparison
 from prdp_torch import scenes as scene_files
 from prdp_torch.tensorboard import TensorBoard
@@ -47,7 +48,11 @@ def command(function):
     @functools.wraps(function)
     def guarded(*args, **kwargs):
         try:
-            function(*args, **kwargs)
+            if processes.launched() > 1 and function.__name__ != "train":
+                raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
+            with processes.joined(), warnings.catch_warnings():
+                warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
+                function(*args, **kwargs)
         except KeyboardInterrupt:
             kept = "--resume keeps finished trainings and goes on from the last checkpoint"
             print(f"prdp: interrupted; {kept}", file=sys.stderr)
@@ -121,7 +126,7 @@ def train(
                 progress.update(task, completed=interval.number, note=note)
 
             callbacks = [show]
-            if tensorboard:
+            if tensorboard and processes.is_first():
                 callbacks.append(TensorBoard(folder / refinement.label / f"seed_{seed}.tensorboard"))
             curves = comparison.run_one(
                 loaded,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prdp_torch import _C, records
+from prdp_torch import _C, processes, records
 from prdp_torch.checkpoint import Checkpoint
 from prdp_torch.networks import make_network
 from prdp_torch.training import Refinement, train
@@ -134,7 +134,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
     )
     if not resume:
         checkpoint.remove()
-    curves = _finished(path, scene, checkpoint) if resume else None
+    curves = processes.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
     if curves is not None:
         return curves
     network = make_network(scene, seed) if scene.trains_network else None
@@ -154,7 +154,9 @@ def _finished(path, scene, checkpoint):
     intervals = record["settings"].pop("intervals")
     if record["settings"] != records.identity(scene):
         return None
-    if intervals != scene.training.intervals:
+    if intervals == scene.training.intervals:
+        checkpoint.remove_before(path)
+    else:
         if checkpoint.read() is None:
             _C.refuse_finished(path, intervals, scene.training.intervals)
         return None

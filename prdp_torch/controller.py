@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, processes
 
 
 class Record(NamedTuple):
@@ -40,8 +40,11 @@ class ToleranceRecord(NamedTuple):
 class _Attached:
     """What controllers share: they hand K and tolerances on to the steppers, and ask them how the solves went."""
 
-    def _take(self, steppers):
+    def _take(self, steppers, process_group):
         who = type(self).__name__
+        if process_group is not None and processes.rank(who, process_group) < 0:
+            raise ValueError(f"{who}: this process does not belong to process_group")
+        self.process_group = process_group
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
@@ -61,15 +64,28 @@ class _Attached:
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
             converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
-        refined = self._step(metric, bool(converged), self._residual(), error)
+        refined = self._step(*self._of_all_processes(metric, bool(converged), error))
         self._push()
         return refined
 
-    def _residual(self):
-        """Where the last solves ended: the mean over the samples, of several steppers the largest."""
-        infos = [info for stepper in self.steppers if (info := getattr(stepper, "info", None)) is not None]
-        residuals = [float(info.residual.double().mean()) for info in infos]
-        return max((r for r in residuals if math.isfinite(r)), default=None)
+    def _of_all_processes(self, metric, converged, error):
+        """(metric, converged, residual, error), the same in every process: means, and whether all have converged. The
+        residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
+        ended = [getattr(stepper, "info", None) for stepper in self.steppers]
+        residuals = [torch.zeros(0) if info is None else info.residual.double() for info in ended]
+        many = processes.count(self.process_group)
+        if many > 1:
+            # One that is refused must be refused in every process.
+            numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
+            numbers += [converged, error is not None]
+            metric, error_sum, agree, known, *of_steppers = processes.sums(
+                [*numbers, *(n for r in residuals for n in (r.sum(), r.numel()))], self.process_group
+            )
+            metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None
+            means = [total / n for total, n in zip(of_steppers[::2], of_steppers[1::2], strict=True) if n]
+        else:
+            means = [float(r.mean()) for r in residuals if r.numel()]
+        return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error
 
     def state_dict(self):
         """Return the state as plain values, for `load_state_dict`."""
@@ -84,6 +100,8 @@ class _Attached:
         self._push()
 
     def __reduce__(self):
+        if self.process_group is not None:
+            raise TypeError(f"{type(self).__name__}: only a controller of the default process group can be copied")
         return _remade, (type(self), self.steppers, self.settings, self.state_dict())
 
 
@@ -130,6 +148,9 @@ class PRDPController(_C.PRDPController, _Attached):
         maximum: K is never raised beyond it. None sets no limit.
         growth: a refinement raises K to growth·K where that is more than K + increment.
         adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations. None leaves them to the stepper.
+        process_group: a group of torch.distributed; None takes the default one. If torch.distributed is initialised,
+            `step` is a collective call. Every process calls it with the metric of its own samples, all of them see the
+            mean, and they refine in the same interval. On a single process it has no effect.
 
     K is not raised while every solve of the steppers meets its tolerance. `warning`, which every controller
     has, is None or says in words what is wrong: the solves stop so far from the solution that their error dominates
@@ -145,9 +166,9 @@ class PRDPController(_C.PRDPController, _Attached):
     Source: paper, section 3.
     """
 
-    def __init__(self, steppers=(), **settings):
+    def __init__(self, steppers=(), *, process_group=None, **settings):
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, metric, converged=None, error=None):
         """Decide after an interval. Returns True if K was raised.
@@ -186,6 +207,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
             ⌈adjoint_ratio·K⌉; in (0, 1].
         floor: the smallest rtol; > 0. In float32 solves reach about 1e-5.
         maximum: K >= 1. It is only a limit, which the solves should not reach.
+        process_group: as for `PRDPController`. The error is averaged over the processes.
 
     Under `torch.compile` a step compiles again for each new rtol. After `torch._dynamo.config.recompile_limit` (8)
     of them it runs uncompiled. Raise that limit, or do not compile the step.
@@ -201,9 +223,9 @@ class ToleranceController(_C.ToleranceController, _Attached):
     and of optimisation with approximate gradients (Pedregosa, ICML 2016).
     """
 
-    def __init__(self, steppers=(), **settings):
+    def __init__(self, steppers=(), *, process_group=None, **settings):
         super().__init__(**_checked("ToleranceController", settings, _C.TOLERANCE_DEFAULTS))
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, error, converged=None):
         """Decide after an interval. Returns True if rtol became smaller.
@@ -234,14 +256,15 @@ class ToleranceController(_C.ToleranceController, _Attached):
 class LinearSchedule(_C.LinearSchedule, _Attached):
     """A manual schedule: K = initial + increment·(calls of step), at most `maximum`. increment = 0 keeps K constant.
 
-    It has the interface of `PRDPController` and ignores the metric. `adjoint_ratio` has the same meaning."""
+    It has the interface of `PRDPController` and ignores the metric. `adjoint_ratio` and
+    `process_group` have the same meaning."""
 
-    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None):
+    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None, process_group=None):
         settings = {"initial": initial, "increment": increment, "maximum": maximum}
         settings = {name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()}
         adjoint_ratio = _check.optional(_check.real, "LinearSchedule", "adjoint_ratio", adjoint_ratio)
         super().__init__(**settings, adjoint_ratio=adjoint_ratio)
-        self._take(steppers)
+        self._take(steppers, process_group)
 
     def step(self, metric=0.0, converged=None, error=None):
         """Advance the schedule. Returns True if K was raised."""

@@ -12,14 +12,19 @@ from pathlib import Path
 
 import torch
 
-from prdp_torch import _C, datasets
+from prdp_torch import _C, datasets, processes
 
 
 def environment():
     """Versions, machine and commit, as far as they can be found out."""
     return {
         "versions": {"prdp_torch": _C.VERSION, "torch": torch.__version__, "python": platform.python_version()},
-        "machine": {"processor": _processor(), "cores": os.cpu_count(), "threads": torch.get_num_threads()},
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "processes": processes.count(),
+        },
         "commit": _commit(),
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }
@@ -61,10 +66,11 @@ def settings(scene):
 
 @contextlib.contextmanager
 def alone_in(folders):
-    """Make the folders, and keep other processes from training into them meanwhile. ValueError if one does."""
+    """Make the folders, and keep other trainings out of them meanwhile. ValueError if one is there already. Of several
+    processes that train together, the first one does so."""
     locks = []
     try:
-        for folder in folders:
+        for folder in folders if processes.is_first() else ():
             folder.mkdir(parents=True, exist_ok=True)
             locks.append(_C.FolderLock(folder))
         yield
@@ -82,11 +88,13 @@ def write(path, content):
 def write_training(path, record, network=None):
     """Write the record of a training, and the `state_dict` of its network (if it has one) beside it: both, each whole,
     or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier record is
-    then still there, with its weights."""
+    then still there, with its weights. Of several processes the first one writes."""
+    if not processes.is_first():
+        return
     weights = []
     if network is not None:
         content = io.BytesIO()
-        torch.save(network.state_dict(), content)
+        torch.save(dict(network.state_dict()), content)  # prdp_train reads no OrderedDict
         weights = [(weights_of(path), content.getvalue())]
         record = {**record, "weights": _C.fingerprint(content.getvalue())}
     _C.write_whole([*weights, (path, _C.seal_record(_json(record)).encode())])
@@ -133,6 +141,8 @@ def _null_for_nan(content):
 def prepare_folder(path):
     """Make the folder and see that it can be written to, before any work. ValueError if not."""
     path = Path(path)
+    if not processes.is_first():
+        return path
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".writable"

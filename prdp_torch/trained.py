@@ -62,7 +62,7 @@ def load_trained(run_folder, seed=0):
     network = records.read_weights(path, make_network(scene, seed))
     if network is None:
         raise ValueError(
-            f"load_trained: '{records.weights_of(path)}' is missing; prdp_train, the C++ trainer, writes no weights"
+            f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
     return Trained(network.eval(), training.propagator(scene, network), scene, record["curves"])
 

@@ -1,6 +1,7 @@
 """The Python trainer. Data, losses and metrics come from the library, the network may be any
 `nn.Module`; `csrc/train` holds the same loops in C++."""
 
+import functools
 import math
 import sys
 import time
@@ -8,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, datasets, field_task, fields
+from prdp_torch import _C, datasets, field_task, fields, processes
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.networks import make_network
 from prdp_torch.scenes import make_stepper
@@ -148,7 +149,14 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     Raises:
         ValueError, TypeError: network, data or checkpoint do not fit the scene. Network and data are checked before
             any work.
+
+    If torch.distributed is initialised, every process calls this with the same arguments. The processes share each
+    batch and the validation samples and return the same curves, which are those of one process to rounding. The first
+    one keeps the checkpoint. ValueError for a task without a network, and if a batch has fewer samples than there are
+    processes.
     """
+    if processes.count() > 1 and not scene.trains_network:
+        raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):
@@ -159,7 +167,8 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
-        task = _network(scene, steppers, seed, network, datasets.of_scene(scene, data, on_data))
+        data = processes.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
+        task = _network(scene, steppers, seed, network, data)
     else:
         task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
     try:
@@ -226,7 +235,8 @@ class _Run:
             resumed=resumed,
             **costs,
         )
-        return any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
+        stopped = any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
+        return processes.sums([stopped])[0] > 0
 
     def _done(self):
         return len(self.curves["seconds"])
@@ -253,18 +263,16 @@ class _Run:
         iterations = forward = adjoint = 0.0
         failures = _C.Failures()
         for loss, samples in task.updates(len(self.curves["update_loss"])):
-            self._check(loss, number)
+            solves += sum(stepper.info.iterations[0].numel() for stepper in self.steppers)
+            loss, refused, *spent = processes.mean([loss, self._refused(), *self._spent()], self._samples())
+            self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
-            for stepper in self.steppers:
-                solves += stepper.info.iterations[0].numel()
-                iterations += _per_sample(stepper.info.iterations)
-                forward += _per_sample(stepper.info.operator_applications)
-            reports = [stepper.adjoint_info for stepper in self.steppers]
-            reports = [report for report in reports if report is not None]
-            adjoint += sum(_per_sample(report.operator_applications) for report in reports)
-            failures.take([s.info.status for s in self.steppers], [report.status for report in reports], samples)
+            iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
+            adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
+            failures.take([stepper.info.status for stepper in self.steppers], adjoints, samples)
         seconds = time.perf_counter() - started
-        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failures.count, seconds)
+        failed = int(processes.sums([failures.count])[0])
+        self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
         if failures.count:
             print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)
 
@@ -293,12 +301,27 @@ class _Run:
         else:
             self.controller.step(metric, error=error)
 
-    def _check(self, loss, done):
+    def _samples(self):
+        return len(self.steppers[0].info.iterations)
+
+    def _refused(self):
+        """Whether the solver was given NaN or Inf by the last update."""
+        return any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers)
+
+    def _spent(self):
+        """Iterations, operator applications and adjoint applications of the last update."""
+        reports = [stepper.info for stepper in self.steppers]
+        adjoint = [report for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
+        return (
+            sum(_per_sample(info.iterations) for info in reports),
+            sum(_per_sample(info.operator_applications) for info in reports),
+            sum((_per_sample(info.operator_applications) for info in adjoint), 0.0),
+        )
+
+    def _check(self, loss, refused, done):
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
-        if self.goes_on:
-            return
-        if any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers):
+        if refused and not self.goes_on:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
@@ -325,12 +348,13 @@ def error(scene, u, reference):
 
 def _network(scene, steppers, seed, network, data):
     """An interval is an epoch, the metric that of validation."""
+    processes.check_batches(len(data.train_start), scene.training.batch)
     if network is None:
         network = make_network(scene, seed)
     else:
         datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = objective(scene, steppers, data, network)
+    loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
@@ -340,10 +364,10 @@ def _network(scene, steppers, seed, network, data):
             for group in optimiser.param_groups:
                 group["lr"] = scene.learning_rate(number)
             optimiser.zero_grad()
-            loss = loss_of(batch)
-            loss.backward()
+            loss, part = loss_of(batch)
+            part.backward()
             optimiser.step()
-            yield float(loss.detach()), batch
+            yield float(loss.detach()), processes.share(batch)
 
     def state():
         parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
@@ -363,11 +387,14 @@ def _network(scene, steppers, seed, network, data):
 
 def _metric(scene, data, network):
     step = propagator(scene, network)
+    start, end = processes.share(data.valid_start), processes.share(data.valid_end)
 
     def metric():
-        with torch.no_grad():
-            reached = fields.rollout(step, data.valid_start, scene.data.valid_steps)[:, -1]
-        return error(scene, reached, data.valid_end)
+        mine = math.nan  # of a process without a sample
+        if len(start):
+            with torch.no_grad():
+                mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
+        return processes.mean([mine], len(start))[0]
 
     return metric
 

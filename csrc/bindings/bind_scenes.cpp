@@ -133,10 +133,12 @@ void bind_scenes(py::module_& m) {
       .def("due", &Checkpoint::due)
       .def("write", [](Checkpoint& c, std::string state) { c.write(std::move(state)); }, py::arg("state"))
       .def("read",
-           [](const Checkpoint& c) {
+           [](Checkpoint& c) {
              const auto state = c.read();
              return state ? std::optional<py::bytes>(*state) : std::nullopt;
            })
+      .def_property_readonly("notice", &Checkpoint::notice)
+      .def("remove_before", &Checkpoint::remove_before, py::arg("record"))
       .def("refuse", &Checkpoint::refuse)
       .def("check_length", &Checkpoint::check_length, py::arg("done"), py::arg("intervals"))
       .def("remove", &Checkpoint::remove);

@@ -26,15 +26,22 @@ volatile std::sig_atomic_t interrupted = 0;
 struct Interrupted {};
 
 struct Options {
-  std::string scene, out, schedule, backward;
+  std::string scene, out, schedule, backward, weights;
   int64_t seeds = 1, constant = -1, intervals = 0;
   bool direct = false, automatic = false, resume = false;
 };
 
 /// What a record or a checkpoint must agree on to be of the same training, which may go on for more intervals.
-Json settings(const prdp::Scene& scene) {
-  return {{"scene", scene.name}, {"text", scene.text}, {"backward", prdp::name(scene.backward)}};
-}
+struct Identity {
+  const prdp::Scene& scene;
+  std::string weights;  // that the network begins with, as bytes; empty: those of the seed
+
+  Json settings() const {
+    Json all{{"scene", scene.name}, {"text", scene.text}, {"backward", prdp::name(scene.backward)}};
+    if (!weights.empty()) all["weights"] = prdp::fingerprint(weights);
+    return all;
+  }
+};
 
 /// The bytes of paths and arguments need not be text.
 std::string text_of(const Json& json, int indent = -1) {
@@ -43,27 +50,29 @@ std::string text_of(const Json& json, int indent = -1) {
 
 Json versions() { return {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}; }
 
-Json record(const prdp::Scene& scene, const std::string& label, int64_t seed, const std::string& command,
+Json record(const Identity& identity, const std::string& label, int64_t seed, const std::string& command,
             const prdp::train::Curves& c) {
-  auto all = settings(scene);
-  all["intervals"] = scene.training.intervals;
+  auto all = identity.settings();
+  all["intervals"] = identity.scene.training.intervals;
   Json curves;
   prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
   if (!c.diverged.empty()) curves["diverged"] = c.diverged;
   if (!c.warning.empty()) curves["warning"] = c.warning;
-  return {{"label", label},
-          {"seed", seed},
-          {"settings", all},
-          {"versions", versions()},
-          {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
-          {"command", command},
-          {"curves", curves}};
+  Json record{{"label", label},
+              {"seed", seed},
+              {"settings", all},
+              {"versions", versions()},
+              {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
+              {"command", command},
+              {"curves", curves}};
+  if (!c.weights.empty()) record["weights"] = prdp::fingerprint(c.weights);
+  return record;
 }
 
 /// Beside the record to come; without --resume what an earlier run has left there is gone.
-prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const prdp::Scene& scene,
+prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const Identity& identity,
                                const std::string& label, int64_t seed) {
-  const Json all{{"trainer", "C++"}, {"label", label}, {"seed", seed}, {"settings", settings(scene)},
+  const Json all{{"trainer", "C++"}, {"label", label}, {"seed", seed}, {"settings", identity.settings()},
                  {"versions", versions()}};
   prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), text_of(all));
   if (!options.resume) checkpoint.remove();
@@ -71,15 +80,19 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, c
 }
 
 /// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on from.
-bool is_done(const fs::path& path, const prdp::Scene& scene, const prdp::Checkpoint& checkpoint) {
+bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
   const auto text = prdp::read_record(path);
   if (!text) return false;
   auto found = Json::parse(*text).value("settings", Json::object());
   const auto intervals = found.value("intervals", int64_t{0});
   found.erase("intervals");
-  if (found != settings(scene)) return false;
-  if (intervals == scene.training.intervals) return true;
-  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, scene.training.intervals);
+  const auto wanted = identity.scene.training.intervals;
+  if (found != identity.settings()) return false;
+  if (intervals == wanted) {
+    checkpoint.remove_before(path);
+    return true;
+  }
+  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, wanted);
   return false;
 }
 
@@ -110,6 +123,7 @@ int run(const Options& options, const std::string& command) {
   if (!options.backward.empty()) scene.set_backward(options.backward);
   if (options.intervals > 0) scene.training.intervals = options.intervals;
   const auto refinement = refinement_of(options, scene);
+  const Identity identity{scene, options.weights.empty() ? "" : prdp::read_whole("weights", options.weights)};
   const auto folder = fs::path(options.out.empty() ? "runs/" + scene.name + "-cpp" : options.out) / refinement.label;
   std::error_code error;
   fs::create_directories(folder, error);
@@ -120,8 +134,12 @@ int run(const Options& options, const std::string& command) {
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
-    auto checkpoint = checkpoint_of(file, options, scene, refinement.label, seed);
-    if (options.resume && is_done(file, scene, checkpoint)) continue;
+    auto checkpoint = checkpoint_of(file, options, identity, refinement.label, seed);
+    if (options.resume) {
+      if (is_done(file, identity, checkpoint)) continue;
+      checkpoint.read();
+      if (!checkpoint.notice().empty()) std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint.notice().c_str());
+    }
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
       if (std::exchange(first, false) || done % 10 == 0)
@@ -131,9 +149,12 @@ int run(const Options& options, const std::string& command) {
       if (interrupted) throw Interrupted{};
       if (slow) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
-    const auto curves = prdp::train::train(scene, refinement, seed, on_interval, checkpoint, on_data);
-    const auto text = prdp::seal_record(text_of(record(scene, refinement.label, seed, command, curves), 1));
-    prdp::write_whole({{file, text}});
+    const auto curves = prdp::train::train(scene, refinement, seed, identity.weights, on_interval, checkpoint, on_data);
+    const auto text = prdp::seal_record(text_of(record(identity, refinement.label, seed, command, curves), 1));
+    std::vector<prdp::NewFile> files;
+    if (!curves.weights.empty()) files.push_back({fs::path(file).replace_extension(".pt"), curves.weights});
+    files.push_back({file, text});
+    prdp::write_whole(files);
     checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
@@ -162,6 +183,7 @@ int main(int argc, char** argv) {
   app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
+  app.add_option("--weights", options.weights, "file of weights that the network begins with, in place of the seed's");
   app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
   k->excludes(s)->excludes(d)->excludes(a);
   s->excludes(d)->excludes(a);

@@ -18,6 +18,7 @@
 #include "prdp/controller/tolerance_controller.h"
 #include "prdp/networks/mlp.h"
 #include "prdp/networks/resnet.h"
+#include "prdp/networks/weights.h"
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/failures.h"
@@ -287,10 +288,11 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
   return {loss_of, metric};
 }
 
-Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed, const OnInterval& on_interval,
-                     const OnProgress& on_data) {
-  const auto data = make_dataset(scene, on_data);
+Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed, const std::string& weights,
+                     const OnInterval& on_interval, const OnProgress& on_data) {
   auto network = make_network(scene, seed);
+  if (!weights.empty()) unpack_weights(weights, *network.ptr());
+  const auto data = make_dataset(scene, on_data);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
                                                               : corrector(scene, steppers, data, network);
   FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
@@ -316,7 +318,9 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
   // The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
   const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) { return std::sqrt(squared) / n; };
-  return run.go({updates, metric, error, save_all, load_all}, on_interval);
+  auto curves = run.go({updates, metric, error, save_all, load_all}, on_interval);
+  curves.weights = pack_weights(module);
+  return curves;
 }
 
 Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const OnInterval& on_interval) {
@@ -346,8 +350,10 @@ Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const On
 
 }  // namespace
 
-Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
-             Checkpoint& checkpoint, const OnProgress& on_data) {
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::string& weights,
+             const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data) {
+  TORCH_CHECK_VALUE(weights.empty() || scene.trains_network(), "weights: the scene '", scene.name,
+                    "' trains no network");
   const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
   if (scene.task == Scene::Task::kField) {
     FieldTraining field(scene, solver, seed);
@@ -359,7 +365,7 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
   for (auto& stepper : steppers) solves.push_back(&stepper);
   Run run(scene, refinement, seed, checkpoint, solves);
   return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, steppers[0], on_interval)
-                                                : train_network(scene, run, steppers, seed, on_interval, on_data);
+                                                : train_network(scene, run, steppers, seed, weights, on_interval, on_data);
 }
 
 }  // namespace prdp::train

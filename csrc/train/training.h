@@ -41,6 +41,7 @@ struct Curves {
   std::vector<double> seconds;
   std::string diverged;  // where and why a training was lost; its curves end there, with a metric of NaN
   std::string warning;   // what the controller says in the end
+  std::string weights;   // of a network in the end, as pack_weights() makes them
 };
 
 /// Calls f(name, values) for each of them that has an entry for every interval or update.
@@ -63,9 +64,10 @@ void each_curve(AnyCurves& curves, const F& f) {
 /// from.
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
-/// Trains the scene once; `seed` is that of the network's weights and of the shuffling, or of a field's noise. Goes on from the
-/// checkpoint where there is one, and keeps itself there whenever one is due after an interval.
-Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const OnInterval& on_interval,
-             Checkpoint& checkpoint, const OnProgress& on_data = {});
+/// Trains the scene once; `seed` is that of the network's weights and of the shuffling, or of a field's noise. A network
+/// begins with `weights`, as pack_weights() makes them, where they are not empty. Goes on from the checkpoint where
+/// there is one, and keeps itself there whenever one is due after an interval.
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::string& weights,
+             const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data = {});
 
 }  // namespace prdp::train

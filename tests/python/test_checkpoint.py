@@ -1,7 +1,9 @@
 """Trainings that are stopped and go on: the same curves, bit for bit, as of those that were left alone."""
 
+import ctypes
 import io
 import json
+import os
 import subprocess
 import sys
 import time
@@ -137,6 +139,66 @@ def test_a_checkpoint_of_other_settings_is_not_gone_on_from_in_cpp(tmp_path):
     assert run("cpp", scene, tmp_path / "alone", *other)[0] == 0
     there, here = (json.loads((tmp_path / run / "prdp/seed_0.json").read_text()) for run in ("killed", "alone"))
     assert without_seconds(there["curves"]) == without_seconds(here["curves"])
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp_path, trainer):
+    scene = scene_of("parameters", tmp_path)
+    arguments = ("--intervals", 300)
+    assert run(trainer, scene, tmp_path / "alone", *arguments)[0] == 0
+    record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
+    stop(start(trainer, scene, tmp_path / "killed", *arguments), checkpoint, SIGKILL)
+    damaged = checkpoint.read_bytes()[:-20]
+    checkpoint.unlink()  # the kill may have left both names with one file
+    checkpoint.write_bytes(damaged)
+    status, errors = run(trainer, scene, tmp_path / "killed", *arguments, "--resume")
+    assert status == 0
+    assert f"checkpoint: '{checkpoint}' is damaged; the training goes on from the one before\n" in errors
+    curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
+    assert without_seconds(curves) == without_seconds(alone)
+    assert [path.name for path in record.parent.iterdir()] == ["seed_0.json"]
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_checkpoint_that_a_kill_has_left_beside_its_record_goes(tmp_path, trainer):
+    scene, out = scene_of("parameters", tmp_path), tmp_path / "out"
+    arguments = (trainer, scene, out, "--intervals", 3)
+    assert run(*arguments)[0] == 0
+    record = out / "prdp/seed_0.json"
+    left = [out / "prdp" / f"seed_0.checkpoint{end}" for end in ("", ".before")]
+    for path in left:
+        path.write_text("of any kind")
+    later = record.stat().st_mtime + 1
+    os.utime(left[0], (later, later))  # of a training that was begun afterwards
+    assert run(*arguments, "--resume")[0] == 0
+    assert all(path.exists() for path in left)
+    earlier = later - 2
+    os.utime(left[0], (earlier, earlier))
+    assert run(*arguments, "--resume")[0] == 0
+    assert [path.name for path in record.parent.iterdir()] == [record.name]
+
+
+def with_the_rights_of_a_user():
+    """Even root obeys the rights of a folder then."""
+    if os.geteuid() == 0:
+        drop, override = 24, (1, 2)  # PR_CAPBSET_DROP; CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+        for capability in override:
+            assert ctypes.CDLL(None).prctl(drop, capability, 0, 0, 0) == 0
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, trainer):
+    scene, out = scene_of("parameters", tmp_path), tmp_path / "out"
+    (out / "prdp").mkdir(parents=True)
+    for folder in (out / "prdp", out):
+        folder.chmod(0o555)
+        command = [*TRAINERS[trainer], scene, "--out", out, "--intervals", "2"]
+        done = subprocess.run(command, capture_output=True, text=True, preexec_fn=with_the_rights_of_a_user)
+        assert done.returncode == 2 and "Permission denied" in done.stderr and done.stderr.count("\n") == 1
+        assert f"cannot write to '{out}" in done.stderr or f"cannot write '{out}" in done.stderr
+        folder.chmod(0o755)
+        assert list((out / "prdp").iterdir()) == []
+        folder.chmod(0o555)
 
 
 # ---- trainings that are interrupted in this process
@@ -287,11 +349,38 @@ def test_a_state_comes_back_and_another_settings_does_not(tmp_path):
     checkpoint.save(state)
     found = Checkpoint(path, seed=0, text="two\nlines").load()
     assert torch.equal(found.pop("u").isnan(), state.pop("u").isnan()) and found == state
-    assert Checkpoint(path, seed=1, text="two\nlines").load() is None
+    with pytest.warns(UserWarning, match=f"'{path}' is of other settings or another version; it is not used"):
+        assert Checkpoint(path, seed=1, text="two\nlines").load() is None
     assert list(tmp_path.iterdir()) == [path]
     checkpoint.remove()
     checkpoint.remove()
     assert checkpoint.load() is None and list(tmp_path.iterdir()) == []
+
+
+def test_two_checkpoints_are_kept(tmp_path):
+    path = tmp_path / "kept"
+    before = tmp_path / "kept.before"
+    checkpoint = Checkpoint(path, seed=0)
+    for state in range(3):
+        checkpoint.save(state)
+        assert checkpoint.load() == state and checkpoint.notice == ""
+    whole = path.read_bytes()
+    for damage in (whole[:-1], b"", b"something else\n", whole.replace(b"seed", b"need")):
+        path.write_bytes(damage)
+        with pytest.warns(UserWarning, match=f"'{path}' is damaged; the training goes on from the one before"):
+            assert checkpoint.load() == 1
+    Checkpoint(path, seed=7).save("foreign")
+    Checkpoint(tmp_path / "other", seed=0).save(5)
+    (tmp_path / "other").rename(before)
+    with pytest.warns(UserWarning, match=f"'{path}' is of other settings or another version; it is not used"):
+        assert checkpoint.load() == 5
+    path.unlink()
+    assert checkpoint.load() == 5
+    before.write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=f"checkpoint: '{before}' is damaged or of another version; delete it"):
+        checkpoint.load()
+    checkpoint.remove()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_changed_byte_or_a_missing_end_is_found(tmp_path):

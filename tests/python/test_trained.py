@@ -60,7 +60,7 @@ def test_what_cannot_be_loaded_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"no 'seed_7.json' in '.*constant_2'; it holds seed_0.json"):
         prdp.load_trained(folder / "constant_2", seed=7)
     (folder / "constant_2/seed_0.pt").unlink()
-    with pytest.raises(ValueError, match=r"seed_0.pt' is missing; prdp_train, the C\+\+ trainer, writes no weights"):
+    with pytest.raises(ValueError, match=r"seed_0.pt', the weights that belong to the record, is missing"):
         prdp.load_trained(folder / "constant_2")
     (folder / "constant_3/seed_0.pt").write_bytes(b"other")
     with pytest.raises(ValueError, match="is damaged or not of the record beside it"):

@@ -182,7 +182,7 @@ T* many_sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, con
   }
   int64_t s = 0;
   if constexpr (Dim == 3)
-    for (; s + 2 <= n; s += 2) two_sweeps<Accelerated>(a, c, x, y, omega + s);
+    for (; s + 2 <= n; s += 2) two_sweeps<Accelerated>(a, c, x, y, Accelerated ? omega + s : nullptr);
   // A plane that goes through registers row by row may be overwritten on the way.
   const bool in_place = Dim == 2 && !Accelerated && registers <= kColumns;
   for (; s < n; ++s) {

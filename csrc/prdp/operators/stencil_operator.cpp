@@ -1,6 +1,5 @@
 #include "prdp/operators/stencil_operator.h"
 
-#include <ATen/Parallel.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include <algorithm>
@@ -9,6 +8,7 @@
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/interruption.h"
 
 namespace prdp {
 
@@ -39,7 +39,7 @@ void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& 
   auto* out = products.mutable_data_ptr<T>();
   constexpr int64_t worthwhile = 1 << 18;  // multiplications for a thread
   const int64_t grain = std::max<int64_t>(1, worthwhile / std::max<int64_t>(1, share * channels * points));
-  at::parallel_for(0, products.size(0) * given, grain, [&](int64_t begin, int64_t end) {
+  interruption::parallel_for(0, products.size(0) * given, grain, [&](int64_t begin, int64_t end) {
     for (int64_t p = begin; p < end; ++p) {
       const int64_t place = pattern.places[p % given], first = p / given * channels;
       for (int64_t field = first; place >= 0 && field < first + share * channels; ++field)
@@ -93,7 +93,12 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
   }
   for (size_t at = axes; at < p.size(); at += axes) {
     kernels::Offset offset{{0, 0, 0}};
-    for (size_t d = 0; d < axes; ++d) offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
+    for (size_t d = 0; d < axes; ++d) {
+      constexpr double exact = 1LL << 53;  // whole numbers of which a double has each
+      TORCH_CHECK_VALUE(std::abs(p[at + d]) <= exact && p[at + d] == std::trunc(p[at + d]),
+                        "Stencil: every entry of an offset must be a whole number, got ", p[at + d]);
+      offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
+    }
     for (const int64_t cells : offset.along)
       TORCH_CHECK_VALUE(std::abs(cells) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
                         " cells along each axis, got ", as_tuple(entries(offset, dim())));

@@ -25,22 +25,53 @@ double seconds() {
   return value;
 }
 
+/// Gives the file a second name, which replaces that of an older one. Where it cannot, there is no second file.
+void keep_as(const fs::path& second, const fs::path& path) {
+  auto unfinished = second;
+  unfinished += ".part";  // what a kill leaves is removed with the other unfinished files
+  std::error_code error;
+  fs::remove(unfinished, error);
+  fs::create_hard_link(path, unfinished, error);
+  if (error) fs::copy_file(path, unfinished, error);  // not every file system has links
+  if (!error) fs::rename(unfinished, second, error);
+}
+
 }  // namespace
 
 Checkpoint::Checkpoint(fs::path path, std::string settings)
-    : path_(std::move(path)), settings_(std::move(settings)), pause_(seconds()) {}
+    : path_(std::move(path)), before_(path_), settings_(std::move(settings)), pause_(seconds()) {
+  before_ += ".before";
+}
 
 bool Checkpoint::due() const { return Clock::now() - last_ >= pause_; }
 
 void Checkpoint::write(std::string state) {
+  keep_as(before_, path_);
   write_sealed(path_, kKind, {settings_, std::move(state)});
   last_ = Clock::now();
 }
 
-std::optional<std::string> Checkpoint::read() const {
-  auto found = read_sealed(path_, kKind, kRemedy);
-  if (!found || found->settings != settings_) return std::nullopt;
-  return std::move(found->content);
+std::optional<std::string> Checkpoint::read() {
+  notice_.clear();
+  std::optional<c10::ValueError> damage;
+  for (const auto& path : {path_, before_}) {
+    std::optional<Sealed> found;
+    try {
+      found = read_sealed(path, kKind, kRemedy);
+    } catch (const c10::ValueError& error) {
+      if (!damage) damage = error;
+      continue;
+    }
+    if (!found) continue;
+    if (found->settings == settings_) {
+      if (damage) notice_ = c10::str("checkpoint: '", path_.string(), "' is damaged; the training goes on from the one before");
+      return std::move(found->content);
+    }
+    if (notice_.empty())
+      notice_ = c10::str("checkpoint: '", path.string(), "' is of other settings or another version; it is not used");
+  }
+  if (damage) throw *damage;
+  return std::nullopt;
 }
 
 void Checkpoint::refuse() const { refuse_damaged(path_, kKind, kRemedy); }
@@ -51,10 +82,18 @@ void Checkpoint::check_length(int64_t done, int64_t intervals) const {
 }
 
 void Checkpoint::remove() const {
-  std::error_code error;
-  TORCH_CHECK_VALUE(!fs::is_directory(path_, error), "checkpoint: cannot remove '", path_.string(), "': it is a folder");
-  fs::remove(path_, error);
-  TORCH_CHECK_VALUE(!error, "checkpoint: cannot remove '", path_.string(), "': ", error.message());
+  for (const auto& path : {before_, path_}) {  // a kill in between leaves the last one
+    std::error_code error;
+    TORCH_CHECK_VALUE(!fs::is_directory(path, error), "checkpoint: cannot remove '", path.string(), "': it is a folder");
+    fs::remove(path, error);
+    TORCH_CHECK_VALUE(!error, "checkpoint: cannot remove '", path.string(), "': ", error.message());
+  }
+}
+
+void Checkpoint::remove_before(const fs::path& record) const {
+  std::error_code error, none;
+  const auto finished = fs::last_write_time(record, error), kept = fs::last_write_time(path_, none);
+  if (!error && !none && kept <= finished) remove();
 }
 
 }  // namespace prdp

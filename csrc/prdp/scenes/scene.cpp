@@ -222,6 +222,8 @@ Scene parse_scene(const std::string& text, const std::string& path) {
     table = toml::parse(text, path);
   } catch (const toml::parse_error& error) {
     TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
+  } catch (const BrokenToml&) {
+    TORCH_CHECK_VALUE(false, path, ": not a TOML file; a key or the name of a table has a character that it cannot have");
   }
 
   Scene scene;

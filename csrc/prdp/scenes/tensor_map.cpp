@@ -2,6 +2,8 @@
 
 #include <torch/csrc/jit/serialization/pickle.h>
 
+#include "prdp/scenes/pickled.h"
+
 namespace prdp {
 
 std::string pack(const TensorMap& tensors) {
@@ -17,8 +19,7 @@ std::string pack(const TensorMap& tensors) {
 TensorMap unpack(const std::string& bytes) {
   TensorMap tensors;
   try {
-    // This reader knows no classes and has no interpreter, unlike torch::jit::load and torch::serialize.
-    const auto loaded = torch::jit::pickle_load({bytes.begin(), bytes.end()});
+    const auto loaded = read_pickled(bytes);
     const auto& entries = loaded.toTupleRef().elements();
     for (size_t i = 0; i + 1 < entries.size(); i += 2)
       tensors.emplace(entries[i].toStringRef(), entries[i + 1].toTensor());

@@ -3,6 +3,9 @@
 
 #include <atomic>
 #include <chrono>
+#ifdef __SANITIZE_THREAD__
+#include <sanitizer/tsan_interface.h>
+#endif
 
 /// How a long computation is ended from outside: Python's Ctrl-C. The loops tell how much work they do, and
 /// every now and then a check may throw, on the thread that called; what had been computed is lost.
@@ -52,11 +55,37 @@ class Watch {
   bool checking_ = false;
 };
 
+#ifdef __SANITIZE_THREAD__
+/// What ThreadSanitizer cannot see, because torch's OpenMP library is built without it: a parallel loop begins after
+/// what was done before it, and ends before what is done after it. Nothing is said about parts of the same loop.
+class ForkAndJoin {
+ public:
+  ForkAndJoin() { __tsan_release(&begun_); }
+  ~ForkAndJoin() { __tsan_acquire(&ended_); }
+  struct Part {
+    explicit Part(const ForkAndJoin& loop) : loop(loop) { __tsan_acquire(&loop.begun_); }
+    ~Part() { __tsan_release(&loop.ended_); }
+    const ForkAndJoin& loop;
+  };
+
+ private:
+  mutable char begun_ = 0, ended_ = 0;
+};
+#else
+struct ForkAndJoin {
+  struct Part {
+    explicit Part(const ForkAndJoin&) {}
+  };
+};
+#endif
+
 /// at::parallel_for, all of whose threads stop soon after one of them has thrown.
 template <class Body>
 void parallel_for(int64_t begin, int64_t end, int64_t grain, const Body& body) {
   std::atomic<bool> stop = false;
+  const ForkAndJoin order;
   at::parallel_for(begin, end, grain, [&](int64_t from, int64_t to) {
+    const ForkAndJoin::Part part(order);
     const Watch::Member member(stop);
     try {
       body(from, to);

@@ -1,0 +1,85 @@
+#include "prdp/networks/weights.h"
+
+#include <caffe2/serialize/inline_container.h>
+#include <torch/csrc/jit/serialization/pickler.h>
+
+#include "prdp/scenes/files.h"
+#include "prdp/scenes/pickled.h"
+
+namespace prdp {
+
+namespace {
+
+using Dict = c10::impl::GenericDict;
+
+/// The tensors in the bytes, by name.
+Dict read(const std::string& bytes) {
+  try {
+    return read_pickled(bytes).toGenericDict();
+  } catch (const std::exception&) {
+    TORCH_CHECK_VALUE(false, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it");
+  }
+}
+
+/// The tensor of this name. Raises ValueError if there is none like `wanted`.
+at::Tensor found(const Dict& state, const std::string& name, const at::Tensor& wanted) {
+  const auto entry = state.find(name);
+  TORCH_CHECK_VALUE(entry != state.end() && entry->value().isTensor(), "weights: there is no tensor '", name, "'");
+  const auto tensor = entry->value().toTensor();
+  TORCH_CHECK_VALUE(tensor.defined() && tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(),
+                    "weights: '", name, "' must be ", wanted.scalar_type(), " of sizes ", wanted.sizes());
+  return tensor;
+}
+
+}  // namespace
+
+std::string pack_weights(const torch::nn::Module& network) {
+  c10::Dict<std::string, at::Tensor> state;
+  for (const auto& weight : network.named_parameters()) state.insert(weight.key(), weight.value().detach());
+  // torch::jit::pickle_save does the same but for one thing: it marks the types of what is in the dict, by a function
+  // that torch.load(weights_only=True) refuses to call.
+  std::string pickled, file;
+  torch::jit::Pickler pickler([&](const char* data, size_t size) { pickled.append(data, size); }, nullptr, nullptr,
+                              nullptr, nullptr, /*tag_aggregates=*/false);
+  pickler.protocol();
+  pickler.pushIValue(state);
+  pickler.stop();
+  caffe2::serialize::PyTorchStreamWriter writer([&](const void* data, size_t size) {
+    file.append(static_cast<const char*>(data), size);
+    return size;
+  });
+  for (size_t i = 0; i < pickler.tensorData().size(); ++i) {
+    const auto data = torch::jit::getWriteableTensorData(pickler.tensorData()[i]);
+    writer.writeRecord("data/" + std::to_string(i), data.data(), data.sizeInBytes());
+  }
+  writer.writeRecord("data.pkl", pickled.data(), pickled.size());
+  writer.writeEndOfFile();
+  return file;
+}
+
+void unpack_weights(const std::string& bytes, torch::nn::Module& network) {
+  const auto state = read(bytes);
+  const auto weights = network.named_parameters();
+  TORCH_CHECK_VALUE(state.size() == weights.size(), "weights: the network has ", weights.size(), " tensors, the file ",
+                    state.size());
+  std::vector<at::Tensor> tensors;
+  for (const auto& weight : weights) tensors.push_back(found(state, weight.key(), weight.value()));
+  const torch::NoGradGuard no_grad;
+  for (size_t i = 0; i < tensors.size(); ++i) weights[i].value().detach().copy_(tensors[i]);
+}
+
+void save_weights(const std::filesystem::path& path, const torch::nn::Module& network) {
+  const auto bytes = pack_weights(network);
+  write_whole({{path, bytes}});
+}
+
+void load_weights(const std::filesystem::path& path, torch::nn::Module& network) {
+  const auto bytes = read_whole("weights", path);
+  try {
+    unpack_weights(bytes, network);
+  } catch (const c10::ValueError& error) {
+    TORCH_CHECK_VALUE(false, error.what_without_backtrace(), ", in '", path.string(), "'");
+  }
+}
+
+}  // namespace prdp

@@ -1,0 +1,146 @@
+"""Several processes that train one network: who this one is, its share of the work, and sums over all of them.
+
+Everything here is about torch.distributed's default group, and does nothing where there is none.
+"""
+
+import contextlib
+import os
+import sys
+
+import torch
+from torch import distributed
+
+
+def count(group=None):
+    """How many processes there are; 1 where torch.distributed is not initialised."""
+    if not distributed.is_available() or not distributed.is_initialized():
+        return 1
+    return distributed.get_world_size(group)
+
+
+def rank(who, group):
+    """This process's number in a group, negative where it does not belong to it. TypeError for what is no group."""
+    if distributed.is_available() and group == distributed.GroupMember.NON_GROUP_MEMBER:
+        return -1
+    if not distributed.is_available() or not isinstance(group, distributed.ProcessGroup):
+        raise TypeError(f"{who}: process_group must be a group of torch.distributed, got {group!r:.80}")
+    return distributed.get_rank(group)
+
+
+def is_first():
+    """Whether this process is the one that writes files."""
+    return count() == 1 or distributed.get_rank() == 0
+
+
+def sums(values, group=None):
+    """The sums over the processes of each of these numbers, to the same bit in all of them."""
+    if count(group) == 1:
+        return list(values)
+    device = "cuda" if distributed.get_backend(group) == "nccl" else "cpu"
+    mine = torch.tensor([float(value) for value in values], dtype=torch.float64, device=device)
+    of_all = [torch.empty_like(mine) for _ in range(count(group))]
+    distributed.all_gather(of_all, mine, group=group)
+    return [sum(column) for column in zip(*(t.tolist() for t in of_all), strict=True)]
+
+
+def mean(values, samples):
+    """The mean of each of these numbers over the processes, which speak for that many samples each."""
+    if count() == 1:
+        return list(values)
+    *totals, weight = sums([*(samples * value if samples else 0.0 for value in values), samples])
+    return [total / weight for total in totals]
+
+
+def share(samples):
+    """This process's part of a tensor of samples or of their numbers."""
+    return samples if count() == 1 else samples.tensor_split(count())[distributed.get_rank()]
+
+
+def check_batches(samples, batch):
+    """Raise ValueError unless every process gets a sample of every batch."""
+    smallest = samples % batch or min(samples, batch)
+    if smallest < count():
+        raise ValueError(f"{count()} processes need as many samples in each batch, but a batch has {smallest}")
+
+
+class _Loss(torch.nn.Module):
+    """What DistributedDataParallel calls: the loss of a share of a batch, with the network's parameters."""
+
+    def __init__(self, network, loss):
+        super().__init__()
+        self.network = network
+        self.loss = loss
+
+    def forward(self, batch):
+        return self.loss(batch)
+
+
+def shared_loss(network, loss):
+    """From `loss`, of the numbers of a batch's samples, to that of this process's share of them: (its value, its
+    part of the whole loss, for the backward pass). The gradients of the parts are then those of the batch's loss."""
+    if count() == 1:
+        return lambda batch: (loss(batch),) * 2
+    parallel = torch.nn.parallel.DistributedDataParallel(_Loss(network, loss))
+
+    def of_share(batch):
+        mine = share(batch)
+        value = parallel(mine)
+        return value, value * (len(mine) * count() / len(batch))  # DistributedDataParallel divides by the count
+
+    return of_share
+
+
+def from_first(make):
+    """What `make()` returns in the first process, in all of them. It is not called in the others."""
+    if count() == 1:
+        return make()
+    box = [make() if is_first() else None]
+    distributed.broadcast_object_list(box, src=0)
+    return box[0]
+
+
+def first_before_others(make):
+    """`make()` of every process, called in the first one before the others: they find the files it has written."""
+    if count() == 1:
+        return make()
+    made = make() if is_first() else None
+    distributed.barrier()
+    return made if is_first() else make()
+
+
+def launched():
+    """How many processes torchrun, or who else sets its variables, has started this one among."""
+    names = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+    return int(os.environ["WORLD_SIZE"]) if all(name in os.environ for name in names) else 1
+
+
+@contextlib.contextmanager
+def joined():
+    """Join the others that torchrun has started, and leave them in the end. Only the first one prints meanwhile.
+
+    RuntimeError, in one sentence, where another process has ended before its time.
+    """
+    if launched() == 1:
+        yield
+        return
+    distributed.init_process_group("gloo")
+    who = f"process {distributed.get_rank()} of {count()}"
+    try:
+        with contextlib.ExitStack() as quiet:
+            if not is_first():
+                nowhere = quiet.enter_context(open(os.devnull, "w"))
+                quiet.enter_context(contextlib.redirect_stdout(nowhere))
+                quiet.enter_context(contextlib.redirect_stderr(nowhere))
+            yield
+    except RuntimeError as error:
+        if not _is_of_a_connection(error):
+            raise
+        raise RuntimeError(f"{who}: another process has ended, and this one with it") from None
+    finally:
+        if sys.exc_info()[0] is None:
+            distributed.destroy_process_group()
+
+
+def _is_of_a_connection(error):
+    """Whether gloo, which has no class of errors of its own, says that it has lost another process."""
+    return any(words in str(error) for words in ("gloo", "Connection closed", "Connection reset", "Broken pipe"))

@@ -1,0 +1,316 @@
+"""Several processes that train one network, over gloo on this machine."""
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import tiny, written
+from torch import distributed
+
+import prdp_torch as prdp
+from prdp_torch import cli, compare, processes, records, scenes
+from prdp_torch.training import Refinement
+
+ROOT = Path(__file__).parents[2]
+# One process imports torch, and those of the tests are forked from it before it has a thread.
+FORK = multiprocessing.get_context("forkserver")
+FORK.set_forkserver_preload(["helpers", "prdp_torch.cli"])
+DOUBLE = (('dtype = "float32"', 'dtype = "float64"'),)
+
+
+def emulator(tmp_path):
+    return written(
+        tmp_path,
+        *DOUBLE,
+        ("batch = 25", "batch = 64"),
+        ("delta = 3", "delta = 2"),
+        ("tau_step = 0.98", "tau_step = 0.5"),
+    )
+
+
+def corrector(tmp_path):
+    return tiny(tmp_path, *DOUBLE, ("train = 8", "train = 7"), ("batch = 2", "batch = 4"))
+
+
+@pytest.fixture(autouse=True)
+def environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of programs
+    monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
+
+
+def _one(work, rank, count, meeting, *arguments):
+    torch.set_num_threads(1)
+    distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=count)
+    work(*arguments)
+    distributed.destroy_process_group()
+
+
+def together(count, tmp_path, work, *arguments):
+    """Run `work(*arguments)` in so many processes."""
+    meeting = tmp_path / f"meeting_{len(list(tmp_path.iterdir()))}"
+    team = [FORK.Process(target=_one, args=(work, rank, count, meeting, *arguments)) for rank in range(count)]
+    for process in team:
+        process.start()
+    for process in team:
+        process.join(120)
+    assert [process.exitcode for process in team] == [0] * count
+
+
+def train(path, folder, intervals, resume=False, stop=None):
+    """Train and write the record; `stop` ends the process after so many intervals."""
+    scene = scenes.load(path)
+    scene.training.intervals = intervals
+
+    def end(interval):
+        if interval.number == stop:
+            distributed.barrier()
+            os._exit(0)
+
+    environment = records.environment()
+    compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, environment, resume, [end])
+
+
+def result(folder):
+    """The record of a training, and its weights as one tensor."""
+    weights = torch.load(folder / "prdp/seed_0.pt", weights_only=True)
+    return json.loads((folder / "prdp/seed_0.json").read_text()), torch.cat([w.flatten() for w in weights.values()])
+
+
+def expect_same(one, other):
+    """The same training to rounding."""
+    (record, weights), (others, other_weights) = one, other
+    torch.testing.assert_close(weights, other_weights, rtol=1e-9, atol=1e-12)
+    assert record["curves"].keys() == others["curves"].keys()
+    for name, values in record["curves"].items():
+        if name in ("max_iter", "budget"):
+            assert values == others["curves"][name]
+        elif name not in ("seconds", "warning"):
+            assert values == pytest.approx(others["curves"][name], rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("scene, intervals", [(emulator, 10), (corrector, 2)])
+def test_several_processes_train_as_one_does(tmp_path, scene, intervals, count):
+    path = scene(tmp_path)
+    train(path, tmp_path / "one", intervals)
+    together(count, tmp_path, train, path, tmp_path / "many", intervals)
+    one, many = result(tmp_path / "one"), result(tmp_path / "many")
+    expect_same(many, one)
+    assert scene is corrector or len(set(one[0]["curves"]["max_iter"])) > 1
+    assert [r["machine"]["processes"] for r, _ in (one, many)] == [1, count]
+    assert sorted(path.name for path in (tmp_path / "many/prdp").iterdir()) == ["seed_0.json", "seed_0.pt"]
+
+
+def test_processes_that_are_stopped_go_on_bit_for_bit_and_one_process_goes_on_from_them(tmp_path):
+    path = emulator(tmp_path)
+    together(2, tmp_path, train, path, tmp_path / "alone", 8)
+    for folder in ("many", "one"):
+        together(2, tmp_path, train, path, tmp_path / folder, 8, False, 5)
+        assert (tmp_path / folder / "prdp/seed_0.checkpoint").exists()
+    together(2, tmp_path, train, path, tmp_path / "many", 8, True)
+    train(path, tmp_path / "one", 8, resume=True)
+    alone, many, one = (result(tmp_path / folder) for folder in ("alone", "many", "one"))
+    assert torch.equal(alone[1], many[1])
+    for record, _ in (alone, many):
+        del record["curves"]["seconds"]
+    assert alone[0]["curves"] == many[0]["curves"]
+    expect_same(one, (many[0] | {"curves": many[0]["curves"] | {"seconds": []}}, many[1]))
+
+
+# ---- controllers in a loop of one's own
+
+
+def steps_of(make, metrics, path):
+    """Step a controller with this process's row of metrics, and write down what it did."""
+    rank = distributed.get_rank()
+    controller = make()
+    for metric in metrics[rank]:
+        controller.step(metric)
+    path.with_suffix(f".{rank}").write_text(repr((controller.max_iter, controller.history)))
+
+
+def impatient():
+    return prdp.PRDPController(window=1, delta=2, tau_step=0.9)
+
+
+def of_this_process_alone():
+    group, _ = distributed.new_subgroups(group_size=1)
+    return prdp.PRDPController(window=1, delta=2, tau_step=0.9, process_group=group)
+
+
+def test_controllers_refine_in_the_same_interval_on_all_processes(tmp_path):
+    dice = torch.Generator().manual_seed(0)
+    metrics = (torch.rand(2, 60, generator=dice, dtype=torch.float64) * 0.9 ** torch.arange(60)).tolist()
+    means = [(a + b) / 2 for a, b in zip(*metrics, strict=True)]
+
+    def alone(make, row):
+        controller = make()
+        for metric in row:
+            controller.step(metric)
+        return repr((controller.max_iter, controller.history))
+
+    for make in (impatient, prdp.ToleranceController):
+        together(2, tmp_path, steps_of, make, metrics, tmp_path / "history")
+        both = [(tmp_path / f"history.{rank}").read_text() for rank in range(2)]
+        assert both == [alone(make, means)] * 2 != [alone(make, row) for row in metrics]
+    together(2, tmp_path, steps_of, of_this_process_alone, metrics, tmp_path / "history")
+    both = [(tmp_path / f"history.{rank}").read_text() for rank in range(2)]
+    assert both == [alone(impatient, row) for row in metrics]
+
+
+def reports_and_refusals(path):
+    rank = distributed.get_rank()
+    u = torch.randn(5, 1, 30, generator=torch.Generator().manual_seed(0))
+    heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=4))
+    controller = prdp.PRDPController([heat], initial=4)
+    heat(u.tensor_split([2])[rank])
+    controller.step(1.0, error=0.5)
+    controller.step(1.0, error=0.5 if rank else None)
+    first, second = controller.history
+    assert first.error == 0.5 and second.error is None
+    heat(u)
+    torch.testing.assert_close(first.residual, float(heat.info.residual.double().mean()), rtol=1e-12, atol=0)
+    for wrong in (-1.0 if rank else 3.0, float("nan") if rank else 3.0):
+        with pytest.raises(ValueError, match="metric must be finite and >= 0, got nan"):
+            controller.step(wrong)
+    assert len(controller.history) == 2
+    # All have to meet the tolerance before that keeps K.
+    kept = prdp.PRDPController(window=1, delta=2)
+    for _ in range(3):
+        kept.step(1.0, converged=bool(rank))
+    assert kept.max_iter == 2
+    group = distributed.new_group([0])
+    if rank == 1:
+        with pytest.raises(ValueError, match="PRDPController: this process does not belong to process_group"):
+            prdp.PRDPController(process_group=group)
+    else:
+        with pytest.raises(TypeError, match="only a controller of the default process group can be copied"):
+            prdp.PRDPController(process_group=group).__reduce__()
+    scene = scenes.load(path)
+    with pytest.raises(ValueError, match="2 processes need as many samples in each batch, but a batch has 1"):
+        prdp.training.train(scene, Refinement.prdp(scene))
+    scene = scenes.load("poisson_1p")
+    with pytest.raises(ValueError, match="share the batches of a network; the task 'parameters' has none"):
+        prdp.training.train(scene, Refinement.prdp(scene))
+
+
+def test_what_controllers_report_and_refuse_is_the_same_on_all_processes(tmp_path):
+    together(2, tmp_path, reports_and_refusals, written(tmp_path, ("batch = 25", "batch = 199")))
+
+
+def test_a_group_must_be_one():
+    with pytest.raises(
+        TypeError, match=r"PRDPController: process_group must be a group of torch.distributed, got 'all'"
+    ):
+        prdp.PRDPController(process_group="all")
+    assert processes.count() == 1 and processes.sums([1.5]) == [1.5]
+
+
+# ---- programs
+
+
+def free_port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def torchrun(*arguments, **options):
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
+    command += ["--master-port", str(free_port()), *map(str, arguments)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def until(exists, process, seconds=100):
+    end = time.monotonic() + seconds
+    while not exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def worker_of(launcher, rank):
+    """The number of a process that torchrun has started."""
+    for children in Path(f"/proc/{launcher.pid}/task").glob("*/children"):
+        for child in children.read_text().split():
+            if f"\0RANK={rank}\0" in Path(f"/proc/{child}/environ").read_text():
+                return int(child)
+    raise AssertionError("no such process")
+
+
+def test_torchrun_ends_with_a_message_when_a_process_dies(tmp_path):
+    launcher = torchrun(
+        "-m", "prdp_torch", "train", emulator(tmp_path), "--out", tmp_path / "out", "--intervals", 100000
+    )
+    until((tmp_path / "out/prdp/seed_0.checkpoint").exists, launcher)
+    os.kill(worker_of(launcher, 1), signal.SIGKILL)
+    _, errors = launcher.communicate(timeout=60)
+    assert launcher.returncode == 1 and "Signal 9 (SIGKILL) received" in errors
+    assert not (tmp_path / "out/prdp/seed_0.json").exists()
+
+
+def as_launched(rank, port, arguments, errors):
+    """`prdp` as a launcher starts it, without one that looks after the others."""
+    os.environ.update(RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    sys.argv = ["prdp", *arguments]
+    torch.set_num_threads(1)
+    with open(os.devnull, "w") as nowhere, open(errors, "w") as kept:
+        sys.stdout, sys.stderr = nowhere, kept
+        cli.main()
+
+
+def launched(tmp_path, *arguments):
+    port = free_port()
+    team = [
+        FORK.Process(target=as_launched, args=(rank, port, arguments, tmp_path / f"errors_{rank}")) for rank in range(2)
+    ]
+    for process in team:
+        process.start()
+    return team
+
+
+def test_a_process_that_loses_another_one_says_so_and_ends(tmp_path):
+    path = emulator(tmp_path)
+    team = launched(tmp_path, "train", path, "--out", str(tmp_path / "out"), "--intervals", "100000")
+    end = time.monotonic() + 100
+    while not (tmp_path / "out/prdp/seed_0.checkpoint").exists():
+        assert time.monotonic() < end and all(process.is_alive() for process in team)
+        time.sleep(0.01)
+    team[1].kill()
+    team[0].join(60)
+    assert team[0].exitcode == 2
+    words = (tmp_path / "errors_0").read_text()
+    assert words == "prdp: process 0 of 2: another process has ended, and this one with it\n"
+
+
+def test_only_training_is_split_and_only_the_first_process_prints(tmp_path):
+    team = launched(tmp_path, "compare", "heat_1d", "--out", str(tmp_path / "out"))
+    for rank, process in enumerate(team):
+        process.join(60)
+        assert process.exitcode == 2
+        words = "prdp: compare: runs in a single process; only train is split by torchrun\n"
+        assert (tmp_path / f"errors_{rank}").read_text() == words
+    team = launched(tmp_path, "train", "heat_1d", "--out", str(tmp_path / "out"), "--intervals", "3")
+    for process in team:
+        process.join(60)
+        assert process.exitcode == 0
+    assert "prdp: warning: seed 0" in (tmp_path / "errors_0").read_text()
+    assert (tmp_path / "errors_1").read_text() == ""
+
+
+def test_the_example_of_a_loop_of_ones_own_has_one_k(tmp_path):
+    launcher = torchrun("examples/distributed.py")
+    output, errors = launcher.communicate(timeout=100)
+    assert launcher.returncode == 0, errors
+    (k,) = set(re.findall(r"process [01] of 2: error (0\.\d+, K = \d+)", output))
+    assert float(k.split(",")[0]) < 0.2 and int(k.split()[-1]) > 1

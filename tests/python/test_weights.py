@@ -1,0 +1,96 @@
+"""Weights that pass between the two trainers."""
+
+import io
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import tiny, written
+
+import prdp_torch as prdp
+from prdp_torch import scenes
+from prdp_torch.networks import make_network
+from prdp_torch.training import Refinement, train
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+def prdp_train(*arguments):
+    command = [ROOT / "build" / "prdp_train", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return done.returncode, done.stderr
+
+
+def scene_of(kind, tmp_path):
+    return written(tmp_path) if kind == "mlp" else tiny(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["mlp", "resnet"])
+def test_weights_pass_from_cpp_to_python_and_back(tmp_path, kind):
+    path = scene_of(kind, tmp_path)
+    scene = scenes.load(path)
+    scene.training.intervals = 2
+    assert prdp_train(path, "--out", tmp_path / "cpp", "--intervals", 2, "--seeds", 2)[0] == 0
+
+    # Python has the network that C++ has trained, not that of the seed.
+    trained = prdp.load_trained(tmp_path / "cpp/prdp")
+    weights = torch.load(tmp_path / "cpp/prdp/seed_0.pt", weights_only=True)
+    assert weights.keys() == make_network(scene, 0).state_dict().keys()
+    scene.training.intervals = 1
+    on = train(scene, Refinement.prdp(scene), network=trained.network)
+    assert on["metric"][0] == pytest.approx(trained.curves["metric"][-1], rel=1e-5)
+
+    # C++ begins with the network that Python has gone on with.
+    torch.save(dict(trained.network.state_dict()), tmp_path / "python.pt")
+    again = (path, "--out", tmp_path / "again", "--intervals", 1, "--weights")
+    for file in (tmp_path / "python.pt", tmp_path / "cpp/prdp/seed_1.pt"):
+        assert prdp_train(*again, file)[0] == 0
+        record = json.loads((tmp_path / "again/prdp/seed_0.json").read_text())
+        other = file.with_suffix(".json")
+        wanted = json.loads(other.read_text())["curves"]["metric"] if other.exists() else on["metric"]
+        assert record["curves"]["metric"][0] == pytest.approx(wanted[-1], rel=1e-5)
+        assert len(record["settings"]["weights"]) == 16
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
+    path = written(tmp_path)
+    state = make_network(scenes.load(path), 0).state_dict()
+    renamed = {f"x{name}": value for name, value in state.items()}
+    wide = {name: value.double() for name, value in state.items()}
+    less = dict(list(state.items())[1:])
+    bomb = state | {"layers.0.weight": Bomb(str(tmp_path / "crater"))}
+    for content, words in [
+        (renamed, "weights: there is no tensor 'layers.0.weight'"),
+        (wide, "weights: 'layers.0.weight' must be Float of sizes [64, 30]"),
+        (less, "weights: the network has 8 tensors, the file 7"),
+        (bomb, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
+        (None, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
+    ]:
+        saved = io.BytesIO()
+        torch.save(content, saved)
+        (tmp_path / "given.pt").write_bytes(saved.getvalue() if content is not None else b"nothing of the kind")
+        status, errors = prdp_train(path, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt")
+        assert status == 2 and words in errors and errors.count("\n") == 1
+    status, errors = prdp_train(path, "--out", tmp_path / "out", "--weights", tmp_path / "missing.pt")
+    assert status == 2 and "weights: cannot read" in errors
+    assert not (tmp_path / "crater").exists()
+    poisson = scenes.available()["poisson_1p"]
+    status, errors = prdp_train(poisson, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt")
+    assert status == 2 and "weights: the scene 'poisson_1p' trains no network" in errors
