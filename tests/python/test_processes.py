@@ -48,7 +48,8 @@ def environment(tmp_path, monkeypatch):
     monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
 
 
-def _one(work, rank, count, meeting, *arguments):
+def _one(environment, work, rank, count, meeting, *arguments):
+    os.environ.update(environment)  # a server of forks has that of the test that started it
     torch.set_num_threads(1)
     distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=count)
     work(*arguments)
@@ -58,7 +59,10 @@ def _one(work, rank, count, meeting, *arguments):
 def together(count, tmp_path, work, *arguments):
     """Run `work(*arguments)` in so many processes."""
     meeting = tmp_path / f"meeting_{len(list(tmp_path.iterdir()))}"
-    team = [FORK.Process(target=_one, args=(work, rank, count, meeting, *arguments)) for rank in range(count)]
+    team = [
+        FORK.Process(target=_one, args=(dict(os.environ), work, rank, count, meeting, *arguments))
+        for rank in range(count)
+    ]
     for process in team:
         process.start()
     for process in team:
