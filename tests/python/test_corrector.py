@@ -57,7 +57,7 @@ def test_the_scene_holds_the_papers_settings():
         ("shape = [48, 48]", "shape = [48]", "shape = [48]", "physics.shape: expected 2 extents"),
         ("[97, 97]", "[97, 96]", "reference_shape", "data.reference_shape: expected 2 N + 1 for each N of"),
         ("valid_max_iter = 120", "valid_max_iter = 0", "valid_max_iter", "data.valid_max_iter: must be >= 1, got 0"),
-        ("seed = 0", "seed = 0\nmodes = 5", "modes", "unknown name 'data.modes'; allowed: file, reference_shape, seed,"),
+        ("seed = 0", "seed = 0\nmodes = 5", "modes", "unknown name 'data.modes'; allowed: file, reference_shape, seed"),
         ("cosine_updates = 800", "cosine_updates = 0", "cosine_up", "training.cosine_updates: must be >= 1, got 0"),
         ("cosine_updates = 800", "cosine_updates = 8\ndecay = 0.9", "decay = ", "unknown name 'training.decay'"),
         ("cosine_updates = 800", "", "[training]", "training.decay: missing; the table holds:"),
