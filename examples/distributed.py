@@ -31,4 +31,5 @@ for _ in range(40):
     # Every process gives the error of its own samples. All of them see the mean, and refine in the same epoch.
     controller.step(error)
 print(f"process {rank} of {processes}: error {controller.history[-1].metric:.3f}, K = {heat.max_iter}", flush=True)
+distributed.barrier()  # gloo may abort a process whose partner has left first
 distributed.destroy_process_group()

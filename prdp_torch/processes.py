@@ -138,6 +138,7 @@ def joined():
         raise RuntimeError(f"{who}: another process has ended, and this one with it") from None
     finally:
         if sys.exc_info()[0] is None:
+            distributed.barrier()  # gloo may abort a process whose partner has left first
             distributed.destroy_process_group()
 
 

@@ -53,6 +53,7 @@ def _one(environment, work, rank, count, meeting, *arguments):
     torch.set_num_threads(1)
     distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=count)
     work(*arguments)
+    distributed.barrier()
     distributed.destroy_process_group()
 
 
