@@ -27,13 +27,9 @@ def rows_of(scene):
     ]
 
 
-def _tolerance(label, title, start="zero", **settings):
-    def attach(steppers):
-        for stepper in steppers:
-            stepper.start = start
-        return ToleranceController(steppers, **settings)
-
-    return Row(label, title, "auto", Refinement(label, attach, watches_error=True))
+def _tolerance(label, title, **settings):
+    refinement = Refinement(label, lambda steppers: ToleranceController(steppers, **settings), watches_error=True)
+    return Row(label, title, "auto", refinement)
 
 
 def main():

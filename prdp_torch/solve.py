@@ -170,19 +170,10 @@ def linear_solve(
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     rhs = b.unsqueeze(0) if lone_vector else b
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
+    settings = solver.rtol, solver.restart, backward, adjoint_max_iter, adjoint_rtol, on_failure
     every = checkpoint_number(checkpoint_every)
     if not compiling:
-        options = _last_options.of(
-            solver.method,
-            solver.rtol,
-            solver.restart,
-            backward,
-            adjoint_max_iter,
-            adjoint_rtol,
-            on_failure,
-            every,
-            False,
-        )
+        options = _last_options.of(solver.method, *settings, every, False)
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
@@ -196,12 +187,7 @@ def linear_solve(
             False,
             solver.method,
             solver.max_iter,
-            solver.rtol,
-            solver.restart,
-            backward,
-            adjoint_max_iter,
-            adjoint_rtol,
-            on_failure,
+            *settings,
             0 if log is None else log.number,
             every,
             start,

@@ -151,30 +151,22 @@ class Stepper(torch.nn.Module):
 
     def _options_kept(self):
         """The options as the compiled library takes them past the dispatcher."""
-        return self._kept_options.of(
-            self.method,
-            self.rtol,
-            self.restart,
-            self.backward,
-            self.adjoint_max_iter,
-            self.adjoint_rtol,
-            self.on_failure,
-            checkpoint_number(self.checkpoint_every),
-            self.start == "state",
-        )
+        return self._kept_options.of(*self._settings(), checkpoint_number(self.checkpoint_every), self.start == "state")
 
     def _options(self, log_number):
+        k = self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self)
+        method, *settings = self._settings()
+        return method, k, *settings, log_number, checkpoint_number(self.checkpoint_every)
+
+    def _settings(self):
         return (
             self.method,
-            self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self),
             self.rtol,
             self.restart,
             self.backward,
             self.adjoint_max_iter,
             self.adjoint_rtol,
             self.on_failure,
-            log_number,
-            checkpoint_number(self.checkpoint_every),
         )
 
     @property

@@ -342,7 +342,7 @@ def propagator(scene, network):
     if scene.task == "emulator":
         return network
     converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
-    return lambda u: _corrected(converged, network, u)
+    return lambda u: corrected(converged, network, u)
 
 
 def error(scene, u, reference):
@@ -416,7 +416,9 @@ def _emulator(scene, steppers, data, network):
     return loss
 
 
-def _corrected(stepper, network, u):
+def corrected(stepper, network, u):
+    """Make a step of the task "corrector": a step of the coarse solver from u, with the network on top. The mean of
+    its pressure is removed in between."""
     coarse = _C.without_mean_pressure(stepper(u))
     return coarse + network(coarse)
 
@@ -426,8 +428,8 @@ def _corrector(scene, steppers, data, network):
     first, second = steppers
 
     def loss(batch):
-        u1 = _corrected(first, network, data.train_start[batch])
-        u2 = _corrected(second, network, u1)
+        u1 = corrected(first, network, data.train_start[batch])
+        u2 = corrected(second, network, u1)
         if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
             worst = torch.minimum(first.info.status, second.info.status)
             u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))

@@ -5,6 +5,7 @@ seen twice."""
 
 import numpy as np
 
+from benchmarks.studies.evaluation import spread
 from prdp_torch.charts import make_figure
 
 SCENES = ("heat_1d", "heat_2d", "burgers_1d")
@@ -44,8 +45,8 @@ def table(rows):
                 continue
             fives = np.concatenate([d.reshape(-1, 5).mean(1) for d in draws])
             lines.append(
-                f"| {name}, {len(draws)} draws | {how} | {_spread([d[:5].mean() for d in draws])} "
-                f"| {_spread([d.mean() for d in draws])} | {fives.min():.2e} to {fives.max():.2e} |"
+                f"| {name}, {len(draws)} draws | {how} | {spread([d[:5].mean() for d in draws])} "
+                f"| {spread([d.mean() for d in draws])} | {fives.min():.2e} to {fives.max():.2e} |"
             )
     lines += ["", "| scene | samples | epochs | | training loss | error on 100 |", "|---|---|---|---|---|---|"]
     for name in SCENES:
@@ -53,7 +54,7 @@ def table(rows):
             chosen = [r for r in _of(rows, name, how) if _samples(r) == samples]
             lines.append(
                 f"| {name} | {samples:,} | {chosen[0]['updates'] * BATCH // samples} | {how} "
-                f"| {np.mean([r['loss'] for r in chosen]):.1e} | {_spread([r['error'] for r in chosen])} |"
+                f"| {np.mean([r['loss'] for r in chosen]):.1e} | {spread([r['error'] for r in chosen])} |"
             )
     return "\n".join(lines)
 
@@ -82,7 +83,3 @@ def _of(rows, name, how):
 
 def _samples(row):
     return row["changes"].get("data.train", 200)
-
-
-def _spread(values):
-    return f"{np.mean(values):.2e} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.0e}"

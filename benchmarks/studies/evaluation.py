@@ -1,9 +1,15 @@
 """What a trained network is worth on the validation samples."""
 
+import numpy as np
 import torch
 
 from prdp_torch import _C, fields
-from prdp_torch.training import propagator
+from prdp_torch.training import error, propagator
+
+
+def spread(values):
+    """Mean ± standard deviation, for a table."""
+    return f"{np.mean(values):.2e} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.0e}"
 
 
 def validation_errors(scene, network):
@@ -12,7 +18,4 @@ def validation_errors(scene, network):
     data = _C.make_dataset(scene)
     with torch.no_grad():
         reached = fields.rollout(propagator(scene, network), data.valid_start, scene.data.valid_steps)[:, -1]
-    of = slice(0, 1) if scene.task == "corrector" else slice(None)
-    difference = (reached - data.valid_end)[:, of].flatten(1).double()
-    reference = data.valid_end[:, of].flatten(1).double()
-    return (difference.square().sum(1) / reference.square().sum(1)).tolist()
+    return [error(scene, u, end) for u, end in zip(reached.split(1), data.valid_end.split(1), strict=True)]

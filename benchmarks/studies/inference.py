@@ -10,7 +10,7 @@ import torch
 import prdp_torch as prdp
 from prdp_torch import _C, records
 from prdp_torch.charts import make_figure
-from prdp_torch.training import propagator
+from prdp_torch.training import error, propagator
 
 KS = (1, 2, 5, 10, 15, 20, 44, 120)
 STEPS = (5, 20, 50)
@@ -40,7 +40,7 @@ def _follow(trained, states, k):
     with torch.no_grad():
         for n in range(1, states.shape[1]):
             u = step(u)
-            errors.append(float(_C.normalised_mse(u[:, :1], states[:, n, :1])))
+            errors.append(error(trained.scene, u, states[:, n]))
     return {"errors": errors, "seconds_a_step": (time.perf_counter() - started) / (states.shape[1] - 1)}
 
 

@@ -9,10 +9,12 @@ import time
 import numpy as np
 import torch
 
+from benchmarks.studies.evaluation import spread
 from benchmarks.studies.trainings import variant
 from prdp_torch import _C, records, scenes
 from prdp_torch.charts import make_figure
 from prdp_torch.networks import make_network
+from prdp_torch.training import corrected, error
 
 STEPS = (2, 4, 8, 16)
 BEYOND = 20  # how far the trained network is followed
@@ -86,22 +88,17 @@ def train(name, steps, gradient, seed, updates):
 
 
 def next_state(name, stepper, network, u):
-    physics = stepper(u)
-    if name == "burgers_1d":
-        return network(physics)
-    coarse = _C.without_mean_pressure(physics)
-    return coarse + network(coarse)
+    return network(stepper(u)) if name == "burgers_1d" else corrected(stepper, network, u)
 
 
 def follow(name, scene, network, states):
     """The error after each step, the start's zero included; the velocity's alone for navier_stokes."""
     stepper = scenes.make_stepper(scene)
-    of = slice(0, 1) if name == "navier_stokes" else slice(None)
     u, errors = states[:, 0], [0.0]
     with torch.no_grad():
         for step in range(1, BEYOND + 1):
             u = next_state(name, stepper, network, u)
-            errors.append(float(_C.normalised_mse(u[:, of], states[:, step, of])))
+            errors.append(error(scene, u, states[:, step]))
     return errors
 
 
@@ -122,14 +119,10 @@ def table(rows):
                 )
                 if trained:
                     lines.append(
-                        f"| {name} | {steps} | {gradient} | {_spread(trained)} | {_spread(beyond)} "
+                        f"| {name} | {steps} | {gradient} | {spread(trained)} | {spread(beyond)} "
                         f"| {np.mean(seconds):.0f} |"
                     )
     return "\n".join(lines)
-
-
-def _spread(values):
-    return f"{np.mean(values):.2e} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.0e}"
 
 
 def chart(rows):

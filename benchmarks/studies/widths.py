@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.studies.evaluation import spread
 from prdp_torch.charts import make_figure
 
 WIDTHS = (16, 24, 32, 48, 64, 96, 128)
@@ -50,8 +51,7 @@ def table(rows):
 
 
 def _errors(rows):
-    errors = [r["error"] for r in rows]
-    return f"{np.mean(errors):.2e} ± {np.std(errors, ddof=1) if len(errors) > 1 else 0:.0e}"
+    return spread([r["error"] for r in rows])
 
 
 def _saved(rows, converged, count):

@@ -52,9 +52,11 @@ def table(x, rows, problem, solver_of):
     }
 
 
-def _always_solved(data):
-    """The rows of a table that solve every sample everywhere."""
-    return " · ".join(name for name, row in zip(data["rows"], data["share"], strict=True) if min(row) == 1.0)
+def _table_of_solvers(x, problem, solvers):
+    """A table, whose answer are the solvers that solve every sample everywhere."""
+    data = table(x, list(solvers), problem, solvers.get)
+    always = " · ".join(name for name, row in zip(data["rows"], data["share"], strict=True) if min(row) == 1.0)
+    return {**data, "answer": f"every CFL number: {always}"}
 
 
 def stiffness(quick):
@@ -147,8 +149,7 @@ def burgers_solvers(quick):
         "GMRES(10)": GMRES(restart=10, max_iter=300),
         "GMRES(64)": GMRES(restart=64, max_iter=47),
     }
-    data = table(x, list(solvers), problems.burgers, solvers.get)
-    return {**data, "answer": f"every CFL number: {_always_solved(data)}"}
+    return _table_of_solvers(x, problems.burgers, solvers)
 
 
 def burgers_restart(quick):
@@ -174,8 +175,7 @@ def flow_solvers(quick):
         "GMRES(50)": GMRES(restart=50, max_iter=80),
         'GMRES(8), "stokes"': GMRES(restart=8, max_iter=500, preconditioner="stokes"),
     }
-    data = table(x, list(solvers), problems.flow, solvers.get)
-    return {**data, "answer": f"every CFL number: {_always_solved(data)}"}
+    return _table_of_solvers(x, problems.flow, solvers)
 
 
 def hyperdiffusion(quick):
