@@ -9,7 +9,6 @@ import torch
 
 from prdp_torch import _C, processes
 
-
 # What torch.load raises.
 _DAMAGED = (RuntimeError, EOFError, pickle.UnpicklingError)
 
