@@ -38,6 +38,19 @@ def golden(name):
     return np.load(DATA / f"{name}.npz")
 
 
+def as_toml(content):
+    """The text of a scene: plain keys first, then one level of tables."""
+
+    def written(value):
+        return str(value).lower() if isinstance(value, bool) else repr(value)
+
+    lines = [f"{name} = {written(value)}" for name, value in content.items() if not isinstance(value, dict)]
+    for name, table in content.items():
+        if isinstance(table, dict):
+            lines += [f"[{name}]", *(f"{key} = {written(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
 def statuses(info):
     return [prdp.SolveStatus(int(s)).name for s in info.status]
 
