@@ -14,7 +14,7 @@ import typer.main
 from helpers import as_toml
 
 import prdp_torch as prdp
-from prdp_torch import cli, scenes
+from prdp_torch.experiments import cli, scenes
 
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
@@ -176,8 +176,8 @@ def documented():
 
 def public_names():
     """(module, name) of all that `import prdp_torch` offers: its own names and those of its modules."""
-    for name in [*prdp.__all__, *prdp._LAZY]:
-        value = getattr(prdp, name)
+    inside = [getattr(prdp.experiments, name) for name in prdp.experiments.__all__]
+    for name, value in [*((name, getattr(prdp, name)) for name in prdp.__all__), *((m.__name__, m) for m in inside)]:
         if not inspect.ismodule(value):
             yield "prdp_torch", name
             continue
