@@ -14,7 +14,7 @@ import typer.main
 from helpers import as_toml
 
 import prdp_torch as prdp
-from prdp_torch import cli, scenes
+from prdp_torch.experiments import cli, scenes
 
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
@@ -183,8 +183,8 @@ def documented():
 
 def public_names():
     """(module, name) of all that `import prdp_torch` offers: its own names and those of its modules."""
-    for name in [*prdp.__all__, *prdp._LAZY]:
-        value = getattr(prdp, name)
+    inside = [getattr(prdp.experiments, name) for name in prdp.experiments.__all__]
+    for name, value in [*((name, getattr(prdp, name)) for name in prdp.__all__), *((m.__name__, m) for m in inside)]:
         if not inspect.ismodule(value):
             yield "prdp_torch", name
             continue
@@ -200,3 +200,9 @@ def test_the_reference_has_every_public_name(module, name):
     whole = [path for path in (module, home) if path in rendered and (rendered[path] is None or name in rendered[path])]
     assert whole or f"{module}.{name}" in rendered
     assert inspect.getdoc(getattr(sys.modules[module], name))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "prdp_torch").rglob("*.py")), ids=lambda path: path.stem)
+def test_the_examples_of_docstrings_are_shown_as_code(path):
+    """mkdocstrings shows only what stands under "Examples:" as code, and takes other lines with >>> for quotations."""
+    assert not re.search(r"\n\n +>>> |^ +Example:$", path.read_text(), re.MULTILINE)

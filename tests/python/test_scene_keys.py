@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import as_toml
 
-from prdp_torch import _C, scenes
+from prdp_torch import _C
+from prdp_torch.experiments import scenes
 
 ROOT = Path(__file__).parents[2]
 KEYS = _C.scene_keys()

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, fields, records, training
-from prdp_torch.networks import make_network
+from prdp_torch import _C, fields
+from prdp_torch.experiments import network_task, records
+from prdp_torch.experiments.networks import make_network
 
 
 class Trained(NamedTuple):
@@ -47,8 +48,9 @@ def load_trained(run_folder, seed=0):
         ValueError: no record or no weights are there, they are damaged or do not belong together, or the
             training diverged.
 
-    >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
-    >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
+    Examples:
+        >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
+        >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
     record = records.read(path)
@@ -64,7 +66,7 @@ def load_trained(run_folder, seed=0):
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
-    return Trained(network.eval(), training.propagator(scene, network), scene, record["curves"])
+    return Trained(network.eval(), network_task.propagator(scene, network), scene, record["curves"])
 
 
 def _record_in(folder, name):
