@@ -81,8 +81,9 @@ def advise(step, sample, seconds=5.0):
     Raises:
         TypeError, ValueError: step and sample do not fit each other. This is checked before any measurement.
 
-    >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
-    >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
+    Examples:
+        >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
+        >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
     """
     if not isinstance(step, Stepper):
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
