@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 ROWS = {  # label: title, colour, marker
@@ -38,9 +38,9 @@ def error_against_cost(found):
         axes.set(xscale="log", yscale="log")
         axes.axhspan(0.0, 1.1, color="#e8f4e8", zorder=0, lw=0)
         axes.grid(alpha=0.3, lw=0.4)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.xaxis.set_minor_formatter(FuncFormatter(lambda x, _: ""))
+        axes.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0]))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
     panels[0].set(xlabel="products with A, converged = 1", ylabel="error, converged = 1")
     panels[1].set(xlabel="seconds, converged = 1")
     panels[0].legend(frameon=False, fontsize=8)
