@@ -31,6 +31,9 @@ Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
 /// The same without the file on disk.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
+/// The training samples alone, in the train_ fields.
+Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress = {});
+
 /// The validation samples and the states of `steps` steps of the converged equation from them, in all
 /// (samples, steps + 1, channels, *shape): at step data.valid_steps what `make_dataset` gives, and as far
 /// beyond as wanted. Raises ValueError for a task that trains no network, which has no samples, and for steps < 0.
