@@ -31,6 +31,9 @@ Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
 /// The same without the cache on disk.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
+/// The training samples alone, in the train_ fields.
+Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress = {});
+
 /// The trajectories of the validation samples: `steps` converged steps, (samples, steps + 1, channels, *shape). Their
 /// state number data.valid_steps is the valid_end of make_dataset(). Raises ValueError for steps < 0, and for a task
 /// that trains no network and so has no samples.

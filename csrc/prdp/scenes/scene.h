@@ -47,6 +47,7 @@ struct Scene {
     // HDF5 file of trajectories in place of random initial states, relative to the folder of the scene file; empty if
     // there is none. Only the Python trainer reads it.
     std::string file{};
+    bool fresh = false;  // new training samples in every epoch (fresh_data.h)
   };
   struct Network {
     std::string kind;             // "mlp" or "resnet"
