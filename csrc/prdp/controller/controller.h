@@ -50,9 +50,8 @@ class Controller {
   virtual int64_t max_iter() const = 0;
   /// All limits for the next interval, K included.
   virtual Budget budget() const = 0;
-  /// Call this after each interval, and once before the first. The metric is >= 0, and smaller is better. Returns true
-  /// if K was raised or the tolerance became smaller. Controllers that use the metric raise ValueError, and change
-  /// nothing, if it is not finite or < 0.
+  /// Call this after each interval, and once before the first. A smaller metric is better. Returns true if the solves
+  /// were refined. Raises ValueError, and changes nothing, for a negative or non-finite metric; a schedule ignores it.
   virtual bool step(double metric, const Solves& solves = {}) = 0;
   virtual const State& state() const = 0;
   /// Restores a state. Raises ValueError, and changes nothing, for a state that these settings cannot have reached.

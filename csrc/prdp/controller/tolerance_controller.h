@@ -14,9 +14,8 @@ struct ToleranceSettings {
 /// Ties the tolerance of the solves to the error of what is trained:
 ///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far, 1 before the first
 ///   adjoint_rtol = rtol / adjoint_ratio, but at most 1/2 and at least adjoint_floor
-/// A tolerance of 1 would be no solve at all, hence 1/2. The adjoint tolerance is relative to a cotangent that shrinks
-/// with the error, and gradients need not become more accurate late in a training, hence the floor. K, and
-/// ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
+/// A tolerance of 1 would be no solve, hence 1/2. The floor is there because the cotangent shrinks with the error, and
+/// gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
 /// Source: the forcing term of inexact Newton methods (Eisenstat and Walker 1996) and of optimisation with
 /// approximate gradients (Pedregosa 2016), applied to training.
 class ToleranceController final : public Controller {

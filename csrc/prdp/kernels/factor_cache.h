@@ -19,8 +19,7 @@ void clear();
 /// How many factors were made so far.
 int64_t count_made();
 
-/// The factors F of the matrix with this key, from the cache or from make(). The key holds every number of the matrix.
-/// Any thread may call this.
+/// The factors F of the matrix whose numbers are the key, from the cache or from make(). Any thread may call this.
 template <class F, class Make>
 std::shared_ptr<const F> find_or_make(std::string key, const Make& make) {
   key += typeid(F).name();

@@ -3,7 +3,8 @@
 
 namespace prdp::kernels {
 
-/// A run of points along an axis: `count` points from index `to` on take the values of those from index `from` on.
+/// A run of points along an axis: `count` points from index `to` on take the values of those
+/// from index `from` on.
 struct Run {
   int64_t to, from, count;
 };

@@ -8,7 +8,8 @@ namespace prdp {
 /// matrix gives values that are not finite, and no exception.
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b);
 
-/// The matrix (batch or 1, n, n) of an operator that acts on each channel of a field of n points alike. Differentiable.
+/// The matrix (batch or 1, n, n) of an operator that acts on each channel of a field of n points
+/// alike. Differentiable.
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options);
 /// The solutions for each channel of b (batch, channel, *shape).
 at::Tensor solve_channels(const at::Tensor& matrix, const at::Tensor& b);

@@ -35,7 +35,8 @@ class RegisteredProducts {
 
   int64_t number() const { return number_; }
   const Products& products() const { return products_; }
-  /// Whether the first product below autograd looks for captured tensors (see refuse_captured_gradients).
+  /// Whether the first product below autograd looks for captured tensors
+  /// (see refuse_captured_gradients).
   enum class Captures { kUnknown, kWanted, kNone };
   mutable std::atomic<Captures> captures{Captures::kUnknown};
   /// The operator, for linear_solve.
@@ -52,9 +53,8 @@ class RegisteredProducts {
 /// happens once for each RegisteredProducts, at the cost of recording one product.
 void refuse_captured_gradients(const OperatorSpec& a);
 
-/// The operator of kind "function"; its shape holds the number of its RegisteredProducts. Derivatives with respect to
-/// the tensors come from autograd through `apply`. The exact solve multiplies A with unit vectors, so it is for small
-/// n.
+/// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
+/// from autograd through `apply`. The exact solve multiplies A with unit vectors, so it is for small n.
 class FunctionOperator final : public Operator {
  public:
   explicit FunctionOperator(const OperatorSpec& spec);

@@ -14,8 +14,7 @@ namespace prdp {
 
 /// An operator as plain numbers and tensors, so that it can pass through torch's dispatcher.
 struct OperatorSpec {
-  /// "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr" or "function".
-  std::string kind;
+  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr", …
   std::vector<int64_t> shape;        // of the grid of unknowns; empty for matrices
   std::vector<double> parameters;    // plain numbers without gradient, such as dt and the lengths
   std::vector<at::Tensor> tensors;   // what A depends on and may get gradients, such as nu

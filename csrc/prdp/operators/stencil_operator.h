@@ -7,10 +7,9 @@ namespace prdp {
 /// An operator for linear_solve: (A v)[i] = Σ_k coefficients[k, i] · v[i + offsets[k]] on a grid of one to three axes,
 /// the same for every channel of v (batch, channel, *shape).
 ///
-/// coefficients: (batch or 1, k, *shape), float32 or float64. They get gradients.
-/// offsets: k distinct ones, each with one entry per axis, at most two cells.
-/// boundary: v is zero outside the grid (Boundary::kDirichlet) or periodic; one for all axes, or one per axis.
-/// Raises ValueError if these do not fit together.
+/// coefficients: (batch or 1, k, *shape), float32 or float64; they get gradients. offsets: k distinct ones, each with
+/// one entry per axis, at most two cells. boundary: v is zero outside the grid (Boundary::kDirichlet) or periodic; one
+/// for all axes, or one per axis. Raises ValueError if these do not fit together.
 OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vector<int64_t>>& offsets,
                      const std::vector<Boundary>& boundary = {Boundary::kDirichlet});
 

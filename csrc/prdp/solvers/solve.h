@@ -34,8 +34,9 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
 /// thread costs more than it saves. A cycle of GMRES counts as its products.
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart);
 
-/// u after exactly `caps` iterations of each sample, as `solver` took them on the way to its rtol, recorded by autograd
-/// if b or the tensors of `a` require grad. The unrolled mode differentiates this map. The start is a constant.
+/// u after exactly `caps` iterations of each sample, as `solver` took them on the way to its rtol, recorded
+/// by autograd if b or the tensors of `a` require grad. The unrolled mode differentiates this map. The start is a
+/// constant.
 struct RecordedSolve {
   at::Tensor u, operator_applications;
 };

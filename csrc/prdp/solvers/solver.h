@@ -97,7 +97,8 @@ enum class Backward {
   kNone,      // u carries no gradient
 };
 
-/// Where the solves of a step start: at zero, or at the state before the step, which linear_solve() takes as x0.
+/// Where the solves of a step start: at zero, or at the state before the step, which linear_solve()
+/// takes as x0.
 enum class Start { kZero, kState };
 
 /// What happens if a sample fails: an error, a warning, or only its status. kZeroGrad is kReturn without a gradient: b

@@ -26,9 +26,8 @@ at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
 /// The cotangent of u from that of b. b is linear in u, and this is its transpose.
 at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar);
 
-/// One step u → u_next, both (batch, channel, *shape). Also the torch op prdp::step. The first solve starts as
-/// options.start says; with Start::kState, later Picard steps start from the last solution. With several Picard steps,
-/// the info has the sum of their iterations, the worst status and the last residual.
+/// One step u → u_next, both (batch, channel, *shape). Also the torch op prdp::step. With Start::kState, later Picard
+/// steps start from the last solution. The info has all their iterations, the worst status and the last residual.
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options);
 
 }  // namespace prdp

@@ -24,9 +24,8 @@ inline at::Tensor start_of_step(const SolveOptions& options, const at::Tensor& s
 /// The base of all steppers: the options of its solves, and their reports. Copies share the adjoint reports.
 class Solving {
  public:
-  /// K, the budget of the forward solve, and of the adjoint solve unless options().adjoint_max_iter is set.
+  /// K >= 0 (else ValueError), for the forward solve, and for the adjoint one unless options().adjoint_max_iter is set.
   int64_t max_iter() const { return options_.solver.max_iter.expect_int(); }
-  /// Raises ValueError unless k >= 0.
   void set_max_iter(int64_t k);
   SolveOptions& options() { return options_; }
 

@@ -10,10 +10,9 @@ namespace prdp {
 /// float64. options().backward chooses how gradients are computed.
 class Stepper : public Solving {
  public:
-  /// Raises ValueError for bad shapes, parameters or budgets, before any work.
+  /// Raises ValueError for bad shapes, parameters or budgets, before any work. So does a step for a bad u.
   Stepper(Equation equation, SolveOptions options);
 
-  /// Raises ValueError or TypeError for a bad u before any work, and c10::LinAlgError if a sample fails.
   at::Tensor operator()(const at::Tensor& u);
   /// Repeats the step. Returns all states, u included: (batch, steps + 1, channel, *shape). info() and adjoint_info()
   /// then hold tensors (batch, steps). One node of autograd (rollout.h).
