@@ -195,6 +195,7 @@ class Stepper(torch.nn.Module):
 
 def _as_graph_input(stepper):
     """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
-    each of them."""
+    each of them. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole process.
+    """
     with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
         return stepper._max_iter + 0  # the number is read where it is used first, which must be here
