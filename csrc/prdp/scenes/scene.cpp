@@ -7,6 +7,7 @@
 
 #include "prdp/scenes/files.h"
 #include "prdp/scenes/toml_section.h"
+#include "prdp/solvers/methods.h"
 
 namespace prdp {
 
@@ -45,12 +46,15 @@ Scene::Physics read_physics(TomlSection s, Task task) {
 }
 
 void read_solver(TomlSection s, Scene& scene) {
-  std::vector<std::string> methods{"jacobi", "steepest_descent", "cg", "gmres", "direct"};
-  if (!scene.physics.periodic()) methods.insert(methods.begin() + 1, "chebyshev");  // heat and Poisson
+  std::vector<std::string> methods;
+  for (const auto& method : kTraits) {
+    const bool fits = method.made_for != MadeFor::kKnownSpectrum || !scene.physics.periodic();  // heat and Poisson
+    if (fits && method.preconditioner == Preconditioner::kNone) methods.emplace_back(method.name);
+  }
   scene.solver.method = method_from_name(s.choice("method", methods));
   scene.solver.max_iter = s.count("max_iter", 1);
   scene.solver.rtol = s.at_least("rtol", 0.0);
-  if (scene.solver.method == Method::kGmres) scene.solver.restart = s.count("restart", 1);
+  if (traits(scene.solver.method).counts == Counts::kCycles) scene.solver.restart = s.count("restart", 1);
   scene.backward = backward_from_name(s.choice("backward", backwards(scene.task)));
   if (s.has("on_failure")) scene.on_failure = on_failure_from_name(s.choice("on_failure", {"return", "zero_grad"}));
   if (s.has("start")) scene.start = start_from_name(s.choice("start", {"zero", "state"}));

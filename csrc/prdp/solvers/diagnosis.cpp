@@ -8,6 +8,8 @@
 #include <map>
 #include <sstream>
 
+#include "prdp/solvers/methods.h"
+
 namespace prdp {
 
 namespace {
@@ -21,20 +23,13 @@ std::string name_of(const OperatorSpec& a) {
 }
 
 std::string name_of(const Solver& solver) {
-  const auto gmres = "GMRES(" + std::to_string(solver.restart) + ")";
-  const std::string by_diagonal = " with preconditioner=\"diagonal\"";
-  switch (solver.method) {
-    case Method::kJacobi: return "Jacobi";
-    case Method::kChebyshev: return "Chebyshev";
-    case Method::kSteepestDescent: return "SteepestDescent";
-    case Method::kConjugateGradient: return "CG";
-    case Method::kConjugateGradientDiagonal: return "CG" + by_diagonal;
-    case Method::kGmres: return gmres;
-    case Method::kGmresDiagonal: return gmres + by_diagonal;
-    case Method::kGmresStokes: return gmres + " with preconditioner=\"stokes\"";
-    case Method::kDirect: return "Direct";
-  }
-  return std::string(name(solver.method));
+  const auto& method = traits(solver.method);
+  std::ostringstream text;
+  text << method.label;
+  if (method.counts == Counts::kCycles) text << "(" << solver.restart << ")";
+  if (method.preconditioner != Preconditioner::kNone)
+    text << " with preconditioner=\"" << name(method.preconditioner) << "\"";
+  return text.str();
 }
 
 std::string number(double x) {
@@ -56,8 +51,6 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
   return norm_of(product - other) / norm_of(product);
 }
 
-bool is_krylov_for_definite(Method m) { return m == Method::kSteepestDescent || is_conjugate_gradient(m); }
-
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
   const double rounding = 100.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
@@ -69,9 +62,10 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
 }
 
 std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (solver.method == Method::kJacobi)
+  const auto made_for = traits(solver.method).made_for;
+  if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
-  if (is_krylov_for_definite(solver.method))
+  if (made_for == MadeFor::kDefinite)
     return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, or Direct";
 }
@@ -84,8 +78,9 @@ std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
 }
 
 std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (solver.method == Method::kDirect) return "A is singular; GMRES solves it for any b in the range of A";
-  if (is_krylov_for_definite(solver.method)) return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
+  if (traits(solver.method).is_direct) return "A is singular; GMRES solves it for any b in the range of A";
+  if (traits(solver.method).made_for == MadeFor::kDefinite)
+    return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
   return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
          "take a b without that part, or add a multiple of the identity to A";
 }
@@ -93,7 +88,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 std::string zero_diagonal(const SolveRole& role) {
   const std::string why = role.a.kind == "navier_stokes" ? "the pressure rows have a zero diagonal"
                                                           : "it divides by the diagonal of A, which has a zero there";
-  return why + (role.solver.method == Method::kGmresDiagonal ? "; take GMRES without it" : "; take GMRES");
+  return why + (traits(role.solver.method).label == "GMRES" ? "; take GMRES without it" : "; take GMRES");
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {

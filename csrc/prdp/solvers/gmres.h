@@ -4,7 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "prdp/solvers/solver.h"
+#include "prdp/solvers/space.h"
 
 namespace prdp {
 
@@ -15,7 +15,7 @@ namespace prdp {
 /// Where autograd records the cycle, the coefficients h of the basis are constants: the least residual
 /// belongs to the space, whatever its basis. The minimiser's own dependence enters by Newton steps that
 /// change nothing in value; two of them give two derivatives.
-template <class Space>
+template <KrylovSpace Space>
 class GmresMethod {
  public:
   using Scalar = typename Space::Scalar;

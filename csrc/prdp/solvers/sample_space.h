@@ -80,7 +80,10 @@ class SampleSpace {
   /// What the start is; null without one.
   const T* started_from() { return started_ ? start() : nullptr; }
 
-  Vector vector() { return workspace_.vector(used_++); }
+  Vector vector() {
+    TORCH_INTERNAL_ASSERT(used_ < workspace_.count(), "the table of methods promises too few vectors");
+    return workspace_.vector(used_++);
+  }
   Vector scratch() { return workspace_.vector(1); }
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
