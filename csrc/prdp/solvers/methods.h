@@ -4,6 +4,7 @@
 #include <tuple>
 #include <type_traits>
 
+#include "prdp/solvers/bicgstab.h"
 #include "prdp/solvers/conjugate_gradient.h"
 #include "prdp/solvers/direct.h"
 #include "prdp/solvers/gmres.h"
@@ -114,6 +115,12 @@ inline constexpr std::tuple kMethods{
                                                       .nanoseconds = 0.6,
                                                       .divides_by_diagonal = true,
                                                       .ends_at_unknowns = true}},
+    MethodRow<BiCGStabMethod>{{.method = Method::kBiCGStab,
+                               .name = "bicgstab",
+                               .label = "BiCGStab",
+                               .products = 2,
+                               .vectors = 6,
+                               .nanoseconds = 0.8}},
     MethodRow<GmresMethod>{{.method = Method::kGmres,
                             .name = "gmres",
                             .label = "GMRES",

@@ -14,6 +14,7 @@ enum class Method {
   kSteepestDescent,
   kConjugateGradient,
   kConjugateGradientDiagonal,
+  kBiCGStab,
   kGmres,
   kGmresDiagonal,
   kGmresStokes,
@@ -62,6 +63,12 @@ struct CG {
   double rtol = kDefaultRtol;
   Preconditioner preconditioner = Preconditioner::kNone;
   operator Solver() const;
+};
+/// For any operator; two products with A per iteration.
+struct BiCGStab {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kBiCGStab, max_iter, rtol}; }
 };
 /// Restarted; max_iter counts cycles. Preconditioned from the right; kStokes is for NavierStokes alone
 /// and runs in plain tensor operations.

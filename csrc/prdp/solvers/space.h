@@ -52,6 +52,13 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   /// 1 where a is not zero, else 0; and the other way round.
   { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
   { s.is_zero(a) } -> std::same_as<typename S::Scalar>;
+  /// 1 where a > b, else 0.
+  { s.is_larger(a, b) } -> std::same_as<typename S::Scalar>;
+  /// y = x, and b = a, where the first is not zero.
+  s.restore(a, x, y);
+  s.restore(a, a, b);
+  /// Unit roundoff.
+  { s.epsilon() } -> std::same_as<double>;
 };
 
 /// What a preconditioner by the diagonal needs beside: products with weights w, entry by entry.
@@ -114,12 +121,8 @@ concept KrylovSpace = VectorSpace<S> && requires(S s, typename S::Vector x, type
   { s.lost_orthogonality(a, b, a) } -> std::same_as<bool>;
   /// 1/a; 0 where a is rounding beside b.
   { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
-  /// max(a, b); and 1 where a > b, else 0.
+  /// max(a, b)
   { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
-  { s.is_larger(a, b) } -> std::same_as<typename S::Scalar>;
-  /// y = x, and b = a, where the first is not zero.
-  s.restore(a, x, y);
-  s.restore(a, a, b);
   /// Whether no sample has a Krylov space left that could be extended.
   { s.all_exhausted(a) } -> std::same_as<bool>;
   /// a itself; its derivative is that of a constant.
@@ -145,10 +148,9 @@ concept IterationSpace =
              bool (*wanted)(const typename S::States::value_type&)) {
       /// One number per sample, on the host.
       s.lanes(a);
-      /// Which samples broke down; ‖A‖ of each; unit roundoff; ‖u‖², where u is x and the start.
+      /// Which samples broke down; ‖A‖ of each; ‖u‖², where u is x and the start.
       s.broken();
       s.operator_norm();
-      { s.epsilon() } -> std::same_as<double>;
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
       /// From here on, operations write to the samples alone that are wanted.
       s.freeze_unless(states, wanted);
