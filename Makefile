@@ -30,7 +30,7 @@ test: $(STAMPS)/configure
 bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
-	.venv-peers/bin/python -m prdp_torch.cli bench
+	.venv-peers/bin/python -m prdp_torch bench
 
 # ThreadSanitizer watches what has threads; csrc/prdp/solvers/interruption.h says what it cannot see of OpenMP.
 sanitize: $(STAMPS)/configure

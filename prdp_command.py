@@ -18,7 +18,7 @@ def main():
     if at_start is signal.default_int_handler:  # not where Ctrl-C is ignored, as in the background
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # nothing is open yet that would need closing
     try:
-        from prdp_torch import cli
+        from prdp_torch.experiments import cli
     except ImportError as error:
         sys.exit(_refused(error))
 

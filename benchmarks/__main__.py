@@ -38,7 +38,7 @@ def main():
     import torch  # only now: it reads the environment
 
     from benchmarks import page
-    from prdp_torch import cli, records
+    from prdp_torch.experiments import cli, records
 
     torch.set_num_threads(1)
     folder = records.prepare_folder(options.out)

@@ -8,7 +8,7 @@ import jinja2
 
 from benchmarks import charts, memory
 from benchmarks.problems import DIFFUSION, PROBLEMS
-from prdp_torch import records
+from prdp_torch.experiments import records
 
 
 def write(results, environment, folder):

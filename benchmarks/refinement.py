@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from prdp_torch import compare, records, scenes
-from prdp_torch.compare import Row
 from prdp_torch.controller import PRDPController, ToleranceController
-from prdp_torch.training import Refinement
+from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.experiments.compare import Row
+from prdp_torch.experiments.refinement import Refinement
 
 
 def rows_of(scene):

@@ -3,9 +3,10 @@
 import torch
 
 from benchmarks import measure
-from prdp_torch import _C, scenes
-from prdp_torch.networks import make_network
-from prdp_torch.scenes import make_stepper
+from prdp_torch import _C
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.scenes import make_stepper
 
 SCENES = ["heat_1d", "heat_2d", "burgers_1d", "burgers_2d", "heat_3d", "navier_stokes"]
 

@@ -12,7 +12,7 @@ from prdp_torch import _load
 
 _load.check_torch()
 
-from prdp_torch import _C, datasets, fields, networks, operators, scenes  # noqa: E402
+from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
@@ -45,27 +45,23 @@ __all__ = [
     "ToleranceController",
     "advise",
     "check_operator",
-    "datasets",
     "detach_failed",
+    "experiments",
     "fields",
     "linear_solve",
     "load_trained",
-    "networks",
     "operators",
-    "scenes",
 ]
-
-# What only trainings need is imported when it is first used.
-_LAZY = {name: name for name in ("checkpoint", "tensorboard", "training")}
-_LAZY["load_trained"] = "trained"
 
 
 def __getattr__(name):
-    if name not in _LAZY:
-        raise AttributeError(f"module 'prdp_torch' has no attribute '{name}'")
-    module = importlib.import_module(f"prdp_torch.{_LAZY[name]}")
-    return module if name == _LAZY[name] else getattr(module, name)
+    """Import what only trainings need when it is first used."""
+    if name == "experiments":
+        return importlib.import_module("prdp_torch.experiments")
+    if name == "load_trained":
+        return importlib.import_module("prdp_torch.experiments.trained").load_trained
+    raise AttributeError(f"module 'prdp_torch' has no attribute '{name}'")
 
 
 def __dir__():
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *__all__})

@@ -2,26 +2,13 @@
 
 import copy
 from dataclasses import dataclass, field
-from statistics import median
 
 import torch
 
-from prdp_torch import _C, _check, datasets
-from prdp_torch.networks import make_network
-from prdp_torch.scenes import make_stepper
+from prdp_torch import _C, _check
 from prdp_torch.solvers import GMRES, Direct
 from prdp_torch.stepper import Stepper
-from prdp_torch.trials import (
-    RUNS,
-    TOLERANCES,
-    Row,
-    candidates,
-    measure,
-    measure_one_iteration,
-    now,
-    random_cotangent,
-    run,
-)
+from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration
 
 WORTH_REFINING = 0.1  # of an update
 
@@ -57,7 +44,7 @@ class Advice:
 
 
 @dataclass
-class _Update:
+class Update:
     """What an update consists of beside one kind of solve."""
 
     network: float = 0.0  # seconds
@@ -71,7 +58,7 @@ class _Update:
 
     def share(self, physics):
         whole = physics + self.network
-        return f"{_percent(physics / whole)} of an update: {_ms(physics)} of {_ms(whole)}"
+        return f"{_percent(physics / whole)} of an update: {milliseconds(physics)} of {milliseconds(whole)}"
 
     def fastest(self, rows, rtol):
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
@@ -109,42 +96,11 @@ def advise(step, sample, seconds=5.0):
         )
     if not sample.isfinite().all():
         raise ValueError("advise: sample holds NaN or Inf")
-    return _advise(step, sample.detach(), _limit(seconds), _Update())
+    return advise_on(step, sample.detach(), checked_limit(seconds), Update())
 
 
-def advise_scene(scene, seconds=5.0):
-    """Advise on a scene from `prdp_torch.scenes.load`, as `advise` does on a step.
-
-    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
-    seconds, step, update = _limit(seconds), make_stepper(scene), _Update()
-    if scene.task == "parameters":
-        problem = _C.make_parameter_problem(scene)
-        sample = (problem.start @ problem.modes)[None, None]
-    else:
-        states = datasets.reference(scene, 0)[:, 0]
-        sample = states[torch.arange(scene.training.batch) % len(states)]
-        network = make_network(scene, 0)
-        # A corrector's first solve starts from data, which need no gradient.
-        adjoints = 0 if scene.backward == "none" else 1
-        update = _Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
-    cotangent = random_cotangent(step, sample)
-    run(step, sample, cotangent)  # to warm up
-    physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
-    update.notes.append(
-        f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
-        f"{update.share(physics)}."
-    )
-    if update.network > physics and scene.dtype == torch.float32:
-        with torch.autocast(sample.device.type, torch.bfloat16):
-            low = scene.executions * _network_seconds(network, sample, seconds)
-        update.notes.append(
-            f"The network is the larger part, {_ms(update.network)}; in bfloat16 autocast it takes {_ms(low)}, "
-            f"{low / update.network:.2g} times that."
-        )
-    return _advise(step, sample, seconds, update)
-
-
-def _advise(step, sample, seconds, update):
+def advise_on(step, sample, seconds, update):
+    """Advise on a step that is a part of `update`, an `Update`."""
     rows, refused = measure(step, sample, candidates(step), seconds)
     best = update.fastest(rows, TOLERANCES[-1])
     other = torch.float64 if sample.dtype == torch.float32 else torch.float32
@@ -183,9 +139,11 @@ def _recommend(step, sample, rows, best, update):
         choice = f"Refine {best.name} with a controller, up to K = {most}"
     whole = "an update" if update.network else "a step"
     reason = (
-        f"physics is {update.share(physics)}" if update.network else f"{whole} takes {_ms(physics)} with its adjoint"
+        f"physics is {update.share(physics)}"
+        if update.network
+        else f"{whole} takes {milliseconds(physics)} with its adjoint"
     )
-    limit = f"at most {_percent(saving)} of {whole}, as {cheapest} takes {_ms(least)}"
+    limit = f"at most {_percent(saving)} of {whole}, as {cheapest} takes {milliseconds(least)}"
     if saving >= WORTH_REFINING:
         limit = f"Refinement can save {limit}."
     elif saving > 0.0:
@@ -216,18 +174,8 @@ def _call(solver, max_iter, rtol):
     return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
 
 
-def _network_seconds(network, u, limit):
-    """One forward and one backward pass; a first one that exceeds the limit is also the last."""
-    times, deadline = [], now(u) + limit
-    while len(times) <= RUNS and (not times or now(u) < deadline):
-        started = now(u)
-        out = network(u)
-        torch.autograd.grad(out, list(network.parameters()), torch.ones_like(out))
-        times.append(now(u) - started)
-    return median(times[1:] or times)
-
-
-def _limit(seconds):
+def checked_limit(seconds):
+    """The limit for each solver, checked."""
     if not 0 < _check.real("advise", "seconds", seconds) < float("inf"):
         raise ValueError(f"advise: seconds must be a number > 0, got {seconds}")
     return float(seconds)
@@ -241,7 +189,7 @@ def _short(ms):
     return f"{ms:.3g}" if ms < 1000 else f"{ms:.0f}"
 
 
-def _ms(seconds):
+def milliseconds(seconds):
     return f"{_short(1e3 * seconds)} ms"
 
 

@@ -6,7 +6,7 @@ seen twice."""
 import numpy as np
 
 from benchmarks.studies.evaluation import spread
-from prdp_torch.charts import make_figure
+from prdp_torch.experiments.charts import make_figure
 
 SCENES = ("heat_1d", "heat_2d", "burgers_1d")
 UPDATES = {"heat_1d": 800, "heat_2d": 560, "burgers_1d": 800}

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from prdp_torch import _C, fields
-from prdp_torch.training import error, propagator
+from prdp_torch.experiments.network_task import error, propagator
 
 
 def spread(values):

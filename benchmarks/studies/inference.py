@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 import prdp_torch as prdp
-from prdp_torch import _C, records
-from prdp_torch.charts import make_figure
-from prdp_torch.training import error, propagator
+from prdp_torch import _C
+from prdp_torch.experiments import records
+from prdp_torch.experiments.charts import make_figure
+from prdp_torch.experiments.network_task import error, propagator
 
 KS = (1, 2, 5, 10, 15, 20, 44, 120)
 STEPS = (5, 20, 50)

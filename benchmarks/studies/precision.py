@@ -6,10 +6,11 @@ import torch
 
 from benchmarks.studies import evaluation
 from benchmarks.studies.trainings import variant
-from prdp_torch import records
-from prdp_torch.charts import make_figure
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import records
+from prdp_torch.experiments.charts import make_figure
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 
 class InBfloat16(torch.nn.Module):

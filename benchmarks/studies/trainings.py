@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 
 from benchmarks.studies import evaluation
-from prdp_torch import records, scenes
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import records, scenes
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 
 def variant(name, changes):

@@ -11,10 +11,11 @@ import torch
 
 from benchmarks.studies.evaluation import spread
 from benchmarks.studies.trainings import variant
-from prdp_torch import _C, records, scenes
-from prdp_torch.charts import make_figure
-from prdp_torch.networks import make_network
-from prdp_torch.training import corrected, error
+from prdp_torch import _C
+from prdp_torch.experiments import records, scenes
+from prdp_torch.experiments.charts import make_figure
+from prdp_torch.experiments.network_task import corrected, error
+from prdp_torch.experiments.networks import make_network
 
 STEPS = (2, 4, 8, 16)
 BEYOND = 20  # how far the trained network is followed

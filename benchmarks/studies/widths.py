@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.studies.evaluation import spread
-from prdp_torch.charts import make_figure
+from prdp_torch.experiments.charts import make_figure
 
 WIDTHS = (16, 24, 32, 48, 64, 96, 128)
 UNKNOWNS, VALID = 30, 100

@@ -90,6 +90,14 @@ void bind_scenes(py::module_& m) {
       .def("learning_rate", &Scene::learning_rate, py::arg("update"));
 
   m.def("read_scene", &read_scene, py::arg("path"));
+  m.def("scene_keys", [] {
+    py::list keys;
+    for (const auto& key : scene_keys())
+      keys.append(py::dict(py::arg("table") = key.table, py::arg("name") = key.name, py::arg("value") = key.value,
+                           py::arg("unit") = key.unit, py::arg("default") = key.otherwise,
+                           py::arg("when") = key.when, py::arg("means") = key.means));
+    return keys;
+  });
   m.def("parse_scene", &parse_scene, py::arg("text"), py::arg("path"));
 
   py::class_<Dataset>(m, "Dataset")

@@ -10,7 +10,7 @@
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/scene.h"
 
-/// The C++ trainer: the same loops as prdp_torch/training.py.
+/// The C++ trainer: the same loops as prdp_torch/experiments/training.py.
 namespace prdp::train {
 
 /// How a training decides how far the solver goes.

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import prdp_torch as prdp
-from prdp_torch import _C, scenes
+from prdp_torch import _C
+from prdp_torch.experiments import scenes
 
 DATA = Path(__file__).parents[1] / "data"
 ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
@@ -35,6 +36,19 @@ SMALL_FIELD = (
 
 def golden(name):
     return np.load(DATA / f"{name}.npz")
+
+
+def as_toml(content):
+    """The text of a scene: plain keys first, then one level of tables."""
+
+    def written(value):
+        return str(value).lower() if isinstance(value, bool) else repr(value)
+
+    lines = [f"{name} = {written(value)}" for name, value in content.items() if not isinstance(value, dict)]
+    for name, table in content.items():
+        if isinstance(table, dict):
+            lines += [f"[{name}]", *(f"{key} = {written(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
 
 
 def statuses(info):
@@ -145,11 +159,10 @@ def line_of(path, text):
 
 
 def assert_refused(path, where, message):
-    """Reading the scene fails with `message` and the line that holds `where`."""
+    """Reading the scene fails with `message` and the line that holds `where`, the first where it is empty."""
     with pytest.raises(ValueError) as error:
         _C.read_scene(path)
     text = str(error.value)
     assert message in text and text.startswith(path + ":")
     number = int(text.removeprefix(path + ":").split(":")[0])
-    # A missing table has no line of its own: the file's first table stands for it.
-    assert number == line_of(path, where) or where == "title"
+    assert number == line_of(path, where)

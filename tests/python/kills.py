@@ -21,12 +21,13 @@ from pathlib import Path
 import torch
 from helpers import small_field, tiny, written
 
-from prdp_torch import _C, cli, records
+from prdp_torch import _C
+from prdp_torch.experiments import cli, records
 
 ROOT = Path(__file__).parents[2]
 # Python's trainer is forked from a process that has imported torch, so that kills hit the training.
 FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(["helpers", "prdp_torch.cli"])
+FORK.set_forkserver_preload(["helpers", "prdp_torch.experiments.cli"])
 TASKS = {
     "emulator": (lambda folder: written(folder), 40),
     "parameters": (lambda folder: written(folder, scene="poisson_1p"), 200),

@@ -11,7 +11,7 @@ from helpers import field
 
 import prdp_torch as prdp
 from prdp_torch import advice as module
-from prdp_torch import scenes
+from prdp_torch.experiments import scene_advice, scenes
 from prdp_torch.trials import Row, Solve, random_cotangent
 
 
@@ -161,13 +161,13 @@ def made_up(name, rtol, seconds, iterations=10):
 def test_refinement_is_recommended_where_physics_is_a_large_part(seconds, network, words):
     step = prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1))
     best = made_up("CG", 1e-5, seconds)
-    text = module._recommend(step, field((8,)), [best], best, module._Update(network))
+    text = module._recommend(step, field((8,)), [best], best, module.Update(network))
     assert text.startswith(words)
 
 
 def test_the_direct_solver_says_whether_a_rough_solve_is_faster():
     best, equal, rough = (made_up(*row) for row in (("Direct", 1e-5, 1.0), ("Direct", 1e-3, 1.0), ("CG", 1e-3, 0.4)))
-    update = module._Update(network=1.0)
+    update = module.Update(network=1.0)
     assert module._recommend(None, None, [best, equal], best, update) == (
         "Use the direct solver, Direct(): it is the fastest to 1e-5, and physics is 50% of an update: 1000 ms of "
         "2000 ms. Refinement has nothing to save: no solver is faster to 1e-3."
@@ -178,7 +178,7 @@ def test_the_direct_solver_says_whether_a_rough_solve_is_faster():
 
 
 def test_a_scene_says_what_share_its_physics_has():
-    advice = module.advise_scene(scenes.load("heat_1d"), seconds=1.0)
+    advice = scene_advice.advise_scene(scenes.load("heat_1d"), seconds=1.0)
     own = next(note for note in advice.notes if note.startswith("As the scene sets it"))
     share, physics, whole = map(float, re.search(r"(\d+)% of an update: (\S+) ms of (\S+) ms", own).groups())
     assert math.isclose(share, 100 * physics / whole, abs_tol=1.0) and "jacobi, K = 25, implicit" in own
@@ -186,7 +186,7 @@ def test_a_scene_says_what_share_its_physics_has():
 
 
 def test_the_command_ends_with_a_recommendation(tmp_path):
-    command = [sys.executable, "-c", "from prdp_torch.cli import main; main()", "advise", "heat_1d", "--seconds", "1"]
+    command = [sys.executable, "-m", "prdp_torch", "advise", "heat_1d", "--seconds", "1"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "Chebyshev" in done.stdout and "of an update" in done.stdout and not list(tmp_path.iterdir())

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from prdp_torch import atlas
-from prdp_torch.atlas import gradients, solves
+from prdp_torch.experiments import atlas
+from prdp_torch.experiments.atlas import gradients, solves
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "stability"
@@ -90,7 +90,7 @@ def test_the_modes_agree_for_b_with_jacobi_on_heat():
 
 
 def test_the_command_writes_a_picture_and_a_record_for_each_map(tmp_path):
-    command = [sys.executable, "-m", "prdp_torch.cli", "stability", "--quick", "--out", tmp_path]
+    command = [sys.executable, "-m", "prdp_torch", "stability", "--quick", "--out", tmp_path]
     names = ["hyperdiffusion", "burgers_restart", "known_matrices"]
     done = subprocess.run([*command, *(f"--only={name}" for name in names)], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from helpers import written
 
-from prdp_torch import compare, report, scenes
 from prdp_torch.controller import PRDPController
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import compare, report, scenes
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 CONVERGED = ("max_iter = 25", "max_iter = 2000")  # rtol = 1e-5 ends the solves
 VARIANTS = {

@@ -106,7 +106,7 @@ def test_readings_are_taken_in_turn():
 def test_all_suites_run_and_leave_a_page(tmp_path):
     suites = ("roofline", "training", "memory")
     done = subprocess.run(
-        [sys.executable, "-m", "prdp_torch.cli", "bench", *suites, "--quick", "--out", tmp_path],
+        [sys.executable, "-m", "prdp_torch", "bench", *suites, "--quick", "--out", tmp_path],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -122,6 +122,6 @@ def test_all_suites_run_and_leave_a_page(tmp_path):
 
 
 def test_an_unknown_suite_is_refused():
-    done = subprocess.run([sys.executable, "-m", "prdp_torch.cli", "bench", "speed"], cwd=ROOT, capture_output=True,
+    done = subprocess.run([sys.executable, "-m", "prdp_torch", "bench", "speed"], cwd=ROOT, capture_output=True,
                           text=True)  # fmt: skip
     assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, diffusion, size" in done.stderr

@@ -8,12 +8,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from prdp_torch import records, scenes
-from prdp_torch.checkpoint import Checkpoint
-from prdp_torch.tensorboard import TensorBoard
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import records, scenes
+from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.tensorboard import TensorBoard
+from prdp_torch.experiments.training import train
 
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 
 
 def short(intervals=6, name="heat_1d"):
@@ -120,7 +121,7 @@ def test_a_resumed_training_shows_every_interval_once(tmp_path, monkeypatch):
 
 
 def test_a_missing_tensorboard_is_one_line(tmp_path):
-    code = "import sys; sys.modules['tensorboard'] = None; " + PRDP[2]
+    code = "import sys; sys.modules['tensorboard'] = None; from prdp_torch.experiments.cli import main; main()"
     command = [sys.executable, "-c", code, "train", "heat_1d", "--tensorboard", "--out", "here"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2 and not list(tmp_path.rglob("*.json"))

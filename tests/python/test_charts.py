@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from prdp_torch import charts, compare, scenes
+from prdp_torch.experiments import charts, compare, scenes
 
 
 def rows_with(errors):

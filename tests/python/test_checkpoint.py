@@ -15,13 +15,14 @@ import torch
 from helpers import small_field, tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import compare, records, scenes
-from prdp_torch.checkpoint import Checkpoint
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
 TRAINERS = {
-    "python": [sys.executable, "-c", "from prdp_torch.cli import main; main()", "train"],
+    "python": [sys.executable, "-m", "prdp_torch", "train"],
     "cpp": [ROOT / "build" / "prdp_train"],
 }
 

@@ -11,12 +11,14 @@ import torch
 from helpers import assert_refused, tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import _C, charts, fields, scenes, training
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C, fields
+from prdp_torch.experiments import charts, network_task, scenes
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 TRAINER = ROOT / "build" / "prdp_train"
 
 
@@ -164,7 +166,7 @@ def objective(scene, network, solver):
         for _ in range(2)
     ]
     data = _C.make_dataset(scene)
-    return data, steppers, training._corrector(scene, steppers, data, network)
+    return data, steppers, network_task._corrector(scene, steppers, data, network)
 
 
 def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve(tmp_path):
@@ -204,7 +206,7 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve
 def test_the_metric_is_the_x_velocity_after_converged_steps(tmp_path):
     scene = scenes.load(tiny(tmp_path, ('"float32"', '"float64"')))
     data = _C.make_dataset(scene)
-    metric = training._metric(scene, data, torch.zeros_like)
+    metric = network_task._metric(scene, data, torch.zeros_like)
     exact = prdp.NavierStokes([8, 8], 1e-4, 0.1, prdp.Direct())
     u = fields.rollout(exact, data.valid_start, 5)[:, -1, 0]
     error = (u - data.valid_end[:, 0]).flatten(1).norm(dim=1) / data.valid_end[:, 0].flatten(1).norm(dim=1)

@@ -11,10 +11,12 @@ import pytest
 import torch
 from helpers import tiny, written
 
-from prdp_torch import _C, compare, datasets, pdebench, records, scenes, trajectories
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C
+from prdp_torch.experiments import compare, datasets, pdebench, records, scenes, trajectories
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
 FROM_FILE = ("modes = 5               # sines and cosines 2πn, n = 1 … 5", 'file = "x.h5"'), ("seed = 0\n", "")
 SMALL = ("train = 200", "train = 50"), ("epochs = 100", "epochs = 3")
@@ -144,7 +146,7 @@ def test_what_is_no_file_of_trajectories_is_one_line_of_the_command(tmp_path, co
 
 
 def test_a_missing_h5py_is_one_line(tmp_path):
-    code = "import sys; sys.modules['h5py'] = None; " + PRDP[2]
+    code = "import sys; sys.modules['h5py'] = None; from prdp_torch.experiments.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, "export", "heat_1d", "--out", "x.h5"], cwd=tmp_path,
                           capture_output=True, text=True)  # fmt: skip
     assert done.returncode == 2 and not (tmp_path / "x.h5").exists()

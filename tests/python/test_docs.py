@@ -11,9 +11,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 import typer.main
+from helpers import as_toml
 
 import prdp_torch as prdp
-from prdp_torch import cli, scenes
+from prdp_torch.experiments import cli, scenes
 
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
@@ -127,71 +128,6 @@ def test_the_scenes_are_read(block, tmp_path):
     assert scenes.load(path).name == "scene"
 
 
-def as_toml(content):
-    """Plain keys first, then one level of tables."""
-
-    def written(value):
-        return str(value).lower() if isinstance(value, bool) else repr(value)
-
-    lines = [f"{name} = {written(value)}" for name, value in content.items() if not isinstance(value, dict)]
-    for name, table in content.items():
-        if isinstance(table, dict):
-            lines += [f"[{name}]", *(f"{key} = {written(value)}" for key, value in table.items())]
-    return "\n".join(lines) + "\n"
-
-
-READER = (ROOT / "csrc/prdp/scenes/scene.cpp").read_text()
-SECTIONS = {
-    "Top level": "Task read_task(.*?)^}.*^  Scene scene;(.*)",
-    "`[physics]`": "read_physics(.*?)^}",
-    "`[solver]`": "read_solver(.*?)^}",
-    "`[data]`": "read_data(.*?)^}",
-    "`[network]`": "read_network(.*?)^}",
-    "`[training]`": "read_training(.*?)^}",
-    "`[parameters]`": "read_parameters(.*?)^}",
-    "`[field]`": "read_field(.*?)^}",
-    "`[prdp]`": "read_prdp(.*?)^}",
-    "`[compare]`": "read_compare(.*?)^}",
-}
-
-
-# What the page calls the values that a function of the reader takes.
-TYPES = {
-    "whole": "whole number >=",
-    "count": "whole number >=",
-    "wholes": "whole numbers",
-    "above": "number >",
-    "at_least": "number >=",
-    "numbers": "numbers",
-    "text": "text",
-    "flag": "`true`, `false`",
-    "section": "table",
-    "choice": "`",
-}
-
-
-@pytest.mark.parametrize("section", SECTIONS)
-def test_the_key_tables_hold_what_the_reader_asks_for(section):
-    """Keys both ways, their types and whether they have a default; the names to choose from and the lower bounds that
-    the reader gives as literals."""
-    functions = re.search(SECTIONS[section], READER, re.MULTILINE | re.DOTALL)
-    source = "".join(functions.groups())
-    text = re.search(rf"^### {re.escape(section)}\n(.*?)(?=^##|\Z)", PAGES["docs/command_line.md"], re.M | re.S)[1]
-    rows = {row[1]: row[2] for row in re.finditer(r"^\| `(\w+)` \| (.*)$", text, re.MULTILINE)}
-
-    asked = re.findall(r'\bs\.(\w+)\("(\w+)"(?:, ([\d.]+))?', source)
-    assert set(rows) == {key for call, key, _ in asked if call != "fail"}
-    chosen = set(re.findall(r'"([a-z]\w*)"', source)) - {key for _, key, _ in asked}
-    assert all(f"`{name}`" in text for name in chosen)
-    optional = {key for call, key, _ in asked if call in ("has", "flag")}
-    for call, key, bound in asked:
-        if call != "fail":
-            value, default, *_ = re.split(r"(?<!\\)\|", rows[key])
-            assert TYPES.get(call, "") in value and bool(default.strip()) == (key in optional), key
-        if bound:
-            assert f"{'>' if call == 'above' else '>='} {float(bound):g}" in rows[key], key
-
-
 def test_the_page_of_the_command_line_names_every_option_of_the_cpp_trainer():
     source = (ROOT / "csrc/train/main.cpp").read_text()
     page = PAGES["docs/command_line.md"]
@@ -240,8 +176,8 @@ def documented():
 
 def public_names():
     """(module, name) of all that `import prdp_torch` offers: its own names and those of its modules."""
-    for name in [*prdp.__all__, *prdp._LAZY]:
-        value = getattr(prdp, name)
+    inside = [getattr(prdp.experiments, name) for name in prdp.experiments.__all__]
+    for name, value in [*((name, getattr(prdp, name)) for name in prdp.__all__), *((m.__name__, m) for m in inside)]:
         if not inspect.ismodule(value):
             yield "prdp_torch", name
             continue

@@ -11,8 +11,10 @@ import pytest
 import torch
 from helpers import assert_refused, small_field
 
-from prdp_torch import _C, compare, field_task, operators, scenes
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C, operators
+from prdp_torch.experiments import compare, field_task, scenes
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
 DOUBLE = ('dtype = "float32"', 'dtype = "float64"')
@@ -171,7 +173,7 @@ def test_a_comparison_has_rows_of_the_direct_solver_and_a_looser_tolerance(tmp_p
     rows = compare.rows_of(scenes.load(path))
     labels = ["converged", "direct", "rtol_0.001", "auto", "prdp", "constant_10", "constant_15", "constant_20"]
     assert [row.label for row in rows] == labels
-    command = [sys.executable, "-c", "from prdp_torch.cli import main; main()", "compare", path, "--seeds", "2"]
+    command = [sys.executable, "-m", "prdp_torch", "compare", path, "--seeds", "2"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "rtol = 0.001" in done.stdout and "rtol = 0.001" in (tmp_path / "runs/small/report.html").read_text()
@@ -187,7 +189,7 @@ def test_a_comparison_has_rows_of_the_direct_solver_and_a_looser_tolerance(tmp_p
         ('"diffusion"', '"heat"', "equation =", "physics.equation: unknown name 'heat'; allowed: diffusion"),
         ("dt = 0.05", "dt = 0.05\nnu = 1.0", "nu =", "unknown name 'physics.nu'; allowed: dt, equation, shape"),
         ('"cg"', '"chebyshev"', "method", "solver.method: unknown name 'chebyshev'; allowed: jacobi, steepest"),
-        ("[field]", "[fields]", "title", "field: missing; the table holds:"),
+        ("[field]", "[fields]", "", "field: missing; the table holds:"),
         ("mean = 0.02", "mean = 0.0", "mean =", "field.mean: must be > 0, got 0"),
         ("contrast = 1.0", "contrast = -1.0", "contrast = -", "field.contrast: must be >= 0, got -1"),
         ("every = 2", "every = 7", "every", "field.every: must be <= steps, for there to be a snapshot"),

@@ -15,13 +15,15 @@ import torch
 from helpers import tiny, written
 from typer.testing import CliRunner
 
-from prdp_torch import _C, cli, compare, records, scenes
-from prdp_torch.checkpoint import Checkpoint
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C
+from prdp_torch.experiments import cli, compare, records, scenes
+from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 TRAINER = ROOT / "build" / "prdp_train"
 TRAINERS = {"python": [*PRDP, "train"], "cpp": [TRAINER]}
 HEAT = scenes.available()["heat_1d"]

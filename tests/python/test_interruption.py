@@ -6,7 +6,8 @@ import sys
 
 SETUP = """
 import os, signal, sys, threading, time, torch, prdp_torch as prdp
-from prdp_torch import _C, scenes
+from prdp_torch import _C
+from prdp_torch.experiments import scenes
 signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.manual_seed(0)
 torch.set_num_threads(2)

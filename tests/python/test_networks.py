@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from prdp_torch import scenes
-from prdp_torch.networks import MLP, ResNet, make_network
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.networks import MLP, ResNet, make_network
 
 SHAPES = [(13,), (7, 9), (5, 6, 7)]
 

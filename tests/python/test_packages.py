@@ -101,7 +101,7 @@ def test_the_wheel_works_in_an_environment_of_its_own(tmp_path):
     (packages / "others.pth").write_text(str(Path(torch.__file__).parents[1]))
     smoke = """
 import torch, prdp_torch as prdp
-from prdp_torch import scenes
+from prdp_torch.experiments import scenes
 u = torch.randn(2, 1, 30, requires_grad=True)
 heat = prdp.Heat((30,), 1e-3, 1.0, prdp.CG(100))
 heat(u).sum().backward()
@@ -125,12 +125,13 @@ def test_the_library_needs_torch_alone():
     """The other packages are for the experiments: the command, charts and reports."""
     solved = """
 import torch, prdp_torch as prdp
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 heat = prdp.Heat((30,), 1e-3, 1.0, prdp.CG(1))
 controller = prdp.PRDPController([heat])
 heat(torch.randn(2, 1, 30, requires_grad=True)).sum().backward()
 print(prdp.advise(heat, torch.randn(2, 1, 30), seconds=0.02).recommendation)
-scene = prdp.scenes.load("heat_1d")
+scene = prdp.experiments.scenes.load("heat_1d")
 scene.training.intervals = 1
 print(train(scene, Refinement.auto())["metric"])
 """

@@ -17,13 +17,14 @@ from helpers import tiny, written
 from torch import distributed
 
 import prdp_torch as prdp
-from prdp_torch import cli, compare, processes, records, scenes
-from prdp_torch.training import Refinement
+from prdp_torch import processes
+from prdp_torch.experiments import cli, compare, records, scenes
+from prdp_torch.experiments.refinement import Refinement
 
 ROOT = Path(__file__).parents[2]
 # One process imports torch, and those of the tests are forked from it before it has a thread.
 FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(["helpers", "prdp_torch.cli"])
+FORK.set_forkserver_preload(["helpers", "prdp_torch.experiments.cli"])
 DOUBLE = (('dtype = "float32"', 'dtype = "float64"'),)
 
 
@@ -203,10 +204,10 @@ def reports_and_refusals(path):
             prdp.PRDPController(process_group=group).__reduce__()
     scene = scenes.load(path)
     with pytest.raises(ValueError, match="2 processes need as many samples in each batch, but a batch has 1"):
-        prdp.training.train(scene, Refinement.prdp(scene))
+        prdp.experiments.training.train(scene, Refinement.prdp(scene))
     scene = scenes.load("poisson_1p")
     with pytest.raises(ValueError, match="share the batches of a network; the task 'parameters' has none"):
-        prdp.training.train(scene, Refinement.prdp(scene))
+        prdp.experiments.training.train(scene, Refinement.prdp(scene))
 
 
 def test_what_controllers_report_and_refuse_is_the_same_on_all_processes(tmp_path):

@@ -4,7 +4,8 @@ import pytest
 import torch
 from helpers import assert_refused, written
 
-from prdp_torch import _C, charts, scenes
+from prdp_torch import _C
+from prdp_torch.experiments import charts, scenes
 
 
 def test_the_projects_scenes_hold_the_papers_settings():
@@ -76,7 +77,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ("hidden", "blocks = 6\nhidden", "blocks", "unknown name 'network.blocks'; allowed: hidden, kind"),
         ("hidden", "zero_output = 1\nhidden", "zero_output", "network.zero_output: expected true or false"),
         ("rtol = 1e-5", "rtol = 1e-5\nrestart = 2", "restart", "unknown name 'solver.restart'; allowed: backward"),
-        ("[network]", "[networks]", "title", "network: missing; the table holds:"),
+        ("[network]", "[networks]", "", "network: missing; the table holds:"),
         ("[physics]", "[physics", "[physics", "Error while parsing"),
     ],
 )  # fmt: skip

@@ -216,7 +216,7 @@ def test_adjoint_failures_are_reported_on_their_own():
         torch.linalg.LinAlgError, match=r"adjoint solve: 1 of 2 .*sample 1 NONFINITE_INPUT at index \(0, 4\)"
     ):
         u.backward(cotangent)
-    assert statuses(heat.info) == ["MAX_ITER"] * 2 or statuses(heat.info) == ["CONVERGED"] * 2
+    assert statuses(heat.info) == ["CONVERGED"] * 2
     assert statuses(heat.adjoint_info)[1] == "NONFINITE_INPUT"
     heat.on_failure = "warn"
     b = field((9,)).requires_grad_()

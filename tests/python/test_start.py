@@ -16,7 +16,8 @@ from helpers import (
 from torch.library import opcheck
 
 import prdp_torch as prdp
-from prdp_torch import _C, operators, scenes
+from prdp_torch import _C, operators
+from prdp_torch.experiments import scenes
 
 modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 SYMMETRIC = [prdp.Jacobi, prdp.Chebyshev, prdp.SteepestDescent, prdp.CG, prdp.GMRES]

@@ -9,8 +9,9 @@ import torch
 from helpers import tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import _C, compare, records, scenes
-from prdp_torch.training import Refinement
+from prdp_torch import _C
+from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.experiments.refinement import Refinement
 
 
 def trained(scene, folder, *refinements, seeds=1):
@@ -80,11 +81,11 @@ def test_a_training_without_a_network_or_that_diverged_is_not_loaded(tmp_path):
 def test_modules_for_trainings_come_with_the_package_when_they_are_used():
     code = (
         "import sys, json; import prdp_torch as prdp; before = [m in sys.modules for m in sys.argv[1:]];"
-        "print(json.dumps([before, 'heat_1d' in prdp.scenes.available(), prdp.training.__name__,"
-        " callable(prdp.load_trained), 'scenes' in dir(prdp)]))"
+        "print(json.dumps([before, 'heat_1d' in prdp.experiments.scenes.available(), callable(prdp.load_trained),"
+        " 'experiments' in dir(prdp)]))"
     )
-    lazy = ("prdp_torch.training", "prdp_torch.trained", "torch.utils.tensorboard", "matplotlib")
+    lazy = ("prdp_torch.experiments", "torch.utils.tensorboard", "matplotlib")
     done = subprocess.run([sys.executable, "-c", code, *lazy], capture_output=True, text=True)
-    assert json.loads(done.stdout) == [[False] * 4, True, "prdp_torch.training", True, True], done.stderr
+    assert json.loads(done.stdout) == [[False] * 3, True, True, True], done.stderr
     with pytest.raises(AttributeError, match="module 'prdp_torch' has no attribute 'nothing'"):
         prdp.nothing  # noqa: B018

@@ -11,11 +11,13 @@ import pytest
 import torch
 from helpers import written
 
-from prdp_torch import _C, scenes
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 TRAINER = ROOT / "build" / "prdp_train"
 
 

@@ -12,10 +12,11 @@ from PIL import Image
 from test_corrector import cache, tiny  # noqa: F401, cache is a fixture of every test here
 
 import prdp_torch as prdp
-from prdp_torch import _C, compare, fields, report, scenes, trajectories, trajectory_charts
-from prdp_torch.networks import make_network
+from prdp_torch import _C, fields
+from prdp_torch.experiments import compare, report, scenes, trajectories, trajectory_charts
+from prdp_torch.experiments.networks import make_network
 
-PRDP = [sys.executable, "-c", "from prdp_torch.cli import main; main()"]
+PRDP = [sys.executable, "-m", "prdp_torch"]
 DOUBLE = ('"float32"', '"float64"')
 
 

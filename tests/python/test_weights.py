@@ -11,9 +11,10 @@ import torch
 from helpers import tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import scenes
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
 

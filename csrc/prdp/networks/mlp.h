@@ -9,7 +9,7 @@ namespace prdp {
 
 /// Multilayer perceptron with ReLU between its layers, from a field to a field of the same shape
 /// (batch, channels, *shape). Parameters layers.0.weight, layers.0.bias, …; torch's default initialisation.
-/// prdp_torch.networks.MLP is its twin: same names, same order, same weights from the same seed.
+/// prdp_torch.experiments.networks.MLP is its twin: same names, same order, same weights from the same seed.
 class MLPImpl : public torch::nn::Module {
  public:
   /// unknowns → hidden[0] → … → unknowns

@@ -11,7 +11,7 @@ namespace prdp {
 /// width → channels point by point. Beyond the grid the blocks see the other end of the field where it
 /// is periodic, else zeros. Parameters lift.weight, lift.bias, blocks.0.0.weight, blocks.0.0.bias,
 /// blocks.0.2.weight, …, project.weight, project.bias; torch's default initialisation.
-/// prdp_torch.networks.ResNet is its twin: same names, same order, same weights from the same seed.
+/// prdp_torch.experiments.networks.ResNet is its twin: same names, same order, same weights from the same seed.
 class ResNetImpl : public torch::nn::Module {
  public:
   /// `dim` axes in `shape`; raises ValueError unless 1, 2 or 3.

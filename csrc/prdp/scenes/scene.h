@@ -87,11 +87,11 @@ struct Scene {
 
   std::string name, path, text;  // text: the file as it was read
   std::string title;
-  Task task;
-  at::ScalarType dtype;
+  Task task = Task::kEmulator;
+  at::ScalarType dtype = at::kFloat;
   Physics physics;
-  Solver solver;  // converged: max_iter is K_ε
-  Backward backward;
+  Solver solver{Method::kJacobi, 1};  // converged: max_iter is K_ε
+  Backward backward = Backward::kImplicit;
   OnFailure on_failure = OnFailure::kReturn;  // or kZeroGrad: a failed sample does not stop a training
   Start start = Start::kZero;
   Data data;
@@ -118,6 +118,19 @@ struct Scene {
   /// The learning rate of an update, counted from 0.
   double learning_rate(int64_t update) const;
 };
+
+/// A key of a scene file, as the documentation lists it.
+struct SceneKey {
+  std::string table;                     // "physics"; empty at the top level
+  std::string name;                      // "nu"
+  std::string value;                     // "number >= 0"
+  std::string unit;                      // "length²/time"; empty: none
+  std::optional<std::string> otherwise;  // the default; nullopt: the key must be given where it applies
+  std::string when;                      // "not for `poisson`"; empty: always
+  std::string means;                     // "viscosity or diffusivity"
+};
+/// Every key that a scene may have, in the order in which they are read.
+std::vector<SceneKey> scene_keys();
 
 /// Reads a scene file. Raises ValueError naming file, line and what is allowed.
 Scene read_scene(const std::string& path);

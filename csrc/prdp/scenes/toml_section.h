@@ -29,75 +29,95 @@ struct BrokenToml {};
 #pragma pop_macro("NDEBUG")
 
 #include "prdp/scenes/scene.h"
+#include "prdp/scenes/scene_key.h"
 
 namespace prdp {
 
-/// One table of a TOML file while it is read. Every key that is asked for is an allowed one; what is
-/// left over in the end is an error, so no list of names is kept beside the reading code.
+/// One table of a TOML file while it is read. KeyList has the same functions, so that one declaration of a key serves
+/// the reader and the documentation. Every key that is asked for is an allowed one; finish() refuses the others.
 class TomlSection {
  public:
   TomlSection(const toml::table& table, std::string file, std::string name)
       : table_(table), file_(std::move(file)), name_(std::move(name)) {}
 
-  bool has(const char* key) {
-    asked_.insert(key);
-    return table_.contains(key);
+  /// Reads an inner table by read(its section, scene).
+  template <class Read>
+  void section(Scene& scene, Read read, const Key& key) {
+    if (!given(key)) return;
+    const auto* inner = table_[key.name].as_table();
+    if (!inner) fail(key.name, "expected a table");
+    TomlSection section(*inner, file_, full(key.name));
+    read(section, scene);
+    section.finish();
   }
-  TomlSection section(const char* key) {
-    require(key);
-    const auto* inner = table_[key].as_table();
-    if (!inner) fail(key, "expected a table");
-    return {*inner, file_, full(key)};
+  void text(std::string& target, const Key& key) {
+    if (given(key)) target = value<std::string>(key.name, "a string");
   }
-
-  std::string text(const char* key) { return value<std::string>(key, "a string"); }
-  std::string choice(const char* key, const std::vector<std::string>& allowed) {
-    const auto chosen = text(key);
-    std::ostringstream list;
-    for (const auto& name : allowed) {
-      if (name == chosen) return chosen;
-      list << (list.tellp() > 0 ? ", " : "") << name;
+  void choice(std::string& target, const Choices& choices, const Key& key) {
+    choice(target, [](const std::string& name) { return name; }, choices, key);
+  }
+  template <class T, class FromName>
+  void choice(T& target, FromName from_name, const Choices& choices, const Key& key) {
+    if (!given(key)) return;
+    const auto chosen = value<std::string>(key.name, "a string");
+    std::ostringstream allowed;
+    for (const auto& [name, when] : choices) {
+      if (!when.holds) continue;
+      if (name == chosen) {
+        target = from_name(chosen);
+        return;
+      }
+      allowed << (allowed.tellp() > 0 ? ", " : "") << name;
     }
-    fail(key, "unknown name '" + chosen + "'; allowed: " + list.str());
+    fail(key.name, "unknown name '" + chosen + "'; allowed: " + allowed.str());
   }
-  bool flag(const char* key, bool otherwise) {
-    if (!has(key)) return otherwise;
-    if (!table_[key].is_boolean()) fail(key, "expected true or false");
-    return table_[key].value_or(otherwise);
+  void flag(bool& target, const Key& key) {
+    if (!given(key)) return;
+    if (!table_[key.name].is_boolean()) fail(key.name, "expected true or false");
+    target = table_[key.name].value_or(target);
   }
-  double number(const char* key) {
-    const double x = value<double>(key, "a number");
-    if (!std::isfinite(x)) fail(key, "must be finite");
-    return x;
+  template <class T>
+  void at_least(T& target, double least, const Key& key) {
+    if (!given<T>(key)) return;
+    const double x = number(key.name);
+    if (x < least) fail(key.name, bound(">=", least, x));
+    target = x;
   }
-  double at_least(const char* key, double least) {
-    const double x = number(key);
-    if (x < least) fail(key, bound(">=", least, x));
-    return x;
+  template <class T>
+  void above(T& target, double least, const Key& key) {
+    if (!given<T>(key)) return;
+    const double x = number(key.name);
+    if (!(x > least)) fail(key.name, bound(">", least, x));
+    target = x;
   }
-  double above(const char* key, double least) {
-    const double x = number(key);
-    if (!(x > least)) fail(key, bound(">", least, x));
-    return x;
-  }
-  int64_t whole(const char* key, int64_t least) {
-    const auto k = value<int64_t>(key, "a whole number");
-    if (k < least) fail(key, bound(">=", least, k));
-    return k;
+  template <class T>
+  void whole(T& target, const Least<int64_t>& least, const Key& key) {
+    if (!given<T>(key)) return;
+    const auto k = value<int64_t>(key.name, "a whole number");
+    if (k < least.value) fail(key.name, bound(">=", least.value, k));
+    target = k;
   }
   /// A whole number that costs are multiples of.
-  int64_t count(const char* key, int64_t least) {
-    const auto k = whole(key, least);
-    if (k > kMostCounted) fail(key, bound("<=", kMostCounted, k));
-    return k;
+  template <class T>
+  void count(T& target, int64_t least, const Key& key) {
+    int64_t k = least;
+    whole(k, least, key);
+    if (k > kMostCounted) fail(key.name, bound("<=", kMostCounted, k));
+    if (key.when.holds) target = k;
   }
-  std::vector<int64_t> wholes(const char* key, int64_t least) {
-    const auto all = values<int64_t>(key, "whole numbers");
-    for (const auto k : all)
-      if (k < least) fail(key, bound(">=", least, k));
-    return all;
+  void wholes(std::vector<int64_t>& target, int64_t least, const Key& key) {
+    if (!given(key)) return;
+    target = values<int64_t>(key.name, "whole numbers");
+    for (const auto k : target)
+      if (k < least) fail(key.name, bound(">=", least, k));
   }
-  std::vector<double> numbers(const char* key) { return values<double>(key, "numbers"); }
+  void numbers(std::vector<double>& target, const Key& key) {
+    if (given(key)) target = values<double>(key.name, "numbers");
+  }
+  /// A condition on what has been read already.
+  void check(bool holds, const char* key, const std::string& expected) const {
+    if (!holds) fail(key, expected);
+  }
 
   /// Raises for keys that nobody asked for.
   void finish() const {
@@ -109,19 +129,29 @@ class TomlSection {
                         full(std::string(key.str())), "'; allowed: ", allowed.str());
     }
   }
+
+ private:
+  std::string full(const std::string& key) const { return name_.empty() ? key : name_ + "." + key; }
   [[noreturn]] void fail(const char* key, const std::string& what) const {
     const auto* node = table_.get(key);
     const auto line = node ? node->source().begin.line : table_.source().begin.line;
     TORCH_CHECK_VALUE(false, file_, ":", line, ": ", full(key), ": ", what);
   }
-
- private:
-  std::string full(const std::string& key) const { return name_.empty() ? key : name_ + "." + key; }
-  void require(const char* key) {
-    if (has(key)) return;
+  /// Whether there is a value to read. Raises if the key applies, is not optional and is missing.
+  template <class T = void>
+  bool given(const Key& key) {
+    if (!key.when.holds) return false;
+    asked_.insert(key.name);
+    if (table_.contains(key.name)) return true;
+    if (key.optional || is_optional<T>) return false;
     std::ostringstream present;
     for (const auto& [other, node] : table_) present << (present.tellp() > 0 ? ", " : "") << other.str();
-    fail(key, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
+    fail(key.name, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
+  }
+  double number(const char* key) const {
+    const double x = value<double>(key, "a number");
+    if (!std::isfinite(x)) fail(key, "must be finite");
+    return x;
   }
   template <class T>
   static std::string bound(const char* relation, T least, T got) {
@@ -130,13 +160,11 @@ class TomlSection {
     return text.str();
   }
   template <class T>
-  T value(const char* key, const char* expected) {
-    require(key);
+  T value(const char* key, const char* expected) const {
     return read<T>(key, *table_.get(key), std::string("expected ") + expected);
   }
   template <class T>
-  std::vector<T> values(const char* key, const char* expected) {
-    require(key);
+  std::vector<T> values(const char* key, const char* expected) const {
     const auto* array = table_[key].as_array();
     if (!array) fail(key, std::string("expected a list of ") + expected);
     std::vector<T> all;

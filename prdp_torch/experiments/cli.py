@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, advice, datasets, processes, records, report, trajectories
-from prdp_torch import compare as comparison
-from prdp_torch import scenes as scene_files
-from prdp_torch.tensorboard import TensorBoard
-from prdp_torch.training import Refinement
+from prdp_torch import _C, processes
+from prdp_torch.experiments import compare as comparison
+from prdp_torch.experiments import datasets, records, report, scene_advice, trajectories
+from prdp_torch.experiments import scenes as scene_files
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.tensorboard import TensorBoard
 
 app = typer.Typer(
     add_completion=False,
@@ -212,7 +213,7 @@ def advise(
     """Measure which solver a scene needs and how much refinement can save, without training."""
     loaded = scene_files.load(scene)
     with console.status("trying the solvers"):
-        advised = advice.advise_scene(loaded, seconds)
+        advised = scene_advice.advise_scene(loaded, seconds)
     console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
 
 
@@ -223,7 +224,7 @@ def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
 ):
     """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
-    project = Path(__file__).resolve().parent.parent
+    project = Path(__file__).resolve().parents[2]
     if not (project / "benchmarks").is_dir():
         raise ValueError("bench: the benchmarks are in the project's folder, not in the installed package; clone it")
     for suite in suites or ():
@@ -245,7 +246,7 @@ def stability(
     ] = False,
 ):
     """Map where the methods work and where they break: a picture and a record for each question."""
-    from prdp_torch import atlas
+    from prdp_torch.experiments import atlas
 
     folder = records.prepare_folder(out or Path("runs") / "stability")
 

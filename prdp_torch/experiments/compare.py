@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prdp_torch import _C, processes, records
-from prdp_torch.checkpoint import Checkpoint
-from prdp_torch.networks import make_network
-from prdp_torch.training import Refinement, train
+from prdp_torch import _C, processes
+from prdp_torch.experiments import records
+from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 
 
 @dataclass

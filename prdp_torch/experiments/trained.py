@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, fields, records, training
-from prdp_torch.networks import make_network
+from prdp_torch import _C, fields
+from prdp_torch.experiments import network_task, records
+from prdp_torch.experiments.networks import make_network
 
 
 class Trained(NamedTuple):
@@ -64,7 +65,7 @@ def load_trained(run_folder, seed=0):
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
-    return Trained(network.eval(), training.propagator(scene, network), scene, record["curves"])
+    return Trained(network.eval(), network_task.propagator(scene, network), scene, record["curves"])
 
 
 def _record_in(folder, name):

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import torch
 
-from prdp_torch import _C, datasets, processes
+from prdp_torch import _C, processes
+from prdp_torch.experiments import datasets
 
 
 def environment():

@@ -4,12 +4,13 @@ import math
 
 import torch
 
-from prdp_torch import scenes
-from prdp_torch.atlas import problems
-from prdp_torch.atlas.solves import spaced
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.atlas import problems
+from prdp_torch.experiments.atlas.solves import spaced
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
 from prdp_torch.solvers import CG, GMRES, Direct, Jacobi
 from prdp_torch.steppers import Burgers, Heat
-from prdp_torch.training import Refinement, train
 
 
 def gradient(stepper, u, cotangent):

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from prdp_torch import datasets, fields, records
-from prdp_torch.networks import make_network
-from prdp_torch.training import error, propagator
+from prdp_torch import fields
+from prdp_torch.experiments import datasets, records
+from prdp_torch.experiments.network_task import error, propagator
+from prdp_torch.experiments.networks import make_network
 
 _FURTHER = 4  # the pictures go on to this many times the step of the metric
 

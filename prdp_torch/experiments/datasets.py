@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, pdebench
+from prdp_torch import _C
+from prdp_torch.experiments import pdebench
 
 TRAINED_STEPS = 2  # that the loss looks ahead
 
@@ -27,7 +28,7 @@ def of_scene(scene, own=None, on_data=None):
     """The data of a training.
 
     Args:
-        scene: from `prdp_torch.scenes.load`.
+        scene: from `prdp_torch.experiments.scenes.load`.
         own: trajectories in place of the scene's: a tensor, an array or a dataset of trajectories, whose first
             `data.train` train and whose next `data.valid` validate; or a pair of them, for training and validation.
             Every state of a training trajectory that two more follow is a start.
@@ -64,7 +65,7 @@ def export(scene, path, steps=None, on_data=None):
 
     Args:
         scene: a scene that trains a network and makes its own data.
-        path: of the file, in PDEBench's layout (`prdp_torch.pdebench`).
+        path: of the file, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
         steps: how many steps each has; by default what the training and the validation metric need.
     """
     steps = max(TRAINED_STEPS, scene.data.valid_steps) if steps is None else steps

@@ -6,8 +6,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from prdp_torch.charts import FIXED, WIDTH, error_measure, make_figure, mean_and_band
-from prdp_torch.trajectories import field
+from prdp_torch.experiments.charts import FIXED, WIDTH, error_measure, make_figure, mean_and_band
+from prdp_torch.experiments.trajectories import field
 
 _COARSE = ("#0072b2", "--")
 _SEEN = 2  # steps that the loss covers, in either task

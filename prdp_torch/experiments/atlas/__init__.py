@@ -3,6 +3,6 @@
 `problems` makes operators and right-hand sides, `solves` and `gradients` measure maps, `pictures` draws them.
 """
 
-from prdp_torch.atlas.maps import MAPS, Map, run
+from prdp_torch.experiments.atlas.maps import MAPS, Map, run
 
 __all__ = ["MAPS", "Map", "run"]

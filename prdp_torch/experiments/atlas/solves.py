@@ -5,7 +5,7 @@ import math
 import torch
 
 from prdp_torch import operators
-from prdp_torch.atlas import problems
+from prdp_torch.experiments.atlas import problems
 from prdp_torch.solve import SolveStatus, linear_solve
 from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent
 

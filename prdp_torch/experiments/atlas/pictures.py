@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullLocator
 
-from prdp_torch.charts import make_figure
+from prdp_torch.experiments.charts import make_figure
 
 # One colour per method in all pictures; Okabe and Ito's, which colour-blind readers can tell apart.
 COLOURS = {"GMRES(2)": "#56B4E9",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jinja2
 
-from prdp_torch import charts, records, trajectory_charts
+from prdp_torch.experiments import charts, records, trajectory_charts
 
 
 class Column(NamedTuple):

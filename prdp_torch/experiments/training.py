@@ -9,78 +9,10 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, datasets, field_task, fields, processes
-from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
-from prdp_torch.networks import make_network
-from prdp_torch.scenes import make_stepper
-from prdp_torch.solve import SolveStatus, detach_failed
-from prdp_torch.task import Task
-
-
-class Refinement:
-    """How a training chooses K and the tolerance. Use one of the class methods below.
-
-    Args:
-        label: name of the folder of the records.
-        attach: a function that takes the steppers and returns their controller.
-        direct: whether the exact solver replaces that of the scene.
-        watches_error: whether the controller's `step` takes the relative error instead of the metric.
-    """
-
-    def __init__(self, label, attach, direct=False, watches_error=False):
-        self.label = label
-        self.attach = attach
-        self.direct = direct
-        self.watches_error = watches_error
-
-    @classmethod
-    def auto(cls):
-        """A tolerance that follows the error (`ToleranceController`), and starts from the state: nothing to choose."""
-
-        def attach(steppers):
-            for stepper in steppers:
-                stepper.start = "state"
-            return ToleranceController(steppers)
-
-        return cls("auto", attach, watches_error=True)
-
-    @classmethod
-    def prdp(cls, scene, growth=None):
-        """PRDP with the settings of the scene, or with another `growth` (`PRDPController`)."""
-        settings = dict(scene.prdp)
-        if growth is not None:
-            settings["growth"] = growth
-        label = "prdp" if growth is None else f"prdp_growth_{growth:g}"
-        return cls(label, lambda steppers: PRDPController(steppers, **settings))
-
-    @classmethod
-    def constant(cls, k):
-        """The same K throughout."""
-        return cls.schedule(k, 0, k, label=f"constant_{k}")
-
-    @classmethod
-    def tolerance(cls, rtol, k):
-        """The same tolerance rtol throughout, with at most k iterations."""
-
-        def attach(steppers):
-            for stepper in steppers:
-                stepper.rtol = rtol
-            return LinearSchedule(steppers, initial=k, increment=0, maximum=k)
-
-        return cls(f"rtol_{rtol:g}", attach)
-
-    @classmethod
-    def schedule(cls, start, step, maximum, label=None):
-        """K starts at `start` and grows by `step` after each interval, up to `maximum`."""
-        return cls(
-            label or f"schedule_{start}_{step}",
-            lambda steppers: LinearSchedule(steppers, initial=start, increment=step, maximum=maximum),
-        )
-
-    @classmethod
-    def exact(cls):
-        """The exact solver."""
-        return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)
+from prdp_torch import _C, processes
+from prdp_torch.experiments import datasets, field_task, network_task, parameter_task
+from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.solve import SolveStatus
 
 
 class Interval(NamedTuple):
@@ -118,7 +50,7 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     """Train a scene once.
 
     Args:
-        scene: from `prdp_torch.scenes.load`.
+        scene: from `prdp_torch.experiments.scenes.load`.
         refinement: a `Refinement`, which chooses K and the tolerance.
         seed: sets the initial weights of the network and the order of the batches; for the task "field", the noise.
             The data of a scene do not depend on it.
@@ -127,8 +59,8 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
             training stops and its checkpoint is saved. If a training continues from a checkpoint, they are first
             called with the intervals that were done before (`resumed`). A diverged interval makes no call.
         on_data: called while data are made with (steps done, all steps), where steps are counted per sample.
-        checkpoint: a `prdp_torch.checkpoint.Checkpoint`. The training continues from its state, and saves its own
-            there whenever one is due. On the same machine, with as many threads, the result is the same bit for
+        checkpoint: a `checkpoint.Checkpoint`. The training continues from its state, and saves its own there
+            whenever one is due. On the same machine, with as many threads, the result is the same bit for
             bit, also for a network with dropout.
         data: trajectories in place of the scene's data: (samples, times, channels, *shape), spaced by the scene's
             dt, as a tensor, an array or a dataset of trajectories. The first `data.train` of them train, the next
@@ -174,9 +106,9 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
         data = processes.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
-        task = _network(scene, steppers, seed, network, data)
+        task = network_task.make_task(scene, steppers, seed, network, data)
     else:
-        task = (field_task.make_task if scene.task == "field" else _parameters)(scene, steppers, seed)
+        task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
     try:
         run.go(task, saved)
     except _Diverged as divergence:
@@ -334,133 +266,3 @@ class _Run:
 def _per_sample(counts):
     """Of counts (batch,), or (batch, steps) of a rollout, summed over the steps."""
     return float(counts.double().mean(0).sum())
-
-
-def propagator(scene, network):
-    """Return a trained network as a function that makes one time step. This is the network itself; for the task
-    "corrector" it is a converged step of the coarse solver, corrected by the network."""
-    if scene.task == "emulator":
-        return network
-    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
-    return lambda u: corrected(converged, network, u)
-
-
-def error(scene, u, reference):
-    """Return the validation error of states u: the mean over the samples of (‖u - reference‖ / ‖reference‖)². For a
-    corrector only the velocity along x counts."""
-    of = slice(0, 1) if scene.task == "corrector" else slice(None)
-    return float(_C.normalised_mse(u[:, of], reference[:, of]))
-
-
-def _network(scene, steppers, seed, network, data):
-    """An interval is an epoch, the metric that of validation."""
-    processes.check_batches(len(data.train_start), scene.training.batch)
-    if network is None:
-        network = make_network(scene, seed)
-    else:
-        datasets.check_network(scene, network, data.train_start[:1])
-    objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
-    optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
-    generator = torch.Generator().manual_seed(seed)
-
-    def updates(first):
-        order = torch.randperm(len(data.train_start), generator=generator)
-        for number, batch in enumerate(order.split(scene.training.batch), first):
-            for group in optimiser.param_groups:
-                group["lr"] = scene.learning_rate(number)
-            optimiser.zero_grad()
-            loss, part = loss_of(batch)
-            part.backward()
-            optimiser.step()
-            yield float(loss.detach()), processes.share(batch)
-
-    def state():
-        parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-        return {**parts, "shuffling": generator.get_state()}
-
-    def load(saved):
-        network.load_state_dict(saved["network"])
-        optimiser.load_state_dict(saved["optimiser"])
-        generator.set_state(saved["shuffling"])
-
-    # The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
-    def of_a_step(metric):
-        return math.sqrt(metric) / scene.data.valid_steps
-
-    return Task(updates, _metric(scene, data, network), of_a_step, state, load)
-
-
-def _metric(scene, data, network):
-    step = propagator(scene, network)
-    start, end = processes.share(data.valid_start), processes.share(data.valid_end)
-
-    def metric():
-        mine = math.nan  # of a process without a sample
-        if len(start):
-            with torch.no_grad():
-                mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
-        return processes.mean([mine], len(start))[0]
-
-    return metric
-
-
-def _emulator(scene, steppers, data, network):
-    """The loss of a batch: the network in place of the equation."""
-    (stepper,) = steppers
-
-    def loss(batch):
-        u2 = stepper(network(data.train_start[batch]))
-        return _C.loss(scene.training.loss, u2, data.train_end[batch])
-
-    return loss
-
-
-def corrected(stepper, network, u):
-    """Make a step of the task "corrector": a step of the coarse solver from u, with the network on top. The mean of
-    its pressure is removed in between."""
-    coarse = _C.without_mean_pressure(stepper(u))
-    return coarse + network(coarse)
-
-
-def _corrector(scene, steppers, data, network):
-    """The loss of a batch: the network on top of a coarse step, twice."""
-    first, second = steppers
-
-    def loss(batch):
-        u1 = corrected(first, network, data.train_start[batch])
-        u2 = corrected(second, network, u1)
-        if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
-            worst = torch.minimum(first.info.status, second.info.status)
-            u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
-        kind = scene.training.loss
-        return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
-
-    return loss
-
-
-def _parameters(scene, steppers, seed):
-    """An interval is a single update, the metric the error of θ."""
-    (stepper,) = steppers
-    problem = _C.make_parameter_problem(scene)
-    theta = problem.start.clone().requires_grad_()
-    # What a user sees, who does not know θ; before the first solve nothing is explained yet.
-    misfit = 1.0
-
-    def updates(number):
-        nonlocal misfit
-        u = stepper((theta @ problem.modes)[None, None])
-        loss = _C.half_mse(u, problem.solution)
-        (gradient,) = torch.autograd.grad(loss, theta)
-        with torch.no_grad():
-            theta.sub_(gradient, alpha=scene.learning_rate(number))
-        misfit = float(_C.relative_error(u.detach(), problem.solution))
-        yield float(loss.detach()), None
-
-    def metric():
-        return float(_C.relative_error(theta.detach(), problem.reference))
-
-    def load(saved):
-        theta.detach().copy_(saved["theta"])
-
-    return Task(updates, metric, lambda _: misfit, lambda: {"theta": theta.detach()}, load)

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from prdp_torch import _C, field_task, solvers, steppers
+from prdp_torch import _C, solvers, steppers
+from prdp_torch.experiments import field_task
 
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 # In a checkout the scenes lie among the examples; a wheel carries them along.
 _FOLDERS = [_PACKAGE.parent / "examples" / "scenes", _PACKAGE / "scenes"]
 

@@ -5,9 +5,9 @@ import math
 import torch
 
 from prdp_torch import _C, operators
+from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed
-from prdp_torch.task import Task
 
 
 class Diffusion:

@@ -1,0 +1,32 @@
+"""Write the tables of scene keys in docs/command_line.md, from what the reader of scenes declares.
+
+Run it after a change of csrc/prdp/scenes/scene_reader.cpp and a build: python docs/scene_keys.py
+"""
+
+import re
+from pathlib import Path
+
+from prdp_torch import _C
+
+PAGE = Path(__file__).with_name("command_line.md")
+TABLE = re.compile(r"^(<!-- docs/scene_keys.py writes the keys of ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)
+
+
+def table(name):
+    """Return the Markdown table of the keys in one table of a scene file; "the top level" has a name too."""
+    rows = ["| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
+    for key in _C.scene_keys():
+        if (key["table"] or "the top level") == name:
+            meaning = key["means"] + (f" ({key['when']})" if key["when"] else "")
+            cells = f"`{key['name']}`", key["value"], key["unit"], key["default"] or "", meaning
+            rows.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def with_tables(page):
+    """Return the text of the page with its tables written anew."""
+    return TABLE.sub(lambda found: f"{found[1]}\n{table(found[2])}\n{found[3]}", page)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_tables(PAGE.read_text()))

@@ -1,0 +1,115 @@
+"""The tasks "emulator" and "corrector": a network in place of the equation, or on top of a coarse step."""
+
+import math
+
+import torch
+
+from prdp_torch import _C, fields, processes
+from prdp_torch.experiments import datasets
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.experiments.task import Task
+from prdp_torch.solve import detach_failed
+
+
+def make_task(scene, steppers, seed, network, data):
+    """An interval is an epoch, the metric that of validation."""
+    processes.check_batches(len(data.train_start), scene.training.batch)
+    if network is None:
+        network = make_network(scene, seed)
+    else:
+        datasets.check_network(scene, network, data.train_start[:1])
+    objective = _emulator if scene.task == "emulator" else _corrector
+    loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
+    optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
+    generator = torch.Generator().manual_seed(seed)
+
+    def updates(first):
+        order = torch.randperm(len(data.train_start), generator=generator)
+        for number, batch in enumerate(order.split(scene.training.batch), first):
+            for group in optimiser.param_groups:
+                group["lr"] = scene.learning_rate(number)
+            optimiser.zero_grad()
+            loss, part = loss_of(batch)
+            part.backward()
+            optimiser.step()
+            yield float(loss.detach()), processes.share(batch)
+
+    def state():
+        parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
+        return {**parts, "shuffling": generator.get_state()}
+
+    def load(saved):
+        network.load_state_dict(saved["network"])
+        optimiser.load_state_dict(saved["optimiser"])
+        generator.set_state(saved["shuffling"])
+
+    # The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
+    def of_a_step(metric):
+        return math.sqrt(metric) / scene.data.valid_steps
+
+    return Task(updates, _metric(scene, data, network), of_a_step, state, load)
+
+
+def _metric(scene, data, network):
+    step = propagator(scene, network)
+    start, end = processes.share(data.valid_start), processes.share(data.valid_end)
+
+    def metric():
+        mine = math.nan  # of a process without a sample
+        if len(start):
+            with torch.no_grad():
+                mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
+        return processes.mean([mine], len(start))[0]
+
+    return metric
+
+
+def _emulator(scene, steppers, data, network):
+    """The loss of a batch: the network in place of the equation."""
+    (stepper,) = steppers
+
+    def loss(batch):
+        u2 = stepper(network(data.train_start[batch]))
+        return _C.loss(scene.training.loss, u2, data.train_end[batch])
+
+    return loss
+
+
+def corrected(stepper, network, u):
+    """Make a step of the task "corrector": a step of the coarse solver from u, with the network on top. The mean of
+    its pressure is removed in between."""
+    coarse = _C.without_mean_pressure(stepper(u))
+    return coarse + network(coarse)
+
+
+def _corrector(scene, steppers, data, network):
+    """The loss of a batch: the network on top of a coarse step, twice."""
+    first, second = steppers
+
+    def loss(batch):
+        u1 = corrected(first, network, data.train_start[batch])
+        u2 = corrected(second, network, u1)
+        if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
+            worst = torch.minimum(first.info.status, second.info.status)
+            u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
+        kind = scene.training.loss
+        return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
+
+    return loss
+
+
+def propagator(scene, network):
+    """Return a trained network as a function that makes one time step. This is the network itself; for the task
+    "corrector" it is a converged step of the coarse solver, corrected by the network."""
+    if scene.task == "emulator":
+        return network
+    converged = make_stepper(scene, max_iter=scene.data.valid_max_iter)
+    return lambda u: corrected(converged, network, u)
+
+
+def error(scene, u, reference):
+    """Return the validation error of states u: the mean over the samples of (‖u - reference‖ / ‖reference‖)². For a
+    corrector only the velocity along x counts."""
+    of = slice(0, 1) if scene.task == "corrector" else slice(None)
+    return float(_C.normalised_mse(u[:, of], reference[:, of]))

@@ -1,0 +1,55 @@
+"""`prdp advise SCENE`: what `prdp_torch.advise` measures for a step, with the scene's network beside it."""
+
+from statistics import median
+
+import torch
+
+from prdp_torch import _C
+from prdp_torch.advice import Update, advise_on, checked_limit, milliseconds
+from prdp_torch.experiments import datasets
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.trials import RUNS, now, random_cotangent, run
+
+
+def advise_scene(scene, seconds=5.0):
+    """Advise on a scene from `prdp_torch.experiments.scenes.load`, as `advise` does on a step.
+
+    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
+    seconds, step, update = checked_limit(seconds), make_stepper(scene), Update()
+    if scene.task == "parameters":
+        problem = _C.make_parameter_problem(scene)
+        sample = (problem.start @ problem.modes)[None, None]
+    else:
+        states = datasets.reference(scene, 0)[:, 0]
+        sample = states[torch.arange(scene.training.batch) % len(states)]
+        network = make_network(scene, 0)
+        # A corrector's first solve starts from data, which need no gradient.
+        adjoints = 0 if scene.backward == "none" else 1
+        update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
+    cotangent = random_cotangent(step, sample)
+    run(step, sample, cotangent)  # to warm up
+    physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
+    update.notes.append(
+        f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
+        f"{update.share(physics)}."
+    )
+    if update.network > physics and scene.dtype == torch.float32:
+        with torch.autocast(sample.device.type, torch.bfloat16):
+            low = scene.executions * _network_seconds(network, sample, seconds)
+        update.notes.append(
+            f"The network is the larger part, {milliseconds(update.network)}; in bfloat16 autocast it takes "
+            f"{milliseconds(low)}, {low / update.network:.2g} times that."
+        )
+    return advise_on(step, sample, seconds, update)
+
+
+def _network_seconds(network, u, most):
+    """One forward and one backward pass; a first one that takes more than `most` is also the last."""
+    times, deadline = [], now(u) + most
+    while len(times) <= RUNS and (not times or now(u) < deadline):
+        started = now(u)
+        out = network(u)
+        torch.autograd.grad(out, list(network.parameters()), torch.ones_like(out))
+        times.append(now(u) - started)
+    return median(times[1:] or times)
