@@ -15,7 +15,7 @@ class Stepper(torch.nn.Module):
     `linear_solve` describes.
 
     Every stepper takes these arguments beside its physics:
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
         start: where the solves start: "zero", or "state", the state before the step, as the x0 of
             `linear_solve`. It saves iterations where a step changes the state little.
