@@ -1,7 +1,8 @@
 """The parts of auto one by one, beside PRDP and converged solves: `python -m benchmarks.refinement SCENE`.
 
-Writes a record for each training and a summary, as `prdp compare` does, and prints the table of docs/refinement.md.
-With --resume, finished trainings are kept.
+Writes a record for each training and a summary, as `prdp compare` does, and prints its rows. The summaries kept in
+docs/results are what docs/result_tables.py and `python -m benchmarks.refinement_charts` read. With --resume, finished
+trainings are kept.
 """
 
 import argparse
@@ -50,25 +51,17 @@ def main():
             run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume, [])
             row.curves.append(run)
         table = compare.summarise(scene, rows[: rows.index(row) + 1])
-        print(_line(table[-1]), flush=True)
-    summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, "rows": table}
-    records.write(folder / "summary.json", summary)
+        print(f"{row.title}: {table[-1]['metric']:.2e}, {table[-1]['operator_applications']:,.0f} products", flush=True)
+    first = records.read(folder / rows[0].label / "seed_0.json")  # resumed trainings were run by its commit
+    summary = {"settings": records.settings(scene), **{name: first[name] for name in environment}}
+    curves = {row.label: _curves(row) for row in rows}
+    records.write(folder / "summary.json", {**summary, "seeds": options.seeds, "rows": table, "curves": curves})
 
 
-def _line(entry):
-    forward = entry["operator_applications"] - entry["adjoint_applications"]
-    spread = f" ± {entry['metric_std']:.1e}" if entry["seeds"] > 1 else ""
-    after = f" after {entry['intervals']:.0f}" if entry["reaches_target"] else ""
-    warns = f", warns in {entry['warnings']} of {entry['seeds']}" if entry["warnings"] else ""
-    cells = (
-        f"{entry['title']}{warns}",
-        f"{entry['metric']:.2e}{spread}{after}",
-        f"{forward:,.0f}",
-        f"{entry['adjoint_applications']:,.0f}",
-        f"{entry['operator_applications']:,.0f}",
-        f"{entry['seconds']:.1f}",
-    )
-    return "| " + " | ".join(cells) + " |"
+def _curves(row):
+    """How the first seed refined: iterations a solve took in the mean, and the tolerance, of each interval."""
+    k = row.taken_per_solve()[0]
+    return {"iterations": [float(f"{x:.4g}") for x in k], "rtol": [float(f"{x:.3g}") for x in row.curves[0]["rtol"]]}
 
 
 if __name__ == "__main__":

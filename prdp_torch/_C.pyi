@@ -3,7 +3,7 @@ import collections.abc
 import os
 import torch
 import typing
-__all__: list[str] = ['CHECKPOINT_SQRT', 'Checkpoint', 'Compare', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Data', 'Dataset', 'Equation', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'LinearSchedule', 'MOST_COUNTED', 'Network', 'PRDPController', 'PRDP_DEFAULTS', 'ParameterProblem', 'Physics', 'RegisteredProducts', 'SOLVE_STATUSES', 'Scene', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'Training', 'VERSION', 'all_trajectories', 'check_operator', 'check_options', 'check_solver', 'clear_factorisations', 'close_adjoint_log', 'count_factorisations', 'diffusion_stencil', 'fingerprint', 'half_mse', 'join_adjoint_logs', 'linear_solve', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'open_adjoint_log', 'parse_scene', 'product_rule', 'read_adjoint_log', 'read_record', 'read_scene', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'sentence', 'solve_with_tensors', 'step', 'validation_trajectories', 'without_mean_pressure', 'write_whole']
+__all__: list[str] = ['CHECKPOINT_SQRT', 'Checkpoint', 'Compare', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Data', 'Dataset', 'Equation', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'LinearSchedule', 'MOST_COUNTED', 'Network', 'PRDPController', 'PRDP_DEFAULTS', 'ParameterProblem', 'Physics', 'RegisteredProducts', 'SOLVE_STATUSES', 'Scene', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'Training', 'VERSION', 'all_trajectories', 'check_operator', 'check_options', 'check_solver', 'clear_factorisations', 'close_adjoint_log', 'count_factorisations', 'diffusion_stencil', 'fingerprint', 'half_mse', 'join_adjoint_logs', 'linear_solve', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'open_adjoint_log', 'parse_scene', 'product_rule', 'read_adjoint_log', 'read_record', 'read_scene', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'sentence', 'solve_with_tensors', 'step', 'validation_trajectories', 'without_mean_pressure', 'write_whole']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -100,6 +100,9 @@ class Physics:
 class Data:
     @property
     def file(self) -> str:
+        ...
+    @property
+    def fresh(self) -> bool:
         ...
     @property
     def modes(self) -> int:
@@ -265,6 +268,11 @@ class Dataset:
         ...
     @property
     def valid_start(self) -> torch.Tensor:
+        ...
+class FreshData:
+    def __init__(self, scene: Scene) -> None:
+        ...
+    def epoch(self, number: typing.SupportsInt | typing.SupportsIndex) -> Dataset:
         ...
 class ParameterProblem:
     @property

@@ -8,7 +8,7 @@ import torch
 from prdp_torch import _C, _check
 from prdp_torch.solvers import GMRES, Direct
 from prdp_torch.stepper import Stepper
-from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration
+from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
 
 WORTH_REFINING = 0.1  # of an update
 
@@ -81,8 +81,9 @@ def advise(step, sample, seconds=5.0):
     Raises:
         TypeError, ValueError: step and sample do not fit each other. This is checked before any measurement.
 
-    >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
-    >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
+    Examples:
+        >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
+        >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
     """
     if not isinstance(step, Stepper):
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
@@ -116,8 +117,17 @@ def advise_on(step, sample, seconds, update):
     if best is not None and twin is not None:
         ratio = update.physics(twin) / update.physics(best)
         notes.append(f"{best.name} in {_name(other)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}.")
+    if best is not None and not isinstance(best.solver, Direct):
+        notes.append(_start_gain(best, measure_with_start(step, sample, best)))
     words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
     return Advice(rows + others, notes, words)
+
+
+def _start_gain(zero, state):
+    products = f"{state.forward.products} products to {_power(zero.rtol)} in place of {zero.forward.products}"
+    worth = state.forward.status != "MAX_ITER" and state.forward.products < zero.forward.products
+    advice = 'pass start="state"' if worth else "keep the start from zero"
+    return f"From the state, the forward solve of {zero.name} takes {products}: {advice}."
 
 
 def _recommend(step, sample, rows, best, update):

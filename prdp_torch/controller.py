@@ -152,16 +152,21 @@ class PRDPController(_C.PRDPController, _Attached):
             `step` is a collective call. Every process calls it with the metric of its own samples, all of them see the
             mean, and they refine in the same interval. On a single process it has no effect.
 
-    K is not raised while every solve of the steppers meets its tolerance. `warning`, which every controller
-    has, is None or says in words what is wrong: the solves stop so far from the solution that their error dominates
-    what is trained; the metric grows (more than twice its least value, three times in a row); or the last `step`
-    refused it. K is raised for a metric that grows as it is on a plateau.
+    K is not raised while every solve of the steppers meets its tolerance. It is raised if the metric grows, as on a
+    plateau.
+
+    Every controller has a `warning`. It is None, or a sentence about one of these:
+
+    - The solves stop so far from the solution that their error dominates what is trained.
+    - The metric grows: it was more than twice its least value, three times in a row.
+    - The last `step` raised an error for its metric.
 
     Raises:
         ValueError, TypeError: a setting or a metric is out of range or of a wrong type.
 
-    >>> controller = prdp.PRDPController([heat], tau_stop=0.9)
-    >>> refined = controller.step(validation_metric)  # after each epoch
+    Examples:
+        >>> controller = prdp.PRDPController([heat], tau_stop=0.9)
+        >>> refined = controller.step(validation_metric)  # after each epoch
 
     Source: paper, section 3.
     """
@@ -217,9 +222,10 @@ class ToleranceController(_C.ToleranceController, _Attached):
     Raises:
         ValueError, TypeError: a setting or an error is out of range or of a wrong type.
 
-    >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
-    >>> controller = prdp.ToleranceController([heat])
-    >>> tightened = controller.step(relative_error)  # after each epoch
+    Examples:
+        >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
+        >>> controller = prdp.ToleranceController([heat])
+        >>> tightened = controller.step(relative_error)  # after each epoch
 
     Source: the forcing term of inexact Newton methods (Eisenstat and Walker, SIAM J. Sci. Comput. 17, 1996)
     and of optimisation with approximate gradients (Pedregosa, ICML 2016).

@@ -1,8 +1,8 @@
 """Functions of periodic velocity fields on the staggered grid of `NavierStokes`. All are differentiable.
 
-Fields are (batch, 2 or 3, Ny, Nx) on the unit square, dx = 1/N: channel 0 is u₁ along x, the last axis, on
-the left face of a cell, channel 1 is u₂ along y on its lower face, and a third channel, the pressure in
-the cell's centre, is of no influence.
+Fields are (batch, 2 or 3, Ny, Nx) on the unit square, dx = 1/N. Channel 0 is u₁ along x, the last axis, on
+the left face of a cell. Channel 1 is u₂ along y on its lower face. A third channel, the pressure in the cell's centre,
+has no influence.
 """
 
 import math

@@ -24,11 +24,12 @@ class ImplicitStep(Stepper):
     Raises:
         TypeError, ValueError: A(u), b(u) and u do not fit each other. This is checked before any work.
 
-    >>> nu, dt = torch.nn.Parameter(torch.tensor(1e-3)), 0.1
-    >>> step = prdp.ImplicitStep(
-    ...     lambda u: prdp.operators.Heat((30,), nu, dt), lambda u: u + dt * (u - u**3), prdp.CG(max_iter=5)
-    ... )
-    >>> states = step.rollout(u0, 10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
+    Examples:
+        >>> nu, dt = torch.nn.Parameter(torch.tensor(1e-3)), 0.1
+        >>> step = prdp.ImplicitStep(
+        ...     lambda u: prdp.operators.Heat((30,), nu, dt), lambda u: u + dt * (u - u**3), prdp.CG(max_iter=5)
+        ... )
+        >>> states = step.rollout(u0, 10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
 
     def __init__(self, operator, rhs=None, solver=None, backward="implicit", **options):

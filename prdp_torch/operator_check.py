@@ -29,9 +29,10 @@ def check_operator(A, example):
     Raises:
         ValueError: lists what is wrong.
 
-    >>> A = prdp.operators.Function(lambda v, k: k * v, tensors=torch.rand(30, dtype=torch.float64))
-    >>> prdp.check_operator(A, torch.zeros(2, 30, dtype=torch.float64))
-    True
+    Examples:
+        >>> A = prdp.operators.Function(lambda v, k: k * v, tensors=torch.rand(30, dtype=torch.float64))
+        >>> prdp.check_operator(A, torch.zeros(2, 30, dtype=torch.float64))
+        True
     """
     who = "check_operator"
     A = operators.as_operator(who, "A", A)

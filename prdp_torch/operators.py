@@ -146,8 +146,8 @@ class Stencil(Operator):
     Raises:
         ValueError, TypeError: the arguments do not fit together. This is checked before any work.
 
-    Example:
-        A = operators.Stencil(torch.stack([1 + a + b, -a, -b], 1), [(0,), (-1,), (1,)], boundary="periodic")
+    Examples:
+        >>> A = operators.Stencil(torch.stack([1 + a + b, -a, -b], 1), [(0,), (-1,), (1,)], boundary="periodic")
     """
 
     kind = "stencil"

@@ -86,23 +86,24 @@ class SolveInfo(NamedTuple):
 
 
 def detach_failed(u, info):
-    """Take the failed samples out of the derivative: u with their values as constants.
+    """Return u with its failed samples as constants, so that no gradient passes through them.
 
-    A solve with on_failure="zero_grad" passes no gradient through a failed sample. A loss may reach the weights by
-    other ways as well, such as a network on top of the step; then take them from the loss with this function.
+    A solve with on_failure="zero_grad" passes no gradient through a failed sample itself. Use this function if the
+    loss depends on the weights in other ways too, for example through a network after the step.
 
     Args:
         u: (batch, ...), or the states (batch, steps + 1, ...) of a rollout.
-        info: the `SolveInfo` of the solve or the rollout. Of a rollout, a sample is constant from the step on that
-            failed.
+        info: the `SolveInfo` of the solve or the rollout. In a rollout, a sample is constant from its first failed
+            step on.
 
     Returns:
-        A tensor of the shape and the values of u; u itself where no sample failed.
+        A tensor with the shape and the values of u. If no sample failed, u itself.
 
     Raises:
-        ValueError: u and info of different batches or steps.
+        ValueError: u and info differ in their batch or their steps.
 
-    >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
+    Examples:
+        >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
     """
     return torch.ops.prdp.detach_failed(u, info.status)
 
@@ -150,8 +151,9 @@ def linear_solve(
         ValueError, TypeError: an argument is wrong. This is checked before any work.
         torch.linalg.LinAlgError: a sample failed, in the forward or the backward pass, and on_failure is "raise".
 
-    >>> A = prdp.operators.Heat((30,), nu=1e-3, dt=1.0)
-    >>> u, info = prdp.linear_solve(A, b, prdp.CG(max_iter=20))  # b: (batch, 1, 30)
+    Examples:
+        >>> A = prdp.operators.Heat((30,), nu=1e-3, dt=1.0)
+        >>> u, info = prdp.linear_solve(A, b, prdp.CG(max_iter=20))  # b: (batch, 1, 30)
 
     Source of the derivatives: Bhatia, Koehler, Thuerey, "Progressively Refined Differentiable
     Physics", ICLR 2025, section 2.1.

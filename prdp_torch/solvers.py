@@ -15,12 +15,15 @@ from prdp_torch import _C, _check
 
 @dataclass
 class Solver:
-    """The base of all solvers.
+    """The base of all solvers, whose arguments every solver takes.
 
     Args:
-        max_iter: K, the maximum number of iterations.
-        rtol: a sample stops at ‖b - A u‖ <= rtol ‖b‖.
-        preconditioner: only for `CG` and `GMRES`.
+        max_iter: K >= 0, the maximum number of iterations.
+        rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
+        preconditioner: None, or the name of one; only for `CG` and `GMRES`.
+
+    Raises:
+        ValueError, TypeError: an argument is out of range or of a wrong type.
     """
 
     max_iter: int

@@ -14,11 +14,14 @@ class Stepper(torch.nn.Module):
     States are (batch, channel, *shape) in float32 or float64, with any strides. Gradients are computed as
     `linear_solve` describes.
 
-    Every stepper takes these arguments beside its physics:
+    The arguments below are those that every stepper takes beside its physics. A subclass defines `operator(u)`, and
+    `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two as functions instead.
+
+    Args:
         solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
-        start: where the solves start: "zero", or "state", the state before the step, as the x0 of
-            `linear_solve`. It saves iterations where a step changes the state little.
+        start: where the solves start: at "zero", or at "state", the state before the step, which then is the x0 of
+            `linear_solve`. This saves iterations if a step changes the state little.
 
     Attributes:
         max_iter: K, the maximum number of iterations. You or a controller may set it at any time. Under
@@ -28,9 +31,6 @@ class Stepper(torch.nn.Module):
         start: as above. It may be set at any time.
         info: the `SolveInfo` of the last forward pass or rollout; None before the first.
         adjoint_info: the `SolveInfo` of the last backward pass; None before the first.
-
-    A subclass defines `operator(u)`, and `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two
-    as functions instead.
 
     Raises:
         ValueError, TypeError: an argument is wrong. This is checked before any work.
@@ -195,6 +195,7 @@ class Stepper(torch.nn.Module):
 
 def _as_graph_input(stepper):
     """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
-    each of them."""
+    each of them. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole process.
+    """
     with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
         return stepper._max_iter + 0  # the number is read where it is used first, which must be here

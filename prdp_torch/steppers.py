@@ -125,8 +125,9 @@ class Poisson(EquationStepper):
         solver, backward and the other options: as in `Stepper`.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
 
-    >>> poisson = prdp.Poisson((30, 30), solver=prdp.CG(max_iter=100))
-    >>> u = poisson(p)  # (batch, 1, 30, 30)
+    Examples:
+        >>> poisson = prdp.Poisson((30, 30), solver=prdp.CG(max_iter=100))
+        >>> u = poisson(p)  # (batch, 1, 30, 30)
 
     Source: second-order differences (paper, appendix C.1).
     """
@@ -157,8 +158,9 @@ class Heat(EquationStepper):
         solver, backward and the other options: as in `Stepper`.
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/(N + 1).
 
-    >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=10))
-    >>> u1 = heat(u0)  # (batch, 1, 30)
+    Examples:
+        >>> heat = prdp.Heat((30,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=10))
+        >>> u1 = heat(u0)  # (batch, 1, 30)
 
     Source: paper, appendix C.2 to C.4.
     """
@@ -189,8 +191,9 @@ class Burgers(EquationStepper):
             `info` then has the sum of their iterations, the worst status and the last residual.
         length: as in `Heat`, but dx = length/N.
 
-    >>> burgers = prdp.Burgers((256,), nu=1e-3, dt=1e-2, solver=prdp.GMRES(max_iter=20))
-    >>> states = burgers.rollout(u0, 50)  # (batch, 1, 256) -> (batch, 51, 1, 256)
+    Examples:
+        >>> burgers = prdp.Burgers((256,), nu=1e-3, dt=1e-2, solver=prdp.GMRES(max_iter=20))
+        >>> states = burgers.rollout(u0, 50)  # (batch, 1, 256) -> (batch, 51, 1, 256)
 
     Source: paper, appendix C.5.
     """
@@ -218,8 +221,9 @@ class NavierStokes(EquationStepper):
         solver, backward and the other options: as in `Stepper`.
         picard_steps, length: as in `Burgers`.
 
-    >>> flow = prdp.NavierStokes((48, 48), nu=1e-4, dt=0.1, solver=prdp.GMRES(max_iter=40, restart=8))
-    >>> u1 = flow(u0)  # (batch, 3, 48, 48)
+    Examples:
+        >>> flow = prdp.NavierStokes((48, 48), nu=1e-4, dt=0.1, solver=prdp.GMRES(max_iter=40, restart=8))
+        >>> u1 = flow(u0)  # (batch, 3, 48, 48)
 
     Source: paper, appendix C.6.
     """

@@ -61,9 +61,10 @@ class Row:
 
 
 def name_of(solver):
-    if not isinstance(solver, GMRES):
-        return type(solver).__name__
-    return f"GMRES({solver.restart})" if solver.preconditioner is None else f"GMRES({solver.restart}, stokes)"
+    settings = [str(solver.restart)] if isinstance(solver, GMRES) else []
+    if getattr(solver, "preconditioner", None) is not None:
+        settings.append(solver.preconditioner)
+    return type(solver).__name__ + (f"({', '.join(settings)})" if settings else "")
 
 
 def candidates(step):
@@ -71,8 +72,11 @@ def candidates(step):
     own = [step.restart] if step.method.startswith("gmres") else []
     restarts = sorted({*RESTARTS, *own})
     every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), *(GMRES(1, restart=m) for m in restarts)]
-    if getattr(step, "kind", None) == "navier_stokes":
+    kind = getattr(step, "kind", None)
+    if kind == "navier_stokes":
         every.append(GMRES(1, restart=8, preconditioner="stokes"))
+    elif kind not in ("heat", "poisson"):  # whose diagonals are constant
+        every += [CG(1, preconditioner="diagonal"), GMRES(1, restart=8, preconditioner="diagonal")]
     return [*every, Direct(1)]
 
 
@@ -95,8 +99,11 @@ def measure(step, sample, solvers, seconds):
             rows += _measure_one(trial, sample, cotangent, solver, seconds)
         except ValueError as error:
             why = _C.sentence(str(error)).removeprefix(f"{type(solver).__name__}: ")
-            refused.append(f"{name_of(solver)} was not tried: {why}.")
-    return rows, refused
+            refused.append((type(solver), f"{name_of(solver)} was not tried: {why}."))
+    tried = {type(row.solver) for row in rows}
+    # One sentence is enough where a method is refused with and without a preconditioner.
+    first = {method: sentence for method, sentence in reversed(refused) if method not in tried}
+    return rows, [sentence for method, sentence in refused if method in tried or sentence == first[method]]
 
 
 def measure_one_iteration(step, sample, solver):
@@ -104,6 +111,14 @@ def measure_one_iteration(step, sample, solver):
     trial = _copy(step)
     set_solver(trial, solver, 1, 0.0)
     return run(trial, sample, random_cotangent(trial, sample), solver, RUNS)
+
+
+def measure_with_start(step, sample, row):
+    """The same solve as `row`, from the state."""
+    trial = _copy(step)
+    trial.start = "state"
+    set_solver(trial, row.solver, 2 * max(solve.iterations for solve in row.solves), row.rtol)
+    return run(trial, sample, random_cotangent(trial, sample), row.solver, RUNS)
 
 
 def _measure_one(trial, sample, cotangent, solver, seconds):

@@ -8,6 +8,7 @@
 #include "prdp/scenes/failures.h"
 #include "prdp/scenes/field_problem.h"
 #include "prdp/scenes/files.h"
+#include "prdp/scenes/fresh_data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/scenes/scene.h"
 #include "prdp/scenes/seal.h"
@@ -27,6 +28,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);
   py::class_<Scene::Data>(m, "Data")
       .def_readonly("file", &Scene::Data::file)
+      .def_readonly("fresh", &Scene::Data::fresh)
       .def_readonly("modes", &Scene::Data::modes)
       .def_readonly("train", &Scene::Data::train)
       .def_readonly("valid", &Scene::Data::valid)
@@ -108,6 +110,9 @@ void bind_scenes(py::module_& m) {
       .def_readonly("valid_end", &Dataset::valid_end);
   m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress(),
         py::call_guard<py::gil_scoped_release>());
+  py::class_<FreshData>(m, "FreshData")
+      .def(py::init<Scene>(), py::arg("scene"))
+      .def("epoch", &FreshData::epoch, py::arg("number"), py::call_guard<py::gil_scoped_release>());
   m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
         py::arg("on_progress") = OnProgress(), py::call_guard<py::gil_scoped_release>());
   m.def("all_trajectories", &all_trajectories, py::arg("scene"), py::arg("steps"),

@@ -8,7 +8,7 @@
 
 namespace prdp::train {
 
-/// Called after each update with its loss and the numbers of its samples among the data, where they have any.
+/// Called after each update with its loss and the numbers of its samples in the data set, if they have any.
 using OnUpdate = std::function<void(double loss, const std::optional<at::Tensor>& samples)>;
 
 /// What a task supplies: the updates of one interval, numbered from `update`, each of them reported;

@@ -22,6 +22,7 @@
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/scenes/data.h"
 #include "prdp/scenes/failures.h"
+#include "prdp/scenes/fresh_data.h"
 #include "prdp/scenes/loss.h"
 #include "prdp/solvers/status.h"
 #include "state.h"
@@ -295,13 +296,20 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
                      const OnInterval& on_interval, const OnProgress& on_data) {
   auto network = make_network(scene, seed);
   if (!weights.empty()) unpack_weights(weights, *network.ptr());
-  const auto data = make_dataset(scene, on_data);
+  auto data = make_dataset(scene, on_data);
+  FreshData fresh(scene);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
                                                               : corrector(scene, steppers, data, network);
   FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
   auto generator = make_generator(seed);
+  const auto updates_of_epoch = (data.train_start.size(0) - 1) / scene.training.batch + 1;
 
   const auto updates = [&](int64_t update, const OnUpdate& on_update) {
+    if (scene.data.fresh) {
+      const auto samples = fresh.epoch(update / updates_of_epoch);
+      std::tie(data.train_start, data.train_first, data.train_end) =
+          std::tie(samples.train_start, samples.train_first, samples.train_end);
+    }
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
       optimiser.zero_grad();

@@ -13,7 +13,7 @@
 /// The C++ trainer: the same loops as prdp_torch/experiments/training.py.
 namespace prdp::train {
 
-/// How a training decides how far the solver goes.
+/// How a training chooses K and the tolerance.
 struct Refinement {
   std::string label;  // "auto", "prdp", "constant_25", "schedule_25_6", "direct"
   std::function<std::unique_ptr<Controller>()> controller;
@@ -21,7 +21,7 @@ struct Refinement {
   bool watches_error = false;  // the controller is given the relative error, not the metric
   std::optional<Start> start{};  // in place of the scene's
 };
-/// What fits every scene with nothing chosen for it; docs/refinement.md says why.
+/// Fits every scene without settings. docs/refinement.md explains it.
 Refinement automatic();
 Refinement prdp(const Scene& scene);
 Refinement schedule(int64_t start, int64_t step, int64_t maximum);
@@ -66,9 +66,9 @@ void each_curve(AnyCurves& curves, const F& f) {
 /// from.
 using OnInterval = std::function<void(int64_t, double, int64_t)>;
 
-/// Trains the scene once; `seed` is that of the network's weights and of the shuffling, or of a field's noise. A network
-/// begins with `weights`, as pack_weights() makes them, where they are not empty. Goes on from the checkpoint where
-/// there is one, and keeps itself there whenever one is due after an interval.
+/// Trains the scene once; `seed` is that of the network's weights and of the shuffling, or of a field's noise. A
+/// network begins with `weights`, as pack_weights() makes them, where they are not empty. Goes on from the checkpoint
+/// where there is one, and keeps itself there whenever one is due after an interval.
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::string& weights,
              const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data = {});
 

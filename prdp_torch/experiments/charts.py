@@ -5,7 +5,7 @@ from itertools import pairwise
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 
 WIDTH = 9.2  # inches, of every picture
 
@@ -150,7 +150,7 @@ _COSTS = (
 def _cost_panels(scene, draw, limits=None):
     """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one. With `limits`, (lowest, highest)
     of the y axis from below, the axis is broken between them."""
-    limits = limits or [(None, None)]
+    limits = limits or [None]
     figure = Figure(figsize=(WIDTH, 4.8 if len(limits) == 1 else 6.0), layout="constrained")
     heights = [1.0, 2.2][-len(limits) :]
     panels = figure.subplots(len(limits), 2, sharex="col", squeeze=False, height_ratios=heights)
@@ -159,6 +159,8 @@ def _cost_panels(scene, draw, limits=None):
             draw(axes, cost)
             axes.set(yscale="log", xlim=(0, None), ylim=limit)
             axes.grid(alpha=0.3, which="both", lw=0.4)
+            if limit and limit[1] > 10 * limit[0]:  # powers of ten suffice; other labels run into each other
+                axes.yaxis.set_minor_formatter(NullFormatter())
         for upper, lower in pairwise(column):
             _break(upper, lower)
         column[-1].set_xlabel(label)

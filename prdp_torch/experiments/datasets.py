@@ -38,6 +38,8 @@ def of_scene(scene, own=None, on_data=None):
     """
     if own is None and not scene.data.file:
         return _C.make_dataset(scene, on_data)
+    if scene.data.fresh:
+        raise ValueError("train: a scene with data.fresh makes its own data in every epoch; it takes no others")
     if own is None:
         own = pdebench.read(path_of(scene), scene)
     pair = own if isinstance(own, (tuple, list)) else _split(scene, _tensor(scene, "data", own))

@@ -14,18 +14,20 @@ from prdp_torch.solve import detach_failed
 
 def make_task(scene, steppers, seed, network, data):
     """An interval is an epoch, the metric that of validation."""
-    processes.check_batches(len(data.train_start), scene.training.batch)
+    train = _TrainingSamples(scene, data)
+    processes.check_batches(train.count, scene.training.batch)
     if network is None:
         network = make_network(scene, seed)
     else:
         datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = processes.shared_loss(network, objective(scene, steppers, data, network))
+    loss_of = processes.shared_loss(network, objective(scene, steppers, train, network))
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
     def updates(first):
-        order = torch.randperm(len(data.train_start), generator=generator)
+        train.begin(first)
+        order = torch.randperm(train.count, generator=generator)
         for number, batch in enumerate(order.split(scene.training.batch), first):
             for group in optimiser.param_groups:
                 group["lr"] = scene.learning_rate(number)
@@ -51,6 +53,24 @@ def make_task(scene, steppers, seed, network, data):
     return Task(updates, _metric(scene, data, network), of_a_step, state, load)
 
 
+class _TrainingSamples:
+    """Start, first and end of the training samples: the same in every epoch, or those of `data.fresh`."""
+
+    def __init__(self, scene, data):
+        self.count = len(data.train_start)
+        self._updates = math.ceil(self.count / scene.training.batch)  # of an epoch
+        self._fresh = _C.FreshData(scene) if scene.data.fresh else None
+        self._take(data)
+
+    def begin(self, update):
+        """Take the samples of the epoch that begins with this update."""
+        if self._fresh is not None:
+            self._take(self._fresh.epoch(update // self._updates))
+
+    def _take(self, data):
+        self.start, self.first, self.end = data.train_start, data.train_first, data.train_end
+
+
 def _metric(scene, data, network):
     step = propagator(scene, network)
     start, end = processes.share(data.valid_start), processes.share(data.valid_end)
@@ -65,13 +85,13 @@ def _metric(scene, data, network):
     return metric
 
 
-def _emulator(scene, steppers, data, network):
+def _emulator(scene, steppers, train, network):
     """The loss of a batch: the network in place of the equation."""
     (stepper,) = steppers
 
     def loss(batch):
-        u2 = stepper(network(data.train_start[batch]))
-        return _C.loss(scene.training.loss, u2, data.train_end[batch])
+        u2 = stepper(network(train.start[batch]))
+        return _C.loss(scene.training.loss, u2, train.end[batch])
 
     return loss
 
@@ -83,18 +103,18 @@ def corrected(stepper, network, u):
     return coarse + network(coarse)
 
 
-def _corrector(scene, steppers, data, network):
+def _corrector(scene, steppers, train, network):
     """The loss of a batch: the network on top of a coarse step, twice."""
     first, second = steppers
 
     def loss(batch):
-        u1 = corrected(first, network, data.train_start[batch])
+        u1 = corrected(first, network, train.start[batch])
         u2 = corrected(second, network, u1)
         if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
             worst = torch.minimum(first.info.status, second.info.status)
             u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
         kind = scene.training.loss
-        return _C.loss(kind, u1, data.train_first[batch]) + _C.loss(kind, u2, data.train_end[batch])
+        return _C.loss(kind, u1, train.first[batch]) + _C.loss(kind, u2, train.end[batch])
 
     return loss
 

@@ -10,7 +10,8 @@ class TensorBoard:
     Raises:
         ImportError: the package tensorboard is not installed.
 
-    >>> training.train(scene, refinement, callbacks=[TensorBoard("runs/heat_1d/tensorboard")])
+    Examples:
+        >>> training.train(scene, refinement, callbacks=[TensorBoard("runs/heat_1d/tensorboard")])
     """
 
     def __init__(self, folder):

@@ -48,8 +48,9 @@ def load_trained(run_folder, seed=0):
         ValueError: no record or no weights are there, they are damaged or do not belong together, or the
             training diverged.
 
-    >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
-    >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
+    Examples:
+        >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
+        >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
     record = records.read(path)

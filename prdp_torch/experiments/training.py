@@ -16,7 +16,7 @@ from prdp_torch.solve import SolveStatus
 
 
 class Interval(NamedTuple):
-    """What a callback of `train` is told: one epoch, or one update where there is no network."""
+    """What a callback of `train` gets: one epoch, or one update if there is no network."""
 
     number: int
     """Counted from 1."""

@@ -12,7 +12,7 @@ from helpers import field
 import prdp_torch as prdp
 from prdp_torch import advice as module
 from prdp_torch.experiments import scene_advice, scenes
-from prdp_torch.trials import Row, Solve, random_cotangent
+from prdp_torch.trials import Row, Solve, measure_with_start, random_cotangent
 
 
 def advise(step, sample, seconds=1.0):
@@ -223,3 +223,30 @@ def test_what_cannot_be_advised_on_is_refused_in_words(step, sample, error, mess
 def test_the_limit_is_a_positive_number(seconds):
     with pytest.raises(ValueError, match="advise: seconds must be a number > 0"):
         prdp.advise(prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 8), seconds)
+
+
+def test_the_gain_of_a_start_is_counted():
+    """A state that a step hardly changes is a good start; one that has nothing to do with b is none."""
+    x = torch.linspace(0.0, 1.0, 22, dtype=torch.float64)[1:-1]
+    smooth, noise, solver = (x * (1 - x))[None, None], field((20,), batch=1), prdp.Jacobi(1000)
+    heat = prdp.Heat((20,), nu=1e-2, dt=1.0, solver=solver)
+    unrelated = prdp.ImplicitStep(heat.operator(smooth), lambda u: noise.flip(-1), solver)
+    cases = (heat, smooth, 'pass start="state"'), (unrelated, noise, "keep the start from zero")
+    for step, u, verdict in cases:
+        solves = [prdp.linear_solve(heat.operator(u), step.rhs(u), solver, x0=x0) for x0 in (None, u)]
+        zero, state = (int(info.operator_applications) for _, info in solves)
+        row = Row(solver, u.dtype, 1e-5, Solve(zero, zero, 1.0, "CONVERGED"), None)
+        words = f"takes {state} products to 1e-5 in place of {zero}: {verdict}."
+        assert (state < zero) == ("pass" in verdict)
+        text = module._start_gain(row, measure_with_start(step, u, row))
+        assert text == f"From the state, the forward solve of Jacobi {words}"
+
+
+def test_a_varying_diagonal_is_divided_out():
+    """With a contrast of 1000 between cells, the diagonal saves most of CG's iterations."""
+    kappa = torch.exp(3.0 * torch.randn(16, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    values = 1.0 + 4.0 * kappa
+    off = -0.2 * torch.ones_like(kappa)
+    stencil = prdp.operators.Stencil(torch.stack([values, off, off])[None], [(0, 0), (0, 1), (0, -1)])
+    found = {row.name: row for row in advise(own_step(lambda u: stencil), field((16, 16), batch=2)).rows}
+    assert found["CG(diagonal)"].forward.products < 0.5 * found["CG"].forward.products

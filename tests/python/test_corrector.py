@@ -59,7 +59,7 @@ def test_the_scene_holds_the_papers_settings():
         ("shape = [48, 48]", "shape = [48]", "shape = [48]", "physics.shape: expected 2 extents"),
         ("[97, 97]", "[97, 96]", "reference_shape", "data.reference_shape: expected 2 N + 1 for each N of"),
         ("valid_max_iter = 120", "valid_max_iter = 0", "valid_max_iter", "data.valid_max_iter: must be >= 1, got 0"),
-        ("seed = 0", "seed = 0\nmodes = 5", "modes", "unknown name 'data.modes'; allowed: file, reference_shape, seed"),
+        ("seed = 0", "seed = 0\nmodes = 5", "modes", "unknown name 'data.modes'; allowed: file, fresh, reference_"),
         ("cosine_updates = 800", "cosine_updates = 0", "cosine_up", "training.cosine_updates: must be >= 1, got 0"),
         ("cosine_updates = 800", "cosine_updates = 8\ndecay = 0.9", "decay = ", "unknown name 'training.decay'"),
         ("cosine_updates = 800", "", "[training]", "training.decay: missing; the table holds:"),
@@ -166,7 +166,7 @@ def objective(scene, network, solver):
         for _ in range(2)
     ]
     data = _C.make_dataset(scene)
-    return data, steppers, network_task._corrector(scene, steppers, data, network)
+    return data, steppers, network_task._corrector(scene, steppers, network_task._TrainingSamples(scene, data), network)
 
 
 def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve(tmp_path):

@@ -193,3 +193,9 @@ def test_the_reference_has_every_public_name(module, name):
     whole = [path for path in (module, home) if path in rendered and (rendered[path] is None or name in rendered[path])]
     assert whole or f"{module}.{name}" in rendered
     assert inspect.getdoc(getattr(sys.modules[module], name))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "prdp_torch").rglob("*.py")), ids=lambda path: path.stem)
+def test_the_examples_of_docstrings_are_shown_as_code(path):
+    """mkdocstrings shows only what stands under "Examples:" as code, and takes other lines with >>> for quotations."""
+    assert not re.search(r"\n\n +>>> |^ +Example:$", path.read_text(), re.MULTILINE)

@@ -118,6 +118,7 @@ def test_the_defaults_are_those_of_a_scene_without_the_keys():
         ("solver", "on_failure"): f"`{scene.on_failure}`",
         ("solver", "start"): f"`{scene.start}`",
         ("data", "file"): scene.data.file or "none",
+        ("data", "fresh"): f"`{str(scene.data.fresh).lower()}`",
         ("network", "zero_output"): f"`{str(scene.network.zero_output).lower()}`",
         ("prdp", "growth"): f"{scene.prdp['growth']:g}",
         ("prdp", "maximum"): str(scene.prdp["maximum"]).lower(),

@@ -4,15 +4,15 @@
 
 #include "prdp/solvers/solver.h"
 
-/// Where adjoint solves leave their SolveInfo. A backward pass has no caller to return it to; so
-/// whoever wants it opens a log, passes its number with the solve and reads it afterwards.
+/// Logs for the reports of adjoint solves. A backward pass cannot return its report to a caller. So a caller opens a
+/// log, passes its number to the solve, and reads the log after the backward pass.
 namespace prdp::adjoint_log {
 
 /// A fresh number, never 0.
 int64_t open();
 void close(int64_t log);
 
-/// The last adjoint solve's; nothing before the first backward pass. Unknown numbers hold nothing.
+/// The report of the last adjoint solve; nothing before the first backward pass, and for unknown numbers.
 std::optional<SolveInfo> read(int64_t log);
 void write(int64_t log, const SolveInfo& info);
 

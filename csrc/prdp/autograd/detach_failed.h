@@ -3,11 +3,11 @@
 
 namespace prdp {
 
-/// u with its failed samples as constants: their values stay, and no gradient passes through them. For a loss that
-/// is made of u by more ways than the solve (a network on top of a step), with on_failure = zero_grad.
+/// Returns u with its failed samples as constants: their values stay, and no gradient passes through them. Use it with
+/// OnFailure::kZeroGrad if the loss depends on the weights in other ways too, such as by a network after the step.
 ///
-/// u: (batch, …) and status: (batch,) of a solve; or the states (batch, steps + 1, …) and the status (batch, steps)
-/// of a rollout, where a sample is constant from the step on that failed. Raises ValueError for other shapes.
+/// Of a solve, u is (batch, …) and status (batch,). Of a rollout, u is (batch, steps + 1, …) and status (batch, steps);
+/// there a sample is constant from its first failed step on. Raises ValueError for other shapes.
 at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status);
 
 }  // namespace prdp

@@ -5,27 +5,27 @@
 
 namespace prdp {
 
-/// Solves A(g) u = b and differentiates it: the one entry for steppers and users, in both languages.
-/// It calls the torch op prdp::linear_solve, so that autograd, torch.compile and fake tensors follow.
+/// Solves A(g) u = b, with gradients for b and for the tensors g of `a`. Steppers and both languages use this function.
+/// It calls the torch op prdp::linear_solve, so it works under autograd, torch.compile and with fake tensors.
 ///
-/// b: (batch, channel, *shape) for stencils, (n,) or (batch, n) for matrices; u has b's shape.
-/// Gradients reach b and the tensors of `a` as options.backward says (paper, section 2.1):
-///   implicit: Aᵀ λ = ū by the same method and budget; b̄ = λ, ḡ = -λᵀ ∂(A(g) u)/∂g
-///   unrolled: the exact derivative of the iterations that each sample really took
-///   none:     none
-/// `x0`, of b's shape and dtype, is where the iterations start, and a constant of the derivatives. They start from
-/// α x0 with α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ per sample, which is never worse than zero; that takes one product. The
-/// tolerance stays relative to ‖b‖. Direct ignores x0, and so does the adjoint solve.
-/// Raises ValueError or TypeError for bad arguments before any work, and torch.linalg.LinAlgError
-/// for failed samples unless options.on_failure says otherwise.
+/// b: (batch, channel, *shape) for operators on grids, (n,) or (batch, n) for matrices; u has the shape of b.
+/// options.backward chooses how gradients are computed (paper, section 2.1):
+///   kImplicit: Aᵀ λ = ū by the same method and budget; b̄ = λ, ḡ = -λᵀ ∂(A(g) u)/∂g
+///   kUnrolled: the exact derivative of the iterations that each sample took
+///   kNone:     no gradient
+/// `x0`, with the shape and dtype of b, is a guess of u. Each sample starts from α x0, where
+/// α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ minimises the residual; this costs one product. The tolerance stays relative to ‖b‖.
+/// x0 gets no gradient. Direct and the adjoint solve ignore it.
+/// Raises c10::ValueError or c10::TypeError for bad arguments before any work, and c10::LinAlgError for failed samples
+/// unless options.on_failure says otherwise.
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0 = {});
 
-/// The same below autograd and the dispatcher, for the kernels of ops: solves, logs and reports.
+/// The same without autograd and the dispatcher, for the kernels of torch ops. It solves, logs and reports failures.
 SolveResult linear_solve_kernel(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                                 const at::Tensor& x0 = {});
 
-/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator.
+/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes.
 OperatorSpec matrix(const at::Tensor& values);
 
 }  // namespace prdp

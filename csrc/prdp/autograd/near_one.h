@@ -7,9 +7,9 @@
 
 namespace prdp {
 
-/// An operator for the loops to work with: the one given, or, where its entries are far from the order of
-/// one, a power of two times it, so that no product of some of them over- or underflows. That changes no bit
-/// of what does not. Kernels that cannot be scaled stay as they are.
+/// The operator for the loops. If the entries of the given one are far from the order of one, it is scaled by a power
+/// of two, so that products of several entries neither overflow nor underflow. Other results do not change in any bit.
+/// Kernels that cannot be scaled stay as they are.
 template <class Kernel>
 class NearOne {
  public:

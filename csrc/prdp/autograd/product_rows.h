@@ -5,14 +5,14 @@
 
 namespace prdp {
 
-/// Gathers pairs (λ, v) of one sample and adds up ∂⟨λ, A v⟩/∂g by the operator's product rule, so many
-/// at once whatever else happens: the sum does not depend on how the pairs come about.
+/// Collects pairs (λ, v) of one sample, and sums ∂⟨λ, A v⟩/∂g over them by the operator's product rule. It always sums
+/// the same number of pairs at once, so the sum does not depend on how the pairs were computed.
 class ProductRows {
  public:
-  /// `a` is the operator of the sample, vectors are of the kind of `like`, a batch of them.
+  /// `a` is the operator of the sample. Vectors have the shape and dtype of `like`, a batch of them.
   ProductRows(std::unique_ptr<Operator> a, const at::Tensor& like);
 
-  /// Where the next pair is to be written, contiguous; push() takes it.
+  /// Contiguous memory for the next pair. Call push() after writing it.
   template <class T>
   T* lambda() const { return lambda_.select(0, count_).template mutable_data_ptr<T>(); }
   template <class T>

@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <vector>
 
-/// Samples of a batch, and what becomes of a sum over them where one is not finite.
+/// Sets of samples of a batch, and sums over them if some are not finite.
 namespace prdp {
 
 using Rows = std::vector<bool>;  // which samples
@@ -16,14 +16,14 @@ inline Rows both(Rows a, const Rows& b) {
   return a;
 }
 
-/// t with zeros, whatever was there, in all samples but these; differentiable.
+/// t with zeros in all samples except these, even if they were not finite; differentiable.
 at::Tensor only(const at::Tensor& t, const Rows& rows);
-/// Which samples hold neither NaN nor Inf.
+/// The samples without NaN and Inf.
 Rows finite_rows(const at::Tensor& t);
 bool all_finite(const std::vector<at::Tensor>& tensors);
 
-/// share(rows), a vector of tensors, sums over these samples. Where it is not finite, the samples to blame
-/// leave `rows`, and the others keep what they have: no number that left the range of the dtype reaches them.
+/// share(rows), a vector of tensors, is a sum over these samples. If it is not finite, the samples that cause this are
+/// removed from `rows`. The others keep their shares, unaffected by numbers outside the range of the dtype.
 template <class Share>
 std::vector<at::Tensor> finite_sum(Rows& rows, const Share& share) {
   auto sum = share(rows);

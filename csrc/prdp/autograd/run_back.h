@@ -7,8 +7,8 @@
 
 namespace prdp {
 
-/// How K iterations are kept for their reverse: of every segment its first iterate, and of one segment
-/// at a time all.
+/// Which of K iterates are stored for the reverse: the first one of every segment,
+/// and all of the current segment.
 struct Checkpoints {
   int64_t iterations, stride;
 
@@ -22,11 +22,11 @@ struct Checkpoints {
   int64_t slots() const { return stride + segments(); }
 };
 
-/// Runs the iterations of a sweep forward, keeping what `plan` says, and then back, one by one: whatever
-/// is kept, the arithmetic and so the result is the same to the last bit. A sweep has start(), step(),
-/// save(slot), load(slot, k) of what k iterations have made, and step_back(slot, k): from the cotangents
-/// after iteration k, which starts from the state in the slot and has just been run again, to those
-/// before it.
+/// Runs the iterations of a sweep forward, storing iterates as `plan` says, and then back, one by one.
+/// The arithmetic does not depend on the plan, so the result is the same to the last bit. A sweep has
+/// start(), step(), save(slot), load(slot, k) for the state after k iterations, and step_back(slot, k).
+/// This takes the cotangents after iteration k to those before it; the iteration starts from the state
+/// in the slot, and has just been run again.
 template <class Sweep>
 void run_back(Sweep& sweep, const Checkpoints& plan) {
   const auto length = [&](int64_t segment) {

@@ -13,7 +13,7 @@ namespace prdp {
 class SolveNode final : public torch::autograd::Node {
  public:
   SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options);
-  /// To be called once u has this node for its history.
+  /// Call this once this node is the history of u.
   void save(const at::Tensor& b, const Solved& solved);
 
   torch::autograd::variable_list apply(torch::autograd::variable_list&& cotangents) override;

@@ -3,8 +3,8 @@
 
 namespace prdp {
 
-/// What a solve A u = b keeps for its derivative; implicit mode needs u where A has a derivative, the
-/// unrolled one all else, and the status both where a failed sample may have passed.
+/// What a solve A u = b stores for its derivative. Implicit mode needs u if A has a derivative. Unrolled mode needs all
+/// the other tensors. Both need the status if failed samples do not raise an error.
 struct Solved {
   at::Tensor b, u, iterations, status, residual;
   at::Tensor x0{};  // undefined: from zero

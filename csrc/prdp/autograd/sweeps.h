@@ -150,13 +150,12 @@ class RecursiveSweep : public SweepBase<Method, Space> {
   std::vector<Correction> corrections_;
 };
 
-/// One iteration at a time, and x alone: the iterate before it is Chebyshev's.
+/// One iteration at a time.
 template <class Space>
 class SingleJacobi : public JacobiMethod<Space> {
  public:
   using JacobiMethod<Space>::JacobiMethod;
   void step() { JacobiMethod<Space>::step(1); }
-  auto carried() { return std::tie(this->x); }
 };
 
 /// x' = x + D⁻¹(b - A x)
@@ -376,40 +375,34 @@ class GmresSweep : public SweepBase<GmresMethod<Space>, Space> {
 
 /// The sweep of a class that iterates; only those named here have one.
 template <class Method>
-struct SweepOf : std::false_type {
-  using Type = void;
-};
+struct SweepOf;
 template <class Space>
-struct SweepOf<JacobiMethod<Space>> : std::true_type {
+struct SweepOf<JacobiMethod<Space>> {
   using Type = JacobiSweep<Space>;
 };
 template <class Space>
-struct SweepOf<SteepestDescentMethod<Space>> : std::true_type {
+struct SweepOf<SteepestDescentMethod<Space>> {
   using Type = SteepestDescentSweep<Space>;
 };
 template <class Space>
-struct SweepOf<ConjugateGradientMethod<Space>> : std::true_type {
+struct SweepOf<ConjugateGradientMethod<Space>> {
   using Type = ConjugateGradientSweep<Space>;
 };
 template <class Space>
-struct SweepOf<GmresMethod<Space>> : std::true_type {
+struct SweepOf<GmresMethod<Space>> {
   using Type = GmresSweep<Space>;
 };
 
-/// Calls body(std::type_identity<sweep of this method>).
+/// Calls body(std::type_identity<sweep of this method>). A row that promises a sweep which is not written does not
+/// compile.
 template <class Space, class Body>
 auto with_sweep(Method method, const Body& body) {
-  const auto written = [](const auto& row) {
-    return row.unrolled != Unrolled::kSweep || SweepOf<typename std::decay_t<decltype(row)>::template In<Space>>::value;
-  };
-  static_assert(std::apply([&](const auto&... row) { return (written(row) && ...); }, kMethods),
-                "the table has a method with a sweep that is not written");
-  return with_row(method, [&](const auto& row) {
-    TORCH_INTERNAL_ASSERT(row.unrolled == Unrolled::kSweep, "no sweep for ", row.name);
-    using Found = SweepOf<typename std::decay_t<decltype(row)>::template In<Space>>;
-    using Result = decltype(body(std::type_identity<JacobiSweep<Space>>()));
-    if constexpr (Found::value) return body(std::type_identity<typename Found::Type>());
-    else return Result();
+  using Result = decltype(body(std::type_identity<JacobiSweep<Space>>()));
+  return with_row(method, [&](auto at) -> Result {
+    if constexpr (at.row.unrolled == Unrolled::kSweep)
+      return body(std::type_identity<typename SweepOf<typename std::decay_t<decltype(at.row)>::template In<Space>>::Type>());
+    TORCH_INTERNAL_ASSERT(at.row.unrolled == Unrolled::kSweep, "no reverse is written for ", at.row.name);
+    return Result();
   });
 }
 

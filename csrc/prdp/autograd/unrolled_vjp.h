@@ -8,14 +8,14 @@
 
 namespace prdp {
 
-/// Product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran, as
-/// the torch op prdp::unrolled_vjp, which runs the iterations again. Each sample goes its way:
-///   its cotangent is not finite, or its gradient would not be   fails in words: NONFINITE_INPUT, OVERFLOW
-///   solved to rounding, where iterations are not smooth         the implicit derivative, to rounding too:
-///     what its last iterations did, or left out for want of a residual, is no derivative of u
-///   else                                                        the derivative of exactly its iterations
-/// The report has the adjoint solve's numbers for those of implicit derivative; for the last the solve's own
-/// iterations and status, with the residual NaN since no system is solved.
+/// The product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran. It is the
+/// torch op prdp::unrolled_vjp, which runs the iterations again. There are three kinds of samples:
+///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
+///   solved to rounding                              gets the implicit derivative, because its last iterations, or
+///                                                   those that it no longer needed, say nothing about that of u
+///   all others                                      get the derivative of exactly their iterations
+/// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
+/// iterations and the status of the forward solve, and NaN as residual, because no system is solved.
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed);
 
@@ -28,7 +28,7 @@ SolveVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const Solved& solved
 at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
                         const SolveOptions& options, at::IntArrayRef needed);
 
-/// The iterations that are differentiated as they ran: so many of each sample, of some none.
+/// The iterations to differentiate: a number for each sample, which may be 0.
 struct UnrolledSolve {
   OperatorSpec a;
   at::Tensor x0;  // undefined: from zero
@@ -37,18 +37,18 @@ struct UnrolledSolve {
   int64_t checkpoint_every = 0;  // as SolveOptions has it
 };
 
-/// The gradients of b and of each tensor, undefined where `needed` (b first) holds 0 or there is none; and
-/// the products with A and Aᵀ that it took, of each sample.
+/// The gradients of b and of each tensor, undefined where `needed` (b first) is 0 or there is no derivative; and the
+/// number of products with A and Aᵀ for each sample.
 struct UnrolledVjp {
   std::vector<at::Tensor> gradients;
   at::Tensor operator_applications;
 };
 
-/// The ways there. By hand-written sweeps in the CPU loops, where `has_sweep`: one sample at a time.
+/// Computes them by hand-written sweeps in the CPU loops, one sample at a time; for what `has_sweep` names.
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                       at::IntArrayRef needed);
-/// By autograd, one iteration at a time, in plain tensor operations: everything else.
+/// Computes them by autograd, one iteration at a time, in plain tensor operations; for everything else.
 UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                        at::IntArrayRef needed);
 

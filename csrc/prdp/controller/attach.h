@@ -7,13 +7,13 @@
 
 namespace prdp {
 
-/// Gives a stepper what the coming interval's solves get.
+/// Sets K and the tolerances of a stepper for the next interval. What the budget does not give stays as it is.
 void set_budget(Solving& stepper, const Budget& budget);
 
-/// What the last solves of the steppers were like, of several the worst; without an error, which only the
-/// training knows.
+/// The outcome of the last solves of the steppers; of several steppers, the worst. Its `error` is empty, because only
+/// the training knows it.
 Solves last_solves(const std::vector<const Solving*>& steppers);
-/// The same, of steppers of one kind.
+/// The same for steppers of one class.
 template <std::derived_from<Solving> Kind>
 Solves last_solves(const std::vector<Kind>& steppers) {
   std::vector<const Solving*> each;

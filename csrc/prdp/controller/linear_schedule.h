@@ -3,12 +3,12 @@
 
 namespace prdp {
 
-/// The manual schedule: K = initial + increment·(steps so far), at most `maximum`. increment = 0 is a
-/// constant K.
+/// A manual schedule: K = initial + increment·(calls of step()), at most `maximum`. increment = 0 keeps K constant. The
+/// metric is ignored.
 class LinearSchedule final : public Controller {
  public:
-  /// Raises ValueError unless 0 <= initial <= maximum, increment >= 0 and 0 < adjoint_ratio <= 1, of K for
-  /// the adjoint.
+  /// The adjoint solve gets ⌈adjoint_ratio·K⌉ iterations; without a ratio the stepper decides. Raises ValueError unless
+  /// 0 <= initial <= maximum, increment >= 0 and 0 < adjoint_ratio <= 1.
   LinearSchedule(int64_t initial, int64_t increment, int64_t maximum, std::optional<double> adjoint_ratio = {});
 
   int64_t max_iter() const override { return state_.max_iter; }
@@ -25,7 +25,7 @@ class LinearSchedule final : public Controller {
  private:
   const char* name() const override { return "LinearSchedule"; }
   const char* remedy() const override { return "give a larger K, or take a ToleranceController"; }
-  bool stalled() const override { return false; }  // it does not look
+  bool stalled() const override { return false; }  // it ignores the metric
 
   int64_t initial_, increment_, maximum_;
   std::optional<double> adjoint_ratio_;

@@ -6,20 +6,20 @@
 
 namespace prdp {
 
-/// What lies beyond the ends of every axis.
+/// The values beyond the ends of every axis.
 enum class Boundary {
   kDirichlet,  // zero; boundary points are not unknowns, dx = length/(N + 1)
-  kPeriodic,   // the other end; dx = length/N
+  kPeriodic,   // those from the other end; dx = length/N
 };
 
-/// A uniform grid on an interval, a rectangle or a box, of side 1 where no lengths are given. `shape` counts
-/// the unknowns in tensor order, (N,), (Ny, Nx) or (Nz, Ny, Nx): the x direction is the last axis; `lengths`
-/// are the sides of the domain in the same order. Functions of a field and a grid
-/// take the last dim() axes of the tensor for it, and name an axis by its place in `shape`.
+/// A uniform grid on an interval, a rectangle or a box. `shape` counts the unknowns in tensor order, (N,), (Ny, Nx) or
+/// (Nz, Ny, Nx): the x direction is the last axis. `lengths` are the sides of the domain in the same order; without
+/// them all sides are 1. Functions of a field and a grid take the last dim() axes of the tensor for the grid, and count
+/// its axes as `shape` does.
 class Grid {
  public:
-  /// Raises ValueError unless `shape` has 1 to 3 positive extents, >= 2 where the grid is periodic, and
-  /// `lengths` is empty or holds a finite number > 0 per axis; `owner` names the caller.
+  /// Raises ValueError, in the name of `owner`, unless `shape` has 1 to 3 extents >= 1 (>= 2 if the grid is periodic),
+  /// and `lengths` is empty or has a finite number > 0 per axis.
   Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary = Boundary::kDirichlet,
        std::vector<double> lengths = {});
 
@@ -42,7 +42,7 @@ class Grid {
   std::vector<double> lengths_;
 };
 
-/// Discrete Laplacian L v, Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Differentiable.
+/// The discrete Laplacian L v = Σ_d (v_{i-1} - 2 v_i + v_{i+1}) / dx_d². Differentiable.
 at::Tensor laplacian(const at::Tensor& v, const Grid& grid);
 /// The diagonal of L: -Σ_d 2 / dx_d².
 double laplacian_diagonal(const Grid& grid);
@@ -56,13 +56,13 @@ at::Tensor forward_difference(const at::Tensor& v, const Grid& grid, int64_t axi
 at::Tensor backward_mean(const at::Tensor& v, const Grid& grid, int64_t axis);
 at::Tensor forward_mean(const at::Tensor& v, const Grid& grid, int64_t axis);
 
-/// Orthonormal sine basis of one axis: S_jk = √(2/(N+1)) sin(π j k/(N+1)), symmetric, S S = I.
+/// The orthonormal sine basis of one axis, (n, n): S_jk = √(2/(N+1)) sin(π j k/(N+1)), symmetric, S S = I.
 at::Tensor sine_basis(int64_t n, const at::TensorOptions& options);
 
-/// Eigenvalues of L in the sine basis, -Σ_d 4 sin²(π k_d / (2 (N_d + 1))) / dx_d², shape `shape`.
+/// The eigenvalues of L in the sine basis, -Σ_d 4 sin²(π k_d / (2 (N_d + 1))) / dx_d², as a tensor of the grid's shape.
 at::Tensor laplacian_eigenvalues(const Grid& grid, const at::TensorOptions& options);
 
-/// Sine transform of the last dim() axes of v; its own inverse.
+/// The sine transform of the last dim() axes of v. It is its own inverse.
 at::Tensor sine_transform(const at::Tensor& v, const Grid& grid);
 
 }  // namespace prdp

@@ -9,8 +9,8 @@
 #include "prdp/kernels/matrix.h"
 #include "prdp/kernels/sparse_factors.h"
 
-/// The exact methods of each operator, made once and used for any number of right-hand sides. Each
-/// has solve(r, d): d = A⁻¹ r in the kernel's padded layout; false where A is singular.
+/// The exact methods of each operator. A factorisation is made once and used for any number of right-hand sides. Each
+/// has solve(r, d), which sets d = A⁻¹ r in the kernel's padded layout and returns false if A is singular.
 namespace prdp::kernels {
 
 template <class T>
@@ -21,7 +21,7 @@ bool all_finite(const T* x, int64_t n) {
 template <class T, int Dim>
 class LaplacianFactors;
 
-/// Thomas' algorithm for the constant tridiagonal matrix; one division a row, made beforehand.
+/// Thomas' algorithm for the constant tridiagonal matrix. The one division per row is done beforehand.
 template <class T>
 class LaplacianFactors<T, 1> {
  public:
@@ -142,7 +142,7 @@ class DenseFactors {
   Eigen::PartialPivLU<Matrix> lu_;
 };
 
-/// Eigen's sparse factors, whose ordering and factorisation may not return from an empty row or column.
+/// Eigen's sparse factors. Its ordering and factorisation may not return if a row or a column is empty.
 template <class T>
 class CsrFactors {
  public:

@@ -14,12 +14,12 @@ using Factors = std::shared_ptr<const void>;
 Factors find(const std::string& key);
 /// Keeps them in place of older ones, unless they are too large.
 void keep(std::string key, Factors factors, int64_t bytes);
-/// Frees all.
+/// Frees all factors.
 void clear();
-/// How many were made so far.
+/// How many factors were made so far.
 int64_t count_made();
 
-/// The factors F of the matrix whose every number is in `key`, from before or from make(). Any thread.
+/// The factors F of the matrix whose numbers are the key, from the cache or from make(). Any thread may call this.
 template <class F, class Make>
 std::shared_ptr<const F> find_or_make(std::string key, const Make& make) {
   key += typeid(F).name();

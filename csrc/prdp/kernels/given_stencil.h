@@ -3,14 +3,14 @@
 
 namespace prdp::kernels {
 
-/// Points of an axis one after the other: `count` from number `to` on take what belongs to those from number
-/// `from` on.
+/// A run of points along an axis: `count` points from index `to` on take the values of those
+/// from index `from` on.
 struct Run {
   int64_t to, from, count;
 };
 
-/// Which coefficients the points take that have a neighbour at `offset`: their own or, in the transpose,
-/// those of the neighbour.
+/// The coefficients of the points that have a neighbour at `offset`: their own or, in the transpose, those of the
+/// neighbour.
 inline std::array<Run, 2> runs(int64_t offset, int64_t n, bool periodic, bool transposed) {
   if (periodic && (!transposed || offset == 0)) return {{{0, 0, n}}};
   const int64_t begin = std::max<int64_t>(-offset, 0);

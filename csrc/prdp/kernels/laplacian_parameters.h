@@ -15,7 +15,7 @@ struct LaplacianParameters {
   std::array<double, 3> off{};
 };
 
-/// The spectral radius of I - D⁻¹A; the eigenvalues are ± in pairs.
+/// The spectral radius of I - D⁻¹A. Its eigenvalues come in pairs ±μ.
 inline double jacobi_radius(const LaplacianParameters& a) {
   double sum = 0;
   for (int64_t d = 0; d < a.dim; ++d)

@@ -9,8 +9,8 @@ namespace prdp::kernels {
 
 /// [[C1, 0, G1], [0, C2, G2], [D1, D2, 0]] with C_i = I/dt + Γ_i - ν L on one sample of a staggered
 /// grid: u1 on the left faces, u2 on the bottom faces, p in the centres of the cells. A constant
-/// pressure is in the null space of A and Aᵀ. It knows its coefficients where all samples share the
-/// velocity, else those of sample(s) do.
+/// pressure is in the null space of A and Aᵀ. It has coefficients itself if all samples
+/// share the velocity; otherwise only sample(s) has them.
 template <class T>
 class NavierStokes : public FieldRows<T> {
   using Base = FieldRows<T>;

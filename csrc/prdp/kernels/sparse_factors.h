@@ -8,8 +8,8 @@
 
 namespace prdp::kernels {
 
-/// Factors of a sparse matrix by Eigen: Cholesky's where it is symmetric and definite of either sign, which
-/// takes a quarter of the time, else LU with pivoting. Once made, any thread may solve with them.
+/// Factors of a sparse matrix by Eigen: Cholesky's if the matrix is symmetric and definite of either sign, which takes
+/// a quarter of the time, otherwise LU with pivoting. Once they are made, any thread may solve with them.
 template <class T>
 class SparseFactors {
  public:

@@ -8,8 +8,8 @@
 
 namespace prdp::kernels {
 
-/// One stencil with coefficients of its own at every point, on each channel of a sample. It knows its
-/// coefficients where all samples share them, else those of sample(s) do.
+/// One stencil with its own coefficients at every point, on each channel of a sample. It has coefficients itself if all
+/// samples share them; otherwise only sample(s) has them.
 template <class T>
 class Stencil : public FieldRows<T> {
  public:

@@ -7,12 +7,12 @@
 
 namespace prdp {
 
-/// Multilayer perceptron with ReLU between its layers, from a field to a field of the same shape
-/// (batch, channels, *shape). Parameters layers.0.weight, layers.0.bias, …; torch's default initialisation.
-/// prdp_torch.experiments.networks.MLP is its twin: same names, same order, same weights from the same seed.
+/// A multilayer perceptron with ReLU between its layers. It maps a field (batch, channels, *shape) to one of the same
+/// shape. Its parameters are layers.0.weight, layers.0.bias, …, with torch's default initialisation.
+/// prdp_torch.experiments.networks.MLP is the same network in Python: same names, order and weights for the same seed.
 class MLPImpl : public torch::nn::Module {
  public:
-  /// unknowns → hidden[0] → … → unknowns
+  /// Widths of the layers: unknowns → hidden[0] → … → unknowns. `unknowns` is channels times the number of points.
   MLPImpl(int64_t unknowns, const std::vector<int64_t>& hidden);
   torch::Tensor forward(const torch::Tensor& u);
 

@@ -5,16 +5,16 @@
 
 namespace prdp {
 
-/// Residual network (He et al. 2016, without normalisation) from a field (batch, channels, *shape) of
-/// any extents to one of the same shape: a convolution lifts channels → width point by point, `blocks`
-/// times x ← relu(x + conv(relu(conv(x)))) with three-wide kernels, and a last convolution projects
-/// width → channels point by point. Beyond the grid the blocks see the other end of the field where it
-/// is periodic, else zeros. Parameters lift.weight, lift.bias, blocks.0.0.weight, blocks.0.0.bias,
-/// blocks.0.2.weight, …, project.weight, project.bias; torch's default initialisation.
-/// prdp_torch.experiments.networks.ResNet is its twin: same names, same order, same weights from the same seed.
+/// A residual convolution network without normalisation (He et al. 2016). It maps a field (batch, channels, *shape) on
+/// any grid to one of the same shape. A pointwise convolution lifts the channels to `width`. Each of the `blocks`
+/// computes x ← relu(x + conv(relu(conv(x)))) with kernels of width three. A pointwise convolution projects back.
+/// Beyond the grid, the blocks see the other end of the field if `periodic`, else zeros. The parameters are
+/// lift.weight, lift.bias, blocks.0.0.weight, blocks.0.0.bias, blocks.0.2.weight, …, project.weight, project.bias, with
+/// torch's default initialisation. prdp_torch.experiments.networks.ResNet is the same network in Python: same names,
+/// order and weights for the same seed.
 class ResNetImpl : public torch::nn::Module {
  public:
-  /// `dim` axes in `shape`; raises ValueError unless 1, 2 or 3.
+  /// `dim` is the number of axes in `shape`. Raises ValueError unless it is 1, 2 or 3.
   ResNetImpl(int64_t dim, int64_t channels, int64_t blocks, int64_t width, bool periodic);
   torch::Tensor forward(const torch::Tensor& u);
 

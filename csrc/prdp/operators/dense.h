@@ -4,12 +4,12 @@
 
 namespace prdp {
 
-/// A⁻¹ b by LU with partial pivoting: matrix (n, n), (1, n, n) or (batch, n, n), b (batch, n, k). A
-/// singular matrix gives values that are not finite, and no exception.
+/// A⁻¹ b by LU with partial pivoting, for a matrix (n, n), (1, n, n) or (batch, n, n) and b (batch, n, k). A singular
+/// matrix gives values that are not finite, and no exception.
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b);
 
-/// The matrix (batch or 1, n, n) that `a` is on each channel of a field of n points, where it takes any
-/// number of channels. Differentiable.
+/// The matrix (batch or 1, n, n) of an operator that acts on each channel of a field of n points
+/// alike. Differentiable.
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options);
 /// The solutions for each channel of b (batch, channel, *shape).
 at::Tensor solve_channels(const at::Tensor& matrix, const at::Tensor& b);

@@ -8,11 +8,11 @@
 #include <algorithm>
 #include <vector>
 
-/// What a tensor can be beside plain numbers in memory.
+/// Tests for tensors that are more than plain numbers in memory.
 namespace prdp {
 
-/// Whether the memory of a tensor holds its values, and nobody watches it: then a kernel may be called
-/// directly. The dispatcher resolves what is fake, wrapped, negated by a bit, or zero without memory.
+/// Whether the memory of a tensor holds its values, so that a kernel may be called directly. Other tensors need the
+/// dispatcher: those that are fake, wrapped, negated or conjugated by a bit, or zero without memory.
 inline bool is_plain(const at::Tensor& t) {
   constexpr c10::DispatchKeySet lazy(
       {c10::DispatchKey::Negative, c10::DispatchKey::Conjugate, c10::DispatchKey::ZeroTensor});

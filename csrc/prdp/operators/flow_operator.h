@@ -5,9 +5,9 @@
 
 namespace prdp {
 
-/// What Burgers and Navier-Stokes share: one step of a flow on a periodic grid, linearised about given
-/// winds. Parameters (dt, length per axis if not 1), tensors (winds, nu); the winds are (batch, channels, *shape), or
-/// (1, channels, *shape) for all samples alike. Channel 0 is the velocity along x, the last axis,
+/// The base of Burgers and Navier-Stokes: one step of a flow on a periodic grid, linearised about given winds.
+/// Parameters: dt, and the length per axis if not 1. Tensors: the winds and nu. The winds are (batch, channels,
+/// *shape), or (1, channels, *shape) if all samples share them. Channel 0 is the velocity along x, the last axis;
 /// channel 1 along y.
 class FlowOperator : public Operator {
  public:
@@ -22,7 +22,7 @@ class FlowOperator : public Operator {
 
   /// Of the channel that blows along a grid axis: (batch or 1, 1, *shape).
   at::Tensor wind_along(int64_t axis) const { return winds_.narrow(1, grid_.dim() - 1 - axis, 1); }
-  /// Gradient of the winds out of its channels, summed over the samples that share them.
+  /// The gradient of the winds from those of its channels, summed over the samples that share them.
   at::Tensor as_winds(std::vector<at::Tensor> channels) const;
   /// Largest of the row norms, one per sample, or one value where the winds are shared.
   at::Tensor largest(const at::Tensor& row_norms) const;

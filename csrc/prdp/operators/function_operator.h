@@ -8,35 +8,35 @@
 
 namespace prdp {
 
-/// A user's own operator: its products as functions of a batch of vectors (batch, …) and of the tensors
-/// that A is made of. They return the shape and dtype of the vectors, change neither argument, and differ
-/// between samples only through the tensors.
+/// An operator of your own, given by its products: functions of a batch of vectors (batch, …) and of the tensors that
+/// A is made of. They return the shape and dtype of the vectors and do not change their arguments. Samples may differ
+/// only through the tensors.
 struct Products {
   using Product = std::function<at::Tensor(const at::Tensor& v, const std::vector<at::Tensor>& tensors)>;
   using Diagonal = std::function<at::Tensor(const std::vector<at::Tensor>& tensors)>;
   using ProductRule = std::function<std::vector<at::Tensor>(const at::Tensor& lambda, const at::Tensor& u,
                                                             const std::vector<at::Tensor>& tensors)>;
   Product apply;
-  Product apply_transpose{};  // torch's own derivative of `apply` where not given
+  Product apply_transpose{};  // if empty, torch's derivative of `apply`
   Diagonal diagonal{};        // broadcastable against the vectors, differentiable; for Jacobi
-  /// The derivative of `apply`, and ∂⟨λ, A u⟩ with respect to each tensor, where a transform of torch.func runs,
-  /// which goes without autograd's C++ interface; empty: there are no such transforms.
+  /// The derivative of `apply`, and ∂⟨λ, A u⟩ with respect to each tensor, for use inside a transform of torch.func,
+  /// which does not work with autograd's C++ interface. Python supplies them; in C++ they stay empty.
   Product transpose_in_transforms{};
   ProductRule product_rule{};
 };
 
-/// Functions cannot cross torch's dispatcher, a number can: it stands for them as long as this lives.
+/// Keeps products alive under a number, because functions cannot pass through torch's dispatcher but numbers can.
 class RegisteredProducts {
  public:
   static std::shared_ptr<const RegisteredProducts> make(Products products);
-  /// Raises ValueError where they no longer live.
+  /// Raises ValueError if they no longer exist.
   static std::shared_ptr<const RegisteredProducts> find(int64_t number);
   ~RegisteredProducts();
 
   int64_t number() const { return number_; }
   const Products& products() const { return products_; }
-  /// Of the first product below autograd: whether it is to look for captured tensors (see
-  /// refuse_captured_gradients).
+  /// Whether the first product below autograd looks for captured tensors
+  /// (see refuse_captured_gradients).
   enum class Captures { kUnknown, kWanted, kNone };
   mutable std::atomic<Captures> captures{Captures::kUnknown};
   /// The operator, for linear_solve.
@@ -48,29 +48,29 @@ class RegisteredProducts {
   int64_t number_ = 0;
 };
 
-/// A product that uses a tensor which requires grad and is not among those handed over would lose its
-/// gradient without a word. After this call the operator's next product below autograd raises ValueError in
-/// that case; once for each RegisteredProducts, at the cost of recording one product.
+/// A product that captures a tensor which requires grad, instead of getting it as an argument, would silently lose its
+/// gradient. After this call, the operator's next product below autograd raises ValueError in that case. This
+/// happens once for each RegisteredProducts, at the cost of recording one product.
 void refuse_captured_gradients(const OperatorSpec& a);
 
-/// Kind "function", shape (number of its products). Derivatives with respect to the tensors come from
-/// autograd through apply; the exact solve probes A with unit vectors, for small systems.
+/// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
+/// from autograd through `apply`. The exact solve multiplies A with unit vectors, so it is for small n.
 class FunctionOperator final : public Operator {
  public:
   explicit FunctionOperator(const OperatorSpec& spec);
   void check_vector(const at::Tensor& b) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
-  /// ValueError where it is not given.
+  /// Raises ValueError if it was not given.
   at::Tensor diagonal() const override;
   at::Tensor solve_directly(const at::Tensor& b) const override;
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
-  /// Unknown: 0, or NaN where a tensor is not finite.
+  /// Not known: 0, or NaN if a tensor is not finite.
   at::Tensor norm() const override;
-  /// Unknown which tensors have a batch axis: nothing.
+  /// Null, because it is not known which tensors have a batch axis.
   std::unique_ptr<Operator> select(const at::Tensor&) const override { return nullptr; }
-  /// Unknown: ValueError.
+  /// Not known, so this raises ValueError.
   std::vector<int64_t> vector_shape() const override;
 
  private:
@@ -83,7 +83,7 @@ class FunctionOperator final : public Operator {
 
   std::shared_ptr<const RegisteredProducts> registered_;
   std::vector<at::Tensor> tensors_;
-  /// A product at `point`, recorded once for all products with the transpose.
+  /// A product at `point`, recorded once and used for all products with the transpose.
   struct Recorded {
     at::Tensor point, product;
   };

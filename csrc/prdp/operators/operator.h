@@ -12,12 +12,12 @@
 
 namespace prdp {
 
-/// The flat description of an operator, as it crosses torch's dispatcher: numbers and tensors only.
+/// An operator as plain numbers and tensors, so that it can pass through torch's dispatcher.
 struct OperatorSpec {
-  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr"
-  std::vector<int64_t> shape;        // grid of unknowns; empty for matrices
+  std::string kind;                  // "heat", "poisson", "burgers", "navier_stokes", "stencil", "dense", "csr", …
+  std::vector<int64_t> shape;        // of the grid of unknowns; empty for matrices
   std::vector<double> parameters;    // plain numbers without gradient, such as dt and the lengths
-  std::vector<at::Tensor> tensors;   // what A depends on and is differentiated for, such as nu
+  std::vector<at::Tensor> tensors;   // what A depends on and may get gradients, such as nu
   bool transposed = false;
 };
 
@@ -27,8 +27,8 @@ struct DenseParameters {
   bool transposed = false;
 };
 
-/// Compressed sparse rows with int64 indices: crow (n + 1), col and values (nnz), contiguous; or
-/// each with a leading batch axis.
+/// Compressed sparse rows with int64 indices: crow (n + 1), col (nnz) and values (nnz), contiguous. Each may have a
+/// leading batch axis.
 struct CsrParameters {
   at::Tensor crow, col, values;
   bool transposed = false;
@@ -52,7 +52,7 @@ struct NavierStokesParameters {
   std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
 };
 
-/// The coefficients (batch or 1, k, *shape), contiguous, of a stencil with k offsets on each of the channels.
+/// The coefficients (batch or 1, k, *shape), contiguous, of a stencil with k offsets, the same for every channel.
 struct StencilParameters {
   at::Tensor coefficients;
   kernels::StencilGrid grid;
@@ -61,56 +61,56 @@ struct StencilParameters {
   bool transposed = false;
 };
 
-/// What the CPU loops need to know of an operator; monostate: it has plain tensor operations only.
+/// What the CPU loops need to know about an operator. With monostate there are no such loops for it.
 using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters, CsrParameters,
                                       BurgersParameters, NavierStokesParameters, StencilParameters>;
 
-/// A linear operator A(g) on batches of fields. Immutable; knows nothing of solvers.
-/// Vectors are batched: (batch, channel, *shape) for stencils, (batch, n) for matrices.
+/// A linear operator A(g) on batches of vectors: (batch, channel, *shape) on grids, (batch, n) for matrices. It is
+/// immutable.
 class Operator {
  public:
   virtual ~Operator() = default;
 
   /// Raises ValueError or TypeError unless b is a right-hand side of this operator.
   virtual void check_vector(const at::Tensor& b) const = 0;
-  /// Raises ValueError where a parameter is not allowed by its value (a negative nu).
+  /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu.
   virtual void check_parameters() const {}
 
   /// A v and Aᵀ v, differentiable in v and in the tensors of A.
   virtual at::Tensor apply(const at::Tensor& v) const = 0;
   virtual at::Tensor apply_transpose(const at::Tensor& v) const = 0;
-  /// Diagonal of A, broadcastable against a batch of vectors.
+  /// The diagonal of A, in a shape that broadcasts against a batch of vectors.
   virtual at::Tensor diagonal() const = 0;
-  /// A⁻¹ b and A⁻ᵀ b by the cheapest exact method that plain tensors allow; differentiable.
+  /// A⁻¹ b and A⁻ᵀ b by the cheapest exact method in plain tensor operations; differentiable.
   virtual at::Tensor solve_directly(const at::Tensor& b) const = 0;
   virtual at::Tensor solve_transpose_directly(const at::Tensor& b) const = 0;
-  /// ∂⟨λ, A(g) u⟩/∂g, one per tensor of A; undefined where there is no derivative. Differentiable.
+  /// ∂⟨λ, A(g) u⟩/∂g, one per tensor of A; undefined for tensors without a derivative. Differentiable.
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
-  /// ‖A‖∞, one value or one per sample.
+  /// ‖A‖∞: one value, or one per sample.
   virtual at::Tensor norm() const = 0;
-  /// v without its part in the null space of A and Aᵀ; v itself where A is regular. Differentiable.
+  /// v without its component in the null space of A and Aᵀ; v itself if A is regular. Differentiable.
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
-  /// M⁻¹ v and M⁻ᵀ v for a cheap M ≈ A that suits this operator; ValueError where there is none.
+  /// M⁻¹ v, or M⁻ᵀ v, for a cheap M ≈ A. Raises ValueError if this operator has none.
   virtual at::Tensor precondition(const at::Tensor& v, bool transposed) const;
-  /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ; differentiable in the tensors of
-  /// A. ValueError where it is not known.
+  /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
+  /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;
-  /// Where the first NaN or Inf that A is made of sits: (i, j) in a matrix, (channel, *grid) in winds.
+  /// The index of the first NaN or Inf in the tensors of A: (i, j) in a matrix, (channel, *grid) in winds.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
-  /// The operator of the samples `index` (int64) alone, differentiable in the same tensors; null where
-  /// that is not known.
+  /// The operator for the samples `index` (int64) alone, differentiable in the same tensors; null if that is not
+  /// possible.
   virtual std::unique_ptr<Operator> select(const at::Tensor& index) const = 0;
-  /// Shape of one vector without its batch axis; with one channel where A takes any number.
+  /// The shape of one vector without its batch axis; with one channel if A takes any number of them.
   virtual std::vector<int64_t> vector_shape() const = 0;
 
-  /// For vectors of b's shape.
+  /// The parameters of the CPU loops, for vectors with the shape of b.
   virtual KernelParameters kernel(const at::Tensor& /*b*/) const { return std::monostate{}; }
 
-  /// A as a matrix (n, n), or (batch, n, n) where A differs between the samples.
+  /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.
   at::Tensor dense(const at::TensorOptions& options) const;
 };
 
-/// Index of the first true entry; which entries are NaN or Inf.
+/// The index of the first true entry, and a mask of the entries that are NaN or Inf.
 std::vector<int64_t> first_true(const at::Tensor& mask);
 at::Tensor nonfinite(const at::Tensor& t);
 

@@ -4,17 +4,17 @@
 
 namespace prdp {
 
-/// (A v)[i] = Σ_k coefficients[k, i] · v[i + offsets[k]] on a grid of one to three axes, the same for every
-/// channel of v (batch, channel, *shape), for linear_solve.
+/// An operator for linear_solve: (A v)[i] = Σ_k coefficients[k, i] · v[i + offsets[k]] on a grid of one to three axes,
+/// the same for every channel of v (batch, channel, *shape).
 ///
-/// coefficients: (batch or 1, k, *shape), float32 or float64; they get gradients. offsets: k distinct ones,
-/// one entry of at most two cells for each axis. boundary: v is zero outside (Boundary::kDirichlet) or
-/// periodic; one for all axes or one for each. Raises ValueError for what does not fit together.
+/// coefficients: (batch or 1, k, *shape), float32 or float64; they get gradients. offsets: k distinct ones, each with
+/// one entry per axis, at most two cells. boundary: v is zero outside the grid (Boundary::kDirichlet) or periodic; one
+/// for all axes, or one per axis. Raises ValueError if these do not fit together.
 OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vector<int64_t>>& offsets,
                      const std::vector<Boundary>& boundary = {Boundary::kDirichlet});
 
-/// Kind "stencil": shape, parameters (for each axis whether it is periodic, then the offsets one after the
-/// other), tensors (coefficients).
+/// The operator of kind "stencil". Parameters: for each axis whether it is periodic, then the offsets one after the
+/// other. Tensors: the coefficients.
 class StencilOperator final : public Operator {
  public:
   explicit StencilOperator(const OperatorSpec& spec);

@@ -64,11 +64,11 @@ at::Tensor converged_step(Stepper& reference, const at::Tensor& u) {
 
 namespace {
 
-/// Initial states of all samples, on the grid of the reference; those of the training come first.
-at::Tensor starts(const Scene& scene) {
+/// The first initial states of the scene, on the grid of the reference; those of the training come before those of the
+/// validation.
+at::Tensor starts(const Scene& scene, int64_t samples) {
   const auto& d = scene.data;
   TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5; run prdp train ", scene.path);
-  const int64_t samples = d.train + d.valid;
   if (scene.task == Scene::Task::kCorrector) return random_flow(d.reference_shape, samples, d.seed);
   return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
 }
@@ -102,15 +102,37 @@ OnSteps counted(int64_t total, const OnProgress& on_progress) {
 
 }  // namespace
 
+namespace {
+
+constexpr int64_t kTrainedSteps = 2;  // that the loss looks ahead
+
+at::Tensor at_time(const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); }
+
+Dataset training_samples(const Scene& scene, const at::Tensor& start, const OnSteps& on_steps) {
+  const auto states = follow(scene, start, kTrainedSteps, on_steps);
+  Dataset data;
+  data.train_start = at_time(states, 0);
+  data.train_end = at_time(states, kTrainedSteps);
+  if (scene.task == Scene::Task::kCorrector) data.train_first = at_time(states, 1);
+  return data;
+}
+
+}  // namespace
+
+Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress) {
+  const int64_t samples = scene.data.train;
+  return training_samples(scene, starts(scene, samples), counted(kTrainedSteps * samples, on_progress));
+}
+
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto& d = scene.data;
-  const auto on_steps = counted(2 * d.train + d.valid_steps * d.valid, on_progress);
-  const auto start = starts(scene);
-  const auto train = follow(scene, start.narrow(0, 0, d.train), 2, on_steps);
+  const auto on_steps = counted(kTrainedSteps * d.train + d.valid_steps * d.valid, on_progress);
+  const auto start = starts(scene, d.train + d.valid);
+  auto data = training_samples(scene, start.narrow(0, 0, d.train), on_steps);
   const auto valid = follow(scene, start.narrow(0, d.train, d.valid), d.valid_steps, on_steps);
-  const auto at_time = [](const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); };
-  return {at_time(train, 0), at_time(train, 2), at_time(valid, 0), at_time(valid, d.valid_steps),
-          scene.task == Scene::Task::kCorrector ? at_time(train, 1) : at::Tensor()};
+  data.valid_start = at_time(valid, 0);
+  data.valid_end = at_time(valid, d.valid_steps);
+  return data;
 }
 
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
@@ -125,7 +147,7 @@ at::Tensor trajectories_of(const char* who, const Scene& scene, int64_t first, i
                            const OnProgress& on_progress) {
   TORCH_CHECK_VALUE(scene.trains_network(), who, ": the task trains no network and has no samples");
   TORCH_CHECK_VALUE(steps >= 0, who, ": steps must be >= 0, got ", steps);
-  return follow(scene, starts(scene).narrow(0, first, samples), steps, counted(steps * samples, on_progress));
+  return follow(scene, starts(scene, scene.data.train + scene.data.valid).narrow(0, first, samples), steps, counted(steps * samples, on_progress));
 }
 
 }  // namespace

@@ -7,47 +7,50 @@
 
 namespace prdp {
 
-/// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of
-/// sin(2πn·) and cos(2πn·) over the axes, amplitudes U(-1, 1). Shape (samples, channels, *shape), values
-/// at the grid's unknowns; the same seed gives the same series in every language.
+/// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of sin(2πn·) and cos(2πn·)
+/// over the axes, with amplitudes uniform in (-1, 1). Returns their values at the unknowns, (samples, channels,
+/// *shape). The same seed gives the same series in Python and C++.
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
-/// reference(u); raises RuntimeError where the solve does not converge.
+/// One step of the reference solver. Raises RuntimeError if its solve does not converge.
 at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
 
-/// Called while data are made with (steps of a sample done, all of them).
+/// Called while data are made, with the number of steps done and of all steps. Steps are counted per sample.
 using OnProgress = std::function<void(int64_t, int64_t)>;
 
-/// Initial states and where steps of the converged equation take them, two of them in training and
-/// data.valid_steps in validation; each (samples, channels, *shape).
+/// The samples of a scene: initial states, and the states after converged steps from them, each
+/// (samples, channels, *shape). Training samples make two steps, validation samples data.valid_steps.
 struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
-  at::Tensor train_first;  // after one step; of the task "corrector" alone
+  at::Tensor train_first;  // after one step; only for the task "corrector"
 };
-/// The data of flows in the plane, whose reference solves are iterative, take seconds to minutes: they are kept on
-/// disk (data_cache.h).
+/// Makes the samples of a scene. Flows in two dimensions take seconds to minutes, because their reference solves are
+/// iterative. Their data are kept on disk (data_cache.h).
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
-/// The same without the file on disk.
+/// The same without the cache on disk.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
-/// The validation samples and the states of `steps` steps of the converged equation from them, in all
-/// (samples, steps + 1, channels, *shape): at step data.valid_steps what `make_dataset` gives, and as far
-/// beyond as wanted. Raises ValueError for a task that trains no network, which has no samples, and for steps < 0.
+/// The training samples alone, in the train_ fields.
+Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress = {});
+
+/// The trajectories of the validation samples: `steps` converged steps, (samples, steps + 1, channels, *shape). Their
+/// state number data.valid_steps is the valid_end of make_dataset(). Raises ValueError for steps < 0, and for a task
+/// that trains no network and so has no samples.
 at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
-/// The same of all samples, the training's first.
+/// The same for all samples, the training samples first.
 at::Tensor all_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
 
-/// What the task "parameters" is about: p(x) = Σ_i θ_i sin(2πi x).
+/// The problem of the task "parameters": find the amplitudes θ of the load p(x) = Σ_i θ_i sin(2πi x).
 struct ParameterProblem {
   at::Tensor modes;      // (P, N): the sines at the unknowns
-  at::Tensor start;      // (P,): θ to begin with
+  at::Tensor start;      // (P,): θ at the beginning
   at::Tensor reference;  // (P,): θ to be found
-  at::Tensor solution;   // (1, 1, N): the exact u of the reference
+  at::Tensor solution;   // (1, 1, N): the exact u for the reference
 };
 ParameterProblem make_parameter_problem(const Scene& scene);
 
-/// The order in which an epoch goes through `samples`, from a generator seeded once per training.
+/// The order in which an epoch goes through the samples: a random permutation of 0 … samples - 1.
 at::Tensor shuffled(int64_t samples, at::Generator& generator);
 at::Generator make_generator(int64_t seed);
 

@@ -7,12 +7,12 @@
 
 namespace prdp {
 
-/// The failed samples of an interval of a training: counted, and the first of them named.
+/// The failed samples of an interval: their number, and a list of the first ones.
 class Failures {
  public:
-  /// Takes what the solves of an update say: the status (batch,), or (batch, steps) of a rollout, of every forward solve
-  /// and of every adjoint one. `samples`, int64 (batch,): the numbers of the samples among the data; 0, 1, … without.
-  /// A sample counts once, and is named with its worst status.
+  /// Adds the solves of an update: the statuses of each forward and of each adjoint solve, (batch,), or (batch, steps)
+  /// for a rollout. `samples`, int64 (batch,), are the numbers of the samples in the data set; by default 0, 1, …. A
+  /// sample counts once, and is listed with its worst status.
   void take(const std::vector<at::Tensor>& forward, const std::vector<at::Tensor>& adjoint,
             const std::optional<at::Tensor>& samples = {});
 

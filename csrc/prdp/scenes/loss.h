@@ -5,17 +5,17 @@
 
 namespace prdp {
 
-/// Mean over the batch of ‖u - reference‖² / ‖reference‖² (paper, appendix E): the loss "nmse", and
-/// the validation metric of every scene that trains a network.
+/// The mean over the batch of ‖u - reference‖² / ‖reference‖² (paper, appendix E). It is the loss "nmse", and the
+/// validation metric of every scene that trains a network.
 at::Tensor normalised_mse(const at::Tensor& u, const at::Tensor& reference);
 
-/// "nmse", or "mse", the mean over all values of (u - reference)².
+/// The loss of this kind: "nmse", as above, or "mse", the mean of (u - reference)² over all values.
 at::Tensor loss(std::string_view kind, const at::Tensor& u, const at::Tensor& reference);
 
-/// ‖u - reference‖² / (2 N) of the task "parameters".
+/// ‖u - reference‖² / (2 N), the loss of the task "parameters".
 at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference);
 
-/// ‖θ - reference‖ / ‖reference‖, the error that the task "parameters" brings down.
+/// ‖θ - reference‖ / ‖reference‖, the metric of the task "parameters".
 at::Tensor relative_error(const at::Tensor& theta, const at::Tensor& reference);
 
 }  // namespace prdp

@@ -87,7 +87,11 @@ void read_data(Section& s, Scene& scene) {
   s.whole(d.seed, 0, {"seed", "seed of the data; every training of the scene uses the same data", "", random});
   s.count(d.valid_max_iter, 1,
           {"valid_max_iter", "K of the converged solves behind the validation metric", "iterations", corrector(scene)});
-  s.whole(d.train, 1, {"train", "training samples; with `file`, trajectories"});
+  s.flag(d.fresh, {.name = "fresh",
+                   .means = "whether every epoch has new training samples, so that none is seen twice",
+                   .when = random,
+                   .optional = true});
+  s.whole(d.train, 1, {"train", "training samples, with `fresh` in each epoch; with `file`, trajectories"});
   s.whole(d.valid, 1, {"valid", "validation samples"});
   s.whole(d.valid_steps, 1,
           {"valid_steps", "validation horizon: how many steps the network makes before its error is measured",

@@ -7,8 +7,8 @@
 #include <sanitizer/tsan_interface.h>
 #endif
 
-/// How a long computation is ended from outside: Python's Ctrl-C. The loops tell how much work they do, and
-/// every now and then a check may throw, on the thread that called; what had been computed is lost.
+/// Ends a long computation from outside, for Python's Ctrl-C. The loops count their work, and from time to time run a
+/// check that may throw on the calling thread. The partial result is lost.
 namespace prdp::interruption {
 
 /// Called about ten times per second on every thread that computes; throws to end the computation. There is
@@ -16,22 +16,22 @@ namespace prdp::interruption {
 using Check = void (*)();
 void set_check(Check check);
 
-/// Thrown on the threads that help another one whose part of the work has been given up.
+/// Thrown on helper threads if another thread has given up its part of the work.
 struct Stopped {};
 
-/// A thread's count of its work since it last looked whether it is to stop.
+/// Counts the work of a thread since its last check.
 class Watch {
  public:
   static Watch& local();
 
-  /// Tells of work about to be done, in multiplications. Looks up after some 100 µs of it.
+  /// Announces work, in multiplications. Checks after some 100 µs of work.
   void spend(int64_t work) {
     left_ -= work;
     if (left_ < 0) look();
   }
-  /// Looks now.
+  /// Checks now.
   void look();
-  /// How often work of this size may be done without looking up.
+  /// How often work of this size may be done between two checks.
   static int64_t at_once(int64_t work) { return work >= kAtOnce ? 1 : kAtOnce / (work > 0 ? work : 1); }
 
   /// While it lives, this thread works on a part of something that `stop` says has been given up.

@@ -161,18 +161,24 @@ static_assert([] {
 
 constexpr const MethodTraits& traits(Method method) { return kTraits[static_cast<size_t>(method)]; }
 
-/// Calls body(row) for the row of this method; `i` is where the search begins.
+/// A row as a type, for what is decided at compile time.
+template <size_t i>
+struct MethodAt {
+  static constexpr const auto& row = std::get<i>(kMethods);
+};
+
+/// Calls body(MethodAt<…>()) for this method; `i` is where the search begins.
 template <size_t i = 0, class Body>
 auto with_row(Method method, const Body& body) {
   if constexpr (i + 1 < kTraits.size())
     if (static_cast<size_t>(method) != i) return with_row<i + 1>(method, body);
-  return body(std::get<i>(kMethods));
+  return body(MethodAt<i>());
 }
 
 /// Calls body(method object) for the method that runs in this space.
 template <IterationSpace Space, class Body>
 auto with_method(Method method, int64_t restart, Space& space, const Body& body) {
-  return with_row(method, [&](const auto& row) { return body(row.make(space, restart)); });
+  return with_row(method, [&](auto at) { return body(at.row.make(space, restart)); });
 }
 
 /// Vectors that a method keeps at most, beside b and one of scratch.

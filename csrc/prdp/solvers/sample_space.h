@@ -203,7 +203,7 @@ class SampleSpace {
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
 
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
-  static constexpr bool recording() { return false; }
+  static constexpr int derivatives() { return 0; }
   Scalar constant(Scalar value) const { return value; }
   void scale(const T* v, Scalar factor, Vector out) {
     loops_.scale(factor, v, out, length());

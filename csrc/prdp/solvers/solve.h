@@ -10,9 +10,9 @@ struct SolveResult {
   SolveInfo info;
 };
 
-/// A solve without derivatives. `caps` (int64, (batch,)) gives each sample its own max_iter. Not guarded, u
-/// is what the iterations make of b, however large: no better iterate and no zeros in its place. `x0`, like b, is
-/// where the iterations start, once it is scaled as linear_solve() says; undefined: from zero.
+/// A solve without derivatives. `caps` (int64, (batch,)) gives each sample its own max_iter. If not `guarded`, u is the
+/// last iterate of every sample, even if it diverged. `x0`, with the shape of b, is a guess that is scaled as
+/// linear_solve() describes; if undefined, the iterations start from zero.
 struct SolveRequest {
   Method method;
   int64_t max_iter;
@@ -23,45 +23,45 @@ struct SolveRequest {
   at::Tensor x0{};
 };
 
-/// A u = b by the CPU loops, or by plain tensor operations where there are none for the operator or
-/// the device. Samples do not influence each other; on the CPU loops not even in the last bit.
+/// Solves A u = b by the CPU loops, or by plain tensor operations if the operator or the device has no such loops.
+/// Samples do not influence each other; in the CPU loops not even in the last bit.
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
-/// The same in plain tensor operations: the oracle for the CPU loops, and the way of other devices.
+/// The same in plain tensor operations, for other devices and as a reference for the tests of the CPU loops.
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
-/// Samples that a thread takes, such that each has some 100 µs of work at least: below that, handing it
-/// over costs more than it saves. A cycle of GMRES counts as its products.
+/// The least number of samples per thread, such that each thread has some 100 µs of work. With less work, a second
+/// thread costs more than it saves. A cycle of GMRES counts as its products.
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart);
 
 /// u after exactly `caps` iterations of each sample, as `solver` took them on the way to its rtol, recorded
-/// by autograd where b or the tensors of `a` require it: the map whose derivative the unrolled mode takes. The
-/// start is a constant of that map.
+/// by autograd if b or the tensors of `a` require grad. The unrolled mode differentiates this map. The start is a
+/// constant.
 struct RecordedSolve {
   at::Tensor u, operator_applications;
 };
 RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::Tensor& x0, const Solver& solver,
                              const at::Tensor& caps);
 
-/// The same iteration by iteration, in plain tensor operations. Of samples with caps > 0 alone.
+/// The same one iteration at a time, in plain tensor operations. Only for samples with caps > 0.
 class StepwiseSolve {
  public:
-  /// What one iteration hands to the next, x first; empty: the start.
+  /// What one iteration needs from the one before it, x first; empty before the first.
   using State = std::vector<at::Tensor>;
 
   StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
                 const at::Tensor& caps);
-  /// What the iterations solve for, scaled: b, or what the start leaves of it.
+  /// The scaled right-hand side of the iterations: b, or b - A start.
   const at::Tensor& rhs() const { return rhs_; }
-  /// The state after iteration `done` + 1 out of the one before it. A sample past its cap stays.
+  /// The state after iteration `done` + 1, from the state before it. A sample past its cap does not change.
   State step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done);
-  /// What x adds to u, and ū to x̄: u = start + P x / scale.
+  /// P x / scale, where u = start + P x / scale. The same function takes ū to x̄.
   at::Tensor scaled_back(const Operator& a, const at::Tensor& x) const { return a.project(x) / scale_; }
-  /// The cotangent of b for that of rhs(): b̄ = P r̄ scale.
+  /// The cotangent of b from that of rhs(): b̄ = P r̄ scale.
   at::Tensor bar_of_b(const Operator& a, const at::Tensor& rhs_bar) const { return a.project(rhs_bar) * scale_; }
-  /// Undefined without one.
+  /// Where the iterations start; undefined if at zero.
   const at::Tensor& start() const { return start_; }
-  int64_t iterations() const;  // of the sample that takes most
+  int64_t iterations() const;  // the largest cap
   const std::vector<int64_t>& applications() const { return applications_; }
 
  private:
@@ -71,33 +71,33 @@ class StepwiseSolve {
   std::vector<int64_t> caps_, applications_;
 };
 
-/// Which solve is reported on.
+/// The solve that a report is about.
 struct SolveRole {
-  const OperatorSpec& a;  // the adjoint solve's is transposed
+  const OperatorSpec& a;  // transposed for an adjoint solve
   const Solver& solver;
   bool adjoint;
   at::Tensor x0{};
 };
 
-/// Raises torch.linalg.LinAlgError, warns or does nothing about failed samples: names them, the operator, the cause
-/// and the remedy (diagnosis.h).
+/// Raises c10::LinAlgError, warns or does nothing about failed samples, as `on_failure` says. The message names the
+/// samples, the operator, the cause and a remedy (diagnosis.h).
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 
-/// While it lives, what is reported on this thread is said of this step, counted from 1, of a rollout.
+/// While it exists, reports on this thread name this step of a rollout, counted from 1.
 class FailuresOfStep {
  public:
   FailuresOfStep(int64_t step, int64_t steps);
   FailuresOfStep(const FailuresOfStep&) = delete;
   ~FailuresOfStep();
-  /// The step this thread is in and their number; 0 and 0 outside of a rollout.
+  /// The step that this thread is in, and the number of steps; 0 and 0 outside of a rollout.
   static std::pair<int64_t, int64_t> now();
 
  private:
   int64_t step_before_, steps_before_;
 };
 
-/// Where warnings go; torch's own by default, which prints them on stderr.
+/// Sets where warnings go. By default torch prints them on stderr.
 using WarningSink = void (*)(const std::string& text);
 void set_warning_sink(WarningSink sink);
 

@@ -29,8 +29,8 @@ inline constexpr double kDefaultRtol = 1e-5;
 /// Products in a cycle of GMRES.
 inline constexpr int64_t kDefaultRestart = 10;
 
-/// A solver and its budget. All start from zero, unless they are given a start, and stop at the first of
-/// ‖b - A u‖ <= rtol ‖b‖ or max_iter iterations; rtol = 0 runs exactly max_iter.
+/// A solver and its limits. Each sample starts from zero or from a given start. It stops when ‖b - A u‖ <= rtol ‖b‖, or
+/// after max_iter iterations. With rtol = 0, exactly max_iter iterations run.
 struct Solver {
   Method method;
   c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
@@ -46,7 +46,7 @@ struct Jacobi {
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kJacobi, max_iter, rtol}; }
 };
-/// Jacobi's iteration accelerated by what is known of the spectrum; for Heat and Poisson.
+/// Jacobi's iteration, accelerated with the known spectrum of A; for Heat and Poisson only (Golub and Varga 1961).
 struct Chebyshev {
   int64_t max_iter;
   double rtol = kDefaultRtol;
@@ -79,27 +79,27 @@ struct GMRES {
   Preconditioner preconditioner = Preconditioner::kNone;
   operator Solver() const;
 };
-/// The cheapest exact method of the operator; an iteration is one direct solve, those after the
-/// first refine its result.
+/// The cheapest exact method of the operator. An iteration is one direct solve; those after the first refine its
+/// result.
 struct Direct {
   int64_t max_iter = 1;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kDirect, max_iter, rtol}; }
 };
 
-/// How the derivative of a solve is taken.
+/// How gradients are computed.
 enum class Backward {
-  kImplicit,  // one adjoint solve Aᵀ λ = ū with the same method; keeps u only
-  kUnrolled,  // the exact derivative of the iterations that ran
+  kImplicit,  // by one adjoint solve Aᵀ λ = ū with the same method; only u is stored
+  kUnrolled,  // as the exact derivative of the iterations that ran
   kNone,      // u carries no gradient
 };
 
-/// Where the solves of a step start: from zero, or from the state before the step as linear_solve() scales
-/// a start.
+/// Where the solves of a step start: at zero, or at the state before the step, which linear_solve()
+/// takes as x0.
 enum class Start { kZero, kState };
 
-/// What a failed sample does: raise an error, warn, or only say so in its status. kZeroGrad is kReturn without a
-/// derivative: nothing that the sample is made of gets a gradient from it, whether its solve failed or the adjoint one.
+/// What happens if a sample fails: an error, a warning, or only its status. kZeroGrad is kReturn without a gradient: b
+/// and A get none from the sample, whether its forward or its adjoint solve failed.
 enum class OnFailure { kRaise, kWarn, kReturn, kZeroGrad };
 
 /// Names as users write them; from_name raises ValueError naming the allowed ones.
@@ -113,30 +113,30 @@ Backward backward_from_name(std::string_view name);
 OnFailure on_failure_from_name(std::string_view name);
 Start start_from_name(std::string_view name);
 
-/// What a solve says of itself, one value per sample, each tensor of shape (batch,).
+/// The report of a solve: tensors of shape (batch,), with one value per sample.
 struct SolveInfo {
-  at::Tensor iterations;             // that made the returned u
+  at::Tensor iterations;             // iterations that produced the returned u
   at::Tensor residual;               // ‖b - A u‖ / ‖b‖, recomputed from u
   at::Tensor status;                 // SolveStatus
-  at::Tensor operator_applications;  // products with A, all told
+  at::Tensor operator_applications;  // number of products with A
 };
 
-/// For checkpoint_every: ⌈√K⌉, K being the iterations that ran.
+/// A value of checkpoint_every that stands for ⌈√K⌉, where K is the number of iterations that ran.
 inline constexpr int64_t kCheckpointSqrt = -1;
 
-/// Everything about a solve but the operator and b.
+/// All settings of a differentiable solve.
 struct SolveOptions {
   Solver solver;
   Backward backward = Backward::kImplicit;
-  std::optional<c10::SymInt> adjoint_max_iter{};  // the primal's where not given
+  std::optional<c10::SymInt> adjoint_max_iter{};  // by default those of the solver
   std::optional<double> adjoint_rtol{};
   OnFailure on_failure = OnFailure::kRaise;
-  int64_t adjoint_log = 0;  // where the adjoint solve leaves its SolveInfo (adjoint_log.h); 0: nowhere
-  /// Unrolled mode keeps every so many iterates and runs those between again; 0: keeps all.
+  int64_t adjoint_log = 0;  // the log that gets the report of the adjoint solve (adjoint_log.h); 0: none
+  /// With n > 0, unrolled mode stores every n-th iterate and recomputes the others; 0 stores all.
   int64_t checkpoint_every = 0;
-  Start start = Start::kZero;  // of steps and rollouts; linear_solve() itself takes x0
+  Start start = Start::kZero;  // only for steps and rollouts; linear_solve() has the argument x0
 
-  /// Raises ValueError for a budget, tolerance or interval out of range, naming it.
+  /// Raises ValueError, in the name of `who`, for a setting out of range.
   void check(const char* who) const;
 };
 

@@ -127,8 +127,8 @@ concept KrylovSpace = VectorSpace<S> && requires(S s, typename S::Vector x, type
   { s.all_exhausted(a) } -> std::same_as<bool>;
   /// a itself; its derivative is that of a constant.
   { s.constant(a) } -> std::same_as<typename S::Scalar>;
-  /// Whether the operations are recorded to be differentiated.
-  { s.recording() } -> std::same_as<bool>;
+  /// How often the operations are recorded to be differentiated.
+  { s.derivatives() } -> std::same_as<int>;
   /// Whether the samples have a start.
   { s.started() } -> std::same_as<bool>;
 };

@@ -5,17 +5,17 @@
 
 namespace prdp {
 
-/// Why a solve stopped, one value per sample. Positive: the system is solved. The first reason wins.
+/// Why the solve of a sample stopped. Positive: the system is solved. Of several reasons, the first one is reported.
 enum class SolveStatus : int64_t {
-  kConverged = 1,            // the true residual b - A u is <= rtol ‖b‖
-  kConvergedBreakdown = 2,   // happy breakdown: the Krylov space holds the solution
-  kMaxIter = -1,             // max_iter iterations done, finite, above rtol: normal life for PRDP
-  kStagnated = -2,           // rtol lies below what the dtype can reach, or no progress any more
-  kDiverged = -3,            // residual beyond 1e13 ‖b‖
-  kOverflow = -4,            // a non-finite number arose from finite input
-  kBreakdown = -5,           // no search direction left: r·Ar = 0, or a singular matrix
-  kZeroDiagonal = -6,        // Jacobi on an operator with a zero on its diagonal
-  kInconsistent = -7,        // b lies outside the range of a singular operator
+  kConverged = 1,            // the recomputed residual satisfies ‖b - A u‖ <= rtol ‖b‖
+  kConvergedBreakdown = 2,   // the Krylov space contains the solution
+  kMaxIter = -1,             // max_iter iterations were done; u is finite. PRDP stops here by design
+  kStagnated = -2,           // no further progress, for example because the dtype cannot reach rtol
+  kDiverged = -3,            // the residual exceeded 1e13 ‖b‖
+  kOverflow = -4,            // finite input gave a number outside the range of the dtype
+  kBreakdown = -5,           // the method cannot continue: r·Ar = 0, or a singular matrix
+  kZeroDiagonal = -6,        // the method divides by the diagonal, which has a zero
+  kInconsistent = -7,        // A is singular, and b is not in its range
   kNonfiniteInput = -8,      // NaN or Inf in b or in the start
   kNonfiniteOperator = -9,   // NaN or Inf in A
 };
@@ -25,15 +25,15 @@ struct StatusText {
   const char* name;  // "MAX_ITER"
 };
 
-/// Every status with its name, in falling order of value.
+/// All statuses with their names, from the largest value to the smallest.
 const std::vector<StatusText>& solve_statuses();
 const char* name(SolveStatus status);
 
-/// A failure raises by default; MAX_ITER and STAGNATED hand out a usable iterate and do not.
+/// Whether the sample failed, which raises an error by default. After MAX_ITER and STAGNATED the iterate is usable.
 inline bool is_failure(SolveStatus status) {
   return static_cast<int64_t>(status) < static_cast<int64_t>(SolveStatus::kStagnated);
 }
-/// Nothing was iterated: u is zero and carries no gradient.
+/// Whether the input was refused before any iteration: u is zero and carries no gradient.
 inline bool is_refused(SolveStatus status) {
   return status == SolveStatus::kZeroDiagonal || status == SolveStatus::kNonfiniteInput ||
          status == SolveStatus::kNonfiniteOperator;

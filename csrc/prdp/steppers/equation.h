@@ -3,15 +3,15 @@
 
 namespace prdp {
 
-/// A discretised equation, flat like an OperatorSpec: its state u gives the linear system
-/// A(u) u_next = b(u). `kind` is "poisson", "heat", "burgers" or "navier_stokes"; `tensors` are those
-/// of the operator that are not the state.
+/// A discretised equation as plain numbers and tensors, like an OperatorSpec. At a state u it gives the linear system
+/// A(u) u_next = b(u). `kind` is "poisson", "heat", "burgers" or "navier_stokes". `tensors` are those of the operator
+/// without the state.
 struct Equation {
   std::string kind;
   std::vector<int64_t> shape;
   std::vector<double> parameters;
   std::vector<at::Tensor> tensors;
-  int64_t picard_steps = 1;  // solves a step, each linearised about the last one's solution
+  int64_t picard_steps = 1;  // solves per step, each linearised about the solution of the one before
 
   /// Raises ValueError or TypeError for a bad shape or parameter.
   void check() const;
@@ -20,14 +20,14 @@ struct Equation {
 /// Whether A depends on the state.
 bool is_flow(const Equation& equation);
 
-/// The system's operator A(u) and right-hand side b(u) at the state u, both differentiable in u.
+/// The operator A(u) and the right-hand side b(u) at the state u, both differentiable in u.
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u);
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
-/// ū for b̄: b is linear in u, and this is its transpose.
+/// The cotangent of u from that of b. b is linear in u, and this is its transpose.
 at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar);
 
-/// One step u → u_next; both (batch, channel, *shape). Also the torch op prdp::step. Its solves start as
-/// options.start says, those of later Picard steps from the last solution. Over several Picard steps the info counts all iterations and holds the worst status; its residual is the last.
+/// One step u → u_next, both (batch, channel, *shape). Also the torch op prdp::step. With Start::kState, later Picard
+/// steps start from the last solution. The info has all their iterations, the worst status and the last residual.
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options);
 
 }  // namespace prdp

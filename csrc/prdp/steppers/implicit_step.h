@@ -6,9 +6,9 @@
 
 namespace prdp {
 
-/// A step of an equation of your own: solves A(u) u_next = b(u) for any operator, with all that the built-in
-/// steppers have. The state u is (batch, …), as the vectors of the operator; gradients reach u and whatever
-/// tensors A(u) and b(u) are made of.
+/// A step of your own equation: it solves A(u) u_next = b(u) for any operator and does all that the built-in steppers
+/// do. The state u has the shape of the operator's vectors, (batch, …). Gradients reach u and all tensors that A(u) and
+/// b(u) are made of.
 ///
 ///   auto allen_cahn = prdp::ImplicitStep(
 ///       prdp::OperatorSpec{"heat", {30}, {dt}, {nu}},
@@ -18,17 +18,17 @@ class ImplicitStep : public Solving {
   using OperatorAt = std::function<OperatorSpec(const at::Tensor& u)>;
   using RhsAt = std::function<at::Tensor(const at::Tensor& u)>;
 
-  /// A and b at a state; without an `rhs` (nullptr), b(u) = u. Raises ValueError for a missing operator or
-  /// options out of range.
+  /// A and b as functions of the state; without an `rhs` (nullptr), b(u) = u. Raises ValueError for a missing operator
+  /// or options out of range.
   ImplicitStep(OperatorAt a, RhsAt rhs, SolveOptions options);
   ImplicitStep(OperatorAt a, RhsAt rhs, Solver solver, Backward backward = Backward::kImplicit);
   /// One operator for all states.
   ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward backward = Backward::kImplicit);
 
-  /// Raises ValueError or TypeError where A(u), b(u) and u do not fit each other, before any work.
+  /// Raises ValueError or TypeError, before any work, if A(u), b(u) and u do not fit each other.
   at::Tensor operator()(const at::Tensor& u);
-  /// The states of `steps` steps, u included: (batch, steps + 1, …); info() and adjoint_info() then hold
-  /// tensors (batch, steps). A failure says in which step. One node of autograd per step.
+  /// Repeats the step. Returns all states, u included: (batch, steps + 1, …). info() and adjoint_info() then hold
+  /// tensors (batch, steps). If a step fails, the error gives its number. Each step is one node of autograd.
   at::Tensor rollout(const at::Tensor& u, int64_t steps);
 
   OperatorSpec operator_at(const at::Tensor& u) const { return operator_(u); }

@@ -6,19 +6,19 @@
 
 namespace prdp {
 
-/// SolveInfo of the solves of a rollout, one after the other.
+/// Collects the reports of the solves of a rollout, one after the other.
 class Reports {
  public:
   void push(const SolveInfo& info);
   void reverse();
-  /// Tensors (batch, solves); `u` tells the batch and the dtype where there are none.
+  /// Tensors (batch, solves). If there are none, `u` gives the batch and the dtype.
   SolveInfo joined(const at::Tensor& u) const;
 
  private:
   std::vector<at::Tensor> iterations_, residual_, status_, applications_;
 };
 
-/// What the solves of a rollout keep for their derivative; undefined where it is not wanted.
+/// What the solves of a rollout store for their derivative; undefined if it is not needed.
 struct KeptSolves {
   at::Tensor solutions, iterations, status, residual;  // (batch, solves (+ 1), …)
 };

@@ -8,36 +8,36 @@
 
 namespace prdp {
 
-/// A log of adjoint solves (adjoint_log.h), closed with its last owner.
+/// A log of adjoint solves (adjoint_log.h). It is closed when its last owner goes.
 using AdjointLog = std::shared_ptr<const int64_t>;
 AdjointLog open_adjoint_log();
 
-/// What the adjoint solves of a row of steps left in one log each, as tensors (batch, steps); nothing before
-/// any. A step on which the loss does not depend had none: it counts as solved in no iterations.
+/// The reports of the adjoint solves of consecutive steps, each with its own log, as tensors (batch, steps); nothing
+/// before the first backward pass. A step that the loss does not depend on counts as solved in 0 iterations.
 std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs);
 
-/// What linear_solve() takes for x0 in a step from `state`; undefined: nothing.
+/// The x0 of linear_solve() in a step from `state`; undefined if the solves start from zero.
 inline at::Tensor start_of_step(const SolveOptions& options, const at::Tensor& state) {
   return options.start == Start::kState ? state : at::Tensor();
 }
 
-/// What every stepper has: the options of its solves and their reports. Copies share the adjoint reports.
+/// The base of all steppers: the options of its solves, and their reports. Copies share the adjoint reports.
 class Solving {
  public:
-  /// K, the budget of the primal solve, and of the adjoint one unless it has its own.
+  /// K >= 0 (else ValueError), for the forward solve, and for the adjoint one unless options().adjoint_max_iter is set.
   int64_t max_iter() const { return options_.solver.max_iter.expect_int(); }
   void set_max_iter(int64_t k);
   SolveOptions& options() { return options_; }
 
-  /// Of the last step; nothing before the first.
+  /// The report of the last step or rollout; nothing before the first.
   const std::optional<SolveInfo>& info() const { return info_; }
-  /// Of the last adjoint solve; nothing before the first backward pass in implicit mode.
+  /// The report of the last backward pass; nothing before the first.
   std::optional<SolveInfo> adjoint_info() const;
-  /// Whether every sample of the last step, and of its adjoint solve where there was one, met rtol.
+  /// Whether all samples met the tolerance, in the last step and in its adjoint solve if there was one.
   bool converged() const;
 
  protected:
-  /// Raises ValueError for options out of range, in the name of `who`.
+  /// Raises ValueError, in the name of `who`, for options out of range.
   Solving(std::string who, SolveOptions options);
 
   std::string who_;

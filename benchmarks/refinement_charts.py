@@ -1,0 +1,87 @@
+"""`python -m benchmarks.refinement_charts`: the pictures of docs/refinement.md, from the records in docs/results."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+ROWS = {  # label: title, colour, marker
+    "converged": ("converged", "#222222", "*"),
+    "prdp": ("PRDP, tuned", "#d62728", "o"),
+    "prdp_defaults": ("PRDP, defaults", "#ff9f1c", "v"),
+    "tolerance": ("tolerance", "#7f7f7f", "s"),
+    "tolerance_adjoint": ("tolerance, adjoint looser", "#2ca02c", "D"),
+    "auto": ("auto", "#1f77b4", "P"),
+}
+FOLLOWED = ("heat_1d", "burgers_2d", "diffusion_inverse")
+
+
+def summaries():
+    """The records by scene."""
+    paths = sorted(RESULTS.glob("refinement_*.json"))
+    return {path.stem.removeprefix("refinement_"): json.loads(path.read_text()) for path in paths}
+
+
+def error_against_cost(found):
+    """Every scene in one picture: error, products and seconds as ratios to the converged row's."""
+    figure = Figure(figsize=(9.2, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, cost in zip(panels, ("operator_applications", "seconds"), strict=True):
+        for label, (title, colour, marker) in ROWS.items():
+            points = [_ratios(summary, label, cost) for summary in found.values()]
+            if label == "converged":
+                points = points[:1]
+            axes.scatter(*zip(*points, strict=True), color=colour, marker=marker, s=36, label=title, alpha=0.8, lw=0)
+        axes.set(xscale="log", yscale="log")
+        axes.axhspan(0.0, 1.1, color="#e8f4e8", zorder=0, lw=0)
+        axes.grid(alpha=0.3, lw=0.4)
+        axes.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0]))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
+    panels[0].set(xlabel="products with A, converged = 1", ylabel="error, converged = 1")
+    panels[1].set(xlabel="seconds, converged = 1")
+    panels[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(f"{len(found)} scenes: error against work. Green: at most a tenth above the converged error")
+    return figure
+
+
+def _ratios(summary, label, cost):
+    base = summary["rows"][0]
+    row = next(row for row in summary["rows"] if row["label"] == label)
+    return row[cost] / base[cost], row["metric"] / base["metric"]
+
+
+def over_the_training(found):
+    """Iterations of a solve, and the tolerance, interval by interval."""
+    figure = Figure(figsize=(9.2, 5.0), layout="constrained")
+    panels = figure.subplots(2, len(FOLLOWED), sharex="col", squeeze=False)
+    for (above, below), name in zip(panels.T, FOLLOWED, strict=True):
+        for label in ("converged", "prdp", "auto"):
+            title, colour, _ = ROWS[label]
+            curves = found[name]["curves"][label]
+            intervals = np.arange(1, 1 + len(curves["rtol"]))
+            above.plot(intervals, curves["iterations"], color=colour, label=title)
+            below.plot(intervals, curves["rtol"], color=colour, label=title)
+        above.set(title=name, yscale="log")
+        below.set(yscale="log", xlabel=found[name]["settings"].get("unit", "interval"))
+        for axes in (above, below):
+            axes.grid(alpha=0.3, lw=0.4)
+        above.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        above.yaxis.set_minor_formatter(FuncFormatter(lambda x, _: ""))
+    panels[0, 0].set_ylabel("iterations of a solve")
+    panels[1, 0].set_ylabel("rtol of the forward solves")
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main():
+    found = summaries()
+    error_against_cost(found).savefig(RESULTS / "refinement.png", dpi=110)
+    over_the_training(found).savefig(RESULTS / "refinement_training.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
