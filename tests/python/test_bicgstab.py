@@ -1,13 +1,22 @@
 """BiCGStab, against the textbook and dense LAPACK."""
 
+import json
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from helpers import dense_burgers, dense_heat, field, spd_matrices, statuses
+from helpers import dense_burgers, dense_heat, field, spd_matrices, statuses, written
 from torch.autograd import gradcheck, gradgradcheck
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
+from prdp_torch.experiments import scenes
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
+
+TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script")
 CSR_WARNS = pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
@@ -248,3 +257,15 @@ def test_transforms_and_compilation(backward):
         exact = prdp.Burgers((6,), 2e-2, 0.2, prdp.BiCGStab(40, rtol=1e-13))
         difference = (exact(u + 1e-6 * v) - exact(u - 1e-6 * v)).detach() / 2e-6
         torch.testing.assert_close(torch.func.jvp(exact, (u,), (v,))[1], difference, rtol=1e-6, atol=1e-8)
+
+
+def test_both_trainers_take_it(tmp_path):
+    path = written(tmp_path, ('method = "jacobi"', 'method = "bicgstab"'))
+    command = [TRAINER, path, "--out", tmp_path / "cpp", "--constant", "4", "--intervals", "2"]
+    subprocess.run(command, check=True, capture_output=True)
+    cpp = json.loads(next((tmp_path / "cpp").glob("*/seed_0.json")).read_text())["curves"]
+    scene = scenes.load(path)
+    scene.training.intervals = 2
+    python = train(scene, Refinement.constant(4))
+    np.testing.assert_allclose(cpp["metric"], python["metric"], rtol=1e-4)
+    assert cpp["budget"] == python["budget"] and python["metric"][-1] < python["metric"][0]
