@@ -5,20 +5,13 @@
 #include <cmath>
 #include <iomanip>
 #include <limits>
-#include <map>
 #include <sstream>
+
+#include "prdp/operators/kinds.h"
 
 namespace prdp {
 
 namespace {
-
-std::string name_of(const OperatorSpec& a) {
-  static const std::map<std::string, std::string> names{
-      {"poisson", "Poisson"}, {"heat", "Heat"},        {"burgers", "Burgers"}, {"navier_stokes", "NavierStokes"},
-      {"stencil", "Stencil"}, {"function", "Function"}, {"dense", "Matrix"},    {"csr", "Matrix"}};
-  const auto found = names.find(a.kind);
-  return found == names.end() ? a.kind : found->second;
-}
 
 std::string name_of(const Solver& solver) {
   const auto gmres = "GMRES(" + std::to_string(solver.restart) + ")";
@@ -91,7 +84,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 }
 
 std::string zero_diagonal(const SolveRole& role) {
-  const std::string why = role.a.kind == "navier_stokes" ? "the pressure rows have a zero diagonal"
+  const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
                                                           : "it divides by the diagonal of A, which has a zero there";
   return why + (role.solver.method == Method::kGmresDiagonal ? "; take GMRES without it" : "; take GMRES");
 }
@@ -99,7 +92,7 @@ std::string zero_diagonal(const SolveRole& role) {
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
-  if (role.a.kind != "navier_stokes") return share + "b lie in the null space of A; take a b without that part";
+  if (!operator_kind(role.a.kind).has_pressure) return share + "b lie in the null space of A; take a b without that part";
   if (role.adjoint)
     return share + "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
                    "pressure that the loss is made of";
@@ -128,7 +121,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();
-  return name_of(role.solver) + " on " + name_of(role.a) + ": " + why;
+  return name_of(role.solver) + " on " + operator_kind(role.a.kind).title + ": " + why;
 }
 
 }  // namespace prdp
