@@ -71,8 +71,12 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
 
 std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
   const bool single = b.scalar_type() == at::kFloat;
-  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (‖A‖ is " +
-         number(value_of_sample(a.norm(), sample)) + ", ‖b‖ is " + number(norm_of(b.select(0, sample))) + "); " +
+  const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
+  const bool known = norm > 0.0;  // not of a function
+  if (!known && !a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>())
+    return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
+  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
+         (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " + (std::isinf(norm_b) ? "above 1.8e+308" : number(norm_b)) + "); " +
          (single ? "take float64, or scale A and b" : "scale A and b");
 }
 
