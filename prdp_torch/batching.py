@@ -10,7 +10,6 @@ from torch.utils._pytree import tree_map
 from prdp_torch import _C
 
 
-
 @torch.library.register_vmap("prdp::linear_solve")
 def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
     size, op = info.batch_size, torch.ops.prdp.linear_solve
