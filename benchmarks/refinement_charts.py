@@ -31,14 +31,14 @@ def error_against_cost(found):
     panels = figure.subplots(1, 2, sharey=True)
     for axes, cost in zip(panels, ("operator_applications", "seconds"), strict=True):
         for label, (title, colour, marker) in ROWS.items():
-            points = [_ratios(summary, label, cost) for summary in found.values()]
+            points = [point for summary in found.values() if (point := _ratios(summary, label, cost))]
             if label == "converged":
                 points = points[:1]
             axes.scatter(*zip(*points, strict=True), color=colour, marker=marker, s=36, label=title, alpha=0.8, lw=0)
         axes.set(xscale="log", yscale="log")
         axes.axhspan(0.0, 1.1, color="#e8f4e8", zorder=0, lw=0)
         axes.grid(alpha=0.3, lw=0.4)
-        axes.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0]))
+        axes.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 4.0]))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
         axes.xaxis.set_minor_locator(NullLocator())
     panels[0].set(xlabel="products with A, converged = 1", ylabel="error, converged = 1")
@@ -51,6 +51,8 @@ def error_against_cost(found):
 def _ratios(summary, label, cost):
     base = summary["rows"][0]
     row = next(row for row in summary["rows"] if row["label"] == label)
+    if row["diverged"]:
+        return None
     return row[cost] / base[cost], row["metric"] / base["metric"]
 
 

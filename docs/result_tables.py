@@ -3,11 +3,14 @@
 Run it after new records: python docs/result_tables.py
 """
 
+import importlib
 import json
 import re
+import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))  # for the tables of benchmarks/studies
 PAGES = (DOCS.parent / "README.md", DOCS / "refinement.md", DOCS / "results.md")
 TABLE = re.compile(r"^(<!-- docs/result_tables.py writes ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)
 
@@ -27,6 +30,8 @@ def rows(name):
 def error(row):
     """The error at the end, or after how many updates the target was reached."""
     warns = ", warns" if row.get("warnings") else ""
+    if row["diverged"]:
+        return f"{row['diverged']} of {row['seeds']} diverged{warns}"
     if row["reaches_target"]:
         return f"after {row['intervals']:.0f} updates{warns}"
     missed = ", not reached" if row["reaches_target"] is False else ""
@@ -92,7 +97,7 @@ def comparison(name):
 def _saved(row):
     if row["kind"] in ("converged", "direct"):
         return "–"
-    return f"{row['products_saved']:.1%}".replace("%", " %") if row["as_good"] and not row["warnings"] else "fails"
+    return _percent(row["products_saved"], 1) if row["as_good"] else "fails"
 
 
 def readme():
@@ -109,16 +114,69 @@ def readme():
     return _table(["scene", "", "error", "products saved", "time saved"], body)
 
 
-def _percent(share):
-    return f"{100 * share:.0f} %"
+def _percent(share, digits=0):
+    return f"{100 * share:.{digits}f} %".replace("-", "−")
 
 
-TABLES = {"the parts of auto": parts_of_auto, "the shares of auto": shares_of_auto, "the README's table": readme}
+# scene: its name and section in results.md; the paper's share of iterations saved, and errors of the converged solver
+# and of PRDP.
+PAPER = {
+    "heat_1d": ("[Heat 1D](#heat-1d-an-emulator)", "79 %", "2.1e-02 ± 3.9e-03", "2.1e-02 ± 3.8e-03"),
+    "heat_2d": ("[Heat 2D](#heat-2d-and-3d-emulators)", "86 %", "1.4e-02 ± 8e-04", "1.1e-02 ± 6e-04"),
+    "burgers_1d": ("[Burgers 1D](#burgers-1d-an-emulator)", "59 %", "5.5e-02 ± 1.4e-02", "6.2e-02 ± 2.1e-02"),
+    "navier_stokes": ("[Navier–Stokes](#navier-stokes-a-corrector)", "81 %", "6e-03 ± 5e-04", "7e-03 ± 4e-04"),
+    "poisson_1p_implicit": ("[Poisson, one parameter](#poisson-one-parameter)", "33 %", "", ""),
+    "poisson_3p_implicit": ("[Poisson, three parameters](#poisson-three-parameters)", "48 %", "", ""),
+    "poisson_3p_sd_implicit": ("the same with steepest descent", "43 %", "", ""),
+}
+
+
+def beside_the_paper():
+    """Of every scene that the paper has."""
+    body = []
+    for name, (title, saved, converged, prdp) in PAPER.items():
+        base, ours = record(name)["rows"][0], rows(name)["prdp"]
+        seeds = str(record(name)["seeds"])
+        body.append([title, seeds, _percent(ours["saved"], 1), saved, error(base), converged, error(ours), prdp])
+    head = ["scene", "seeds", "PRDP saves", "paper", "error, converged", "paper", "error, PRDP", "paper"]
+    return _table(head, body)
+
+
+def three_parameters():
+    """Poisson with three parameters: two solvers, two kinds of gradient."""
+    body = []
+    for name, title in (("poisson_3p", "Jacobi"), ("poisson_3p_sd", "steepest descent")):
+        for backward in ("implicit", "unrolled"):
+            found = rows(f"{name}_{backward}")
+            base, prdp, auto, direct = (found[label] for label in ("converged", "prdp", "auto", "direct"))
+            ours = error(prdp), f"{prdp['budget']:,.0f}", _percent(prdp["saved"], 1)
+            body.append(
+                [f"{title}, {backward}", error(base), f"{base['budget']:,.0f}", *ours, error(auto), error(direct)]
+            )
+    head = ["", "converged: error", "iterations", "PRDP: error", "iterations", "saved", "auto: error", "direct: error"]
+    return _table(head, body)
+
+
+TABLES = {
+    "the parts of auto": parts_of_auto,
+    "the shares of auto": shares_of_auto,
+    "the README's table": readme,
+    "the scenes beside the paper": beside_the_paper,
+    "three parameters": three_parameters,
+}
+
+
+def study(name):
+    """The table that the study itself makes."""
+    module = importlib.import_module(f"benchmarks.studies.{name}")
+    return module.table(record(f"studies/{name}")["rows"]) + "\n"
 
 
 def table(name):
-    kind, _, scene = name.partition(" of ")
-    return comparison(scene) if kind == "the comparison" else TABLES[name]()
+    kind, _, what = name.partition(" of ")
+    if kind in ("the comparison", "the study"):
+        return (comparison if kind == "the comparison" else study)(what)
+    return TABLES[name]()
 
 
 def with_tables(page):

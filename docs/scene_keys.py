@@ -18,7 +18,8 @@ def table(name):
     for key in _C.scene_keys():
         if (key["table"] or "the top level") == name:
             meaning = key["means"] + (f" ({key['when']})" if key["when"] else "")
-            cells = f"`{key['name']}`", key["value"], key["unit"], key["default"] or "", meaning
+            value = re.sub("(>=?) ", r"\1&nbsp;", key["value"])
+            cells = f"`{key['name']}`", value, key["unit"], key["default"] or "", meaning
             rows.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
 

@@ -150,9 +150,10 @@ void bind_scenes(py::module_& m) {
              const auto state = c.read();
              return state ? std::optional<py::bytes>(*state) : std::nullopt;
            })
+      .def("read_before", [](Checkpoint& c) { return py::bytes(c.read_before()); })
       .def_property_readonly("notice", &Checkpoint::notice)
-      .def("remove_before", &Checkpoint::remove_before, py::arg("record"))
       .def("refuse", &Checkpoint::refuse)
+      .def("remove_before", &Checkpoint::remove_before, py::arg("record"))
       .def("check_length", &Checkpoint::check_length, py::arg("done"), py::arg("intervals"))
       .def("remove", &Checkpoint::remove);
 

@@ -132,15 +132,24 @@ class Run {
   }
 
   void restore(const Task& task) {
-    try {
-      const auto tensors = unpack(*saved_);
-      task.load(tensors);
-      load(tensors, curves_, *controller_);
-    } catch (const c10::Error&) {
-      checkpoint_.refuse();
+    if (!loads(task, *saved_)) {
+      if (!loads(task, checkpoint_.read_before())) checkpoint_.refuse();
+      std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint_.notice().c_str());
     }
     checkpoint_.check_length(done(), intervals_);
     take_budget();
+  }
+
+  /// Whether the state is one of this training. Where it is not, some of it may have been taken.
+  bool loads(const Task& task, const std::string& state) {
+    try {
+      const auto tensors = unpack(state);
+      task.load(tensors);
+      load(tensors, curves_, *controller_);
+      return true;
+    } catch (const c10::Error&) {
+      return false;
+    }
   }
 
   void run_interval(const Task& task, int64_t done) {

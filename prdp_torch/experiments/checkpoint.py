@@ -9,6 +9,9 @@ import torch
 
 from prdp_torch import _C, processes
 
+# What torch.load raises.
+_DAMAGED = (RuntimeError, EOFError, pickle.UnpicklingError)
+
 
 class Checkpoint(_C.Checkpoint):
     """The checkpoint file of one training.
@@ -40,11 +43,25 @@ class Checkpoint(_C.Checkpoint):
         """Return the state that was saved last, or None if there is none with these settings. If the file is damaged,
         warn and return the state before it. ValueError if there is none before it either."""
         content = processes.from_first(self.read)
+        if content is None:
+            state = None
+        else:
+            try:
+                state = _unpacked(content)
+            except _DAMAGED:
+                state = self.load_before()
         if self.notice:
             warnings.warn(self.notice, stacklevel=3)
-        if content is None:
-            return None
+        return state
+
+    def load_before(self):
+        """Return the state before the one that `load` has returned, for a trainer that can make no sense of that;
+        `notice` then says so. ValueError if there is none."""
         try:
-            return torch.load(io.BytesIO(content), weights_only=True)  # tensors and plain values; no code is run
-        except (RuntimeError, EOFError, pickle.UnpicklingError):
+            return _unpacked(processes.from_first(self.read_before))
+        except _DAMAGED:
             self.refuse()
+
+
+def _unpacked(content):
+    return torch.load(io.BytesIO(content), weights_only=True)  # tensors and plain values; no code is run

@@ -26,29 +26,30 @@ def columns(scene):
     unit = f"{scene.unit}s"
     reached = []
     if target is not None:
-        reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts whole."))
+        reached.append(Column(unit, unit + until, f"{unit}:{until}; a run that misses it counts in full."))
     return [
-        Column("", "", "Converged: K_ε, the K that the scene takes for converged. !: the controller warns, see below."),
+        Column("", "", "Converged: K_ε, the K of the scene's converged solver. !: the controller warns, see below."),
         Column(
             "error", f"final {error}", "" if scene.task == "parameters" else "± one standard deviation over the seeds."
         ),
-        Column("last K", "last K", "last K: of auto and rtol, what their last solves took."),
+        Column("last K", "last K", "last K: for auto and rtol, the iterations of their last solves."),
         *reached,
         Column(
             "", f"iterations allowed{until}", f"Iterations allowed: K summed over the solves{until}, the paper's count."
         ),
         Column("", "of these saved"),
-        Column("", "iterations taken", "Fewer are taken where a solve meets its tolerance before K."),
+        Column("", "iterations taken", "A solve that meets its tolerance takes fewer than K."),
         Column("forward", "forward products"),
         Column(
             "adjoint",
             "adjoint products",
-            "forward, adjoint: products with A of the solves; like the iterations, per sample of a batch.",
+            "forward, adjoint: products with A in the solves. They and the iterations are per sample of a batch.",
         ),
         Column(
             "saved",
             "products saved",
-            "saved: of the converged run's products, where the error is as good: within its spread, or a tenth.",
+            "saved: share of the converged run's products, given only if the error is at most one standard deviation, "
+            "or a tenth, above that of the converged run.",
         ),
         Column("s", "seconds of training"),
     ]
@@ -111,7 +112,7 @@ def failures(scene, table):
         goal = f"the error of {_short(scene, table[0])}"
         if table[0]["reaches_target"]:
             goal = f"an error of {scene.compare.target:g}"
-        said.append(f"Do not reach {goal}: {', '.join(worse)}.")
+        said.append(f"Do not reach {goal}: {'; '.join(worse)}.")
     for entry in table:
         if entry["warning"] and entry["kind"] != "constant":
             count = f", {entry['warnings']} of {entry['seeds']} seeds" if entry["seeds"] > 1 else ""

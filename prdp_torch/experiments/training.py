@@ -5,6 +5,7 @@ import functools
 import math
 import sys
 import time
+import warnings
 from typing import NamedTuple
 
 import torch
@@ -185,15 +186,26 @@ class _Run:
         self.checkpoint.save({**state, "random": torch.get_rng_state()})
 
     def _restore(self, task, saved):
+        if not self._loads(task, saved):
+            if not self._loads(task, self.checkpoint.load_before()):
+                self.checkpoint.refuse()
+            if processes.is_first():
+                warnings.warn(self.checkpoint.notice, stacklevel=4)
+        self.checkpoint.check_length(self._done(), self.intervals)
+
+    def _loads(self, task, saved):
+        """Whether the state is one of this training. Where it is not, some of it may have been taken."""
         try:
             task.load(saved["task"])
             self.controller.load_state_dict(saved["controller"])
             torch.set_rng_state(saved["random"])
-            self.curves = saved["curves"]
-            done = self._done()
-        except (RuntimeError, KeyError, TypeError, ValueError):
-            self.checkpoint.refuse()
-        self.checkpoint.check_length(done, self.intervals)
+            curves = saved["curves"]
+            whole = curves.keys() == self.curves.keys() and len(curves["metric"]) == len(curves["seconds"]) + 1
+        except (RuntimeError, KeyError, TypeError, ValueError, AttributeError):
+            return False
+        if whole:
+            self.curves = curves
+        return whole
 
     def _run_interval(self, task, number):
         k, rtol = self.controller.max_iter, self.steppers[0].rtol

@@ -1,8 +1,8 @@
 """Trainings that are killed at random moments, and must end as those that were left alone, bit for bit.
 
-    python tests/python/kills.py --kills 100
+    python tests/python/kills.py --kills 100 --out docs/stability/kills.json
 
-kills each trainer so many times in each task, and prints a table. test_kills.py does so a few times.
+kills each trainer so many times in each task, prints a table and keeps it. test_kills.py does so a few times.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -153,18 +153,23 @@ def main():
     parser.add_argument("--kills", type=int, default=100, help="of each trainer in each task")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--trainers", nargs="+", choices=TRAINERS, default=TRAINERS)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--out", type=Path, help="a file for the record, in JSON")
     given = parser.parse_args()
+    record = {**records.environment(), "seed": given.seed, "rows": []}
     print("| trainer | task | kills | with files | trainings | lost | damaged files |\n|---|---|---|---|---|---|---|")
-    bad = 0
     with tempfile.TemporaryDirectory() as folder:
         for trainer in given.trainers:
-            for task in TASKS:
+            for task in given.tasks:
                 dice = random.Random(f"{given.seed} {trainer} {task}")
-                c = kill(trainer, task, given.kills, Path(folder) / f"{trainer}_{task}", dice)
-                cells = (trainer, task, c.kills, c.in_training, c.runs, c.lost, c.damaged)
-                print("|", " | ".join(map(str, cells)), "|", flush=True)
-                bad += c.lost + c.damaged
-    return 1 if bad else 0
+                started = time.monotonic()
+                count = asdict(kill(trainer, task, given.kills, Path(folder) / f"{trainer}_{task}", dice))
+                print("|", " | ".join(map(str, (trainer, task, *count.values()))), "|", flush=True)
+                seconds = round(time.monotonic() - started, 1)
+                record["rows"].append({"trainer": trainer, "task": task, **count, "seconds": seconds})
+                if given.out:
+                    records.write(given.out, record)
+    return 1 if any(row["lost"] or row["damaged"] for row in record["rows"]) else 0
 
 
 if __name__ == "__main__":

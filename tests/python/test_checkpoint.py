@@ -12,7 +12,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 import torch
-from helpers import small_field, tiny, written
+from helpers import reseal, small_field, tiny, written
 
 import prdp_torch as prdp
 from prdp_torch.experiments import compare, records, scenes
@@ -158,6 +158,54 @@ def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp
     curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
     assert without_seconds(curves) == without_seconds(alone)
     assert [path.name for path in record.parent.iterdir()] == ["seed_0.json"]
+
+
+def without_a_part(trainer, content):
+    """A state that lacks what is loaded last."""
+    state = torch.load(io.BytesIO(content), weights_only=True)
+    if trainer == "python":
+        del state["curves"]["failed"]
+    else:
+        last = state.index("history_residual")
+        state = (*state[:last], *state[last + 2 :])
+    changed = io.BytesIO()
+    torch.save(state, changed)
+    return changed.getvalue()
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+@pytest.mark.parametrize(
+    "change", [lambda *_: b"no state at all", without_a_part], ids=["no state", "a part is missing"]
+)
+def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_from(tmp_path, trainer, change):
+    scene = scene_of("parameters", tmp_path)
+    arguments = ("--intervals", 300)
+    assert run(trainer, scene, tmp_path / "alone", *arguments)[0] == 0
+    record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
+    stop(start(trainer, scene, tmp_path / "killed", *arguments), checkpoint, SIGKILL)
+    content = checkpoint.read_bytes().split(b"\n", 2)[2]
+    reseal(checkpoint, change(trainer, content))
+    status, errors = run(trainer, scene, tmp_path / "killed", *arguments, "--resume")
+    assert status == 0, errors
+    assert errors.count(f"checkpoint: '{checkpoint}' is damaged; the training goes on from the one before\n") == 1
+    curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
+    assert without_seconds(curves) == without_seconds(alone)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_where_both_checkpoints_were_tampered_with_it_is_one_line(tmp_path, trainer):
+    scene, out = scene_of("parameters", tmp_path), tmp_path / "killed"
+    checkpoint = out / "prdp/seed_0.checkpoint"
+    stop(start(trainer, scene, out, "--intervals", 300), checkpoint, SIGKILL)
+    reseal(checkpoint, b"no state at all")
+    reseal(checkpoint.with_suffix(".checkpoint.before"), b"no state either")
+    status, errors = run(trainer, scene, out, "--intervals", 300, "--resume")
+    assert status == 2
+    assert errors.endswith(
+        f"checkpoint: '{checkpoint}' is damaged or of another version; delete it, and its training starts afresh\n"
+    )
+    assert errors.count("\n") == 1
+    assert not (out / "prdp/seed_0.json").exists()
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import tiny, written
+from helpers import reseal, tiny, written
 from typer.testing import CliRunner
 
 from prdp_torch import _C
@@ -163,13 +163,6 @@ class Bomb:
         return os.mkdir, (self.path,)
 
 
-def reseal(path, state):
-    """Puts another state into a checkpoint, with the fingerprint that belongs to it."""
-    mark, settings, _ = path.read_bytes().split(b"\n", 2)
-    rest = settings + b"\n" + state
-    path.write_bytes(mark.split(b", ")[0] + b", " + _C.fingerprint(rest).encode() + b"\n" + rest)
-
-
 @pytest.mark.filterwarnings("ignore:`torch.jit", "ignore:'torch.load' received a zip file")
 def test_no_checkpoint_runs_code(tmp_path):
     process = subprocess.Popen([TRAINER, HEAT, "--out", tmp_path / "cpp"], stdout=subprocess.PIPE, text=True)
@@ -183,7 +176,8 @@ def test_no_checkpoint_runs_code(tmp_path):
     bomb = io.BytesIO()
     torch.save(Bomb(str(tmp_path / "crater")), bomb)
     for state in (script.getvalue(), bomb.getvalue(), b"", b"nothing"):
-        reseal(path, state)
+        for file in (path, *path.parent.glob("*.before")):
+            reseal(file, state)
         status, errors = run("cpp", HEAT, "--out", tmp_path / "cpp", "--resume")
         assert status == 2 and f"'{path}' is damaged or of another version" in errors and "code was run" not in errors
 

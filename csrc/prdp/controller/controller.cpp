@@ -73,10 +73,10 @@ std::string Controller::about_residual() const {
   if (last.error) {
     // The residual is relative to a state that holds the error as well.
     if (residual <= kShareOfError * *last.error / (1.0 + *last.error)) return {};
-    text << "too far off for an error of " << *last.error << ": what is trained may have taken up the solver's error";
+    text << "too far off for an error of " << *last.error << ": what is trained may have learned the solver's error";
   } else {
     if (residual <= kLargeResidual || !stalled()) return {};
-    text << "and the metric no longer falls: what is trained may have taken up the solver's error";
+    text << "and the metric no longer falls: what is trained may have learned the solver's error";
   }
   text << "; " << remedy();
   return text.str();

@@ -53,28 +53,52 @@ void Checkpoint::write(std::string state) {
 
 std::optional<std::string> Checkpoint::read() {
   notice_.clear();
+  found_before_ = false;
   std::optional<c10::ValueError> damage;
-  for (const auto& path : {path_, before_}) {
-    std::optional<Sealed> found;
-    try {
-      found = read_sealed(path, kKind, kRemedy);
-    } catch (const c10::ValueError& error) {
-      if (!damage) damage = error;
-      continue;
+  try {
+    if (auto state = found_in(path_)) return state;
+  } catch (const c10::ValueError& error) {
+    damage = error;
+  }
+  try {
+    if (auto state = found_in(before_)) {
+      if (damage) note_damage();
+      found_before_ = true;
+      return state;
     }
-    if (!found) continue;
-    if (found->settings == settings_) {
-      if (damage) notice_ = c10::str("checkpoint: '", path_.string(), "' is damaged; the training goes on from the one before");
-      return std::move(found->content);
-    }
-    if (notice_.empty())
-      notice_ = c10::str("checkpoint: '", path.string(), "' is of other settings or another version; it is not used");
+  } catch (const c10::ValueError& error) {
+    if (!damage) damage = error;
   }
   if (damage) throw *damage;
   return std::nullopt;
 }
 
-void Checkpoint::refuse() const { refuse_damaged(path_, kKind, kRemedy); }
+std::string Checkpoint::read_before() {
+  std::optional<std::string> state;
+  try {
+    if (!found_before_) state = found_in(before_);
+  } catch (const c10::ValueError&) {
+  }
+  if (!state) refuse();
+  note_damage();
+  return *std::move(state);
+}
+
+void Checkpoint::refuse() const { refuse_damaged(found_before_ ? before_ : path_, kKind, kRemedy); }
+
+/// None where the file is not there, or is of other settings, which it notes. Raises ValueError for a damaged one.
+std::optional<std::string> Checkpoint::found_in(const fs::path& path) {
+  auto found = read_sealed(path, kKind, kRemedy);
+  if (!found) return std::nullopt;
+  if (found->settings == settings_) return std::move(found->content);
+  if (notice_.empty())
+    notice_ = c10::str("checkpoint: '", path.string(), "' is of other settings or another version; it is not used");
+  return std::nullopt;
+}
+
+void Checkpoint::note_damage() {
+  notice_ = c10::str("checkpoint: '", path_.string(), "' is damaged; the training goes on from the one before");
+}
 
 void Checkpoint::check_length(int64_t done, int64_t intervals) const {
   TORCH_CHECK_VALUE(done <= intervals, "checkpoint: '", path_.string(), "' is of a training that has done ", done,

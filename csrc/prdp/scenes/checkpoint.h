@@ -24,10 +24,13 @@ class Checkpoint {
   /// The state last written; that of the one before where the last is damaged, missing or of other settings; none
   /// where there is neither. Raises ValueError, naming the file and the remedy, for a damaged one without another.
   std::optional<std::string> read();
-  /// What was wrong with files that the last read() passed over, in a sentence; empty where nothing was.
-  const std::string& notice() const { return notice_; }
-  /// Raises that ValueError: for a state that its trainer cannot make sense of.
+  /// The state of the one before, for a trainer that can make no sense of what read() has returned. Raises that
+  /// ValueError where there is none, or read() has returned it already.
+  std::string read_before();
+  /// Raises that ValueError: where the trainer can make no sense of the one before either.
   [[noreturn]] void refuse() const;
+  /// What was wrong with files that the last call of the two passed over, in a sentence; empty where nothing was.
+  const std::string& notice() const { return notice_; }
   /// Raises ValueError for a state of more intervals than the training is to have.
   void check_length(int64_t done, int64_t intervals) const;
   /// Removes both files, where they are there. Raises ValueError where one cannot be removed.
@@ -38,11 +41,15 @@ class Checkpoint {
  private:
   using Clock = std::chrono::steady_clock;
 
+  std::optional<std::string> found_in(const std::filesystem::path& path);
+  void note_damage();
+
   std::filesystem::path path_, before_;
   std::string settings_;
   std::chrono::duration<double> pause_;
   Clock::time_point last_ = Clock::now();
   std::string notice_;
+  bool found_before_ = false;  // that read() has returned the state of the one before
 };
 
 }  // namespace prdp

@@ -5,22 +5,14 @@
 #include <cmath>
 #include <iomanip>
 #include <limits>
-#include <map>
 #include <sstream>
 
+#include "prdp/operators/kinds.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
 
 namespace {
-
-std::string name_of(const OperatorSpec& a) {
-  static const std::map<std::string, std::string> names{
-      {"poisson", "Poisson"}, {"heat", "Heat"},        {"burgers", "Burgers"}, {"navier_stokes", "NavierStokes"},
-      {"stencil", "Stencil"}, {"function", "Function"}, {"dense", "Matrix"},    {"csr", "Matrix"}};
-  const auto found = names.find(a.kind);
-  return found == names.end() ? a.kind : found->second;
-}
 
 std::string name_of(const Solver& solver) {
   const auto& method = traits(solver.method);
@@ -72,8 +64,12 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
 
 std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
   const bool single = b.scalar_type() == at::kFloat;
-  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (‖A‖ is " +
-         number(value_of_sample(a.norm(), sample)) + ", ‖b‖ is " + number(norm_of(b.select(0, sample))) + "); " +
+  const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
+  const bool known = norm > 0.0;  // not of a function
+  if (!known && !a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>())
+    return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
+  return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
+         (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " + (std::isinf(norm_b) ? "above 1.8e+308" : number(norm_b)) + "); " +
          (single ? "take float64, or scale A and b" : "scale A and b");
 }
 
@@ -88,7 +84,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 }
 
 std::string zero_diagonal(const SolveRole& role) {
-  const std::string why = role.a.kind == "navier_stokes" ? "the pressure rows have a zero diagonal"
+  const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
                                                           : "it divides by the diagonal of A, which has a zero there";
   return why + (traits(role.solver.method).label == "GMRES" ? "; take GMRES without it" : "; take GMRES");
 }
@@ -96,7 +92,7 @@ std::string zero_diagonal(const SolveRole& role) {
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
-  if (role.a.kind != "navier_stokes") return share + "b lie in the null space of A; take a b without that part";
+  if (!operator_kind(role.a.kind).has_pressure) return share + "b lie in the null space of A; take a b without that part";
   if (role.adjoint)
     return share + "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
                    "pressure that the loss is made of";
@@ -125,7 +121,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();
-  return name_of(role.solver) + " on " + name_of(role.a) + ": " + why;
+  return name_of(role.solver) + " on " + operator_kind(role.a.kind).title + ": " + why;
 }
 
 }  // namespace prdp

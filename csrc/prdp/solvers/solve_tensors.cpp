@@ -42,7 +42,7 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
     const auto& s = states[i];
     double residual = s.b2 > 0.0 ? std::sqrt(s.residual2 / s.b2) : 0.0;
     if (s.status == SolveStatus::kZeroDiagonal) residual = 1.0;
-    else if (is_refused(s.status)) residual = std::numeric_limits<double>::infinity();
+    else if (is_refused(s.status) || std::isnan(residual)) residual = std::numeric_limits<double>::infinity();
     info.iterations.mutable_data_ptr<int64_t>()[i] = s.iterations;
     info.residual.mutable_data_ptr<double>()[i] = residual;
     info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(s.status);
