@@ -3,11 +3,14 @@
 Run it after new records: python docs/result_tables.py
 """
 
+import importlib
 import json
 import re
+import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))  # for the tables of benchmarks/studies
 PAGES = (DOCS.parent / "README.md", DOCS / "refinement.md", DOCS / "results.md")
 TABLE = re.compile(r"^(<!-- docs/result_tables.py writes ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)
 
@@ -163,9 +166,17 @@ TABLES = {
 }
 
 
+def study(name):
+    """The table that the study itself makes."""
+    module = importlib.import_module(f"benchmarks.studies.{name}")
+    return module.table(record(f"studies/{name}")["rows"]) + "\n"
+
+
 def table(name):
-    kind, _, scene = name.partition(" of ")
-    return comparison(scene) if kind == "the comparison" else TABLES[name]()
+    kind, _, what = name.partition(" of ")
+    if kind in ("the comparison", "the study"):
+        return (comparison if kind == "the comparison" else study)(what)
+    return TABLES[name]()
 
 
 def with_tables(page):

@@ -3,7 +3,7 @@ import collections.abc
 import os
 import torch
 import typing
-__all__: list[str] = ['CHECKPOINT_SQRT', 'Checkpoint', 'Compare', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Data', 'Dataset', 'Equation', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'LinearSchedule', 'MOST_COUNTED', 'Network', 'PRDPController', 'PRDP_DEFAULTS', 'ParameterProblem', 'Physics', 'RegisteredProducts', 'SOLVE_STATUSES', 'Scene', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'Training', 'VERSION', 'all_trajectories', 'check_operator', 'check_options', 'check_solver', 'clear_factorisations', 'close_adjoint_log', 'count_factorisations', 'diffusion_stencil', 'fingerprint', 'half_mse', 'join_adjoint_logs', 'linear_solve', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'open_adjoint_log', 'parse_scene', 'product_rule', 'read_adjoint_log', 'read_record', 'read_scene', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'sentence', 'solve_with_tensors', 'step', 'validation_trajectories', 'without_mean_pressure', 'write_whole']
+__all__: list[str] = ['CHECKPOINT_SQRT', 'Checkpoint', 'Compare', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Data', 'Dataset', 'Equation', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'LinearSchedule', 'MOST_COUNTED', 'Network', 'PRDPController', 'PRDP_DEFAULTS', 'ParameterProblem', 'Physics', 'RegisteredProducts', 'SOLVE_STATUSES', 'Scene', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'Training', 'VERSION', 'all_trajectories', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'clear_factorisations', 'close_adjoint_log', 'count_factorisations', 'diffusion_stencil', 'fingerprint', 'half_mse', 'join_adjoint_logs', 'linear_solve', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'open_adjoint_log', 'parse_scene', 'product_rule', 'read_adjoint_log', 'read_record', 'read_scene', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'sentence', 'solve_with_tensors', 'step', 'validation_trajectories', 'without_mean_pressure', 'write_whole']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -339,6 +339,10 @@ class Failures:
         ...
 def all_trajectories(scene: Scene, steps: typing.SupportsInt | typing.SupportsIndex, on_progress: collections.abc.Callable[[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex], None] = None) -> torch.Tensor:
     ...
+def batched_axes(kind: str) -> list[int] | None:
+    """
+    The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 if it is shaped like a state. None if that is not known.
+    """
 def check_operator(kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], tensors: collections.abc.Sequence[torch.Tensor]) -> None:
     ...
 def check_options(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex, backward: str, adjoint_max_iter: typing.SupportsInt | typing.SupportsIndex | None, adjoint_rtol: typing.SupportsFloat | typing.SupportsIndex | None, on_failure: str, checkpoint_every: typing.SupportsInt | typing.SupportsIndex, start: str = 'zero') -> None:

@@ -7,17 +7,7 @@ tensor that is mapped, such as nu, the entries are solved one after the other.
 import torch
 from torch.utils._pytree import tree_map
 
-# Per tensor of an operator, how many dimensions it has where it has a batch axis: of a grid its axes and
-# two (None), of the rest as many; 0 where all samples share it.
-_DIMS = {
-    "poisson": [],
-    "heat": [0],
-    "burgers": [None, 0],
-    "navier_stokes": [None, 0],
-    "dense": [3],
-    "csr": [2, 2, 2],
-    "stencil": [None],
-}
+from prdp_torch import _C
 
 
 @torch.library.register_vmap("prdp::linear_solve")
@@ -41,9 +31,10 @@ def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
 
 def _fold(tensors, mapped, kind, axes, size, batch):
     """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
-    if kind not in _DIMS:  # a Function: unknown which of its tensors have a batch axis
+    batched_axes = _C.batched_axes(kind)
+    if batched_axes is None:  # a Function: unknown which of its tensors have a batch axis
         return None if tensors else []
-    dims = [axes + 2 if n is None else n for n in _DIMS[kind]]
+    dims = [axes + 2 if n < 0 else n for n in batched_axes]
     folded = []
     for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
         if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:

@@ -96,6 +96,17 @@ class CG(Solver):
     preconditioners: ClassVar[tuple[str, ...]] = ("diagonal",)
 
 
+@dataclass
+class BiCGStab(Solver):
+    """BiCGStab, for any operator. An iteration has two products with A, and memory does not grow with the number of
+    iterations, as it does with the restart length of GMRES. The residual may rise on its way down.
+
+    Source: van der Vorst 1992.
+    """
+
+    method: ClassVar[str] = "bicgstab"
+
+
 @dataclass(kw_only=True)
 class GMRES(Solver):
     """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, and `max_iter` counts cycles.

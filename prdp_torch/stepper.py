@@ -18,7 +18,7 @@ class Stepper(torch.nn.Module):
     `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two as functions instead.
 
     Args:
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES` or `Direct`.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
         start: where the solves start: at "zero", or at "state", the state before the step, which then is the x0 of
             `linear_solve`. This saves iterations if a step changes the state little.

@@ -10,7 +10,7 @@ import torch
 
 from prdp_torch import _C, operators
 from prdp_torch.solve import SolveStatus
-from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, Solver, SteepestDescent
+from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Solver, SteepestDescent
 
 TOLERANCES = (1e-3, 1e-5)
 RESTARTS = (2, 8, 30)
@@ -71,7 +71,7 @@ def candidates(step):
     """The solvers to try on a step."""
     own = [step.restart] if step.method.startswith("gmres") else []
     restarts = sorted({*RESTARTS, *own})
-    every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), *(GMRES(1, restart=m) for m in restarts)]
+    every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), *(GMRES(1, restart=m) for m in restarts)]
     kind = getattr(step, "kind", None)
     if kind == "navier_stokes":
         every.append(GMRES(1, restart=8, preconditioner="stokes"))

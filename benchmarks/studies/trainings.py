@@ -83,6 +83,10 @@ class Study:
         }
 
     def write(self, path):
-        """The rows without the texts of their scenes, which the changes give."""
-        rows = [{key: value for key, value in row.items() if key != "text"} for row in self.rows]
-        records.write(path, {**records.environment(), "rows": rows})
+        """The rows without what the record as a whole says, or the changes give: one commit may have run only some."""
+        environment = records.environment()
+        left_out = {"text", "fingerprint", *environment} - {"commit"}
+        rows = [{key: value for key, value in row.items() if key not in left_out} for row in self.rows]
+        for row in rows:
+            row["errors"] = [float(f"{error:.4g}") for error in row.get("errors", ())]
+        records.write(path, {**environment, "rows": rows})

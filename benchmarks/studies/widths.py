@@ -1,6 +1,7 @@
 """The size of the network: heat_1d with widths that span an order of magnitude of parameters (paper, appendix)."""
 
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 from benchmarks.studies.evaluation import spread
 from prdp_torch.experiments.charts import make_figure
@@ -72,6 +73,7 @@ def chart(rows):
     right.set(xscale="log", xlabel="parameters", ylabel="products with A", ylim=(0, None))
     for axes in (left, right):
         axes.grid(alpha=0.3, lw=0.4)
+        axes.set_xticks(n, [f"{x:,}" for x in n], rotation=45)
+        axes.xaxis.set_minor_locator(NullLocator())
     right.legend(frameon=False)
-    figure.suptitle("Heat 1D: does the size of the network change what refinement saves?")
     return figure

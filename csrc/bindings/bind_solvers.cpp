@@ -2,6 +2,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/solving.h"
@@ -124,6 +125,10 @@ void bind_solvers(py::module_& m) {
            py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
            py::arg("product_rule"))
       .def_property_readonly("number", &RegisteredProducts::number);
+  m.def(
+      "batched_axes", [](const std::string& kind) { return operator_kind(kind).batched_axes; }, py::arg("kind"),
+      "The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 "
+      "if it is shaped like a state. None if that is not known.");
   m.def("check_operator",
         [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
            std::vector<at::Tensor> tensors) {

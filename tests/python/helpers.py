@@ -11,7 +11,7 @@ from prdp_torch import _C
 from prdp_torch.experiments import scenes
 
 DATA = Path(__file__).parents[1] / "data"
-ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
+ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES]
 SOLVERS = [*ITERATIVE, prdp.Direct]
 TINY = (
     ("shape = [48, 48]", "shape = [8, 8]"),

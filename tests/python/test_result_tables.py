@@ -24,7 +24,7 @@ def test_the_tables_are_those_of_the_records(page):
     assert text == module.with_tables(text), "run: python docs/result_tables.py"
 
 
-@pytest.mark.parametrize("path", sorted((DOCS / "results").glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)
 def test_a_record_says_where_it_comes_from(path):
     record = json.loads(path.read_text())
     assert record["commit"] and record["command"] and record["versions"]["torch"] and record["machine"]["processor"]

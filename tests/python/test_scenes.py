@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import assert_refused, written
 
-from prdp_torch import _C
+from prdp_torch import _C, BiCGStab
 from prdp_torch.experiments import charts, scenes
 
 
@@ -83,6 +83,16 @@ def test_the_projects_scenes_hold_the_papers_settings():
 )  # fmt: skip
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):
     assert_refused(written(tmp_path, (before, after)), where, message)
+
+
+def test_bicgstab_is_a_method_of_scenes_without_a_restart(tmp_path):
+    solver = ('method = "gmres"\nrestart = 2             # Arnoldi steps in a cycle; a cycle is one iteration\n',
+              'method = "bicgstab"\n')  # fmt: skip
+    scene = scenes.load(written(tmp_path, solver, scene="burgers_1d"))
+    assert (scene.method, scene.max_iter) == ("bicgstab", 23)
+    assert isinstance(scenes._solver(scene, 5), BiCGStab)
+    with_restart = written(tmp_path, (solver[0], solver[1] + "restart = 2\n"), scene="burgers_1d", name="restart")
+    assert_refused(with_restart, "restart = 2", "unknown name 'solver.restart'; allowed: backward")
 
 
 def test_chebyshev_is_for_scenes_of_known_spectrum(tmp_path):

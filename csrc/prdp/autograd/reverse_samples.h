@@ -97,26 +97,19 @@ class SweepSpace : public SampleSpace<Kernel> {
 
 /// Vectors that a sweep needs beside its method's, x̄ included.
 inline int64_t sweep_vectors_of(Method method, int64_t restart) {
-  return method == Method::kGmres ? restart + 6 : 6;
+  return 6 + (traits(method).counts == Counts::kCycles ? restart : 0);
 }
 
 /// Runs the sweep of `method` with x̄ in the vector `x_bar`; returns where b̄ is.
 template <class Space, class T>
 T* run_sweep(Space& space, T* x_bar, const ReverseBatch<T>& batch, const Checkpoints& plan, double b2,
              T** diagonal_bar) {
-  const auto run = [&](auto sweep) -> T* {
+  return with_sweep<Space>(batch.method, [&]<class Sweep>(std::type_identity<Sweep>) -> T* {
+    Sweep sweep(space, x_bar, {batch.rtol, plan.iterations, b2, batch.restart});
     run_back(sweep, plan);
     if constexpr (requires { sweep.diagonal_bar(); }) *diagonal_bar = sweep.diagonal_bar();
     return sweep.finish();
-  };
-  switch (batch.method) {
-    case Method::kJacobi: return run(JacobiSweep<Space>(space, x_bar));
-    case Method::kSteepestDescent:
-      return run(SteepestDescentSweep<Space>(space, x_bar, {batch.rtol, plan.iterations, b2}));
-    case Method::kConjugateGradient:
-      return run(ConjugateGradientSweep<Space>(space, x_bar, {batch.rtol, plan.iterations, b2}));
-    default: return run(GmresSweep<Space>(space, x_bar, batch.restart));
-  }
+  });
 }
 
 template <class Kernel, class T>
@@ -164,8 +157,9 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
   auto& workspace = kernels::Workspace<T>::local();
   const int64_t n = a.unknowns(), restart = std::min(batch.restart, n);
   const int64_t most = begin < end ? *std::max_element(batch.iterations + begin, batch.iterations + end) : 0;
-  KeptIterates<T> kept(Checkpoints(most, batch.checkpoint_every).slots(),
-                       batch.method == Method::kConjugateGradient ? 2 : 1, a.length(), a.halo());
+  const int64_t state_vectors = with_sweep<SweepSpace<Kernel>>(
+      batch.method, []<class Sweep>(std::type_identity<Sweep>) { return Sweep::kStateVectors; });
+  KeptIterates<T> kept(Checkpoints(most, batch.checkpoint_every).slots(), state_vectors, a.length(), a.halo());
   const auto reverse = [&](const NearOne<Kernel>& near, const NearOne<Kernel>& transposed, int64_t s) {
     reverse_sample(near, *transposed, workspace, kept, batch, s);
   };

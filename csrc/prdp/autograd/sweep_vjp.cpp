@@ -50,11 +50,7 @@ void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<
 }  // namespace
 
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
-  const auto method = solve.solver.method;
-  // Chebyshev's weights and the preconditioners depend on A too: autograd knows how.
-  const bool written_out = method == Method::kJacobi || method == Method::kSteepestDescent ||
-                           method == Method::kConjugateGradient || method == Method::kGmres;
-  return b.is_cpu() && written_out && !std::holds_alternative<std::monostate>(a.kernel(b));
+  return b.is_cpu() && traits(solve.solver.method).unrolled == Unrolled::kSweep && !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -66,7 +62,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
   const auto x0 = solve.x0.defined() ? solve.x0.contiguous() : at::Tensor();
   const auto rhs = b.contiguous(), bar = cotangent.contiguous(), iterations = solve.iterations.contiguous();
   const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
-  const bool for_diagonal = for_a && solve.solver.method == Method::kJacobi;
+  const bool for_diagonal = for_a && traits(solve.solver.method).divides_by_diagonal;
   const auto b_bar = at::empty_like(rhs), diagonal_bar = for_diagonal ? at::empty_like(rhs) : at::Tensor();
   UnrolledVjp found{std::vector<at::Tensor>(needed.size()), at::empty_like(iterations)};
   std::vector<std::vector<at::Tensor>> of_samples(rhs.size(0));

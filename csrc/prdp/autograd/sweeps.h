@@ -11,6 +11,14 @@
 /// gradient to the space. The space (reverse_samples.h) has Aᵀ and axpy beside what methods need.
 namespace prdp {
 
+/// What a sweep is told of the solve: the method's rtol, the iterations that it ran, ‖b‖², and restart.
+struct SweepRun {
+  double rtol;
+  int64_t iterations;
+  double b2;
+  int64_t restart;
+};
+
 /// States of a method in memory of their own: saves and loads what an iteration starts from.
 template <class Method, class Space>
 class SweepBase : public Method {
@@ -22,6 +30,11 @@ class SweepBase : public Method {
   template <class... Arguments>
   SweepBase(Space& space, Vector x_bar, Arguments... arguments)
       : Method(space, arguments...), sweep_space_(space), x_bar_(x_bar) {}
+
+  /// Vectors that a state is made of.
+  static constexpr int64_t kStateVectors = []<class... Part>(std::tuple<Part&...>*) {
+    return (int64_t{std::is_same_v<Part, Vector>} + ...);
+  }(static_cast<decltype(std::declval<Method&>().carried())*>(nullptr));
 
   void save(int64_t slot) {
     each([&](auto& part, int64_t v, int64_t s) { put(part, slot, v, s); });
@@ -71,13 +84,7 @@ class RecursiveSweep : public SweepBase<Method, Space> {
   using Vector = typename Space::Vector;
   using Scalar = typename Space::Scalar;
 
-  /// The method's rtol, the iterations that it ran, and ‖b‖².
-  struct Run {
-    double rtol;
-    int64_t iterations;
-    double b2;
-  };
-  RecursiveSweep(Space& space, Vector x_bar, Run run)
+  RecursiveSweep(Space& space, Vector x_bar, SweepRun run)
       : Base(space, x_bar), r_bar_(space.vector()), b_bar_(space.vector()), t_(space.vector()), run_(run) {}
 
   void start() {
@@ -138,18 +145,17 @@ class RecursiveSweep : public SweepBase<Method, Space> {
     this->go_on_from(known.norm2);
   }
 
-  Run run_;
+  SweepRun run_;
   int64_t done_ = 0, furthest_ = 0;  // iterations behind the state at hand; and ever
   std::vector<Correction> corrections_;
 };
 
-/// One iteration at a time, and x alone: the iterate before it is Chebyshev's.
+/// One iteration at a time.
 template <class Space>
 class SingleJacobi : public JacobiMethod<Space> {
  public:
   using JacobiMethod<Space>::JacobiMethod;
   void step() { JacobiMethod<Space>::step(1); }
-  auto carried() { return std::tie(this->x); }
 };
 
 /// x' = x + D⁻¹(b - A x)
@@ -160,7 +166,7 @@ class JacobiSweep : public SweepBase<SingleJacobi<Space>, Space> {
   using Base::sweep_space_, Base::x_bar_;
 
  public:
-  JacobiSweep(Space& space, Vector x_bar)
+  JacobiSweep(Space& space, Vector x_bar, SweepRun)
       : Base(space, x_bar), b_bar_(space.vector()), diagonal_bar_(space.vector()), t_(space.vector()),
         product_(space.vector()) {}
 
@@ -190,7 +196,7 @@ class SteepestDescentSweep : public RecursiveSweep<SteepestDescentMethod<Space>,
   using Base::sweep_space_, Base::x_bar_, Base::r_bar_, Base::b_bar_, Base::t_, Base::q_, Base::alpha_;
 
  public:
-  SteepestDescentSweep(Space& space, Vector x_bar, typename Base::Run run)
+  SteepestDescentSweep(Space& space, Vector x_bar, SweepRun run)
       : Base(space, x_bar, run), q_bar_(space.vector()) {}
 
   void step_back(int64_t slot, int64_t) {
@@ -231,7 +237,7 @@ class ConjugateGradientSweep : public RecursiveSweep<ConjugateGradientMethod<Spa
   using Base::r_, Base::q_, Base::alpha_, Base::beta_;
 
  public:
-  ConjugateGradientSweep(Space& space, Vector x_bar, typename Base::Run run)
+  ConjugateGradientSweep(Space& space, Vector x_bar, SweepRun run)
       : Base(space, x_bar, run), p_bar_(space.vector()), q_bar_(space.vector()) {}
 
   void step_back(int64_t slot, int64_t) {
@@ -284,8 +290,8 @@ class GmresSweep : public SweepBase<GmresMethod<Space>, Space> {
   using Base::sweep_space_, Base::x_bar_, Base::v_, Base::y_, Base::columns_;
 
  public:
-  GmresSweep(Space& space, Vector x_bar, int64_t restart)
-      : Base(space, x_bar, restart, Preconditioner::kNone),
+  GmresSweep(Space& space, Vector x_bar, SweepRun run)
+      : Base(space, x_bar, run.restart, Preconditioner::kNone),
         b_bar_(space.vector()),
         r_bar_(space.vector()),
         e_(space.vector()),
@@ -366,5 +372,38 @@ class GmresSweep : public SweepBase<GmresMethod<Space>, Space> {
   Vector b_bar_, r_bar_, e_, p_bar_, t_;
   std::vector<Vector> v_bar_;
 };
+
+/// The sweep of a class that iterates; only those named here have one.
+template <class Method>
+struct SweepOf;
+template <class Space>
+struct SweepOf<JacobiMethod<Space>> {
+  using Type = JacobiSweep<Space>;
+};
+template <class Space>
+struct SweepOf<SteepestDescentMethod<Space>> {
+  using Type = SteepestDescentSweep<Space>;
+};
+template <class Space>
+struct SweepOf<ConjugateGradientMethod<Space>> {
+  using Type = ConjugateGradientSweep<Space>;
+};
+template <class Space>
+struct SweepOf<GmresMethod<Space>> {
+  using Type = GmresSweep<Space>;
+};
+
+/// Calls body(std::type_identity<sweep of this method>). A row that promises a sweep which is not written does not
+/// compile.
+template <class Space, class Body>
+auto with_sweep(Method method, const Body& body) {
+  using Result = decltype(body(std::type_identity<JacobiSweep<Space>>()));
+  return with_row(method, [&](auto at) -> Result {
+    if constexpr (at.row.unrolled == Unrolled::kSweep)
+      return body(std::type_identity<typename SweepOf<typename std::decay_t<decltype(at.row)>::template In<Space>>::Type>());
+    TORCH_INTERNAL_ASSERT(at.row.unrolled == Unrolled::kSweep, "no reverse is written for ", at.row.name);
+    return Result();
+  });
+}
 
 }  // namespace prdp

@@ -10,6 +10,7 @@
 #include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/rows.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {
@@ -76,8 +77,8 @@ Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_
   return rows;
 }
 
-/// The samples that were solved to rounding, but those whose iterations are smooth there: all of Jacobi's and
-/// Chebyshev's up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
+/// The samples that were solved to rounding, but those whose iterations are smooth there: all of a polynomial
+/// up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
 template <class MakeU>
 Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeU& make_u) {
   auto rows = within_rounding(a, solved, make_u);
@@ -88,10 +89,10 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
     for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != count || kept[i]);
   };
   const Rows none(batch, false);
-  if (solver.method == Method::kJacobi || solver.method == Method::kChebyshev)
+  if (traits(solver.method).is_polynomial)
     leave_out(solver.max_iter.expect_int(), none);
   const int64_t unknowns = solved.b.numel() / batch;
-  if (is_conjugate_gradient(solver.method) &&
+  if (traits(solver.method).ends_at_unknowns &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
     const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
@@ -218,8 +219,8 @@ UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b
                                 at::IntArrayRef needed) {
   const auto method = solve.solver.method;
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
-  if ((method == Method::kJacobi || method == Method::kChebyshev) && for_b_alone) {
-    // K sweeps from zero are u = p(I - D⁻¹A) D⁻¹ b with a polynomial p; transposed, that is K sweeps with Aᵀ.
+  if (traits(method).is_polynomial && for_b_alone) {
+    // K iterations from zero are u = p(I - D⁻¹A) D⁻¹ b; transposed, that is K iterations with Aᵀ.
     auto transpose = solve.a;
     transpose.transposed = !transpose.transposed;
     const SolveRequest request{method, 0, 0.0, solve.solver.restart, solve.iterations, /*guarded=*/false};

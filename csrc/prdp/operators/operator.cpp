@@ -2,12 +2,7 @@
 
 #include <numeric>
 
-#include "prdp/operators/burgers_operator.h"
-#include "prdp/operators/function_operator.h"
-#include "prdp/operators/laplacian_operator.h"
-#include "prdp/operators/matrix_operator.h"
-#include "prdp/operators/navier_stokes_operator.h"
-#include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/kinds.h"
 
 namespace prdp {
 
@@ -97,23 +92,10 @@ class Transposed final : public Operator {
   std::unique_ptr<Operator> a_;
 };
 
-std::unique_ptr<Operator> make_untransposed(const OperatorSpec& spec) {
-  if (spec.kind == "heat") return std::make_unique<HeatOperator>(spec);
-  if (spec.kind == "poisson") return std::make_unique<PoissonOperator>(spec);
-  if (spec.kind == "burgers") return std::make_unique<BurgersOperator>(spec);
-  if (spec.kind == "navier_stokes") return std::make_unique<NavierStokesOperator>(spec);
-  if (spec.kind == "stencil") return std::make_unique<StencilOperator>(spec);
-  if (spec.kind == "dense") return std::make_unique<DenseOperator>(spec);
-  if (spec.kind == "function") return std::make_unique<FunctionOperator>(spec);
-  if (spec.kind == "csr") return std::make_unique<CsrOperator>(spec);
-  TORCH_CHECK_VALUE(false, "operator: unknown kind '", spec.kind,
-                    "'; allowed: heat, poisson, burgers, navier_stokes, stencil, dense, csr, function");
-}
-
 }  // namespace
 
 std::unique_ptr<Operator> make_operator(const OperatorSpec& spec) {
-  auto a = make_untransposed(spec);
+  auto a = operator_kind(spec.kind).make(spec);
   if (spec.transposed) return std::make_unique<Transposed>(std::move(a));
   return a;
 }

@@ -4,7 +4,17 @@
 #include <cmath>
 #include <numbers>
 
+#include "prdp/steppers/equation_kinds.h"
+
 namespace prdp {
+
+// The list of scene keys is made from a scene without an equation.
+bool Scene::Physics::periodic() const { return !equation.empty() && equation_kind(equation).periodic; }
+
+int64_t Scene::Physics::channels() const {
+  const int64_t channels = equation_kind(equation).channels;
+  return channels == kPerAxis ? static_cast<int64_t>(shape.size()) : channels;
+}
 
 Solver Scene::reference_solver() const {
   if (physics.direct_is_cheap()) return Direct{};

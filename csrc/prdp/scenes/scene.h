@@ -26,14 +26,9 @@ struct Scene {
     std::vector<int64_t> shape;
     double nu = 0.0, dt = 0.0;  // length²/time, time; poisson has neither, diffusion no nu
 
-    bool periodic() const {
-      return equation == "burgers" || equation == "navier_stokes" || equation == "diffusion";
-    }
-    /// Channels of a state (batch, channels, *shape): burgers has one per axis, navier_stokes also a pressure.
-    int64_t channels() const {
-      if (equation == "navier_stokes") return 3;
-      return equation == "burgers" ? static_cast<int64_t>(shape.size()) : 1;
-    }
+    bool periodic() const;  // of the grid
+    /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
+    int64_t channels() const;
     /// Whether an exact solve costs about as much as an iterative one. On periodic grids of two and more dimensions it
     /// does not: their sparse LU takes tens of times as long.
     bool direct_is_cheap() const { return !(periodic() && shape.size() > 1); }

@@ -5,6 +5,7 @@
 #include "prdp/scenes/key_list.h"
 #include "prdp/scenes/scene.h"
 #include "prdp/scenes/toml_section.h"
+#include "prdp/solvers/methods.h"
 
 /// Every key of a scene file is declared here, once: where it goes, what it may be, its unit and its meaning.
 /// The functions run on a TomlSection to read a file, and on a KeyList to list the keys.
@@ -49,13 +50,16 @@ void read_physics(Section& s, Scene& scene) {
 template <class Section>
 void read_solver(Section& s, Scene& scene) {
   const When spectrum{!scene.physics.periodic(), "only for `heat` and `poisson`"};
-  const Choices methods{"jacobi", {"chebyshev", spectrum}, "steepest_descent", "cg", "gmres", "direct"};
+  Choices methods;
+  for (const auto& method : kTraits)
+    if (method.preconditioner == Preconditioner::kNone)
+      methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum : When{});
   s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
   s.count(scene.solver.max_iter, 1,
           {"max_iter", "K of the converged solver, K_ε in the paper", "iterations (`gmres`: cycles)"});
   s.at_least(scene.solver.rtol, 0.0,
              {"rtol", "relative residual at which a solve stops; 0 runs exactly K iterations"});
-  const When gmres{scene.solver.method == Method::kGmres, "only for `gmres`"};
+  const When gmres{traits(scene.solver.method).counts == Counts::kCycles, "only for `gmres`"};
   s.count(scene.solver.restart, 1, {"restart", "restart length", "products per cycle", gmres});
   s.choice(scene.backward, backward_from_name, backwards(scene), {"backward", "how gradients are computed"});
   s.choice(scene.on_failure, on_failure_from_name, {"return", "zero_grad"},

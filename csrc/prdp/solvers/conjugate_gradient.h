@@ -2,10 +2,12 @@
 #include <cstdint>
 #include <tuple>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators of either sign.
-template <class Space>
+template <VectorSpace Space>
 class ConjugateGradientMethod {
  public:
   static constexpr bool kHasRecursiveResidual = true;

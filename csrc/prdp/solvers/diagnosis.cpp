@@ -5,36 +5,23 @@
 #include <cmath>
 #include <iomanip>
 #include <limits>
-#include <map>
 #include <sstream>
+
+#include "prdp/operators/kinds.h"
+#include "prdp/solvers/methods.h"
 
 namespace prdp {
 
 namespace {
 
-std::string name_of(const OperatorSpec& a) {
-  static const std::map<std::string, std::string> names{
-      {"poisson", "Poisson"}, {"heat", "Heat"},        {"burgers", "Burgers"}, {"navier_stokes", "NavierStokes"},
-      {"stencil", "Stencil"}, {"function", "Function"}, {"dense", "Matrix"},    {"csr", "Matrix"}};
-  const auto found = names.find(a.kind);
-  return found == names.end() ? a.kind : found->second;
-}
-
 std::string name_of(const Solver& solver) {
-  const auto gmres = "GMRES(" + std::to_string(solver.restart) + ")";
-  const std::string by_diagonal = " with preconditioner=\"diagonal\"";
-  switch (solver.method) {
-    case Method::kJacobi: return "Jacobi";
-    case Method::kChebyshev: return "Chebyshev";
-    case Method::kSteepestDescent: return "SteepestDescent";
-    case Method::kConjugateGradient: return "CG";
-    case Method::kConjugateGradientDiagonal: return "CG" + by_diagonal;
-    case Method::kGmres: return gmres;
-    case Method::kGmresDiagonal: return gmres + by_diagonal;
-    case Method::kGmresStokes: return gmres + " with preconditioner=\"stokes\"";
-    case Method::kDirect: return "Direct";
-  }
-  return std::string(name(solver.method));
+  const auto& method = traits(solver.method);
+  std::ostringstream text;
+  text << method.label;
+  if (method.counts == Counts::kCycles) text << "(" << solver.restart << ")";
+  if (method.preconditioner != Preconditioner::kNone)
+    text << " with preconditioner=\"" << name(method.preconditioner) << "\"";
+  return text.str();
 }
 
 std::string number(double x) {
@@ -56,8 +43,6 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
   return norm_of(product - other) / norm_of(product);
 }
 
-bool is_krylov_for_definite(Method m) { return m == Method::kSteepestDescent || is_conjugate_gradient(m); }
-
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
   const double rounding = 100.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
@@ -69,9 +54,10 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
 }
 
 std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (solver.method == Method::kJacobi)
+  const auto made_for = traits(solver.method).made_for;
+  if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
-  if (is_krylov_for_definite(solver.method))
+  if (made_for == MadeFor::kDefinite)
     return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, or Direct";
 }
@@ -88,22 +74,25 @@ std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
 }
 
 std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (solver.method == Method::kDirect) return "A is singular; GMRES solves it for any b in the range of A";
-  if (is_krylov_for_definite(solver.method)) return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
+  if (traits(solver.method).is_direct) return "A is singular; GMRES solves it for any b in the range of A";
+  if (traits(solver.method).made_for == MadeFor::kDefinite)
+    return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
+  if (traits(solver.method).counts == Counts::kIterations)
+    return "a residual r, or its shadow, is orthogonal to A r: take GMRES";
   return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
          "take a b without that part, or add a multiple of the identity to A";
 }
 
 std::string zero_diagonal(const SolveRole& role) {
-  const std::string why = role.a.kind == "navier_stokes" ? "the pressure rows have a zero diagonal"
+  const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
                                                           : "it divides by the diagonal of A, which has a zero there";
-  return why + (role.solver.method == Method::kGmresDiagonal ? "; take GMRES without it" : "; take GMRES");
+  return why + (traits(role.solver.method).label == "GMRES" ? "; take GMRES without it" : "; take GMRES");
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
-  if (role.a.kind != "navier_stokes") return share + "b lie in the null space of A; take a b without that part";
+  if (!operator_kind(role.a.kind).has_pressure) return share + "b lie in the null space of A; take a b without that part";
   if (role.adjoint)
     return share + "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
                    "pressure that the loss is made of";
@@ -132,7 +121,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();
-  return name_of(role.solver) + " on " + name_of(role.a) + ": " + why;
+  return name_of(role.solver) + " on " + operator_kind(role.a.kind).title + ": " + why;
 }
 
 }  // namespace prdp

@@ -2,10 +2,12 @@
 #include <cstdint>
 #include <tuple>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// u ← u + A⁻¹(b - A u) by an exact method: the first iteration solves, those after it refine.
-template <class Space>
+template <FactorisedSpace Space>
 class DirectMethod {
  public:
   explicit DirectMethod(Space& space)

@@ -4,7 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "prdp/solvers/solver.h"
+#include "prdp/solvers/space.h"
 
 namespace prdp {
 
@@ -15,7 +15,7 @@ namespace prdp {
 /// Where autograd records the cycle, the coefficients h of the basis are constants: the least residual
 /// belongs to the space, whatever its basis. The minimiser's own dependence enters by Newton steps that
 /// change nothing in value; two of them give two derivatives.
-template <class Space>
+template <KrylovSpace Space>
 class GmresMethod {
  public:
   using Scalar = typename Space::Scalar;
@@ -28,7 +28,7 @@ class GmresMethod {
         kept_r_(space.vector()), h_(m_ * (m_ + 1)), inverse_(m_), cos_(m_), sin_(m_), g_(m_ + 1), y_(m_),
         again_(m_ + 1) {
     for (int64_t j = 0; j <= m_; ++j) v_.push_back(space.vector());
-    if (space.recording()) products_.resize(m_);
+    if (space.derivatives() > 0) products_.resize(m_);
   }
 
   void start() {
@@ -91,7 +91,7 @@ class GmresMethod {
     loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
       space_.apply(v_[j], v_[j + 1], preconditioner_);
-      if (space_.recording()) products_[j] = v_[j + 1];
+      if (space_.derivatives() > 0) products_[j] = v_[j + 1];
       scale_ = space_.larger(scale_, orthogonalise(j));
       const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
       h(j + 1, j) = h(j + 1, j) * space_.is_not_zero(inverse);
@@ -153,8 +153,7 @@ class GmresMethod {
         inverse_[k] = inverse_[k] * kept;
       }
     }
-    if (!space_.recording()) return;
-    for (int derivative = 1; derivative <= 2; ++derivative) {
+    for (int derivative = 1; derivative <= space_.derivatives(); ++derivative) {
       Vector e = r_;
       space_.subtract_combination(y_.data(), products_, columns, e);
       std::vector<Scalar> change(columns);

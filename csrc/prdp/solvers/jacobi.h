@@ -3,6 +3,8 @@
 #include <tuple>
 #include <vector>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// u ← u + D⁻¹(b - A u). From zero the first iterate is D⁻¹ b for free; from then on one product an
@@ -11,7 +13,7 @@ namespace prdp {
 /// Accelerated, it is Chebyshev's semi-iteration (Golub and Varga 1961): with ρ, the spectral radius of
 /// I - D⁻¹A, whose eigenvalues come in pairs ±μ, u_{k+1} = u_{k-1} + ω_{k+1} (u_k + D⁻¹(b - A u_k) - u_{k-1}),
 /// ω₁ = 1, ω₂ = 1/(1 - ρ²/2), ω_{k+1} = 1/(1 - ρ² ω_k/4). No dot products.
-template <class Space>
+template <SweepingSpace Space>
 class JacobiMethod {
  public:
   explicit JacobiMethod(Space& space, bool accelerated = false)
@@ -50,7 +52,7 @@ class JacobiMethod {
   bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_contract(); }
 
   /// What the next iteration starts from; resume() once it has been put back, as after `done` iterations.
-  auto carried() { return std::tie(x, next_); }
+  auto carried() { return std::tie(x); }
   void resume(int64_t done) {
     ready_ = false;
     done_ = done;
@@ -81,6 +83,14 @@ class JacobiMethod {
   int64_t done_ = 0;
   Scalar radius2_{};            // ρ²
   std::vector<Scalar> omega_;  // from the second iteration on
+};
+
+template <SweepingSpace Space>
+class ChebyshevMethod : public JacobiMethod<Space> {
+ public:
+  explicit ChebyshevMethod(Space& space) : JacobiMethod<Space>(space, /*accelerated=*/true) {}
+
+  auto carried() { return std::tie(this->x, this->next_); }
 };
 
 }  // namespace prdp

@@ -1,4 +1,10 @@
 #pragma once
+#include <array>
+#include <string_view>
+#include <tuple>
+#include <type_traits>
+
+#include "prdp/solvers/bicgstab.h"
 #include "prdp/solvers/conjugate_gradient.h"
 #include "prdp/solvers/direct.h"
 #include "prdp/solvers/gmres.h"
@@ -7,28 +13,183 @@
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
+/// The table of methods. Whatever the library wants to know about a method, it reads here.
 namespace prdp {
 
-/// Vectors that a method keeps at most, beside b and one of scratch.
-inline int64_t vectors_of(Method method, int64_t restart) {
-  return is_gmres(method) ? restart + 5 : method == Method::kConjugateGradientDiagonal ? 5 : 4;
+/// What max_iter counts: iterations, or cycles, each of which builds up as many vectors as `restart` says.
+enum class Counts { kIterations, kCycles };
+
+/// The operators that a method is made for. On others it may fail, and the error names the reason.
+enum class MadeFor {
+  kAny,
+  kDefinite,       // symmetric and definite
+  kDominant,       // the spectral radius of I - D⁻¹A is below 1
+  kKnownSpectrum   // the operator knows that radius: Heat and Poisson
+};
+
+/// The CPU loops that run a method. Where there are none, plain tensor operations do.
+enum class RunsOn { kAllLoops, kLaplacianLoops, kTensors };
+
+/// How the derivative of unrolled iterations is made. (In implicit mode every method solves with Aᵀ.)
+enum class Unrolled {
+  kSweep,   // by a reverse of its own in the CPU loops (autograd/sweeps.h), and by replay without them
+  kReplay,  // by autograd, which runs one iteration at a time again
+};
+
+/// One row of the table.
+struct MethodTraits {
+  Method method;
+  std::string_view name;   // in scenes and in the ops
+  std::string_view label;  // its class in C++ and Python, which errors name
+  Preconditioner preconditioner = Preconditioner::kNone;
+  MadeFor made_for = MadeFor::kAny;
+  Counts counts = Counts::kIterations;
+  int64_t products = 1;       // with A per iteration, or per vector of a cycle
+  int64_t vectors;            // that it keeps at most beside b and scratch; a cycle keeps `restart` more
+  double nanoseconds;         // of a core per unknown and iteration, or vector of a cycle
+  bool divides_by_diagonal = false;  // refuses an operator with a zero on it
+  bool is_direct = false;  // takes the operator's exact method, and no start
+  /// From zero, u is a polynomial of A, fixed by the number of iterations, times b. Then u is smooth in A and
+  /// linear in b, and the transposed map is as many iterations with Aᵀ.
+  bool is_polynomial = false;
+  bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
+  RunsOn runs_on = RunsOn::kAllLoops;
+  Unrolled unrolled = Unrolled::kReplay;
+};
+
+/// A row with the class that iterates.
+template <template <IterationSpace> class Iteration>
+struct MethodRow : MethodTraits {
+  template <IterationSpace Space>
+  using In = Iteration<Space>;
+
+  template <IterationSpace Space>
+  auto make(Space& space, int64_t restart) const {
+    if constexpr (std::is_constructible_v<Iteration<Space>, Space&, int64_t, Preconditioner>)
+      return Iteration<Space>(space, restart, preconditioner);
+    else
+      return Iteration<Space>(space);
+  }
+};
+
+/// In the order of the enumerators.
+inline constexpr std::tuple kMethods{
+    MethodRow<JacobiMethod>{{.method = Method::kJacobi,
+                             .name = "jacobi",
+                             .label = "Jacobi",
+                             .made_for = MadeFor::kDominant,
+                             .vectors = 4,
+                             .nanoseconds = 0.1,
+                             .divides_by_diagonal = true,
+                             .is_polynomial = true,
+                             .unrolled = Unrolled::kSweep}},
+    MethodRow<ChebyshevMethod>{{.method = Method::kChebyshev,
+                                .name = "chebyshev",
+                                .label = "Chebyshev",
+                                .made_for = MadeFor::kKnownSpectrum,
+                                .vectors = 4,
+                                .nanoseconds = 0.1,
+                                .is_polynomial = true,
+                                .runs_on = RunsOn::kLaplacianLoops}},
+    MethodRow<SteepestDescentMethod>{{.method = Method::kSteepestDescent,
+                                      .name = "steepest_descent",
+                                      .label = "SteepestDescent",
+                                      .made_for = MadeFor::kDefinite,
+                                      .vectors = 4,
+                                      .nanoseconds = 0.3,
+                                      .unrolled = Unrolled::kSweep}},
+    MethodRow<ConjugateGradientMethod>{{.method = Method::kConjugateGradient,
+                                        .name = "cg",
+                                        .label = "CG",
+                                        .made_for = MadeFor::kDefinite,
+                                        .vectors = 4,
+                                        .nanoseconds = 0.3,
+                                        .ends_at_unknowns = true,
+                                        .unrolled = Unrolled::kSweep}},
+    MethodRow<PreconditionedConjugateGradientMethod>{{.method = Method::kConjugateGradientDiagonal,
+                                                      .name = "cg_diagonal",
+                                                      .label = "CG",
+                                                      .preconditioner = Preconditioner::kDiagonal,
+                                                      .made_for = MadeFor::kDefinite,
+                                                      .vectors = 5,
+                                                      .nanoseconds = 0.6,
+                                                      .divides_by_diagonal = true,
+                                                      .ends_at_unknowns = true}},
+    MethodRow<BiCGStabMethod>{{.method = Method::kBiCGStab,
+                               .name = "bicgstab",
+                               .label = "BiCGStab",
+                               .products = 2,
+                               .vectors = 6,
+                               .nanoseconds = 0.8}},
+    MethodRow<GmresMethod>{{.method = Method::kGmres,
+                            .name = "gmres",
+                            .label = "GMRES",
+                            .counts = Counts::kCycles,
+                            .vectors = 5,
+                            .nanoseconds = 0.8,
+                            .unrolled = Unrolled::kSweep}},
+    MethodRow<GmresMethod>{{.method = Method::kGmresDiagonal,
+                            .name = "gmres_diagonal",
+                            .label = "GMRES",
+                            .preconditioner = Preconditioner::kDiagonal,
+                            .counts = Counts::kCycles,
+                            .vectors = 5,
+                            .nanoseconds = 0.8,
+                            .divides_by_diagonal = true}},
+    MethodRow<GmresMethod>{{.method = Method::kGmresStokes,
+                            .name = "gmres_stokes",
+                            .label = "GMRES",
+                            .preconditioner = Preconditioner::kStokes,
+                            .counts = Counts::kCycles,
+                            .vectors = 5,
+                            .nanoseconds = 0.8,
+                            .runs_on = RunsOn::kTensors}},
+    MethodRow<DirectMethod>{{.method = Method::kDirect,
+                             .name = "direct",
+                             .label = "Direct",
+                             .vectors = 4,
+                             .nanoseconds = 0.3,
+                             .is_direct = true}}};
+
+inline constexpr auto kTraits = std::apply(
+    [](const auto&... row) { return std::array<MethodTraits, sizeof...(row)>{row...}; }, kMethods);
+static_assert([] {
+  for (size_t i = 0; i < kTraits.size(); ++i)
+    if (static_cast<size_t>(kTraits[i].method) != i) return false;
+  return true;
+}(), "the rows of the table are not in the order of the enumerators");
+
+constexpr const MethodTraits& traits(Method method) { return kTraits[static_cast<size_t>(method)]; }
+
+/// A row as a type, for what is decided at compile time.
+template <size_t i>
+struct MethodAt {
+  static constexpr const auto& row = std::get<i>(kMethods);
+};
+
+/// Calls body(MethodAt<…>()) for this method; `i` is where the search begins.
+template <size_t i = 0, class Body>
+auto with_row(Method method, const Body& body) {
+  if constexpr (i + 1 < kTraits.size())
+    if (static_cast<size_t>(method) != i) return with_row<i + 1>(method, body);
+  return body(MethodAt<i>());
 }
 
 /// Calls body(method object) for the method that runs in this space.
-template <class Space, class Body>
+template <IterationSpace Space, class Body>
 auto with_method(Method method, int64_t restart, Space& space, const Body& body) {
-  switch (method) {
-    case Method::kJacobi: return body(JacobiMethod<Space>(space));
-    case Method::kChebyshev: return body(JacobiMethod<Space>(space, /*accelerated=*/true));
-    case Method::kSteepestDescent: return body(SteepestDescentMethod<Space>(space));
-    case Method::kConjugateGradient: return body(ConjugateGradientMethod<Space>(space));
-    case Method::kConjugateGradientDiagonal: return body(PreconditionedConjugateGradientMethod<Space>(space));
-    case Method::kGmres: return body(GmresMethod<Space>(space, restart, Preconditioner::kNone));
-    case Method::kGmresDiagonal: return body(GmresMethod<Space>(space, restart, Preconditioner::kDiagonal));
-    case Method::kGmresStokes: return body(GmresMethod<Space>(space, restart, Preconditioner::kStokes));
-    case Method::kDirect: break;
-  }
-  return body(DirectMethod<Space>(space));
+  return with_row(method, [&](auto at) { return body(at.row.make(space, restart)); });
+}
+
+/// Vectors that a method keeps at most, beside b and one of scratch.
+constexpr int64_t vectors_of(Method method, int64_t restart) {
+  return traits(method).vectors + (traits(method).counts == Counts::kCycles ? restart : 0);
+}
+
+/// Iterations, or those vectors that so many cycles build up.
+constexpr double steps_of(Method method, int64_t iterations, int64_t restart) {
+  return static_cast<double>(iterations) *
+         static_cast<double>(traits(method).counts == Counts::kCycles ? restart : 1);
 }
 
 }  // namespace prdp

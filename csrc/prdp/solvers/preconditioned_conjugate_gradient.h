@@ -2,12 +2,14 @@
 #include <cstdint>
 #include <tuple>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// Conjugate gradients for symmetric definite operators of either sign, preconditioned by the magnitude of
 /// the diagonal: z = |D|⁻¹ r, α = r·z / p·Ap; u += α p; r -= α A p; p ← z + β p. The residual that it is
 /// judged by is r itself.
-template <class Space>
+template <WeightedSpace Space>
 class PreconditionedConjugateGradientMethod {
  public:
   static constexpr bool kHasRecursiveResidual = true;

@@ -55,12 +55,12 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
     finish(status, 0, residual);
   };
   const T magnitude = kernels::largest_magnitude(b, n);
-  const T* x0 = batch.method == Method::kDirect || !batch.x0 ? nullptr : batch.x0 + s * n;
+  const T* x0 = traits(batch.method).is_direct || !batch.x0 ? nullptr : batch.x0 + s * n;
   if (!std::isfinite(magnitude) || (x0 && !std::isfinite(kernels::largest_magnitude(x0, n))))
     return hand_out_zeros(SolveStatus::kNonfiniteInput, std::numeric_limits<double>::infinity());
   if (!operator_is_finite)
     return hand_out_zeros(SolveStatus::kNonfiniteOperator, std::numeric_limits<double>::infinity());
-  if (divides_by_diagonal(batch.method) && kernel.has_zero_diagonal())
+  if (traits(batch.method).divides_by_diagonal && kernel.has_zero_diagonal())
     return hand_out_zeros(SolveStatus::kZeroDiagonal, 1.0);
   if (magnitude == T(0)) return hand_out_zeros(SolveStatus::kConverged, 0.0);
 
@@ -105,7 +105,7 @@ void solve_samples(const Kernel& kernel, const SampleBatch<T>& batch, int64_t be
     const auto solve = [&](const Kernel& a, int64_t from, int64_t to) {
       const bool finite = a.operator_is_finite();
       std::optional<typename SampleSpace<Kernel>::Factors> factors;
-      if (batch.method == Method::kDirect && finite) factors.emplace(a);
+      if (traits(batch.method).is_direct && finite) factors.emplace(a);
       space.set_operator(a, factors ? &*factors : nullptr);
       for (int64_t s = from; s < to; ++s) solve_sample(a, finite, space, method, batch, s);
     };

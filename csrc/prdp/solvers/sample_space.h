@@ -80,7 +80,10 @@ class SampleSpace {
   /// What the start is; null without one.
   const T* started_from() { return started_ ? start() : nullptr; }
 
-  Vector vector() { return workspace_.vector(used_++); }
+  Vector vector() {
+    TORCH_INTERNAL_ASSERT(used_ < workspace_.count(), "the table of methods promises too few vectors");
+    return workspace_.vector(used_++);
+  }
   Vector scratch() { return workspace_.vector(1); }
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
@@ -200,7 +203,7 @@ class SampleSpace {
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
 
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
-  static constexpr bool recording() { return false; }
+  static constexpr int derivatives() { return 0; }
   Scalar constant(Scalar value) const { return value; }
   void scale(const T* v, Scalar factor, Vector out) {
     loops_.scale(factor, v, out, length());

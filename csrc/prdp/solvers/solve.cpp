@@ -3,6 +3,7 @@
 #include <ATen/EmptyTensor.h>
 
 #include "prdp/solvers/interruption.h"
+#include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_cpu.h"
 
 namespace prdp {
@@ -17,11 +18,14 @@ SolveInfo empty_info(const at::Tensor& b) {
   return {empty(batch, at::kLong), empty(batch, b.scalar_type()), empty(batch, at::kLong), empty(batch, at::kLong)};
 }
 
-/// What an iteration takes of a core for each unknown, in nanoseconds; in GMRES a product of a cycle.
-double cost_per_unknown(Method method) {
-  if (method == Method::kJacobi || method == Method::kChebyshev) return 0.1;
-  if (is_gmres(method)) return 0.8;
-  return method == Method::kConjugateGradientDiagonal ? 0.6 : 0.3;
+/// Whether the CPU loops run this method for the operator with these parameters.
+bool has_loops(Method method, const KernelParameters& parameters) {
+  switch (traits(method).runs_on) {
+    case RunsOn::kAllLoops: return !std::holds_alternative<std::monostate>(parameters);
+    case RunsOn::kLaplacianLoops: return std::holds_alternative<kernels::LaplacianParameters>(parameters);
+    case RunsOn::kTensors: break;
+  }
+  return false;
 }
 
 template <class T, class Parameters>
@@ -54,21 +58,16 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
-  const double products = static_cast<double>(iterations) *
-                          static_cast<double>(is_gmres(method) ? std::min(restart, unknowns) : 1);
-  const double work = cost_per_unknown(method) * static_cast<double>(samples * unknowns) *
-                      (std::min(products, 1000.0) + 4.0);
+  const double steps = steps_of(method, iterations, std::min(restart, unknowns));
+  const double work = traits(method).nanoseconds * static_cast<double>(samples * unknowns) *
+                      (std::min(steps, 1000.0) + 4.0);
   const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
   return at::divup(samples, threads);
 }
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto parameters = a.kernel(b);
-  const bool has_loops =
-      request.method == Method::kChebyshev ? std::holds_alternative<kernels::LaplacianParameters>(parameters)
-                                           : !std::holds_alternative<std::monostate>(parameters) &&
-                                                 request.method != Method::kGmresStokes;
-  if (!b.is_cpu() || !has_loops) return solve_with_tensors(a, b, request);
+  if (!b.is_cpu() || !has_loops(request.method, parameters)) return solve_with_tensors(a, b, request);
   return std::visit(
       [&](const auto& p) -> SolveResult {
         if constexpr (std::is_same_v<std::decay_t<decltype(p)>, std::monostate>) {

@@ -20,10 +20,10 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method, con
       if (host.const_data_ptr<bool>()[i]) status[i] = why;
   };
   // A method that does not suit the operator raises here, also where nothing needs to be iterated.
-  if (method == Method::kChebyshev) a.jacobi_radius();
+  if (traits(method).made_for == MadeFor::kKnownSpectrum) a.jacobi_radius();
   // The last mark holds: the order is that of the CPU loops, from the end.
   mark(magnitude.eq(0), SolveStatus::kConverged);
-  if (divides_by_diagonal(method)) {
+  if (traits(method).divides_by_diagonal) {
     const auto zero = a.diagonal().eq(0);
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
@@ -97,7 +97,7 @@ at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& sta
   return start.defined() ? b - a.project(a.apply(start)) : b;
 }
 
-bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && method != Method::kDirect; }
+bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
 /// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
 std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
@@ -142,7 +142,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
                                         starts ? largest_magnitude(request.x0) : at::Tensor());
   const auto is_open = [](SolveStatus s) { return s == SolveStatus::kMaxIter; };
   const bool iterates = request.max_iter > 0 && std::any_of(status.begin(), status.end(), is_open);
-  if (request.method == Method::kGmresStokes && !iterates && b.size(0) > 0) a.precondition(at::zeros_like(b), false);
+  if (traits(request.method).preconditioner == Preconditioner::kStokes && !iterates && b.size(0) > 0)
+    a.precondition(at::zeros_like(b), false);
   auto takes_part = at::empty({b.size(0)}, at::kBool);
   std::vector<SampleState> states(status.size());
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();

@@ -1,4 +1,4 @@
-#include "prdp/solvers/solver.h"
+#include "prdp/solvers/methods.h"
 
 #include <array>
 #include <sstream>
@@ -11,15 +11,14 @@ namespace {
 template <class Enum, size_t N>
 using Names = std::array<std::pair<Enum, std::string_view>, N>;
 
-constexpr Names<Method, 9> kMethods{{{Method::kJacobi, "jacobi"},
-                                     {Method::kChebyshev, "chebyshev"},
-                                     {Method::kSteepestDescent, "steepest_descent"},
-                                     {Method::kConjugateGradient, "cg"},
-                                     {Method::kConjugateGradientDiagonal, "cg_diagonal"},
-                                     {Method::kGmres, "gmres"},
-                                     {Method::kGmresDiagonal, "gmres_diagonal"},
-                                     {Method::kGmresStokes, "gmres_stokes"},
-                                     {Method::kDirect, "direct"}}};
+constexpr auto kMethodNames = [] {
+  Names<Method, kTraits.size()> names{};
+  for (size_t i = 0; i < names.size(); ++i) names[i] = {kTraits[i].method, kTraits[i].name};
+  return names;
+}();
+constexpr Names<Preconditioner, 3> kPreconditioners{{{Preconditioner::kNone, "none"},
+                                                     {Preconditioner::kDiagonal, "diagonal"},
+                                                     {Preconditioner::kStokes, "stokes"}}};
 constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
                                          {Backward::kUnrolled, "unrolled"},
                                          {Backward::kNone, "none"}}};
@@ -49,11 +48,12 @@ Enum from_name(const Names<Enum, N>& names, std::string_view wanted, const char*
 
 }  // namespace
 
-std::string_view name(Method method) { return to_name(kMethods, method); }
+std::string_view name(Method method) { return traits(method).name; }
+std::string_view name(Preconditioner preconditioner) { return to_name(kPreconditioners, preconditioner); }
 std::string_view name(Backward backward) { return to_name(kBackwards, backward); }
 std::string_view name(OnFailure on_failure) { return to_name(kOnFailures, on_failure); }
 std::string_view name(Start start) { return to_name(kStarts, start); }
-Method method_from_name(std::string_view name) { return from_name(kMethods, name, "solver"); }
+Method method_from_name(std::string_view name) { return from_name(kMethodNames, name, "solver"); }
 Backward backward_from_name(std::string_view name) { return from_name(kBackwards, name, "backward"); }
 OnFailure on_failure_from_name(std::string_view name) {
   return from_name(kOnFailures, name, "on_failure");
@@ -69,23 +69,18 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
 }
 
+/// The method of this label with this preconditioner.
+Method with_preconditioner(std::string_view label, Preconditioner preconditioner) {
+  for (const auto& row : kTraits)
+    if (row.label == label && row.preconditioner == preconditioner) return row.method;
+  TORCH_CHECK_VALUE(false, label, ": takes no preconditioner of the kind ", name(preconditioner));
+}
+
 }  // namespace
 
-CG::operator Solver() const {
-  TORCH_CHECK_VALUE(preconditioner != Preconditioner::kStokes,
-                    "CG: preconditioner must be kNone or kDiagonal; kStokes is for GMRES");
-  const bool diagonal = preconditioner == Preconditioner::kDiagonal;
-  return {diagonal ? Method::kConjugateGradientDiagonal : Method::kConjugateGradient, max_iter, rtol};
-}
+CG::operator Solver() const { return {with_preconditioner("CG", preconditioner), max_iter, rtol}; }
 
-GMRES::operator Solver() const {
-  switch (preconditioner) {
-    case Preconditioner::kNone: break;
-    case Preconditioner::kDiagonal: return {Method::kGmresDiagonal, max_iter, rtol, restart};
-    case Preconditioner::kStokes: return {Method::kGmresStokes, max_iter, rtol, restart};
-  }
-  return {Method::kGmres, max_iter, rtol, restart};
-}
+GMRES::operator Solver() const { return {with_preconditioner("GMRES", preconditioner), max_iter, rtol, restart}; }
 
 void Solver::check(const char* who) const {
   check_budget(who, "", max_iter, rtol);

@@ -7,12 +7,14 @@
 
 namespace prdp {
 
+/// What each of them is, methods.h says.
 enum class Method {
   kJacobi,
   kChebyshev,
   kSteepestDescent,
   kConjugateGradient,
   kConjugateGradientDiagonal,
+  kBiCGStab,
   kGmres,
   kGmresDiagonal,
   kGmresStokes,
@@ -21,17 +23,6 @@ enum class Method {
 
 /// What CG and GMRES may be preconditioned by: the diagonal of A, or a Navier-Stokes step without winds.
 enum class Preconditioner { kNone, kDiagonal, kStokes };
-
-/// Methods that divide by the diagonal, and refuse an operator with a zero on it.
-constexpr bool divides_by_diagonal(Method m) {
-  return m == Method::kJacobi || m == Method::kConjugateGradientDiagonal || m == Method::kGmresDiagonal;
-}
-constexpr bool is_conjugate_gradient(Method m) {
-  return m == Method::kConjugateGradient || m == Method::kConjugateGradientDiagonal;
-}
-constexpr bool is_gmres(Method m) {
-  return m == Method::kGmres || m == Method::kGmresDiagonal || m == Method::kGmresStokes;
-}
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -73,6 +64,12 @@ struct CG {
   Preconditioner preconditioner = Preconditioner::kNone;
   operator Solver() const;
 };
+/// For any operator; two products with A per iteration.
+struct BiCGStab {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  operator Solver() const { return {Method::kBiCGStab, max_iter, rtol}; }
+};
 /// Restarted; max_iter counts cycles. Preconditioned from the right; kStokes is for NavierStokes alone
 /// and runs in plain tensor operations.
 struct GMRES {
@@ -107,6 +104,7 @@ enum class OnFailure { kRaise, kWarn, kReturn, kZeroGrad };
 
 /// Names as users write them; from_name raises ValueError naming the allowed ones.
 std::string_view name(Method method);
+std::string_view name(Preconditioner preconditioner);
 std::string_view name(Backward backward);
 std::string_view name(OnFailure on_failure);
 std::string_view name(Start start);

@@ -2,10 +2,12 @@
 #include <cstdint>
 #include <tuple>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// α = r·r / r·Ar; u += α r; r -= α A r. Fits definite operators of either sign.
-template <class Space>
+template <VectorSpace Space>
 class SteepestDescentMethod {
  public:
   static constexpr bool kHasRecursiveResidual = true;
@@ -28,7 +30,6 @@ class SteepestDescentMethod {
     go_on_from(space_.residual(x, r_));
     return rr_;
   }
-
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, rr_); }

@@ -104,7 +104,7 @@ class TensorSpace {
   Scalar ratio(const Scalar& num, const Scalar& den) const;
 
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
-  bool recording() const { return recording_; }
+  int derivatives() const { return recording_ ? 2 : 0; }
   Scalar constant(const Scalar& value) const { return value.detach(); }
   void scale(const Vector& v, const Scalar& factor, Vector& out) const { out = factor * v; }
   void dots(const std::vector<Vector>& v, int64_t count, const Vector& w, Scalar* h) const {

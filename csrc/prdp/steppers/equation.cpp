@@ -7,7 +7,7 @@
 
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/autograd/flat_options.h"
-#include "prdp/grid/grid.h"
+#include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/solving.h"
 
 namespace prdp {
@@ -16,8 +16,8 @@ namespace {
 
 /// A state of the equation in which nothing moves.
 at::Tensor rest(const Equation& equation) {
-  const bool has_pressure = equation.kind == "navier_stokes";
-  std::vector<int64_t> sizes{1, has_pressure ? 3 : static_cast<int64_t>(equation.shape.size())};
+  const int64_t channels = equation_kind(equation.kind).channels;
+  std::vector<int64_t> sizes{1, channels == kPerAxis ? static_cast<int64_t>(equation.shape.size()) : channels};
   // A negative extent is left for the operator to refuse.
   for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
   uint64_t numbers = 0;
@@ -28,10 +28,6 @@ at::Tensor rest(const Equation& equation) {
 
 }  // namespace
 
-bool is_flow(const Equation& equation) {
-  return equation.kind == "burgers" || equation.kind == "navier_stokes";
-}
-
 void Equation::check() const {
   TORCH_CHECK_VALUE(picard_steps >= 1, kind, ": picard_steps must be >= 1, got ", picard_steps);
   make_operator(equation_operator(*this, rest(*this)))->check_parameters();
@@ -39,25 +35,18 @@ void Equation::check() const {
 
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u) {
   auto tensors = equation.tensors;
-  if (is_flow(equation)) tensors.insert(tensors.begin(), u);  // the winds
+  if (equation_kind(equation.kind).linearised) tensors.insert(tensors.begin(), u);  // the winds
   return {equation.kind, equation.shape, equation.parameters, tensors};
 }
 
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u) {
-  if (equation.kind == "poisson") return -u;  // Δu = -p
-  if (equation.kind == "navier_stokes") {
-    Grid("NavierStokes", equation.shape, Boundary::kPeriodic).check_field(u, 3);
-    const auto velocity = u.narrow(1, 0, 2);
-    return at::cat({velocity / equation.parameters[0], at::zeros_like(u.narrow(1, 2, 1))}, 1);
-  }
-  return u;
+  const auto rhs = equation_kind(equation.kind).rhs;
+  return rhs ? rhs(equation, u) : u;
 }
 
 at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar) {
-  if (equation.kind == "poisson") return -bar;
-  if (equation.kind == "navier_stokes")
-    return at::cat({bar.narrow(1, 0, 2) / equation.parameters[0], at::zeros_like(bar.narrow(1, 2, 1))}, 1);
-  return bar;
+  const auto transposed = equation_kind(equation.kind).rhs_transposed;
+  return transposed ? transposed(equation, bar) : bar;
 }
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {

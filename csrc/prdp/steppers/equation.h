@@ -17,9 +17,6 @@ struct Equation {
   void check() const;
 };
 
-/// Whether A depends on the state.
-bool is_flow(const Equation& equation);
-
 /// The operator A(u) and the right-hand side b(u) at the state u, both differentiable in u.
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u);
 at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);

@@ -13,6 +13,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/steppers/solving.h"
 
@@ -162,7 +163,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     ctx->mark_non_differentiable({iterations, residual, status, applications});
     ctx->set_materialize_grads(false);
     const bool unrolled = options.backward == Backward::kUnrolled;
-    const bool a_varies = is_flow(call->equation) || any_requires_grad(tensors);
+    const bool a_varies = equation_kind(call->equation.kind).linearised || any_requires_grad(tensors);
     const bool may_have_failed = options.on_failure != OnFailure::kRaise;
     variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
                         unrolled || may_have_failed ? status : at::Tensor(),

@@ -7,6 +7,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/interruption.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/solving.h"
 
 namespace prdp {
@@ -46,8 +47,8 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
                                       const Equation& equation, const SolveOptions& options,
                                       at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
   const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
-  const bool rhs_is_state = equation.kind == "heat" || equation.kind == "burgers";
-  const bool flow = is_flow(equation);
+  const auto& kind = equation_kind(equation.kind);
+  const bool rhs_is_state = !kind.rhs;
   auto each = options;
   each.adjoint_log = 0;
   auto bars = cotangent.unbind(1);
@@ -70,11 +71,11 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     }
     std::vector<int64_t> wanted(needed.begin(), needed.end());
     wanted[0] = needed[0] || first > 0;
-    if (flow) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
+    if (kind.linearised) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
     const auto [gradients, info] = solve_vjp(bars[s + 1], solved, a, each, wanted, adjoint_solve);
     reports.push(info);
     add_to(rhs_is_state ? bars[first] : rhs_bar, gradients[0]);
-    if (flow) add_to(bars[s], gradients[1]);
+    if (kind.linearised) add_to(bars[s], gradients[1]);
     if (s == first && rhs_bar.defined()) {
       add_to(bars[s], equation_rhs_transposed(equation, rhs_bar));
       rhs_bar = at::Tensor();

@@ -1,0 +1,27 @@
+#pragma once
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// What the library knows about a kind of operator: a row of the table in kinds.cpp.
+struct OperatorKind {
+  const char* kind;   // as in OperatorSpec
+  const char* title;  // as in messages
+  std::unique_ptr<Operator> (*make)(const OperatorSpec& spec);
+  /// The number of axes of each tensor where it has one for the batch: 0 if all samples share it, kLikeState if it is
+  /// shaped like a state. nullopt if that is not known, as for the tensors of a function.
+  std::optional<std::vector<int64_t>> batched_axes;
+  bool has_pressure = false;  // rows without a diagonal, and a mean that A maps to zero
+};
+
+inline constexpr int64_t kLikeState = -1;
+
+/// Raises ValueError for an unknown kind.
+const OperatorKind& operator_kind(const std::string& kind);
+
+}  // namespace prdp

@@ -1,0 +1,77 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <tuple>
+
+#include "prdp/solvers/space.h"
+
+namespace prdp {
+
+/// BiCGStab (van der Vorst 1992), for any operator: two products per iteration and no basis to keep. With r̂, the
+/// first residual: ρ = r̂·r, p ← r + β (p - ω v) with β = (ρ/ρ₋)(α/ω), v = A p, α = ρ / r̂·v, s = r - α v, t = A s,
+/// ω = s·t / t·t, x += α p + ω s, r = s - ω t.
+///
+/// Where r has become all but orthogonal to r̂, so that two digits of ρ are left at most, it starts anew from
+/// r̂ = p = r. It breaks down where r̂·v is rounding, or s·t of the iteration before was.
+template <VectorSpace Space>
+class BiCGStabMethod {
+ public:
+  using Scalar = typename Space::Scalar;
+  static constexpr bool kHasRecursiveResidual = true;
+
+  explicit BiCGStabMethod(Space& space)
+      : x(space.vector()), space_(space), r_(space.vector()), hat_(space.vector()), p_(space.vector()),
+        v_(space.vector()), t_(space.vector()) {}
+
+  void start() {
+    for (auto* vector : {&x, &p_, &v_}) space_.fill_zero(*vector);
+    space_.copy(space_.b(), r_);
+    space_.copy(space_.b(), hat_);
+    rr_ = hh_ = ss_ = st_ = tt_ = space_.b2();
+    inverse_ = rr_ * 0;
+  }
+  void step() {
+    using std::sqrt;
+    Scalar rho = space_.dot(hat_, r_);
+    const Scalar rounding = sqrt(hh_) * sqrt(rr_) * (200 * space_.epsilon());
+    const Scalar lost = space_.is_larger(rounding, rho) * space_.is_larger(rounding, -rho);
+    space_.restore(lost, r_, hat_);
+    space_.restore(lost, rr_, hh_);
+    space_.restore(lost, rr_, rho);
+    space_.restore(lost, rr_ * 0, inverse_);
+
+    const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
+    space_.xpby(v_, -over_omega, p_);
+    space_.xpby(r_, -rho * inverse_, p_);
+    const Scalar vv = space_.apply_with_dots(p_, v_)[1], hv = space_.dot(hat_, v_);
+    inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
+    const Scalar moves = space_.is_not_zero(over_omega) * space_.is_not_zero(inverse_);
+    ss_ = space_.descend(rho * inverse_ * moves, p_, v_, x, r_);
+    const auto [st, tt] = space_.apply_with_dots(r_, t_);
+    st_ = st;
+    tt_ = tt;
+    rr_ = space_.descend(space_.ratio(st, tt) * moves, r_, t_, x, r_);
+  }
+  auto residual2() const { return rr_; }
+  /// From the true residual it starts anew.
+  auto recompute_residual() {
+    rr_ = space_.residual(x, r_);
+    space_.copy(r_, hat_);
+    for (auto* square : {&hh_, &ss_, &st_, &tt_}) space_.assign(rr_, *square);
+    space_.assign(rr_ * 0, inverse_);
+    return rr_;
+  }
+
+  /// What the next iteration starts from, beside x; resume() once it has been put back.
+  auto carried() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_); }
+  void resume(int64_t) {}
+
+  typename Space::Vector x;
+
+ private:
+  Space& space_;
+  typename Space::Vector r_, hat_, p_, v_, t_;       // r, and s between; r̂; A p; A s
+  Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
+};
+
+}  // namespace prdp
