@@ -1,0 +1,30 @@
+"""docs/architecture.md says what is true of the source."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/architecture.md").read_text()
+
+
+def test_a_folder_includes_only_folders_above_it():
+    table = re.search(r"## The folders\n.*?\n\n(\|.*?)\n\n", PAGE, re.DOTALL)[1]
+    order = re.findall(r"`csrc/prdp/(\w+)`", table)
+    folders = {path.name for path in (ROOT / "csrc/prdp").iterdir() if path.is_dir()}
+    assert set(order) == folders
+    for path in sorted((ROOT / "csrc/prdp").glob("*/*.*")):
+        for included in re.findall(r'#include "prdp/(\w+/\w+\.h)"', path.read_text()):
+            above = order.index(included.split("/")[0]) <= order.index(path.parent.name)
+            assert above or included == "solvers/interruption.h", f"{path.name} includes {included}"
+
+
+def test_the_files_of_the_page_exist():
+    named = re.findall(r"`([\w/]+\.(?:h|cpp|py|toml|txt))`", PAGE)
+    assert len(named) > 30
+    homes = [ROOT, ROOT / "csrc/prdp", ROOT / "prdp_torch", ROOT / "prdp_torch/experiments"]
+    missing = {
+        name
+        for name in named
+        if "NAME" not in name and not any((home / name).exists() or list(home.glob(f"*/{name}")) for home in homes)
+    }
+    assert not missing
