@@ -7,6 +7,7 @@
 #include <sstream>
 
 #include "../fuzz/targets.h"
+#include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
 #include "prdp/scenes/scene.h"
 
@@ -68,6 +69,12 @@ TEST(Fuzz, AnOffsetOfAStencilIsAWholeNumber) {
   for (const double offset : {double(NAN), double(INFINITY), -1e300, 0.5})
     EXPECT_THROW(prdp::make_operator({"stencil", {4}, {0.0, offset}, {coefficients}}), c10::ValueError) << offset;
   EXPECT_NO_THROW(prdp::make_operator({"stencil", {4}, {0.0, 1.0}, {coefficients}}));
+}
+
+TEST(Fuzz, AVectorOfAStencilHasAChannel) {
+  const prdp::OperatorSpec a{"stencil", {4}, {0.0, 1.0}, {at::ones({1, 1, 4}, at::kDouble)}};
+  for (const auto method : {prdp::Method::kJacobi, prdp::Method::kChebyshev})
+    EXPECT_THROW(prdp::linear_solve(a, at::zeros({2, 0, 4}, at::kDouble), {{method, 3}}), c10::ValueError);
 }
 
 }  // namespace

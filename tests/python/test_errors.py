@@ -206,3 +206,7 @@ def test_vectors_without_unknowns_are_refused():
     for solver in (prdp.CG(3), prdp.Direct()):
         with pytest.raises(ValueError, match=r"Function: every extent of a vector must be >= 1, got \[2, 0\]"):
             prdp.linear_solve(function, torch.zeros(2, 0), solver)
+    stencil = operators.Stencil(torch.ones(1, 2, 4), [(0,), (1,)])
+    for solver in (prdp.CG(3), prdp.Direct(), prdp.Jacobi(3), prdp.GMRES(3)):
+        with pytest.raises(ValueError, match=r"Stencil: a vector must have at least one channel, got \[2, 0, 4\]"):
+            prdp.linear_solve(stencil, torch.zeros(2, 0, 4), solver)

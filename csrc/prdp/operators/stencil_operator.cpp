@@ -120,6 +120,7 @@ void StencilOperator::check_vector(const at::Tensor& b) const {
     for (int64_t d = 0; d < dim(); ++d) expected << ", " << extent(d);
     TORCH_CHECK_VALUE(false, "Stencil: expected (batch, channel", expected.str(), "), got ", sizes);
   }
+  TORCH_CHECK_VALUE(sizes[1] != 0, "Stencil: a vector must have at least one channel, got ", sizes);
   TORCH_CHECK_VALUE(coefficients_.sym_size(0) == 1 || coefficients_.sym_size(0) == sizes[0],
                     "Stencil: the coefficients hold ", coefficients_.sym_size(0), " samples, the vector holds ",
                     sizes[0]);
