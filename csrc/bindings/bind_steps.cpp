@@ -1,8 +1,6 @@
 #include <ATen/PythonTorchFunctionTLS.h>
 #include <torch/csrc/autograd/python_variable.h>
 
-#include <variant>
-
 #include "bindings.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/disguises.h"
@@ -29,12 +27,8 @@ std::vector<at::Tensor> unwrapped(const std::vector<py::object>& tensors) {
   return found;
 }
 
-/// A number, or the tensor in which a stepper keeps it.
-using Budget = std::variant<at::Tensor, int64_t>;
-
-SolveOptions with(SolveOptions options, const Budget& max_iter, int64_t adjoint_log) {
-  const auto* tensor = std::get_if<at::Tensor>(&max_iter);
-  options.solver.max_iter = tensor ? tensor->item<int64_t>() : std::get<int64_t>(max_iter);
+SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
+  options.solver.max_iter = max_iter;
   options.adjoint_log = adjoint_log;
   return options;
 }
@@ -49,7 +43,7 @@ py::object report(const Solve& solve) {
 }
 
 py::object call_step(const py::object& u, const std::vector<py::object>& tensors, const Equation& equation,
-                     const SolveOptions& options, const Budget& max_iter, int64_t adjoint_log) {
+                     const SolveOptions& options, int64_t max_iter, int64_t adjoint_log) {
   HANDLE_TH_ERRORS
   if (!nobody_in_python_watches(u, tensors)) return py::none();
   auto whole = equation;
@@ -62,7 +56,7 @@ py::object call_step(const py::object& u, const std::vector<py::object>& tensors
 
 py::object call_linear_solve(const py::object& b, const std::vector<py::object>& tensors, std::string kind,
                              std::vector<int64_t> shape, std::vector<double> parameters, const SolveOptions& options,
-                             const Budget& max_iter, int64_t adjoint_log, const std::optional<py::object>& x0) {
+                             int64_t max_iter, int64_t adjoint_log, const std::optional<py::object>& x0) {
   HANDLE_TH_ERRORS
   if (!nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0))) return py::none();
   const OperatorSpec a{std::move(kind), std::move(shape), std::move(parameters), unwrapped(tensors)};

@@ -1,7 +1,5 @@
 #include "prdp/operators/kinds.h"
 
-#include <c10/util/StringUtil.h>
-
 #include "prdp/operators/burgers_operator.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/laplacian_operator.h"
@@ -34,11 +32,7 @@ const std::vector<OperatorKind> kKinds{
 }  // namespace
 
 const OperatorKind& operator_kind(const std::string& kind) {
-  for (const auto& row : kKinds)
-    if (row.kind == kind) return row;
-  std::vector<std::string> known;
-  for (const auto& row : kKinds) known.emplace_back(row.kind);
-  TORCH_CHECK_VALUE(false, "operator: unknown kind '", kind, "'; allowed: ", c10::Join(", ", known));
+  return row_of(kKinds, "operator", kind);
 }
 
 }  // namespace prdp

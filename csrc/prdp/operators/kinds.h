@@ -1,4 +1,6 @@
 #pragma once
+#include <c10/util/StringUtil.h>
+
 #include <memory>
 #include <optional>
 #include <string>
@@ -20,6 +22,16 @@ struct OperatorKind {
 };
 
 inline constexpr int64_t kLikeState = -1;
+
+/// The row of a table. Raises ValueError for a kind that has none.
+template <class Row>
+const Row& row_of(const std::vector<Row>& rows, const char* table, const std::string& kind) {
+  for (const auto& row : rows)
+    if (row.kind == kind) return row;
+  std::vector<std::string> known;
+  for (const auto& row : rows) known.emplace_back(row.kind);
+  TORCH_CHECK_VALUE(false, table, ": unknown kind '", kind, "'; allowed: ", c10::Join(", ", known));
+}
 
 /// Raises ValueError for an unknown kind.
 const OperatorKind& operator_kind(const std::string& kind);

@@ -1,8 +1,7 @@
 #include "prdp/steppers/equation_kinds.h"
 
-#include <c10/util/StringUtil.h>
-
 #include "prdp/grid/grid.h"
+#include "prdp/operators/kinds.h"
 
 namespace prdp {
 
@@ -32,11 +31,7 @@ const std::vector<EquationKind> kKinds{
 }  // namespace
 
 const EquationKind& equation_kind(const std::string& kind) {
-  for (const auto& row : kKinds)
-    if (row.kind == kind) return row;
-  std::vector<std::string> known;
-  for (const auto& row : kKinds) known.emplace_back(row.kind);
-  TORCH_CHECK_VALUE(false, "equation: unknown kind '", kind, "'; allowed: ", c10::Join(", ", known));
+  return row_of(kKinds, "equation", kind);
 }
 
 }  // namespace prdp
