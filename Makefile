@@ -36,7 +36,7 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 sanitize: $(STAMPS)/configure
 	$(BIN)/cmake -S . -B build-address -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=address,undefined > build/sanitize.log
 	$(BIN)/cmake --build build-address --parallel $$(nproc) --target prdp_tests
-	UBSAN_OPTIONS=print_stacktrace=1 build-address/prdp_tests --gtest_brief=1
+	UBSAN_OPTIONS=print_stacktrace=1 LSAN_OPTIONS=suppressions=tests/cpp/leaks_of_torch.txt build-address/prdp_tests --gtest_brief=1
 	$(BIN)/cmake -S . -B build-thread -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=thread > build/sanitize.log
 	$(BIN)/cmake --build build-thread --parallel $$(nproc) --target prdp_tests
 	build-thread/prdp_tests --gtest_brief=1 --gtest_filter='Threads.*'

@@ -157,7 +157,25 @@ def three_parameters():
     return _table(head, body)
 
 
+def navier_stokes():
+    """One seed of each row, and how much the metric varies over the last epochs."""
+    found = record("navier_stokes")
+    base, body = found["rows"][0], []
+    for row in found["rows"]:
+        last = found["curves"][row["label"]]["metric"][-10:]
+        mean = sum(last) / len(last)
+        deviation = (sum((x - mean) ** 2 for x in last) / (len(last) - 1)) ** 0.5
+        title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
+        products = row["operator_applications"]
+        saved = "–" if row["kind"] == "converged" else _percent(1 - products / base["operator_applications"], 1)
+        cells = f"{mean:.2e} ± {deviation:.0e}", f"{row['last_k']:.3g}", f"{row['iterations']:,.0f}", f"{products:,.0f}"
+        body.append([title, f"{row['metric']:.2e}", *cells, saved])
+    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved"]
+    return _table(head, body)
+
+
 TABLES = {
+    "Navier–Stokes": navier_stokes,
     "the parts of auto": parts_of_auto,
     "the shares of auto": shares_of_auto,
     "the README's table": readme,
