@@ -4,7 +4,10 @@
 #include <atomic>
 #include <chrono>
 #ifdef __SANITIZE_THREAD__
-#include <sanitizer/tsan_interface.h>
+#include <algorithm>
+#include <exception>
+#include <thread>
+#include <vector>
 #endif
 
 /// Ends a long computation from outside, for Python's Ctrl-C. The loops count their work, and from time to time run a
@@ -56,36 +59,41 @@ class Watch {
 };
 
 #ifdef __SANITIZE_THREAD__
-/// What ThreadSanitizer cannot see, because torch's OpenMP library is built without it: a parallel loop begins after
-/// what was done before it, and ends before what is done after it. Nothing is said about parts of the same loop.
-class ForkAndJoin {
- public:
-  ForkAndJoin() { __tsan_release(&begun_); }
-  ~ForkAndJoin() { __tsan_acquire(&ended_); }
-  struct Part {
-    explicit Part(const ForkAndJoin& loop) : loop(loop) { __tsan_acquire(&loop.begun_); }
-    ~Part() { __tsan_release(&loop.ended_); }
-    const ForkAndJoin& loop;
+/// at::parallel_for on threads of its own. ThreadSanitizer takes the hand-over of a loop for a race in torch's OpenMP
+/// library, which is built without it.
+template <class Body>
+void share(int64_t begin, int64_t end, int64_t grain, const Body& body) {
+  if (begin >= end) return;
+  const int64_t parts = std::min<int64_t>(at::get_num_threads(), at::divup(end - begin, std::max<int64_t>(grain, 1)));
+  const int64_t size = at::divup(end - begin, parts);
+  std::vector<std::exception_ptr> thrown(static_cast<size_t>(parts));
+  const auto run = [&](int64_t part) {
+    try {
+      body(begin + part * size, std::min(end, begin + (part + 1) * size));
+    } catch (...) {
+      thrown[static_cast<size_t>(part)] = std::current_exception();
+    }
   };
-
- private:
-  mutable char begun_ = 0, ended_ = 0;
-};
+  {
+    std::vector<std::jthread> others;
+    for (int64_t part = 1; part * size < end - begin; ++part) others.emplace_back(run, part);
+    run(0);
+  }
+  for (const auto& exception : thrown)
+    if (exception) std::rethrow_exception(exception);
+}
 #else
-struct ForkAndJoin {
-  struct Part {
-    explicit Part(const ForkAndJoin&) {}
-  };
-};
+template <class Body>
+void share(int64_t begin, int64_t end, int64_t grain, const Body& body) {
+  at::parallel_for(begin, end, grain, body);
+}
 #endif
 
 /// at::parallel_for, all of whose threads stop soon after one of them has thrown.
 template <class Body>
 void parallel_for(int64_t begin, int64_t end, int64_t grain, const Body& body) {
   std::atomic<bool> stop = false;
-  const ForkAndJoin order;
-  at::parallel_for(begin, end, grain, [&](int64_t from, int64_t to) {
-    const ForkAndJoin::Part part(order);
+  share(begin, end, grain, [&](int64_t from, int64_t to) {
     const Watch::Member member(stop);
     try {
       body(from, to);
