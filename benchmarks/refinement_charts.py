@@ -68,7 +68,7 @@ def over_the_training(found):
             above.plot(intervals, curves["iterations"], color=colour, label=title)
             below.plot(intervals, curves["rtol"], color=colour, label=title)
         above.set(title=name, yscale="log")
-        below.set(yscale="log", xlabel=found[name]["settings"].get("unit", "interval"))
+        below.set(yscale="log", xlabel="interval")
         for axes in (above, below):
             axes.grid(alpha=0.3, lw=0.4)
         above.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))

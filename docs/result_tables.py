@@ -1,18 +1,17 @@
 """Write the tables of results in README.md, docs/refinement.md and docs/results.md from the records in docs/results.
 
-Run it after new records: python docs/result_tables.py
+Run it after new records: python -m docs.result_tables
 """
 
 import importlib
 import json
-import re
-import sys
 from pathlib import Path
 
+from docs import page_tables
+
 DOCS = Path(__file__).parent
-sys.path.insert(0, str(DOCS.parent))  # for the tables of benchmarks/studies
 PAGES = (DOCS.parent / "README.md", DOCS / "refinement.md", DOCS / "results.md")
-TABLE = re.compile(r"^(<!-- docs/result_tables.py writes ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)
+TABLE = page_tables.places("result_tables.py")
 
 SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
 SCENES = (*SCENES, "diffusion_inverse")
@@ -199,7 +198,7 @@ def table(name):
 
 def with_tables(page):
     """Return the text of a page with its tables written anew."""
-    return TABLE.sub(lambda found: f"{found[1]}\n{table(found[2])}\n{found[3]}", page)
+    return page_tables.with_tables(page, "result_tables.py", table)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
 """Write the tables of scene keys in docs/command_line.md, from what the reader of scenes declares.
 
-Run it after a change of csrc/prdp/scenes/scene_reader.cpp and a build: python docs/scene_keys.py
+Run it after a change of csrc/prdp/scenes/scene_reader.cpp and a build: python -m docs.scene_keys
 """
 
 import re
 from pathlib import Path
 
+from docs import page_tables
 from prdp_torch import _C
 
 PAGE = Path(__file__).with_name("command_line.md")
-TABLE = re.compile(r"^(<!-- docs/scene_keys.py writes the keys of ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)
+TABLE = page_tables.places("scene_keys.py")
 
 
 def table(name):
@@ -26,7 +27,7 @@ def table(name):
 
 def with_tables(page):
     """Return the text of the page with its tables written anew."""
-    return TABLE.sub(lambda found: f"{found[1]}\n{table(found[2])}\n{found[3]}", page)
+    return page_tables.with_tables(page, "scene_keys.py", lambda what: table(what.removeprefix("the keys of ")))
 
 
 if __name__ == "__main__":
