@@ -111,7 +111,7 @@ void bind_scenes(py::module_& m) {
   m.def("make_dataset", &make_dataset, py::arg("scene"), py::arg("on_progress") = OnProgress(),
         py::call_guard<py::gil_scoped_release>());
   py::class_<FreshData>(m, "FreshData")
-      .def(py::init<Scene>(), py::arg("scene"))
+      .def(py::init<Scene, Dataset>(), py::arg("scene"), py::arg("first"))
       .def("epoch", &FreshData::epoch, py::arg("number"), py::call_guard<py::gil_scoped_release>());
   m.def("validation_trajectories", &validation_trajectories, py::arg("scene"), py::arg("steps"),
         py::arg("on_progress") = OnProgress(), py::call_guard<py::gil_scoped_release>());

@@ -306,7 +306,7 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   auto network = make_network(scene, seed);
   if (!weights.empty()) unpack_weights(weights, *network.ptr());
   auto data = make_dataset(scene, on_data);
-  FreshData fresh(scene);
+  FreshData fresh(scene, data);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
                                                               : corrector(scene, steppers, data, network);
   FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));

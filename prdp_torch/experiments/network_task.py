@@ -59,7 +59,7 @@ class _TrainingSamples:
     def __init__(self, scene, data):
         self.count = len(data.train_start)
         self._updates = math.ceil(self.count / scene.training.batch)  # of an epoch
-        self._fresh = _C.FreshData(scene) if scene.data.fresh else None
+        self._fresh = _C.FreshData(scene, data) if scene.data.fresh else None
         self._take(data)
 
     def begin(self, update):

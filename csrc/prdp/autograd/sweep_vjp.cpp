@@ -50,7 +50,8 @@ void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<
 }  // namespace
 
 bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
-  return b.is_cpu() && traits(solve.solver.method).unrolled == Unrolled::kSweep && !std::holds_alternative<std::monostate>(a.kernel(b));
+  return b.is_cpu() && traits(solve.solver.method).unrolled == Unrolled::kSweep &&
+         !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 
 UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,

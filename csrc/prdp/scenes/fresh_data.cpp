@@ -16,7 +16,7 @@ int64_t seed_of(int64_t seed, int64_t epoch) {
 
 }  // namespace
 
-FreshData::FreshData(Scene scene) : scene_(std::move(scene)) {}
+FreshData::FreshData(Scene scene, Dataset first) : scene_(std::move(scene)), first_(std::move(first)) {}
 
 FreshData::~FreshData() {
   stopped_ = true;
@@ -24,6 +24,7 @@ FreshData::~FreshData() {
 }
 
 Dataset FreshData::make(int64_t number) const {
+  if (number == 0) return first_;
   auto scene = scene_;
   scene.data.seed = seed_of(scene_.data.seed, number);
   return compute_training_samples(scene, [this](int64_t, int64_t) {

@@ -11,20 +11,21 @@ namespace prdp {
 /// training that goes on from a checkpoint sees the same.
 class FreshData {
  public:
-  explicit FreshData(Scene scene);
+  /// `first`: the samples of the first epoch, which `make_dataset` has made.
+  FreshData(Scene scene, Dataset first);
   /// Stops what is being made.
   ~FreshData();
   FreshData(const FreshData&) = delete;
   FreshData& operator=(const FreshData&) = delete;
 
-  /// The samples of epoch `number`, counted from 0, in the train_ fields of a Dataset; the first epoch's are those of
-  /// `make_dataset`. Raises RuntimeError where a reference solve does not converge.
+  /// The samples of epoch `number`, counted from 0, in the train_ fields of a Dataset. Raises RuntimeError where a reference solve does not converge.
   Dataset epoch(int64_t number);
 
  private:
   Dataset make(int64_t number) const;
 
   Scene scene_;
+  Dataset first_;
   std::atomic<bool> stopped_ = false;
   int64_t coming_ = -1;  // the epoch that is being made
   std::future<Dataset> made_;
