@@ -9,7 +9,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullL
 from prdp_torch.experiments.charts import make_figure
 
 # One colour per method in all pictures; Okabe and Ito's, which colour-blind readers can tell apart.
-COLOURS = {"GMRES(2)": "#56B4E9",
+COLOURS = {"GMRES(2)": "#56B4E9", "BiCGStab": "#8C6D31",
            "Jacobi": "#0072B2", "Chebyshev": "#009E73", "SteepestDescent": "#CC79A7", "CG": "#E69F00",
            "GMRES": "#D55E00", "Direct": "#222222", "constant K": "#0072B2", "implicit": "#0072B2",
            "unrolled": "#D55E00", "solution": "#888888", "primal": "#0072B2", "adjoint": "#D55E00"}  # fmt: skip
@@ -30,7 +30,7 @@ def titled(question, answer, panels=1, height=4.4):
 
 def _style(name):
     method = next((m for m in COLOURS if name.startswith(m)), None)
-    dashed = any(word in name for word in ("diagonal", "unrolled", "float64"))
+    dashed = any(word in name for word in ("diagonal", "stokes", "unrolled", "float64"))
     return {"color": COLOURS.get(method, "#666666"), "ls": "--" if dashed else "-"}
 
 
@@ -58,8 +58,8 @@ def cost(xlabel, boundary=None):
         figure, (axes,) = titled(question, data["answer"])
         _draw_lines(axes, data["x"], data["lines"])
         for name, values in data["lines"].items():
-            if None in values and any(v is not None for v in values):
-                last = max(i for i, v in enumerate(values) if v is not None)
+            last = values.index(None) - 1 if None in values else -1
+            if last >= 0:
                 axes.plot(data["x"][last], values[last], "X", ms=11, color=_style(name)["color"], mec="white", zorder=4)
         axes.set(xlabel=xlabel, ylabel="products with A until 1e-5\n(median; × where the solves begin to fail)")
         if boundary is not None:

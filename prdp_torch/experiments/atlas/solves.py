@@ -7,7 +7,7 @@ import torch
 from prdp_torch import operators
 from prdp_torch.experiments.atlas import problems
 from prdp_torch.solve import SolveStatus, linear_solve
-from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent
+from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, SteepestDescent
 
 
 def solve(a, b, solver):
@@ -52,11 +52,22 @@ def table(x, rows, problem, solver_of):
     }
 
 
-def _table_of_solvers(x, problem, solvers):
+def _table_of_solvers(x, problem, solvers, of_x="every CFL number"):
     """A table, whose answer are the solvers that solve every sample everywhere."""
     data = table(x, list(solvers), problem, solvers.get)
     always = " · ".join(name for name, row in zip(data["rows"], data["share"], strict=True) if min(row) == 1.0)
-    return {**data, "answer": f"every CFL number: {always}"}
+    return {**data, "answer": f"{of_x}: {always}"}
+
+
+def _of_burgers(products):
+    """Solvers that are given so many products each."""
+    return {
+        "Jacobi": Jacobi(products),
+        "SteepestDescent": SteepestDescent(products),
+        "CG": CG(products),
+        "BiCGStab": BiCGStab(products // 2),
+        **{f"GMRES({m})": GMRES(restart=m, max_iter=math.ceil(products / m)) for m in (2, 10, 64)},
+    }
 
 
 def stiffness(quick):
@@ -140,16 +151,15 @@ def contrast(quick):
 
 
 def burgers_solvers(quick):
-    x = spaced(0.1, 1000, 3 if quick else 9)
-    solvers = {
-        "Jacobi": Jacobi(3000),
-        "SteepestDescent": SteepestDescent(3000),
-        "CG": CG(3000),
-        "GMRES(2)": GMRES(restart=2, max_iter=1500),
-        "GMRES(10)": GMRES(restart=10, max_iter=300),
-        "GMRES(64)": GMRES(restart=64, max_iter=47),
-    }
-    return _table_of_solvers(x, problems.burgers, solvers)
+    return _table_of_solvers(spaced(0.1, 1000, 3 if quick else 9), problems.burgers, _of_burgers(3000))
+
+
+def burgers_amplitude(quick):
+    x = spaced(0.01, 1000, 3 if quick else 11)
+    data = _table_of_solvers(x, problems.burgers_of_amplitude, _of_burgers(3000), "every amplitude")
+    shares = dict(zip(data["rows"], data["share"], strict=True))
+    last = max(value for value, share in zip(x, shares["CG"], strict=True) if share == 1.0)
+    return {**data, "last": last, "answer": f"{data['answer']}; CG up to a Péclet number of {last:g}"}
 
 
 def burgers_restart(quick):
@@ -169,6 +179,7 @@ def flow_solvers(quick):
         "Jacobi": Jacobi(4000),
         "SteepestDescent": SteepestDescent(4000),
         "CG": CG(4000),
+        "BiCGStab": BiCGStab(2000),
         "GMRES(2)": GMRES(restart=2, max_iter=2000),
         "GMRES(8)": GMRES(restart=8, max_iter=500),
         "GMRES(20)": GMRES(restart=20, max_iter=200),
@@ -176,6 +187,19 @@ def flow_solvers(quick):
         'GMRES(8), "stokes"': GMRES(restart=8, max_iter=500, preconditioner="stokes"),
     }
     return _table_of_solvers(x, problems.flow, solvers)
+
+
+def flow_grid(quick):
+    x = [8, 16] if quick else [8, 16, 32, 48, 64, 96]
+    solvers = {
+        "BiCGStab": BiCGStab(4000),
+        "GMRES(8)": GMRES(restart=8, max_iter=1000),
+        'GMRES(8), "stokes"': GMRES(restart=8, max_iter=1000, preconditioner="stokes"),
+    }
+    data = lines(x, problems.flow_of_size, solvers)
+    taken = [data["lines"][name][-1] for name in ("GMRES(8)", 'GMRES(8), "stokes"')]
+    answer = f'at {x[-1]}²: GMRES(8) {taken[0] or math.nan:,.0f} products, with "stokes" {taken[1]:,.0f}'
+    return {**data, "answer": answer}
 
 
 def hyperdiffusion(quick):
@@ -195,6 +219,7 @@ def known_matrices(quick):
         "Jacobi": Jacobi(3000),
         "SteepestDescent": SteepestDescent(3000),
         "CG": CG(3000),
+        "BiCGStab": BiCGStab(3000),
         "GMRES(1)": GMRES(restart=1, max_iter=3000),
         "GMRES(2)": GMRES(restart=2, max_iter=3000),
         "GMRES(16)": GMRES(restart=16, max_iter=3000),
@@ -221,8 +246,9 @@ def primal_adjoint(quick):
         residuals["primal"].append(float(info.residual))
         residuals["adjoint"].append(float(info.adjoint.residual))
     outcomes = {}
-    solvers = {"SteepestDescent": SteepestDescent(300), "CG": CG(300), "GMRES(2)": GMRES(restart=2, max_iter=150),
-               "GMRES(4)": GMRES(restart=4, max_iter=75), "Jacobi": Jacobi(300)}  # fmt: skip
+    solvers = {"SteepestDescent": SteepestDescent(300), "CG": CG(300), "BiCGStab": BiCGStab(150),
+               "GMRES(2)": GMRES(restart=2, max_iter=150), "GMRES(4)": GMRES(restart=4, max_iter=75),
+               "Jacobi": Jacobi(300)}  # fmt: skip
     a, winds = problems.burgers(100.0, n=16, batch=32 if quick else 256)
     cotangent = problems.noise(*winds.shape, seed=1)
     for name, solver in solvers.items():
