@@ -43,7 +43,10 @@ MAPS = {
         ("contrast of the diffusivity, max κ/min κ (random from cell to cell, 32²)",),
     ),
     "burgers_solvers": Map(
-        "Which solver takes a Burgers step?", solves.burgers_solvers, "shares", (f"{CFL} (N = 64, random states)", "")
+        "Which solver takes a Burgers step?",
+        solves.burgers_solvers,
+        "shares",
+        (f"{CFL} (N = 64, random states, 3,000 products at most)", ""),
     ),
     "burgers_amplitude": Map(
         "Which amplitude of a Burgers state can each solver take?",

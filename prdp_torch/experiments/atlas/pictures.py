@@ -100,7 +100,7 @@ def floor(question, data):
 
 
 def shares(xlabel, ylabel):
-    """A table of the share of samples that were solved; what the others say where none was."""
+    """A table of the share of samples that were solved: the products where all were, the status where none was."""
 
     def draw(question, data):
         rows = data["rows"]
@@ -108,14 +108,15 @@ def shares(xlabel, ylabel):
         share = np.array(data["share"])
         image = axes.imshow(share, cmap=SHARES, vmin=0, vmax=1, aspect="auto")
         for i, j in np.ndindex(share.shape):
-            said = data["status"][i][j]
-            text = f"{share[i, j]:.0%}" if share[i, j] > 0 else said.replace("_", "\n")
+            products, status = data["products"][i][j], data["status"][i][j].replace("_", "\n")
+            text = f"{products:,.0f}" if products is not None else f"{share[i, j]:.0%}" if share[i, j] > 0 else status
             size = 9 if share[i, j] > 0 else 6.5
             axes.text(j, i, text, ha="center", va="center", fontsize=size, color="black", linespacing=0.9)
         axes.set_xticks(range(len(data["x"])), [f"{x:g}" for x in data["x"]])
         axes.set_yticks(range(len(rows)), rows)
         axes.set(xlabel=xlabel, ylabel=ylabel)
-        figure.colorbar(image, ax=axes, label="share of samples solved to 1e-5", format=lambda v, _: f"{v:.0%}")
+        label = "share of samples solved to 1e-5\n(numbers: products with A, the median)"
+        figure.colorbar(image, ax=axes, label=label, format=lambda v, _: f"{v:.0%}")
         return figure
 
     return draw
