@@ -127,26 +127,33 @@ def follow(name, scene, network, states):
     return errors
 
 
+KEYS = ("trained", "beyond", "forward_products", "adjoint_products", "seconds")
+
+
 def _values(rows, name, steps, gradient, key):
     return [r[key] for r in rows if r["scene"] == name and r["steps"] == steps and r["gradient"] == gradient]
 
 
 def table(rows):
-    lines = [
-        "| scene | steps trained | gradient | error after them | error after 20 | s |",
-        "|---|---|---|---|---|---|",
-    ]
+    heads = (
+        "scene",
+        "steps trained",
+        "gradient",
+        "error after them",
+        f"error after {BEYOND}",
+        "forward products",
+        "adjoint products",
+        "s",
+    )
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name in CHANGES:
         for steps in STEPS:
             for gradient in GRADIENTS:
-                trained, beyond, seconds = (
-                    _values(rows, name, steps, gradient, key) for key in ("trained", "beyond", "seconds")
-                )
-                if trained:
-                    lines.append(
-                        f"| {name} | {steps} | {gradient} | {spread(trained)} | {spread(beyond)} "
-                        f"| {np.mean(seconds):.0f} |"
-                    )
+                values = {key: _values(rows, name, steps, gradient, key) for key in KEYS}
+                if values["trained"]:
+                    errors = [spread(values[key]) for key in ("trained", "beyond")]
+                    costs = [f"{np.mean(values[key]):,.0f}" for key in KEYS[2:]]
+                    lines.append(f"| {name} | {steps} | {gradient} | {' | '.join(errors + costs)} |")
     return "\n".join(lines)
 
 
@@ -161,9 +168,13 @@ def chart(rows):
                     [m for m, _ in found], [np.mean(v) for _, v in found], [np.std(v) for _, v in found],
                     color=colour, marker="o", capsize=3, label=gradient,
                 )  # fmt: skip
+        alone = [row["alone"][BEYOND] for row in rows if row["scene"] == name and row["alone"]]
+        if alone:
+            axes.axhline(alone[0], color="#888888", ls="--", label="coarse solver alone")
         axes.set(xscale="log", yscale="log", xlabel="steps that are trained through", title=name)
         axes.set_xticks(STEPS, STEPS)
         axes.grid(alpha=0.3, lw=0.4)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(title="gradient through the solver", frameon=False)
     panels[0].set_ylabel(f"error after {BEYOND} steps, 20 samples")
-    panels[0].legend(title="gradient through the solver", frameon=False)
     return figure
