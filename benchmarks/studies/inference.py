@@ -21,6 +21,7 @@ WAYS = {"converged": "#222222", "prdp": "#d62728", "auto": "#1f77b4"}
 COARSE = "coarse solver alone"
 KS = (1, 2, 4, 8, 12, 16, 24, 120)  # with 120 every solve meets the scene's rtol
 STEPS = (5, 10, 20, 50)
+ENERGY = 20  # after which the kinetic energy is compared with the reference's
 PICTURES = 20  # steps that the snapshots show
 VALID = 10
 
@@ -57,15 +58,16 @@ def _course(study, scene, how, seed, k, network, states):
     def solve(u):
         return _timed(seconds["solve"], stepper, u)
 
-    reached, errors, products = [states[:, 0]], [0.0], 0.0
+    reached, errors, energies, products = [states[:, 0]], [0.0], [1.0], 0.0
     with torch.no_grad():
         for n in range(1, states.shape[1]):
             reached.append(_timed(seconds["step"], corrected, solve, network, reached[-1]))
             errors.append(error(scene, reached[-1], states[:, n]))
+            energies.append(float(_energy(reached[-1]) / _energy(states[:, n])))
             products += float(stepper.info.operator_applications.double().mean())
     samples, steps = len(states), len(errors) - 1
     row = {
-        "how": how, "seed": seed, "k": k, "errors": errors, "products_a_step": products / steps,
+        "how": how, "seed": seed, "k": k, "errors": errors, "energies": energies, "products_a_step": products / steps,
         **{f"{part}_ms": 1e3 * float(np.median(values)) / samples for part, values in seconds.items()},
         **records.environment(),
     }  # fmt: skip
@@ -73,6 +75,11 @@ def _course(study, scene, how, seed, k, network, states):
     study.rows.append(row)
     kind = "coarse" if how == COARSE else how
     return Course(how, kind, torch.stack(reached[: PICTURES + 1], 1), np.array([errors[1:]]))
+
+
+def _energy(states):
+    """The mean of u₁² + u₂² over grid and samples."""
+    return states[:, :2].square().sum(1).mean()
 
 
 def _timed(seconds, function, *arguments):
@@ -97,12 +104,19 @@ def _mean(rows, key, n=None):
 
 def table(rows):
     steps = _steps(rows)
-    heads = [f"error after {n}" for n in steps] + ["products per step", "ms, solve", "ms, step"]
+    heads = [
+        *(f"error after {n}" for n in steps),
+        f"energy after {min(ENERGY, steps[-1])}",
+        "products per step",
+        "ms, solve",
+        "ms, step",
+    ]
     lines = [f"| trained with | K | {' | '.join(heads)} |", "|---" * (len(heads) + 2) + "|"]
     for how in (COARSE, *WAYS):
         for k in sorted({row["k"] for row in rows if row["how"] == how}):
             chosen = _of(rows, how, k)
             cells = [f"{_mean(chosen, 'errors', n):.2e}" for n in steps]
+            cells += [f"{_mean(chosen, 'energies', min(ENERGY, steps[-1])):.2f}"]
             cells += [f"{_mean(chosen, 'products_a_step'):.0f}"]
             cells += [f"{_mean(chosen, part):.2f}" for part in ("solve_ms", "step_ms")]
             lines.append(f"| {how} | {k} | {' | '.join(cells)} |")

@@ -20,7 +20,7 @@ from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.networks import make_network
 
 STEPS = (2, 4, 8, 16)
-BEYOND = 20  # how far the trained network is followed
+BEYOND = (20, 40)  # how far the trained network is followed
 TRAIN, VALID = 200, 20
 UPDATES = {"burgers_1d": 400, "navier_stokes": 500}
 BATCH = {"burgers_1d": 25, "navier_stokes": 10}
@@ -55,7 +55,7 @@ def _kept(study, name, steps, gradient, seed, updates):
             "changes": CHANGES[name], **train(name, steps, gradient, seed, updates), **records.environment(),
         }  # fmt: skip
         records.write_training(path, row)
-    study.report(f"{label}: {row['trained']:.3e} after {steps}, {row['beyond']:.3e} after {BEYOND}")
+    study.report(f"{label}: {row['trained']:.3e} after {steps}, {row['beyond'][-1]:.3e} after {BEYOND[-1]}")
     study.rows.append(row)
 
 
@@ -63,9 +63,12 @@ def _kept(study, name, steps, gradient, seed, updates):
 def trajectories(name):
     """The scene, and its trajectories to learn from and to validate with, one state for each step of ours."""
     every = 1 if name == "navier_stokes" else 2
-    scene = variant(name, {**CHANGES[name], "data.valid": TRAIN + VALID})
-    states = _C.validation_trajectories(scene, BEYOND * every)[:, ::every]
-    return scene, states[:TRAIN], states[TRAIN:]
+    train, valid = (
+        variant(name, {**CHANGES[name], "data.valid": samples, "data.seed": seed})
+        for seed, samples in enumerate((TRAIN, VALID))
+    )
+    to_learn = _C.validation_trajectories(train, STEPS[-1] * every)[:, ::every]
+    return valid, to_learn, _C.validation_trajectories(valid, BEYOND[-1] * every)[:, ::every]
 
 
 def make_steppers(scene, gradient, steps):
@@ -101,7 +104,7 @@ def train(name, steps, gradient, seed, updates):
     seconds = time.process_time() - started
     errors = follow(name, scene, network, valid_states)
     return {
-        "trained": errors[steps], "beyond": errors[BEYOND], "errors": errors, "seconds": seconds,
+        "trained": errors[steps], "beyond": [errors[n] for n in BEYOND], "errors": errors, "seconds": seconds,
         "forward_products": forward, "adjoint_products": adjoint, "loss": float(loss.detach()),
         "alone": follow(name, scene, torch.zeros_like, valid_states) if name == "navier_stokes" else None,
     }  # fmt: skip
@@ -121,39 +124,30 @@ def follow(name, scene, network, states):
     stepper = scenes.make_stepper(scene)
     u, errors = states[:, 0], [0.0]
     with torch.no_grad():
-        for step in range(1, BEYOND + 1):
+        for step in range(1, states.shape[1]):
             u = next_state(name, stepper, network, u)
             errors.append(error(scene, u, states[:, step]))
     return errors
 
 
-KEYS = ("trained", "beyond", "forward_products", "adjoint_products", "seconds")
-
-
-def _values(rows, name, steps, gradient, key):
-    return [r[key] for r in rows if r["scene"] == name and r["steps"] == steps and r["gradient"] == gradient]
+def _of(rows, name, steps, gradient):
+    return [row for row in rows if (row["scene"], row["steps"], row["gradient"]) == (name, steps, gradient)]
 
 
 def table(rows):
-    heads = (
-        "scene",
-        "steps trained",
-        "gradient",
-        "error after them",
-        f"error after {BEYOND}",
-        "forward products",
-        "adjoint products",
-        "s",
-    )
+    heads = ["scene", "steps trained", "gradient", "error after them", *(f"after {n}" for n in BEYOND)]
+    heads += ["forward products", "adjoint products", "s"]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name in CHANGES:
         for steps in STEPS:
             for gradient in GRADIENTS:
-                values = {key: _values(rows, name, steps, gradient, key) for key in KEYS}
-                if values["trained"]:
-                    errors = [spread(values[key]) for key in ("trained", "beyond")]
-                    costs = [f"{np.mean(values[key]):,.0f}" for key in KEYS[2:]]
-                    lines.append(f"| {name} | {steps} | {gradient} | {' | '.join(errors + costs)} |")
+                chosen = _of(rows, name, steps, gradient)
+                if chosen:
+                    errors = [spread([row["errors"][n] for row in chosen]) for n in (steps, *BEYOND)]
+                    costs = [np.mean([row[f"{kind}_products"] for row in chosen]) for kind in ("forward", "adjoint")]
+                    costs.append(min(row["seconds"] for row in chosen))
+                    cells = [*errors, *(f"{cost:,.0f}" for cost in costs)]
+                    lines.append(f"| {name} | {steps} | {gradient} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -161,20 +155,26 @@ def chart(rows):
     figure, panels = make_figure(panels=2)
     for axes, name in zip(panels, CHANGES, strict=True):
         for gradient, colour in zip(GRADIENTS, ("#222222", "#1f77b4", "#d62728"), strict=True):
-            found = [(m, _values(rows, name, m, gradient, "beyond")) for m in STEPS]
-            found = [(m, values) for m, values in found if values]
-            if found:
+            for n, line in zip(BEYOND, ("-", ":"), strict=True):
+                found = [(m, [row["errors"][n] for row in _of(rows, name, m, gradient)]) for m in STEPS]
+                found = [(m, values) for m, values in found if values]
+                if not found:
+                    continue
                 axes.errorbar(
                     [m for m, _ in found], [np.mean(v) for _, v in found], [np.std(v) for _, v in found],
-                    color=colour, marker="o", capsize=3, label=gradient,
+                    color=colour, ls=line, marker="o", capsize=3, label=f"{gradient}, {n} steps",
                 )  # fmt: skip
-        alone = [row["alone"][BEYOND] for row in rows if row["scene"] == name and row["alone"]]
-        if alone:
-            axes.axhline(alone[0], color="#888888", ls="--", label="coarse solver alone")
+        alone = [row["alone"] for row in rows if row["scene"] == name and row["alone"]]
+        for n, line in zip(BEYOND, ("-", ":"), strict=True):
+            if alone:
+                axes.axhline(alone[0][n], color="#999999", ls=line, label=f"coarse solver alone, {n} steps")
         axes.set(xscale="log", yscale="log", xlabel="steps that are trained through", title=name)
         axes.set_xticks(STEPS, STEPS)
         axes.grid(alpha=0.3, lw=0.4)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(title="gradient through the solver", frameon=False)
-    panels[0].set_ylabel(f"error after {BEYOND} steps, 20 samples")
+    panels[0].set_ylabel(f"error, {VALID} samples")
+    entries = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8,
+        title="gradient through the solver, and how far the network is followed",
+    )  # fmt: skip
     return figure
