@@ -2,6 +2,7 @@
 appendix)."""
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from benchmarks.studies.evaluation import spread
 from benchmarks.studies.trainings import saved
@@ -24,15 +25,19 @@ def _of(rows, name, how):
 
 
 def table(rows):
-    lines = ["| scene | | error | last K | iterations saved |", "|---|---|---|---|---|"]
+    lines = ["| scene | | error | training loss | last K | iterations saved | warns |", "|---|---|---|---|---|---|---|"]
     for name in SEEDS:
         for how, title in WAYS.items():
             chosen = _of(rows, name, how)
             if chosen:
                 share = "–" if how == "converged" else saved(chosen, _of(rows, name, "converged"), "budget")
-                last = np.mean([row["last_k"] for row in chosen])
+                loss, last = (np.mean([row[key] for row in chosen]) for key in ("loss", "last_k"))
+                warns = sum(row["warning"] is not None for row in chosen)
                 errors = spread([row["error"] for row in chosen])
-                lines.append(f"| {name}, {len(chosen)} seeds | {title} | {errors} | {last:.3g} | {share} |")
+                lines.append(
+                    f"| {name}, {len(chosen)} seeds | {title} | {errors} | {loss:.1e} | {last:.3g} | {share} "
+                    f"| {f'{warns} of {len(chosen)}' if warns else '–'} |"
+                )
     return "\n".join(lines)
 
 
@@ -44,6 +49,7 @@ def chart(rows):
             axes.scatter([r["budget"] for r in chosen], [r["error"] for r in chosen], color=colour, label=title)
         axes.set(xlabel="iterations, K summed over the solves", ylabel="validation error", title=name)
         axes.set(xlim=(0, None), ylim=(0, None))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.grid(alpha=0.3, lw=0.4)
     panels[0].legend(frameon=False)
     return figure
