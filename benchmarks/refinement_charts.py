@@ -56,6 +56,27 @@ def _ratios(summary, label, cost):
     return row[cost] / base[cost], row["metric"] / base["metric"]
 
 
+def time_against_products(found):
+    """What is saved of the products, and of the seconds with network and optimiser: one point a scene."""
+    figure = Figure(figsize=(6.2, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for label in ("prdp", "auto"):
+        title, colour, marker = ROWS[label]
+        for name, summary in found.items():
+            row, base = next(row for row in summary["rows"] if row["label"] == label), summary["rows"][0]
+            saved = [100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds")]
+            axes.scatter(*saved, color=colour, marker=marker, s=36, label=title)
+            title = None  # once in the legend
+            if label == "auto":
+                axes.annotate(name, saved, xytext=(0, 6), textcoords="offset points", rotation=60, fontsize=8)
+    axes.axline((0, 0), slope=1, color="#888888", lw=1, ls="--")
+    axes.set(xlabel="products saved, %", ylabel="time saved, %", xlim=(0, 100), ylim=(None, 100))
+    axes.axhline(0, color="#888888", lw=1)
+    axes.grid(alpha=0.3, lw=0.4)
+    axes.legend(frameon=False, loc="upper left")
+    return figure
+
+
 def over_the_training(found):
     """Iterations of a solve, and the tolerance, interval by interval."""
     figure = Figure(figsize=(9.2, 5.0), layout="constrained")
@@ -82,6 +103,7 @@ def over_the_training(found):
 def main():
     found = summaries()
     error_against_cost(found).savefig(RESULTS / "refinement.png", dpi=110)
+    time_against_products(found).savefig(RESULTS / "time_saved.png", dpi=110)
     over_the_training(found).savefig(RESULTS / "refinement_training.png", dpi=110)
 
 

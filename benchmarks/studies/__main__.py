@@ -1,11 +1,12 @@
 """`python -m benchmarks.studies NAME`: run a study, or go on with it; write its table, chart and record."""
 
 import argparse
+import contextlib
 import importlib
 import sys
 from pathlib import Path
 
-STUDIES = ("data", "inference", "precision", "unroll", "widths")
+STUDIES = ("data", "inference", "loss", "precision", "residuals", "unroll", "widths")
 
 
 def main():
@@ -19,7 +20,8 @@ def main():
 
     module = importlib.import_module(f"benchmarks.studies.{options.study}")
     study = Study(options.out / options.study, lambda text: print(text, file=sys.stderr, flush=True))
-    module.run(study, options.seeds, options.quick)
+    with contextlib.suppress(KeyboardInterrupt):  # what is done is written
+        module.run(study, options.seeds, options.quick)
     study.write(options.out / f"{options.study}.json")
     module.chart(study.rows).savefig(options.out / f"{options.study}.png", dpi=110)
     print(module.table(study.rows))

@@ -5,9 +5,11 @@ import re
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from benchmarks.studies import evaluation
+from prdp_torch import PRDPController
 from prdp_torch.experiments import records, scenes
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement
@@ -31,9 +33,35 @@ def variant(name, changes):
         return scenes.load(path)
 
 
+class _OnLoss(PRDPController):
+    """Hears the training loss from a callback; what the trainer tells it, the validation metric, is passed over."""
+
+    def step(self, metric, error=None):
+        return False
+
+    def hear(self, interval):
+        super().step(interval.loss, error=interval.error)
+
+
+class PRDPOnLoss(Refinement):
+    """PRDP with the settings of the scene, driven by the training loss."""
+
+    def __init__(self, scene):
+        super().__init__("prdp_loss", self._attach)
+        self._settings = dict(scene.prdp)
+
+    def _attach(self, steppers):
+        self._controller = _OnLoss(steppers, **self._settings)
+        return self._controller
+
+    def callbacks(self):
+        return [lambda interval: self._controller.hear(interval)]
+
+
 REFINEMENTS = {
     "converged": lambda scene: Refinement.constant(scene.max_iter),
     "prdp": Refinement.prdp,
+    "prdp_loss": PRDPOnLoss,
     "auto": lambda scene: Refinement.auto(),
     "direct": lambda scene: Refinement.exact(),
 }
@@ -61,7 +89,9 @@ class Study:
 
     def _row(self, scene, how, seed, changes):
         network = make_network(scene, seed)
-        curves = train(scene, REFINEMENTS[how](scene), seed=seed, network=network)
+        refinement = REFINEMENTS[how](scene)
+        callbacks = refinement.callbacks() if how == "prdp_loss" else ()
+        curves = train(scene, refinement, seed=seed, network=network, callbacks=callbacks)
         errors = evaluation.validation_errors(scene, network)
         return {
             "scene": scene.name,
@@ -75,6 +105,7 @@ class Study:
             "updates": len(curves["update_loss"]),
             "products": sum(curves["operator_applications"]),
             "iterations": sum(curves["iterations"]),
+            "budget": sum(curves["budget"]),
             "last_k": curves["max_iter"][-1],
             "seconds": sum(curves["seconds"]),
             "warning": curves.get("warning"),
@@ -90,3 +121,8 @@ class Study:
         for row in rows:
             row["errors"] = [float(f"{error:.4g}") for error in row.get("errors", ())]
         records.write(path, {**environment, "rows": rows})
+
+
+def saved(rows, converged, count):
+    """The share of a cost that is saved, for a table."""
+    return f"{100 * (1 - np.mean([r[count] for r in rows]) / np.mean([r[count] for r in converged])):.0f} %"

@@ -2,8 +2,10 @@
 adjoint, with one of a few iterations, and with none: then each step learns from its own error alone.
 
 navier_stokes, coarser than its scene: u ← û + network(û), û the coarse step. burgers_1d: u ← network(û), û the
-solver's step, so that the network stands for every second step."""
+solver's step, so that the network stands for every second step. Trainings take turns on a machine, so their seconds
+are those of the processor."""
 
+import functools
 import time
 
 import numpy as np
@@ -18,13 +20,16 @@ from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.networks import make_network
 
 STEPS = (2, 4, 8, 16)
-BEYOND = 20  # how far the trained network is followed
-TRAIN, VALID, BATCH = 200, 20, 25
-UPDATES = {"navier_stokes": 400, "burgers_1d": 800}
-CHANGES = {
-    "navier_stokes": {"physics.shape": [24, 24], "data.reference_shape": [49, 49]},
+BEYOND = (20, 40)  # how far the trained network is followed
+TRAIN, VALID = 200, 20
+UPDATES = {"burgers_1d": 400, "navier_stokes": 500}
+BATCH = {"burgers_1d": 25, "navier_stokes": 10}
+CHANGES = {  # the corrector starts as no correction: 16 steps of an untrained one leave the scene
     "burgers_1d": {},
-}
+    "navier_stokes": {
+        "physics.shape": [24, 24], "data.reference_shape": [49, 49], "network.width": 32, "network.zero_output": True,
+    },
+}  # fmt: skip
 GRADIENTS = {  # options of the stepper
     "exact": {"backward": "implicit"},
     "three iterations": {"backward": "implicit", "adjoint_max_iter": 3},
@@ -33,10 +38,10 @@ GRADIENTS = {  # options of the stepper
 
 
 def run(study, seeds, quick):
-    for name in list(CHANGES)[1:] if quick else CHANGES:
-        for steps in STEPS[:1] if quick else STEPS:
-            for gradient in GRADIENTS:
-                for seed in range(min(seeds, 3)):
+    for seed in range(seeds):
+        for name in list(CHANGES)[:1] if quick else CHANGES:
+            for steps in STEPS[:1] if quick else STEPS:
+                for gradient in GRADIENTS:
                     _kept(study, name, steps, gradient, seed, 5 if quick else UPDATES[name])
 
 
@@ -44,48 +49,70 @@ def _kept(study, name, steps, gradient, seed, updates):
     label = f"{name}_{steps}_{gradient.replace(' ', '_')}_seed{seed}"
     path = study.folder / f"{label}.json"
     row = records.read(path)
-    if row is None or row["updates"] != updates:
+    if row is None or (row["updates"], row["changes"]) != (updates, CHANGES[name]):
         row = {
             "scene": name, "steps": steps, "gradient": gradient, "seed": seed, "updates": updates,
             "changes": CHANGES[name], **train(name, steps, gradient, seed, updates), **records.environment(),
         }  # fmt: skip
         records.write_training(path, row)
-    study.report(f"{label}: {row['trained']:.3e} after {steps}, {row['beyond']:.3e} after {BEYOND}")
+    study.report(f"{label}: {row['trained']:.3e} after {steps}, {row['beyond'][-1]:.3e} after {BEYOND[-1]}")
     study.rows.append(row)
 
 
+@functools.cache
+def trajectories(name):
+    """The scene, and its trajectories to learn from and to validate with, one state for each step of ours."""
+    every = 1 if name == "navier_stokes" else 2
+    train, valid = (
+        variant(name, {**CHANGES[name], "data.valid": samples, "data.seed": seed})
+        for seed, samples in enumerate((TRAIN, VALID))
+    )
+    to_learn = _C.validation_trajectories(train, STEPS[-1] * every)[:, ::every]
+    return valid, to_learn, _C.validation_trajectories(valid, BEYOND[-1] * every)[:, ::every]
+
+
+def make_steppers(scene, gradient, steps):
+    """One for each step, so that each keeps the report of its adjoint solve."""
+    steppers = [scenes.make_stepper(scene) for _ in range(steps)]
+    for stepper in steppers:
+        for option, value in GRADIENTS[gradient].items():
+            setattr(stepper, option, value)
+    return steppers
+
+
 def train(name, steps, gradient, seed, updates):
-    every = 1 if name == "navier_stokes" else 2  # solver steps of the reference to one of ours
-    scene = variant(name, {**CHANGES[name], "data.valid": TRAIN + VALID})
-    states = _C.validation_trajectories(scene, BEYOND * every)[:, ::every]
-    train_states, valid_states = states[:TRAIN], states[TRAIN:]
-    stepper = scenes.make_stepper(scene)
-    stepper.adjoint_max_iter = GRADIENTS[gradient].get("adjoint_max_iter")
-    stepper.backward = GRADIENTS[gradient]["backward"]
+    scene, train_states, valid_states = trajectories(name)
+    steppers = make_steppers(scene, gradient, steps)
     network = make_network(scene, seed)
-    optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-3, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates, eta_min=1e-4)
     generator = torch.Generator().manual_seed(seed)
-    started, products = time.perf_counter(), 0.0
+    started, forward, adjoint = time.process_time(), 0.0, 0.0
     for _ in range(updates):
-        chosen = torch.randperm(TRAIN, generator=generator)[:BATCH]
-        batch = train_states[chosen]
+        batch = train_states[torch.randperm(TRAIN, generator=generator)[: BATCH[name]]]
         u, loss = batch[:, 0], 0.0
-        for step in range(1, steps + 1):
+        for step, stepper in enumerate(steppers, 1):
             u = next_state(name, stepper, network, u)
-            products += float(stepper.info.operator_applications.double().mean())
-            loss = loss + _C.normalised_mse(u, batch[:, step])
+            loss = loss + _C.loss(scene.training.loss, u, batch[:, step])
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-    seconds = time.perf_counter() - started
+        forward += sum(_products(stepper.info) for stepper in steppers)
+        adjoint += sum(_products(stepper.adjoint_info) for stepper in steppers)
+    seconds = time.process_time() - started
     errors = follow(name, scene, network, valid_states)
     return {
-        "trained": errors[steps], "beyond": errors[BEYOND], "errors": errors,
-        "seconds": seconds, "forward_products": products, "loss": float(loss.detach()),
+        "trained": errors[steps], "beyond": [errors[n] for n in BEYOND], "errors": errors, "seconds": seconds,
+        "forward_products": forward, "adjoint_products": adjoint, "loss": float(loss.detach()),
+        "alone": follow(name, scene, torch.zeros_like, valid_states) if name == "navier_stokes" else None,
     }  # fmt: skip
+
+
+def _products(info):
+    """Products with A of a solve, per sample; of no solve, none."""
+    return 0.0 if info is None else float(info.operator_applications.double().mean())
 
 
 def next_state(name, stepper, network, u):
@@ -97,32 +124,30 @@ def follow(name, scene, network, states):
     stepper = scenes.make_stepper(scene)
     u, errors = states[:, 0], [0.0]
     with torch.no_grad():
-        for step in range(1, BEYOND + 1):
+        for step in range(1, states.shape[1]):
             u = next_state(name, stepper, network, u)
             errors.append(error(scene, u, states[:, step]))
     return errors
 
 
-def _values(rows, name, steps, gradient, key):
-    return [r[key] for r in rows if r["scene"] == name and r["steps"] == steps and r["gradient"] == gradient]
+def _of(rows, name, steps, gradient):
+    return [row for row in rows if (row["scene"], row["steps"], row["gradient"]) == (name, steps, gradient)]
 
 
 def table(rows):
-    lines = [
-        "| scene | steps trained | gradient | error after them | error after 20 | s |",
-        "|---|---|---|---|---|---|",
-    ]
+    heads = ["scene", "steps trained", "gradient", "error after them", *(f"after {n}" for n in BEYOND)]
+    heads += ["forward products", "adjoint products", "s"]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name in CHANGES:
         for steps in STEPS:
             for gradient in GRADIENTS:
-                trained, beyond, seconds = (
-                    _values(rows, name, steps, gradient, key) for key in ("trained", "beyond", "seconds")
-                )
-                if trained:
-                    lines.append(
-                        f"| {name} | {steps} | {gradient} | {spread(trained)} | {spread(beyond)} "
-                        f"| {np.mean(seconds):.0f} |"
-                    )
+                chosen = _of(rows, name, steps, gradient)
+                if chosen:
+                    errors = [spread([row["errors"][n] for row in chosen]) for n in (steps, *BEYOND)]
+                    costs = [np.mean([row[f"{kind}_products"] for row in chosen]) for kind in ("forward", "adjoint")]
+                    costs.append(min(row["seconds"] for row in chosen))
+                    cells = [*errors, *(f"{cost:,.0f}" for cost in costs)]
+                    lines.append(f"| {name} | {steps} | {gradient} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -130,16 +155,26 @@ def chart(rows):
     figure, panels = make_figure(panels=2)
     for axes, name in zip(panels, CHANGES, strict=True):
         for gradient, colour in zip(GRADIENTS, ("#222222", "#1f77b4", "#d62728"), strict=True):
-            found = [(m, _values(rows, name, m, gradient, "beyond")) for m in STEPS]
-            found = [(m, values) for m, values in found if values]
-            if found:
+            for n, line in zip(BEYOND, ("-", ":"), strict=True):
+                found = [(m, [row["errors"][n] for row in _of(rows, name, m, gradient)]) for m in STEPS]
+                found = [(m, values) for m, values in found if values]
+                if not found:
+                    continue
                 axes.errorbar(
                     [m for m, _ in found], [np.mean(v) for _, v in found], [np.std(v) for _, v in found],
-                    color=colour, marker="o", capsize=3, label=gradient,
+                    color=colour, ls=line, marker="o", capsize=3, label=f"{gradient}, {n} steps",
                 )  # fmt: skip
+        alone = [row["alone"] for row in rows if row["scene"] == name and row["alone"]]
+        for n, line in zip(BEYOND, ("-", ":"), strict=True):
+            if alone:
+                axes.axhline(alone[0][n], color="#999999", ls=line, label=f"coarse solver alone, {n} steps")
         axes.set(xscale="log", yscale="log", xlabel="steps that are trained through", title=name)
         axes.set_xticks(STEPS, STEPS)
         axes.grid(alpha=0.3, lw=0.4)
-    panels[0].set_ylabel(f"error after {BEYOND} steps, 20 samples")
-    panels[0].legend(title="gradient through the solver", frameon=False)
+    panels[0].set_ylabel(f"error, {VALID} samples")
+    entries = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8,
+        title="gradient through the solver, and how far the network is followed",
+    )  # fmt: skip
     return figure

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 from benchmarks.studies.evaluation import spread
+from benchmarks.studies.trainings import saved
 from prdp_torch.experiments.charts import make_figure
 
 WIDTHS = (16, 24, 32, 48, 64, 96, 128)
@@ -45,7 +46,7 @@ def table(rows):
         converged, prdp, auto = (_of(rows, width, how) for how in WAYS)
         lines.append(
             f"| {width} | {parameters(width):,} | {_errors(converged)} | {_errors(prdp)} "
-            f"| {_saved(prdp, converged, 'iterations')} | {_errors(auto)} | {_saved(auto, converged, 'products')} |"
+            f"| {saved(prdp, converged, 'iterations')} | {_errors(auto)} | {saved(auto, converged, 'products')} |"
         )
     powers = ", ".join(f"{how} {exponent(rows, how):.2f}" for how in WAYS)
     return "\n".join([*lines, "", f"error ∝ parameters^p with p: {powers}"])
@@ -53,10 +54,6 @@ def table(rows):
 
 def _errors(rows):
     return spread([r["error"] for r in rows])
-
-
-def _saved(rows, converged, count):
-    return f"{100 * (1 - np.mean([r[count] for r in rows]) / np.mean([r[count] for r in converged])):.0f} %"
 
 
 def chart(rows):

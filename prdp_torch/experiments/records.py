@@ -95,7 +95,7 @@ def write_training(path, record, network=None):
     weights = []
     if network is not None:
         content = io.BytesIO()
-        torch.save(dict(network.state_dict()), content)  # prdp_train reads no OrderedDict
+        torch.save(network.state_dict(), content)
         weights = [(weights_of(path), content.getvalue())]
         record = {**record, "weights": _C.fingerprint(content.getvalue())}
     _C.write_whole([*weights, (path, _C.seal_record(_json(record)).encode())])

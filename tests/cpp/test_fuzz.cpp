@@ -10,6 +10,7 @@
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
 #include "prdp/scenes/scene.h"
+#include "prdp/scenes/tensor_map.h"
 
 /// A short run of what `make fuzz` does at length: the corpus, and copies of it with bytes changed, moved or left out.
 /// A fault ends the process, or throws what the target does not let pass.
@@ -56,6 +57,13 @@ TEST(Fuzz, TheCorpusAndChangedCopiesOfItAreReadOrRefused) {
     }
     EXPECT_GT(files, 1) << target.name;
   }
+}
+
+/// Where nothing in the corpus were read to its end, no changed copy would be, either.
+TEST(Fuzz, TheCorpusHoldsFilesThatAreRead) {
+  const auto content = [](const char* name) { return read(corpus("files") / name).substr(1); };
+  EXPECT_EQ(prdp::unpack(content("tensors")).size(), 1);
+  for (const auto* name : {"weights", "weights_of_dict"}) EXPECT_EQ(prdp::unpack(content(name)).size(), 4) << name;
 }
 
 /// What fuzzing has found.

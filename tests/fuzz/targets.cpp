@@ -14,6 +14,7 @@
 #include "prdp/scenes/scene.h"
 #include "prdp/scenes/seal.h"
 #include "prdp/scenes/tensor_map.h"
+#include "prdp/solvers/methods.h"
 
 namespace prdp_fuzz {
 
@@ -129,11 +130,8 @@ void operators(std::string_view input) {
   }
   spec.transposed = bytes.below(2);
   const auto b = tensor(bytes, false);
-  prdp::SolveOptions options{{bytes.one_of<prdp::Method>({prdp::Method::kJacobi, prdp::Method::kSteepestDescent,
-                                                          prdp::Method::kConjugateGradient, prdp::Method::kGmres,
-                                                          prdp::Method::kDirect, prdp::Method::kChebyshev,
-                                                          prdp::Method::kGmresDiagonal, prdp::Method::kGmresStokes}),
-                              std::min<int64_t>(bytes.number(), 30), bytes.real(),
+  const auto method = prdp::kTraits[static_cast<size_t>(bytes.below(prdp::kTraits.size()))].method;
+  prdp::SolveOptions options{{method, std::min<int64_t>(bytes.number(), 30), bytes.real(),
                               std::min<int64_t>(bytes.number(), 30)}};
   options.on_failure = prdp::OnFailure::kReturn;
   refused_or_done([&] { prdp::linear_solve(spec, b, options); });

@@ -41,7 +41,8 @@ def test_matrices_with_known_outcomes():
         row: dict(zip(data["x"], status, strict=True)) for row, status in zip(data["rows"], data["status"], strict=True)
     }
     swap = found["swap [[0, 1], [1, 0]]"]
-    assert swap["Jacobi"] == "ZERO_DIAGONAL" and swap["CG"] == swap["SteepestDescent"] == "BREAKDOWN"
+    assert swap["Jacobi"] == "ZERO_DIAGONAL"
+    assert swap["CG"] == swap["SteepestDescent"] == swap["BiCGStab"] == "BREAKDOWN"  # r·A r = 0
     assert (
         swap["GMRES(1)"] == "STAGNATED" and swap["GMRES(2)"] == "CONVERGED_BREAKDOWN" and swap["Direct"] == "CONVERGED"
     )
@@ -58,9 +59,24 @@ def test_jacobi_takes_every_burgers_step_and_no_flow():
     data = solves.burgers_solvers(quick=True)
     shares = dict(zip(data["rows"], data["share"], strict=True))
     assert shares["Jacobi"] == [1.0] * 3 == shares["GMRES(64)"] and shares["CG"][-1] == 0.0
+    assert shares["BiCGStab"] == [1.0] * 3
     data = solves.flow_solvers(quick=True)
     status = dict(zip(data["rows"], data["status"], strict=True))
     assert set(status["Jacobi"]) == {"ZERO_DIAGONAL"} and set(status["GMRES(50)"]) == {"CONVERGED"}
+
+
+def test_cg_takes_burgers_steps_that_are_almost_heat():
+    """At a small amplitude A is symmetric but for as much; at a large one it is not."""
+    data = solves.burgers_amplitude(quick=True)
+    shares = dict(zip(data["rows"], data["share"], strict=True))
+    assert shares["CG"][0] == 1.0 and shares["CG"][-1] == 0.0 and data["last"] == data["x"][0] == 0.01
+    assert shares["Jacobi"] == shares["BiCGStab"] == [1.0] * 3
+
+
+def test_a_finer_grid_takes_more_products_of_a_flow_but_few_with_its_preconditioner():
+    lines = solves.flow_grid(quick=True)["lines"]
+    assert lines["GMRES(8)"][1] > 1.5 * lines["GMRES(8)"][0] and lines["BiCGStab"][1] > 1.5 * lines["BiCGStab"][0]
+    assert lines['GMRES(8), "stokes"'][1] <= lines["GMRES(8)"][1] / 3
 
 
 def test_the_diagonal_is_no_help_where_it_is_constant():

@@ -18,6 +18,7 @@ SOLVERS = {
     "SteepestDescent": prdp.SteepestDescent(K),
     "CG": prdp.CG(K),
     'CG with preconditioner="diagonal"': prdp.CG(K, **BY_DIAGONAL),
+    "BiCGStab": prdp.BiCGStab(K),
     "GMRES(3)": prdp.GMRES(K, restart=3),
     'GMRES(3) with preconditioner="diagonal"': prdp.GMRES(K, restart=3, **BY_DIAGONAL),
     'GMRES(3) with preconditioner="stokes"': prdp.GMRES(K, restart=3, preconditioner="stokes"),
@@ -25,7 +26,7 @@ SOLVERS = {
 }
 DIVIDING = [name for name in SOLVERS if name == "Jacobi" or "diagonal" in name]
 OPERATORS = ["Heat", "Poisson", "Burgers", "NavierStokes", "Stencil", "Function", "Matrix", "CSR"]
-PLAIN = ["SteepestDescent", "CG", "GMRES(3)", "Direct"]
+PLAIN = ["SteepestDescent", "CG", "BiCGStab", "GMRES(3)", "Direct"]
 
 
 def is_refused(method, operator):
@@ -104,11 +105,12 @@ WAYS = {
                       [(m, o) for m, o in PAIRS
                        if m in DIVIDING and o in ("NavierStokes", "Stencil", "Matrix", "CSR")]),
     "turn": ("BREAKDOWN", r" \(the iterate handed out has relative residual [\d.e-]+ after \d+ iterations\), ",
-             f"r·A r is zero for a residual r: {KRYLOV}",
-             [(m, o) for m in ("SteepestDescent", "CG") for o in ("Function", "Matrix", "CSR")]),
+             f"r·A r is zero for a residual r(: {KRYLOV}|, or r̂·A p for .*; take GMRES)",
+             [(m, o) for m in ("SteepestDescent", "CG", "BiCGStab") for o in ("Function", "Matrix", "CSR")]),
     "singular": ("BREAKDOWN", r" \(the iterate .*\), ",
-                 f"(A is singular; GMRES solves it|.*A is singular, and b lies outside its range; take a b|.*{KRYLOV})",
-                 [(m, o) for m in ("CG", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
+                 "(A is singular; GMRES solves it|.*A is singular, and b lies outside its range; take a b"
+                 f"|.*{KRYLOV}|r·A r is zero for a residual r, or r̂·A p for .*; take GMRES)",
+                 [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),
     "strong": ("DIVERGED", r" \(the iterate .*\), ",
                "the residual grew beyond 1e13 ‖b‖"
@@ -117,7 +119,8 @@ WAYS = {
                 ('CG with preconditioner="diagonal"', "Burgers")]),
     "mean pressure": ("INCONSISTENT", r" \(the iterate .*\), ",
                       r"[\d.]+ % of (b|the cotangent) are a mean of its pressure",
-                      [(m, "NavierStokes") for m in SOLVERS if m == "CG" or (m[0] in "GD" and m not in DIVIDING)]),
+                      [(m, "NavierStokes") for m in SOLVERS
+                       if m in ("CG", "BiCGStab") or (m[0] in "GD" and m not in DIVIDING)]),
     "small": ("OVERFLOW", r" \(the iterate .*\), ",
               r"a number left the range of float64 \((‖A‖ is 0.1, )?‖b‖ is (above )?[\d.e+]+\); scale A and b",
               [(m, o) for m in (*PLAIN, "Jacobi") for o in ("Matrix", "CSR")] + [(m, "Function") for m in PLAIN]),

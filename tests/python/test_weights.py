@@ -4,6 +4,7 @@ import io
 import json
 import os
 import subprocess
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,7 @@ def test_weights_pass_from_cpp_to_python_and_back(tmp_path, kind):
     assert on["metric"][0] == pytest.approx(trained.curves["metric"][-1], rel=1e-5)
 
     # C++ begins with the network that Python has gone on with.
-    torch.save(dict(trained.network.state_dict()), tmp_path / "python.pt")
+    torch.save(trained.network.state_dict(), tmp_path / "python.pt")
     again = (path, "--out", tmp_path / "again", "--intervals", 1, "--weights")
     for file in (tmp_path / "python.pt", tmp_path / "cpp/prdp/seed_1.pt"):
         assert prdp_train(*again, file)[0] == 0
@@ -81,8 +82,8 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
         (renamed, "weights: there is no tensor 'layers.0.weight'"),
         (wide, "weights: 'layers.0.weight' must be Float of sizes [64, 30]"),
         (less, "weights: the network has 8 tensors, the file 7"),
-        (bomb, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
-        (None, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it"),
+        (bomb, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it"),
+        (None, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it"),
     ]:
         saved = io.BytesIO()
         torch.save(content, saved)
@@ -95,3 +96,75 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
     poisson = scenes.available()["poisson_1p"]
     status, errors = prdp_train(poisson, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt")
     assert status == 2 and "weights: the scene 'poisson_1p' trains no network" in errors
+
+
+def patched(saved, change, **sizes):
+    """The file of torch.save with its pickle changed, and with other sizes in its directory than its files have."""
+    with zipfile.ZipFile(io.BytesIO(saved)) as whole:
+        files = {file.filename: whole.read(file) for file in whole.infolist()}
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, change(content) if name.endswith("data.pkl") else content)
+        for file in archive.infolist():
+            for name, size in sizes.items():
+                if file.filename.endswith(f"data/{name.removeprefix('file_')}"):
+                    file.file_size = file.compress_size = size
+    return made.getvalue()
+
+
+def replaced(*pairs):
+    def change(pickle):
+        for old, new in pairs:
+            assert old in pickle
+            pickle = pickle.replace(old, new, 1)
+        return pickle
+
+    return change
+
+
+LENGTH = b"M\x80\x07t"  # of the first storage, 64 · 30 numbers
+FAR, FARTHER = (b"J" + number.to_bytes(4, "little") for number in (1 << 30, 1 << 30 | 1 << 11))
+FORGERIES = {
+    "a tensor beyond its storage": (replaced((b"QK\x00", b"Q" + FAR)), {}),
+    "a storage beyond its file": (replaced((LENGTH, FAR + b"t")), {}),
+    "a tensor beyond its file": (replaced((LENGTH, FARTHER + b"t"), (b"QK\x00", b"Q" + FAR)), {}),
+    "a text of 4 GB": (replaced((b"X\x0f\0\0\0layers", b"X\xf0\xff\xff\xfflayers")), {}),
+    "the last memo of 32 bits": (replaced((b"q\x02", b"r\xff\xff\xff\xff")), {}),
+    "a file of 3 GB": (bytes, {"file_0": 3 << 30}),
+    "a file without end": (bytes, {"file_1": 1 << 62}),
+}
+
+
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_forged_weights_are_refused_and_take_no_memory(tmp_path, forgery):
+    path = written(tmp_path)
+    change, sizes = FORGERIES[forgery]
+    saved = io.BytesIO()
+    torch.save(dict(make_network(scenes.load(path), 0).state_dict()), saved)
+    (tmp_path / "given.pt").write_bytes(patched(saved.getvalue(), change, **sizes))
+    command = [ROOT / "build" / "prdp_train", path, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as trainer:
+        errors = trainer.stderr.read()
+        status, used = os.wait4(trainer.pid, 0)[1:]
+        trainer.returncode = os.waitstatus_to_exitcode(status)
+    assert trainer.returncode == 2 and errors.count("\n") == 1
+    assert "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it" in errors
+    assert used.ru_maxrss < 1 << 20  # in KiB
+
+
+def test_archives_with_numbers_of_64_bits_are_read(tmp_path, monkeypatch):
+    """torch writes them where a file, or all of them together, has 4 GB."""
+    path = written(tmp_path)
+    saved = io.BytesIO()
+    torch.save(make_network(scenes.load(path), 1).state_dict(), saved)
+    curves = []
+    for limit in (zipfile.ZIP64_LIMIT, 0):
+        monkeypatch.setattr(zipfile, "ZIP64_LIMIT", limit)
+        (tmp_path / "given.pt").write_bytes(patched(saved.getvalue(), bytes))
+        assert (b"PK\6\6" in (tmp_path / "given.pt").read_bytes()) == (limit == 0)
+        given = ("--intervals", 1, "--weights", tmp_path / "given.pt")
+        assert prdp_train(path, "--out", tmp_path / str(limit), *given)[0] == 0
+        record = json.loads((tmp_path / str(limit) / "prdp/seed_0.json").read_text())
+        curves.append(record["curves"]["metric"])
+    assert curves[0] == curves[1]

@@ -4,29 +4,26 @@
 #include <torch/csrc/jit/serialization/pickler.h>
 
 #include "prdp/scenes/files.h"
-#include "prdp/scenes/pickled.h"
+#include "prdp/scenes/tensor_map.h"
 
 namespace prdp {
 
 namespace {
 
-using Dict = c10::impl::GenericDict;
-
-/// The tensors in the bytes, by name.
-Dict read(const std::string& bytes) {
+TensorMap read(std::string_view bytes) {
   try {
-    return read_pickled(bytes).toGenericDict();
-  } catch (const std::exception&) {
-    TORCH_CHECK_VALUE(false, "weights: expected a dict of tensors, as torch.save(dict(network.state_dict()), path) writes it");
+    return unpack(bytes);
+  } catch (const c10::ValueError&) {
+    TORCH_CHECK_VALUE(false, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it");
   }
 }
 
 /// The tensor of this name. Raises ValueError if there is none like `wanted`.
-at::Tensor found(const Dict& state, const std::string& name, const at::Tensor& wanted) {
+const at::Tensor& found(const TensorMap& state, const std::string& name, const at::Tensor& wanted) {
   const auto entry = state.find(name);
-  TORCH_CHECK_VALUE(entry != state.end() && entry->value().isTensor(), "weights: there is no tensor '", name, "'");
-  const auto tensor = entry->value().toTensor();
-  TORCH_CHECK_VALUE(tensor.defined() && tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(),
+  TORCH_CHECK_VALUE(entry != state.end(), "weights: there is no tensor '", name, "'");
+  const auto& tensor = entry->second;
+  TORCH_CHECK_VALUE(tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(),
                     "weights: '", name, "' must be ", wanted.scalar_type(), " of sizes ", wanted.sizes());
   return tensor;
 }

@@ -9,7 +9,7 @@ namespace prdp {
 /// The parameters of a network by name, as the bytes of a file that `torch.load(path, weights_only=True)` reads in
 /// Python: the `state_dict` of the same network there.
 std::string pack_weights(const torch::nn::Module& network);
-/// The inverse, also for files that `torch.save(dict(network.state_dict()), path)` has written in Python. Only tensors
+/// The inverse, also for files that `torch.save(network.state_dict(), path)` has written in Python. Only tensors
 /// are read, and no code in the bytes is run. Raises ValueError, and changes nothing, for other bytes and for tensors
 /// whose names, sizes or dtype differ from those of the network.
 void unpack_weights(const std::string& bytes, torch::nn::Module& network);

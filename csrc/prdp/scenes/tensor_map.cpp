@@ -2,8 +2,6 @@
 
 #include <torch/csrc/jit/serialization/pickle.h>
 
-#include "prdp/scenes/pickled.h"
-
 namespace prdp {
 
 std::string pack(const TensorMap& tensors) {
@@ -14,19 +12,6 @@ std::string pack(const TensorMap& tensors) {
   }
   const auto bytes = torch::jit::pickle_save(c10::ivalue::Tuple::create(std::move(entries)));
   return {bytes.data(), bytes.size()};
-}
-
-TensorMap unpack(const std::string& bytes) {
-  TensorMap tensors;
-  try {
-    const auto loaded = read_pickled(bytes);
-    const auto& entries = loaded.toTupleRef().elements();
-    for (size_t i = 0; i + 1 < entries.size(); i += 2)
-      tensors.emplace(entries[i].toStringRef(), entries[i + 1].toTensor());
-  } catch (const std::exception&) {
-    TORCH_CHECK_VALUE(false, "expected named tensors");
-  }
-  return tensors;
 }
 
 const at::Tensor& entry(const TensorMap& tensors, const std::string& name, at::ScalarType dtype,

@@ -3,6 +3,7 @@
 
 #include <map>
 #include <string>
+#include <string_view>
 
 namespace prdp {
 
@@ -11,9 +12,9 @@ using TensorMap = std::map<std::string, at::Tensor>;
 
 /// The tensors as bytes.
 std::string pack(const TensorMap& tensors);
-/// The inverse of `pack`, whose bytes make tensors and nothing else: no code in them is run. Raises ValueError for
-/// other bytes.
-TensorMap unpack(const std::string& bytes);
+/// The tensors in such bytes, or in those of a dict or a state_dict that torch.save has written in Python. No code in
+/// them is run, and no more memory is taken than they are long. Raises ValueError for other bytes.
+TensorMap unpack(std::string_view bytes);
 
 /// The tensor of this name. Raises ValueError if there is none of this dtype and these sizes.
 const at::Tensor& entry(const TensorMap& tensors, const std::string& name, at::ScalarType dtype, at::IntArrayRef sizes);

@@ -43,7 +43,16 @@ MAPS = {
         ("contrast of the diffusivity, max κ/min κ (random from cell to cell, 32²)",),
     ),
     "burgers_solvers": Map(
-        "Which solver takes a Burgers step?", solves.burgers_solvers, "shares", (f"{CFL} (N = 64, random states)", "")
+        "Which solver takes a Burgers step?",
+        solves.burgers_solvers,
+        "shares",
+        (f"{CFL} (N = 64, random states, 3,000 products at most)", ""),
+    ),
+    "burgers_amplitude": Map(
+        "Which amplitude of a Burgers state can each solver take?",
+        solves.burgers_amplitude,
+        "shares",
+        ("cell Péclet number, max|u| dx/nu (N = 64, nu dt/dx² = 10, 3,000 products at most)", ""),
     ),
     "burgers_restart": Map(
         "How small a restart can Burgers take?",
@@ -57,6 +66,7 @@ MAPS = {
         "shares",
         (f"{CFL} (16², 4,000 products at most)", ""),
     ),
+    "flow_grid": Map("How does the work of a Navier–Stokes step grow with the grid?", solves.flow_grid, "grid_size"),
     "hyperdiffusion": Map(
         "Where does Jacobi diverge?",
         solves.hyperdiffusion,

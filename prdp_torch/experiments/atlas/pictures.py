@@ -9,7 +9,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, NullFormatter, NullL
 from prdp_torch.experiments.charts import make_figure
 
 # One colour per method in all pictures; Okabe and Ito's, which colour-blind readers can tell apart.
-COLOURS = {"GMRES(2)": "#56B4E9",
+COLOURS = {"GMRES(2)": "#56B4E9", "BiCGStab": "#8C6D31",
            "Jacobi": "#0072B2", "Chebyshev": "#009E73", "SteepestDescent": "#CC79A7", "CG": "#E69F00",
            "GMRES": "#D55E00", "Direct": "#222222", "constant K": "#0072B2", "implicit": "#0072B2",
            "unrolled": "#D55E00", "solution": "#888888", "primal": "#0072B2", "adjoint": "#D55E00"}  # fmt: skip
@@ -30,7 +30,7 @@ def titled(question, answer, panels=1, height=4.4):
 
 def _style(name):
     method = next((m for m in COLOURS if name.startswith(m)), None)
-    dashed = any(word in name for word in ("diagonal", "unrolled", "float64"))
+    dashed = any(word in name for word in ("diagonal", "stokes", "unrolled", "float64"))
     return {"color": COLOURS.get(method, "#666666"), "ls": "--" if dashed else "-"}
 
 
@@ -58,8 +58,8 @@ def cost(xlabel, boundary=None):
         figure, (axes,) = titled(question, data["answer"])
         _draw_lines(axes, data["x"], data["lines"])
         for name, values in data["lines"].items():
-            if None in values and any(v is not None for v in values):
-                last = max(i for i, v in enumerate(values) if v is not None)
+            last = values.index(None) - 1 if None in values else -1
+            if last >= 0:
                 axes.plot(data["x"][last], values[last], "X", ms=11, color=_style(name)["color"], mec="white", zorder=4)
         axes.set(xlabel=xlabel, ylabel="products with A until 1e-5\n(median; × where the solves begin to fail)")
         if boundary is not None:
@@ -100,7 +100,7 @@ def floor(question, data):
 
 
 def shares(xlabel, ylabel):
-    """A table of the share of samples that were solved; what the others say where none was."""
+    """A table of the share of samples that were solved: the products where all were, the status where none was."""
 
     def draw(question, data):
         rows = data["rows"]
@@ -108,14 +108,15 @@ def shares(xlabel, ylabel):
         share = np.array(data["share"])
         image = axes.imshow(share, cmap=SHARES, vmin=0, vmax=1, aspect="auto")
         for i, j in np.ndindex(share.shape):
-            said = data["status"][i][j]
-            text = f"{share[i, j]:.0%}" if share[i, j] > 0 else said.replace("_", "\n")
+            products, status = data["products"][i][j], data["status"][i][j].replace("_", "\n")
+            text = f"{products:,.0f}" if products is not None else f"{share[i, j]:.0%}" if share[i, j] > 0 else status
             size = 9 if share[i, j] > 0 else 6.5
             axes.text(j, i, text, ha="center", va="center", fontsize=size, color="black", linespacing=0.9)
         axes.set_xticks(range(len(data["x"])), [f"{x:g}" for x in data["x"]])
         axes.set_yticks(range(len(rows)), rows)
         axes.set(xlabel=xlabel, ylabel=ylabel)
-        figure.colorbar(image, ax=axes, label="share of samples solved to 1e-5", format=lambda v, _: f"{v:.0%}")
+        label = "share of samples solved to 1e-5\n(numbers: products with A, the median)"
+        figure.colorbar(image, ax=axes, label=label, format=lambda v, _: f"{v:.0%}")
         return figure
 
     return draw

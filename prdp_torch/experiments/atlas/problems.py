@@ -28,11 +28,29 @@ def burgers(cfl, n=64, batch=SAMPLES, dtype=torch.float64, smooth=False):
     return operators.Burgers(u, 1e-3, cfl / n), u
 
 
+def burgers_of_amplitude(peclet, ratio=10.0, n=64):
+    """A Burgers step with ratio = nu dt/dx² about random states with max|u| dx/nu = peclet (nu = 1e-3), and those
+    states. Heat is the limit of small ones."""
+    _, u = burgers(1.0, n)
+    u = peclet * 1e-3 * n * u
+    return operators.Burgers(u, 1e-3, ratio / (1e-3 * n**2)), u
+
+
 def flow(cfl, n=16, batch=8, dtype=torch.float64):
     """A Navier-Stokes step with cfl = dt max|u|/dx about random solenoidal velocities (nu = 1e-3)."""
     u = fields.project(noise(batch, 3, n, n))
     u = (u / u[:, :2].abs().amax((1, 2, 3), keepdim=True)).to(dtype)
     dt = cfl / n
+    b = u / dt
+    b[:, 2] = 0.0
+    return operators.NavierStokes(u, 1e-3, dt), b
+
+
+def flow_of_size(n, dt=0.1, batch=4):
+    """A Navier-Stokes step about smooth random velocities with max|u| = 1 (nu = 1e-3), the same dt on all grids."""
+    modes = (torch.fft.fftfreq(n, 1 / n).abs()[:, None] <= 3) & (torch.fft.rfftfreq(n, 1 / n) <= 3)
+    u = fields.project(torch.fft.irfft2(torch.fft.rfft2(noise(batch, 3, n, n)) * modes, s=(n, n)))
+    u = u / u[:, :2].abs().amax((1, 2, 3), keepdim=True)
     b = u / dt
     b[:, 2] = 0.0
     return operators.NavierStokes(u, 1e-3, dt), b

@@ -1,29 +1,34 @@
 """Maps of solves: how many products with A a method takes, and what it says where it breaks."""
 
 import math
+from typing import NamedTuple
 
 import torch
 
 from prdp_torch import operators
 from prdp_torch.experiments.atlas import problems
 from prdp_torch.solve import SolveStatus, linear_solve
-from prdp_torch.solvers import CG, GMRES, Chebyshev, Direct, Jacobi, SteepestDescent
+from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, SteepestDescent
 
 
 def solve(a, b, solver):
     return linear_solve(a, b, solver, backward="none", on_failure="return")
 
 
-def share_solved(a, b, solver):
-    """Of the samples, and the most frequent status."""
-    status = solve(a, b, solver)[1].status
-    return float((status > 0).double().mean()), SolveStatus(int(status.mode().values)).name
+class Outcome(NamedTuple):
+    share: float
+    """Of the samples, those that are solved."""
+    status: str
+    """The most frequent one."""
+    products: float | None
+    """With A, the median over the samples; None where some are not solved."""
 
 
-def products(a, b, solver):
-    """The median over the samples, or None where some are not solved."""
+def outcome(a, b, solver):
     info = solve(a, b, solver)[1]
-    return float(info.operator_applications.double().median()) if bool((info.status > 0).all()) else None
+    share = float((info.status > 0).double().mean())
+    products = float(info.operator_applications.double().median()) if share == 1.0 else None
+    return Outcome(share, SolveStatus(int(info.status.mode().values)).name, products)
 
 
 def spaced(low, high, count):
@@ -37,26 +42,38 @@ def lines(x, problem, solvers):
     """Products with A of each solver over x."""
     return {
         "x": x,
-        "lines": {name: [products(*problem(value), solver) for value in x] for name, solver in solvers.items()},
+        "lines": {name: [outcome(*problem(value), solver).products for value in x] for name, solver in solvers.items()},
     }
 
 
 def table(x, rows, problem, solver_of):
-    """Share of the samples solved and the status, of each row over x."""
-    cells = [[share_solved(*problem(value), solver_of(row)) for value in x] for row in rows]
-    return {
-        "x": x,
-        "rows": [str(row) for row in rows],
-        "share": [[share for share, _ in row] for row in cells],
-        "status": [[status for _, status in row] for row in cells],
-    }
+    """What comes of each row over x."""
+    cells = [[outcome(*problem(value), solver_of(row)) for value in x] for row in rows]
+    of = {field: [[getattr(cell, field) for cell in row] for row in cells] for field in Outcome._fields}
+    return {"x": x, "rows": [str(row) for row in rows], **of}
 
 
-def _table_of_solvers(x, problem, solvers):
+def _table_of_solvers(x, problem, solvers, of_x="every CFL number"):
     """A table, whose answer are the solvers that solve every sample everywhere."""
     data = table(x, list(solvers), problem, solvers.get)
     always = " · ".join(name for name, row in zip(data["rows"], data["share"], strict=True) if min(row) == 1.0)
-    return {**data, "answer": f"every CFL number: {always}"}
+    return {**data, "answer": f"{of_x}: {always}"}
+
+
+def _gmres(restart, products, **options):
+    """As many cycles as there are products for; one of each is for the residual."""
+    return GMRES(restart=restart, max_iter=products // (restart + 1), **options)
+
+
+def _of_burgers(products):
+    """Solvers that are given so many products each."""
+    return {
+        "Jacobi": Jacobi(products),
+        "SteepestDescent": SteepestDescent(products),
+        "CG": CG(products),
+        "BiCGStab": BiCGStab(products // 2),
+        **{f"GMRES({m})": _gmres(m, products) for m in (2, 10, 64)},
+    }
 
 
 def stiffness(quick):
@@ -140,22 +157,21 @@ def contrast(quick):
 
 
 def burgers_solvers(quick):
-    x = spaced(0.1, 1000, 3 if quick else 9)
-    solvers = {
-        "Jacobi": Jacobi(3000),
-        "SteepestDescent": SteepestDescent(3000),
-        "CG": CG(3000),
-        "GMRES(2)": GMRES(restart=2, max_iter=1500),
-        "GMRES(10)": GMRES(restart=10, max_iter=300),
-        "GMRES(64)": GMRES(restart=64, max_iter=47),
-    }
-    return _table_of_solvers(x, problems.burgers, solvers)
+    return _table_of_solvers(spaced(0.1, 1000, 3 if quick else 9), problems.burgers, _of_burgers(3000))
+
+
+def burgers_amplitude(quick):
+    x = spaced(0.01, 1000, 3 if quick else 11)
+    data = _table_of_solvers(x, problems.burgers_of_amplitude, _of_burgers(3000), "every amplitude")
+    shares = dict(zip(data["rows"], data["share"], strict=True))
+    last = max(value for value, share in zip(x, shares["CG"], strict=True) if share == 1.0)
+    return {**data, "last": last, "answer": f"CG up to a Péclet number of {last:g}; {data['answer']}"}
 
 
 def burgers_restart(quick):
     x = spaced(0.1, 1000, 3 if quick else 9)
     rows = [2, 32] if quick else [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
-    data = table(x, rows, problems.burgers, lambda m: GMRES(restart=m, max_iter=3000 // m))
+    data = table(x, rows, problems.burgers, lambda m: _gmres(m, 3000))
     whole = [m for m, row in zip(rows, data["share"], strict=True) if min(row) == 1.0]
     smallest = next((m for m in rows if all(n in whole for n in rows if n >= m)), None)
     solved = [c for c, share in zip(x, data["share"][rows.index(2)], strict=True) if share == 1.0]
@@ -169,13 +185,24 @@ def flow_solvers(quick):
         "Jacobi": Jacobi(4000),
         "SteepestDescent": SteepestDescent(4000),
         "CG": CG(4000),
-        "GMRES(2)": GMRES(restart=2, max_iter=2000),
-        "GMRES(8)": GMRES(restart=8, max_iter=500),
-        "GMRES(20)": GMRES(restart=20, max_iter=200),
-        "GMRES(50)": GMRES(restart=50, max_iter=80),
-        'GMRES(8), "stokes"': GMRES(restart=8, max_iter=500, preconditioner="stokes"),
+        "BiCGStab": BiCGStab(2000),
+        **{f"GMRES({m})": _gmres(m, 4000) for m in (2, 8, 20, 50)},
+        'GMRES(8), "stokes"': _gmres(8, 4000, preconditioner="stokes"),
     }
     return _table_of_solvers(x, problems.flow, solvers)
+
+
+def flow_grid(quick):
+    x = [8, 16] if quick else [8, 16, 32, 48, 64, 96]
+    solvers = {
+        "BiCGStab": BiCGStab(4000),
+        "GMRES(8)": _gmres(8, 8000),
+        'GMRES(8), "stokes"': _gmres(8, 8000, preconditioner="stokes"),
+    }
+    data = lines(x, problems.flow_of_size, solvers)
+    taken = [data["lines"][name][-1] for name in ("GMRES(8)", 'GMRES(8), "stokes"')]
+    answer = f'at {x[-1]}²: GMRES(8) {taken[0] or math.nan:,.0f} products, with "stokes" {taken[1]:,.0f}'
+    return {**data, "answer": answer}
 
 
 def hyperdiffusion(quick):
@@ -184,7 +211,7 @@ def hyperdiffusion(quick):
     solvers = {"Jacobi": Jacobi(40000), "CG": CG(4000), "GMRES(10)": GMRES(max_iter=400)}
     data = lines(x, problems.hyperdiffusion, solvers)
     last = max(value for value, taken in zip(x, data["lines"]["Jacobi"], strict=True) if taken is not None)
-    status = share_solved(*problems.hyperdiffusion(x[-1]), Jacobi(40000))[1]
+    status = outcome(*problems.hyperdiffusion(x[-1]), Jacobi(40000)).status
     answer = f"beyond nu dt/dx⁴ = 1/4: solved at {last:g}, {status} at {x[-1]:g}"
     return {**data, "last": last, "answer": answer}
 
@@ -195,13 +222,14 @@ def known_matrices(quick):
         "Jacobi": Jacobi(3000),
         "SteepestDescent": SteepestDescent(3000),
         "CG": CG(3000),
+        "BiCGStab": BiCGStab(3000),
         "GMRES(1)": GMRES(restart=1, max_iter=3000),
         "GMRES(2)": GMRES(restart=2, max_iter=3000),
         "GMRES(16)": GMRES(restart=16, max_iter=3000),
         "Direct": Direct(),
     }
     cases = problems.matrices()
-    status = [[share_solved(a, b, solver)[1] for solver in solvers.values()] for a, b in cases.values()]
+    status = [[outcome(a, b, solver).status for solver in solvers.values()] for a, b in cases.values()]
     solved = {name: sum(row[i].startswith("CONV") for row in status) for i, name in enumerate(solvers)}
     most = max(solved.values())
     best = " and ".join(name for name, count in solved.items() if count == most)
@@ -221,8 +249,8 @@ def primal_adjoint(quick):
         residuals["primal"].append(float(info.residual))
         residuals["adjoint"].append(float(info.adjoint.residual))
     outcomes = {}
-    solvers = {"SteepestDescent": SteepestDescent(300), "CG": CG(300), "GMRES(2)": GMRES(restart=2, max_iter=150),
-               "GMRES(4)": GMRES(restart=4, max_iter=75), "Jacobi": Jacobi(300)}  # fmt: skip
+    solvers = {"SteepestDescent": SteepestDescent(300), "CG": CG(300), "BiCGStab": BiCGStab(150),
+               "GMRES(2)": _gmres(2, 300), "GMRES(4)": _gmres(4, 300), "Jacobi": Jacobi(300)}  # fmt: skip
     a, winds = problems.burgers(100.0, n=16, batch=32 if quick else 256)
     cotangent = problems.noise(*winds.shape, seed=1)
     for name, solver in solvers.items():

@@ -1,0 +1,29 @@
+"""The studies of docs/results.md train what they say."""
+
+import pytest
+import torch
+
+from benchmarks.studies import unroll
+from benchmarks.studies.trainings import PRDPOnLoss, variant
+from prdp_torch.experiments.training import train
+
+
+def test_prdp_on_the_loss_hears_the_mean_loss_of_each_epoch():
+    scene = variant("heat_1d", {"data.train": 50, "training.epochs": 3})
+    refinement = PRDPOnLoss(scene)
+    curves = train(scene, refinement, callbacks=refinement.callbacks())
+    losses = torch.tensor(curves["update_loss"]).view(3, 2).mean(1)
+    heard = [call.metric for call in refinement._controller.history]
+    assert heard == pytest.approx(losses.tolist(), rel=1e-6)
+
+
+def test_one_unrolled_step_needs_no_gradient_through_the_solver():
+    exact, none = (unroll.train("burgers_1d", 1, gradient, 0, 3) for gradient in ("exact", "none"))
+    assert exact["errors"] == none["errors"]
+    assert exact["adjoint_products"] == none["adjoint_products"] == 0
+
+
+def test_two_unrolled_steps_tell_the_gradients_apart():
+    exact, few, none = (unroll.train("burgers_1d", 2, gradient, 0, 3) for gradient in unroll.GRADIENTS)
+    assert len({tuple(row["errors"]) for row in (exact, few, none)}) == 3
+    assert exact["adjoint_products"] > few["adjoint_products"] > none["adjoint_products"] == 0
