@@ -32,7 +32,7 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	.venv-peers/bin/python -m prdp_torch bench
 
-# ThreadSanitizer watches what has threads; csrc/prdp/solvers/interruption.h shares loops in a way that it understands.
+# ThreadSanitizer watches what has threads; csrc/prdp/threads/interruption.h shares loops in a way that it understands.
 sanitize: $(STAMPS)/configure
 	$(BIN)/cmake -S . -B build-address -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=address,undefined > build/sanitize.log
 	$(BIN)/cmake --build build-address --parallel $$(nproc) --target prdp_tests

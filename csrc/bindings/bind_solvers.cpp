@@ -3,7 +3,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/solving.h"
 

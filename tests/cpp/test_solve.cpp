@@ -3,7 +3,7 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 
 /// The CPU loops against the plain-tensor solver, which share only the text of the methods.
@@ -43,16 +43,16 @@ TEST(Solve, LoopsEqualPlainTensorsAtSizesAroundTheVectorWidth) {
       SCOPED_TRACE(testing::Message() << name << " " << at::IntArrayRef(shape));
       const auto b = prdp_test::random_field(shape, 4);
       const int64_t k = method == Method::kDirect ? 1 : 3;
-      expect_same(heat(shape), b, {method, k, 0.0, {}}, 1e-13);
-      expect_same(heat(shape), b.to(at::kFloat), {method, k, 0.0, {}}, 2e-6);
+      expect_same(heat(shape), b, {method, k, 0.0}, 1e-13);
+      expect_same(heat(shape), b.to(at::kFloat), {method, k, 0.0}, 2e-6);
     }
 }
 
 TEST(Solve, LoopsEqualPlainTensorsUpToTheSameStop) {
   for (const auto& [method, name] : kMethods) {
     SCOPED_TRACE(name);
-    expect_same(heat({30}), prdp_test::random_field({30}, 5), {method, 200, 1e-8, {}}, 1e-9);
-    expect_same(heat({12, 9}), prdp_test::random_field({12, 9}, 5), {method, 200, 1e-8, {}}, 1e-9);
+    expect_same(heat({30}), prdp_test::random_field({30}, 5), {method, 200, 1e-8}, 1e-9);
+    expect_same(heat({12, 9}), prdp_test::random_field({12, 9}, 5), {method, 200, 1e-8}, 1e-9);
   }
 }
 
@@ -66,7 +66,7 @@ TEST(Solve, EachSampleStopsAtItsOwnCap) {
     for (const auto& result : {prdp::solve(*a, b, request), prdp::solve_with_tensors(*a, b, request)}) {
       EXPECT_TRUE(at::equal(result.info.iterations, caps));
       for (int64_t i = 0; i < 4; ++i) {
-        const auto alone = prdp::solve(*a, b.narrow(0, i, 1), {method, caps[i].item<int64_t>(), 0.0, {}});
+        const auto alone = prdp::solve(*a, b.narrow(0, i, 1), {method, caps[i].item<int64_t>(), 0.0});
         EXPECT_LT((alone.u[0] - result.u[i]).abs().max().item<double>(), 1e-13);
       }
     }
@@ -77,7 +77,7 @@ TEST(Solve, CountsProductsWithTheOperator) {
   const auto a = prdp::make_operator(heat({20}));
   const auto b = prdp_test::random_field({20}, 1);
   const auto products = [&](Method method, int64_t k, double rtol) {
-    return prdp::solve(*a, b, {method, k, rtol, {}}).info.operator_applications[0].item<int64_t>();
+    return prdp::solve(*a, b, {method, k, rtol}).info.operator_applications[0].item<int64_t>();
   };
   // From zero the first Jacobi iterate is free, and each solve ends with its true residual.
   EXPECT_EQ(products(Method::kJacobi, 10, 0.0), 10);
@@ -105,7 +105,7 @@ TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
   const auto matrices = at::stack({first, at::eye(3, at::kDouble) * 2.0, first, at::eye(3, at::kDouble) * 4.0});
   const auto a = prdp::make_operator({"dense", {}, {}, {matrices}});
   const auto b = at::ones({4, 3}, at::kDouble);
-  const auto result = prdp::solve(*a, b, {Method::kJacobi, 500, 0.0, {}});
+  const auto result = prdp::solve(*a, b, {Method::kJacobi, 500, 0.0});
   EXPECT_EQ(result.info.status[0].item<int64_t>(), -3);
   EXPECT_TRUE(result.u.isfinite().all().item<bool>());
   EXPECT_TRUE(result.u[1].eq(0.5).all().item<bool>());
@@ -116,11 +116,11 @@ TEST(Solve, AnInterruptionEndsAllThreadsAndLeavesNothingBehind) {
   struct Interrupted {};
   const auto a = prdp::make_operator(heat({64, 64}));
   const auto b = at::randn({16, 1, 64, 64}, at::kDouble);
-  const prdp::SolveRequest request{Method::kConjugateGradient, 200, 1e-10, {}};
+  const prdp::SolveRequest request{Method::kConjugateGradient, 200, 1e-10};
   const auto wanted = prdp::solve(*a, b, request).u;
   prdp::interruption::set_check([] { throw Interrupted{}; });
   for (const auto method : {Method::kJacobi, Method::kConjugateGradient})
-    EXPECT_THROW(prdp::solve(*a, b, {method, int64_t{1} << 50, 0.0, {}}), Interrupted);
+    EXPECT_THROW(prdp::solve(*a, b, {method, int64_t{1} << 50, 0.0}), Interrupted);
   prdp::interruption::set_check(nullptr);
   EXPECT_TRUE(at::equal(prdp::solve(*a, b, request).u, wanted));
 
@@ -150,7 +150,7 @@ TEST(Matrix, OnlySquareOnesWithIndicesInRangeAreTaken) {
 
 TEST(Solve, EmptyBatchIsNoTrouble) {
   const auto a = prdp::make_operator(heat({20}));
-  const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {Method::kJacobi, 3, 1e-5, {}});
+  const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {Method::kJacobi, 3, 1e-5});
   EXPECT_EQ(result.u.size(0), 0);
   EXPECT_EQ(result.info.status.numel(), 0);
 }

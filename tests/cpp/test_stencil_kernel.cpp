@@ -153,7 +153,7 @@ TEST(Stencil, IsAnOperatorOfTheLibrary) {
   const auto matrix = 3.0 * at::eye(4, at::kDouble) - at::eye(4, at::kDouble).roll(1, 0);
   EXPECT_TRUE(at::allclose(a->dense(c.options()), matrix));
   const auto b = at::arange(1, 9, at::kDouble).view({1, 2, 4});
-  const auto u = prdp::solve(*a, b, {prdp::Method::kDirect, 1, 0.0, {}}).u;
+  const auto u = prdp::solve(*a, b, {prdp::Method::kDirect, 1, 0.0}).u;
   EXPECT_TRUE(at::allclose(at::matmul(u, matrix.mT()), b));
   EXPECT_THROW(prdp::stencil(c, {{0}}), c10::ValueError);
   EXPECT_THROW(prdp::stencil(c, {{0}, {3}}), c10::ValueError);

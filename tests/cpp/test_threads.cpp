@@ -8,7 +8,7 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/steppers/stepper.h"
 
 /// The loop over the samples of a batch, and callers that solve at the same time. `make sanitize` runs these under

@@ -3,7 +3,7 @@
 #include "prdp/autograd/reverse_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {

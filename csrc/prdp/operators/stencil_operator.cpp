@@ -8,7 +8,7 @@
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 

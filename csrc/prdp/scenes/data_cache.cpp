@@ -4,8 +4,6 @@
 
 #include <cstdlib>
 #include <filesystem>
-#include <iomanip>
-#include <sstream>
 
 #include "prdp/scenes/seal.h"
 #include "prdp/scenes/tensor_map.h"
@@ -16,19 +14,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr int kFormat = 2;
-
-/// All that the data depend on, in words.
-std::string settings_of(const Scene& scene) {
-  const auto& p = scene.physics;
-  const auto& d = scene.data;
-  std::ostringstream text;
-  text << std::setprecision(17) << "prdp data " << kFormat << ": " << p.equation << ", shape "
-       << at::IntArrayRef(p.shape) << ", reference_shape " << at::IntArrayRef(d.reference_shape) << ", nu " << p.nu
-       << ", dt " << p.dt << ", modes " << d.modes << ", train " << d.train << ", valid " << d.valid
-       << ", valid_steps " << d.valid_steps << ", seed " << d.seed << ", " << scene.dtype;
-  return text.str();
-}
+constexpr int kFormat = 3;
 
 fs::path cache_folder() {
   const char *chosen = std::getenv("PRDP_CACHE"), *home = std::getenv("HOME");
@@ -65,7 +51,7 @@ Dataset dataset_of(const TensorMap& tensors, const Scene& scene) {
 
 Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
   constexpr const char *kKind = "data", *kRemedy = "it is made again";
-  const auto settings = settings_of(scene);
+  const auto settings = c10::str("prdp data ", kFormat, ": ", data_settings(scene));
   const auto path = cache_folder() / (scene.physics.equation + '-' + fingerprint(settings) + ".data");
   if (const auto found = read_sealed(path, kKind, kRemedy)) {
     TORCH_CHECK_VALUE(found->settings == settings, "data: '", path.string(), "' holds '", found->settings, "', not '",

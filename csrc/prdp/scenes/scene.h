@@ -128,6 +128,9 @@ struct SceneKey {
 /// Every key that a scene may have, in the order in which they are read.
 std::vector<SceneKey> scene_keys();
 
+/// The type of the tensors and all keys of [physics] and [data], with their values: what the data depend on.
+std::string data_settings(const Scene& scene);
+
 /// Reads a scene file. Raises ValueError for a mistake; it names the file, the line, the key and what is allowed.
 Scene read_scene(const std::string& path);
 /// The same for the text of a scene, such as that in a record. `path` is used in errors and for the name of the scene.

@@ -3,6 +3,7 @@
 
 #include "prdp/scenes/files.h"
 #include "prdp/scenes/key_list.h"
+#include "prdp/scenes/key_values.h"
 #include "prdp/scenes/scene.h"
 #include "prdp/scenes/toml_section.h"
 #include "prdp/solvers/methods.h"
@@ -234,6 +235,14 @@ std::vector<SceneKey> scene_keys() {
   Scene defaults;
   read_all(list, defaults);
   return keys;
+}
+
+std::string data_settings(const Scene& scene) {
+  KeyValues values;
+  Scene read = scene;
+  read_physics(values, read);
+  read_data(values, read);
+  return c10::str(scene.dtype, values.line());
 }
 
 Scene read_scene(const std::string& path) { return parse_scene(read_whole("scene", path), path); }

@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "prdp/kernels/direct_factors.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
 

@@ -2,7 +2,7 @@
 
 #include <ATen/EmptyTensor.h>
 
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_cpu.h"
 

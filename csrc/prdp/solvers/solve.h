@@ -17,7 +17,7 @@ struct SolveRequest {
   Method method;
   int64_t max_iter;
   double rtol;
-  int64_t restart;
+  int64_t restart = kDefaultRestart;
   std::optional<at::Tensor> caps{};
   bool guarded = true;
   at::Tensor x0{};

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
 

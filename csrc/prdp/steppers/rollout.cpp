@@ -11,7 +11,7 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/disguises.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/rollout_vjp.h"

@@ -5,7 +5,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/solving.h"

@@ -1,4 +1,4 @@
-#include "prdp/solvers/interruption.h"
+#include "prdp/threads/interruption.h"
 
 #include <c10/util/Exception.h>
 
