@@ -11,7 +11,7 @@ namespace {
 
 using State = StepwiseSolve::State;
 
-/// The whole batch as a sweep for run_back(): autograd records one iteration at a time and takes its
+/// The whole batch for run_back(): autograd records one iteration at a time and takes its
 /// derivative before the next.
 class Replay {
  public:

@@ -22,33 +22,31 @@ struct Checkpoints {
   int64_t slots() const { return stride + segments(); }
 };
 
-/// Runs the iterations of a sweep forward, storing iterates as `plan` says, and then back, one by one.
-/// The arithmetic does not depend on the plan, so the result is the same to the last bit. A sweep has
-/// start(), step(), save(slot), load(slot, k) for the state after k iterations, and step_back(slot, k).
-/// This takes the cotangents after iteration k to those before it; the iteration starts from the state
-/// in the slot, and has just been run again.
-template <class Sweep>
-void run_back(Sweep& sweep, const Checkpoints& plan) {
+/// Runs iterations forward, storing iterates as `plan` says, and then takes them back, one by one. The arithmetic does
+/// not depend on the plan, so the result is the same to the last bit. `run` has start(), step(), save(slot),
+/// load(slot, k) for the state after k iterations, and step_back(slot, k). This runs iteration k again from the state in
+/// the slot, which has just been loaded, and takes the cotangents after it to those before it.
+template <class Run>
+void run_back(Run& run, const Checkpoints& plan) {
   const auto length = [&](int64_t segment) {
     return std::min(plan.stride, plan.iterations - segment * plan.stride);
   };
-  sweep.start();
+  run.start();
   for (int64_t segment = 0; segment < plan.segments(); ++segment) {
-    sweep.save(plan.stride + segment);
+    run.save(plan.stride + segment);
     if (segment + 1 == plan.segments()) break;
-    for (int64_t i = 0; i < plan.stride; ++i) sweep.step();
+    for (int64_t i = 0; i < plan.stride; ++i) run.step();
   }
   for (int64_t segment = plan.segments() - 1; segment >= 0; --segment) {
-    sweep.load(plan.stride + segment, segment * plan.stride);
+    run.load(plan.stride + segment, segment * plan.stride);
     for (int64_t i = 0; i < length(segment); ++i) {
-      sweep.save(i);
-      if (i + 1 < length(segment)) sweep.step();
+      run.save(i);
+      if (i + 1 < length(segment)) run.step();
     }
     for (int64_t i = length(segment) - 1; i >= 0; --i) {
       const int64_t k = segment * plan.stride + i;
-      sweep.load(i, k);
-      sweep.step();
-      sweep.step_back(i, k);
+      run.load(i, k);
+      run.step_back(i, k);
     }
   }
 }

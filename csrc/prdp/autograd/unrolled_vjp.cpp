@@ -229,7 +229,7 @@ UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b
     found.gradients[0] = b_bar;
     return found;
   }
-  if (has_sweep(*make_operator(solve.a), solve, b)) return sweep_vjp(cotangent, b, solve, needed);
+  if (can_use_tape(*make_operator(solve.a), solve, b)) return tape_vjp(cotangent, b, solve, needed);
   return replay_vjp(cotangent, b, solve, needed);
 }
 

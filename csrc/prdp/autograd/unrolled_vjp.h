@@ -44,9 +44,10 @@ struct UnrolledVjp {
   at::Tensor operator_applications;
 };
 
-/// Computes them by hand-written sweeps in the CPU loops, one sample at a time; for what `has_sweep` names.
-bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
-UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+/// Computes them with a tape of the operations in the CPU loops (tape.h), one iteration of one sample at a time; for
+/// operators that have such loops, and methods that run on all of them.
+bool can_use_tape(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
+UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                       at::IntArrayRef needed);
 /// Computes them by autograd, one iteration at a time, in plain tensor operations; for everything else.
 UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,

@@ -55,15 +55,16 @@ class Workspace {
     // Vectors that start at the same place in their pages would wait for each other's stores.
     constexpr int64_t page = 4096 / sizeof(T), apart = 11 * kLanes<T>;
     stride_ = (round_up_to_lanes<T>(length) + 2 * halo + page - 1) / page * page + apart;
+    used_ = round_up_to_lanes<T>(length) + 2 * halo;
     halo_ = halo;
     count_ = count;
     const auto needed = static_cast<size_t>(count * stride_ + kLanes<T>);
     if (memory_.size() < needed) memory_.resize(needed);
     for (int64_t i = 0; i < count; ++i) clear(i);
   }
-  /// Zeroes a vector with its halos and padding.
+  /// Zeroes a vector with its halos.
   void clear(int64_t index) {
-    std::memset(vector(index) - halo_, 0, static_cast<size_t>(stride_) * sizeof(T));
+    std::memset(vector(index) - halo_, 0, static_cast<size_t>(used_) * sizeof(T));
   }
   int64_t count() const { return count_; }
 
@@ -75,7 +76,7 @@ class Workspace {
 
  private:
   std::vector<T> memory_;
-  int64_t stride_ = 0, halo_ = 0, count_ = 0;
+  int64_t stride_ = 0, used_ = 0, halo_ = 0, count_ = 0;  // `used_` of each stride, which ends with a gap
 };
 
 }  // namespace prdp::kernels

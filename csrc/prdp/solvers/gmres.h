@@ -72,7 +72,8 @@ class GmresMethod {
 
   /// What the next cycle starts from once residual2() is known; resume() once it has been put back.
   auto carried() { return std::tie(x, scale_); }
-  void resume(int64_t) {
+  void resume(int64_t done) {
+    if (done == 0) return start();
     residual2_ = space_.b2() / 0;  // no cycle before to take back
     ready_ = false;
   }

@@ -30,12 +30,6 @@ enum class MadeFor {
 /// The CPU loops that run a method. Where there are none, plain tensor operations do.
 enum class RunsOn { kAllLoops, kLaplacianLoops, kTensors };
 
-/// How the derivative of unrolled iterations is made. (In implicit mode every method solves with Aᵀ.)
-enum class Unrolled {
-  kSweep,   // by a reverse of its own in the CPU loops (autograd/sweeps.h), and by replay without them
-  kReplay,  // by autograd, which runs one iteration at a time again
-};
-
 /// One row of the table.
 struct MethodTraits {
   Method method;
@@ -54,7 +48,6 @@ struct MethodTraits {
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
   RunsOn runs_on = RunsOn::kAllLoops;
-  Unrolled unrolled = Unrolled::kReplay;
 };
 
 /// A row with the class that iterates.
@@ -81,8 +74,7 @@ inline constexpr std::tuple kMethods{
                              .vectors = 4,
                              .nanoseconds = 0.1,
                              .divides_by_diagonal = true,
-                             .is_polynomial = true,
-                             .unrolled = Unrolled::kSweep}},
+                             .is_polynomial = true}},
     MethodRow<ChebyshevMethod>{{.method = Method::kChebyshev,
                                 .name = "chebyshev",
                                 .label = "Chebyshev",
@@ -96,16 +88,14 @@ inline constexpr std::tuple kMethods{
                                       .label = "SteepestDescent",
                                       .made_for = MadeFor::kDefinite,
                                       .vectors = 4,
-                                      .nanoseconds = 0.3,
-                                      .unrolled = Unrolled::kSweep}},
+                                      .nanoseconds = 0.3}},
     MethodRow<ConjugateGradientMethod>{{.method = Method::kConjugateGradient,
                                         .name = "cg",
                                         .label = "CG",
                                         .made_for = MadeFor::kDefinite,
                                         .vectors = 4,
                                         .nanoseconds = 0.3,
-                                        .ends_at_unknowns = true,
-                                        .unrolled = Unrolled::kSweep}},
+                                        .ends_at_unknowns = true}},
     MethodRow<PreconditionedConjugateGradientMethod>{{.method = Method::kConjugateGradientDiagonal,
                                                       .name = "cg_diagonal",
                                                       .label = "CG",
@@ -126,8 +116,7 @@ inline constexpr std::tuple kMethods{
                             .label = "GMRES",
                             .counts = Counts::kCycles,
                             .vectors = 5,
-                            .nanoseconds = 0.8,
-                            .unrolled = Unrolled::kSweep}},
+                            .nanoseconds = 0.8}},
     MethodRow<GmresMethod>{{.method = Method::kGmresDiagonal,
                             .name = "gmres_diagonal",
                             .label = "GMRES",
@@ -158,6 +147,12 @@ static_assert([] {
     if (static_cast<size_t>(kTraits[i].method) != i) return false;
   return true;
 }(), "the rows of the table are not in the order of the enumerators");
+
+/// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h).
+/// Else autograd does it, in plain tensor operations.
+constexpr bool has_tape(const MethodTraits& method) {
+  return method.runs_on == RunsOn::kAllLoops && !method.is_direct;
+}
 
 constexpr const MethodTraits& traits(Method method) { return kTraits[static_cast<size_t>(method)]; }
 

@@ -39,7 +39,7 @@ void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagona
 }
 
 template <class T, class Parameters>
-void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
+void reverse(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
            int64_t grain) {
   interruption::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
     const at::NoGradGuard no_grad;
@@ -49,12 +49,12 @@ void sweep(const Parameters& a, const Parameters& transpose, const ReverseBatch<
 
 }  // namespace
 
-bool has_sweep(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
-  return b.is_cpu() && traits(solve.solver.method).unrolled == Unrolled::kSweep &&
+bool can_use_tape(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
+  return b.is_cpu() && has_tape(traits(solve.solver.method)) &&
          !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 
-UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
+UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                       at::IntArrayRef needed) {
   const auto a = make_operator(solve.a);
   auto transposed = solve.a;
@@ -95,7 +95,7 @@ UnrolledVjp sweep_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Un
         [&](const auto& p) {
           using Parameters = std::decay_t<decltype(p)>;
           if constexpr (!std::is_same_v<Parameters, std::monostate>)
-            sweep(p, std::get<Parameters>(transpose), batch, size, grain);
+            reverse(p, std::get<Parameters>(transpose), batch, size, grain);
         },
         parameters);
   };

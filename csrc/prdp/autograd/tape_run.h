@@ -1,0 +1,184 @@
+#pragma once
+#include <array>
+#include <tuple>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "prdp/autograd/tape_back.h"
+#include "prdp/autograd/tape_space.h"
+#include "prdp/solvers/iterate.h"
+
+namespace prdp {
+
+/// The states of one sample that its iterations are run again from.
+template <class T>
+class KeptStates {
+ public:
+  KeptStates(int64_t length, int64_t halo) : length_(length), halo_(halo) {}
+  /// Makes room; what was kept before is lost.
+  void prepare(int64_t slots, int64_t vectors, int64_t numbers) {
+    vectors_each_ = vectors;
+    numbers_each_ = numbers;
+    if (vectors_.count() < vectors * slots) vectors_.prepare(vectors * slots, length_, halo_);
+    numbers_.resize(numbers * slots);
+  }
+  T* vector(int64_t slot, int64_t v) { return vectors_.vector(vectors_each_ * slot + v); }
+  T& number(int64_t slot, int64_t s) { return numbers_[numbers_each_ * slot + s]; }
+
+ private:
+  int64_t length_, halo_, vectors_each_ = 0, numbers_each_ = 0;
+  kernels::Workspace<T> vectors_;
+  std::vector<T> numbers_;
+};
+
+/// The iterations of a method as they ran, for run_back(). An iteration is taken back by its operations, which the
+/// space records while it runs again. What it starts from and ends with is x and what the method carries.
+template <class Method, class Kernel>
+class TapeRun {
+  using T = typename Kernel::Scalar;
+  using Space = TapeSpace<Kernel>;
+  using Vector = typename Space::Vector;
+  using Number = typename Space::Scalar;
+
+ public:
+  /// The method's rtol, and ‖b‖².
+  struct Stop {
+    double rtol, b2;
+  };
+  /// Vectors and numbers of a state. x is kept where an iteration reads it.
+  static constexpr int64_t kNumbers = []<class... Part>(std::tuple<Part&...>*) {
+    return (int64_t{std::is_same_v<Part, Number>} + ... + 0);
+  }(static_cast<decltype(std::declval<Method&>().carried())*>(nullptr));
+  static constexpr int64_t kVectors =
+      static_cast<int64_t>(std::tuple_size_v<decltype(std::declval<Method&>().carried())>) - kNumbers + 1;
+
+  /// The cotangent of the last iterate is in x_bar, memory of the tape.
+  TapeRun(Tape<T>& tape, Space& space, TapeBack<Kernel>& back, Method method, KeptStates<T>& kept, T* x_bar, Stop stop)
+      : tape_(tape), space_(space), back_(back), method_(std::move(method)), kept_(kept), stop_(stop) {
+    each([&](auto& part, size_t i) {
+      const bool is_x = static_cast<void*>(&part) == &method_.x;
+      bars_[i] = {is_x ? x_bar : tape_.new_memory(), is_x, T(0)};
+    });
+  }
+
+  void start() {
+    space_.record(true);
+    method_.start();
+    each([&](auto& part, size_t i) { put(part, begin_, i); });
+    tape_.keep();
+    space_.record(false);
+    each([&](auto& part, size_t) { forget(part); });
+    done_ = 0;
+  }
+  void step() {
+    iterate_once();
+    ++done_;
+  }
+  void save(int64_t slot) {
+    int64_t v = 0, n = 0;
+    each([&](auto& part, size_t) {
+      if constexpr (is_number<decltype(part)>) kept_.number(slot, n++) = part.value;
+      else if (reads(part)) std::copy_n(space_.value(part), tape_.length(), kept_.vector(slot, v++));
+    });
+  }
+  void load(int64_t slot, int64_t k) {
+    int64_t v = 0, n = 0;
+    each([&](auto& part, size_t) {
+      if constexpr (is_number<decltype(part)>) space_.set(part, kept_.number(slot, n++));
+      else space_.set(part, reads(part) ? kept_.vector(slot, v++) : nullptr);
+    });
+    method_.resume(k);
+    done_ = k;
+  }
+  /// Runs iteration k again, from the state at hand, and takes it back.
+  void step_back(int64_t, int64_t k) {
+    tape_.release();
+    space_.record(true);
+    Parts before = begin_;
+    if (k > 0) {
+      each([&](auto& part, size_t i) {
+        if constexpr (is_number<decltype(part)>) space_.set(part, part.value);
+        put(part, before, i);
+      });
+    } else {
+      each([&](auto& part, size_t i) { pull(part, before, i); });
+    }
+    method_.resume(k);
+    iterate_once();
+    each([&](auto& part, size_t i) {
+      if constexpr (!is_number<decltype(part)>) {
+        if (bars_[i].holds) tape_.give_bar(part.version, bars_[i].vector);
+      } else if (part.node >= 0) {
+        tape_.numbers[part.node].bar += bars_[i].number;
+      }
+    });
+    back_.take_back(tape_.kept_ops(), tape_.kept_numbers());
+    space_.record(false);
+    if (k == 0) return;
+    each([&](auto& part, size_t i) {
+      if constexpr (is_number<decltype(part)>) bars_[i].number = tape_.numbers[before.numbers[i].node].bar;
+      else bars_[i].holds = tape_.take_bar(before.vectors[i].version, bars_[i].vector);
+    });
+  }
+  /// The cotangent of b.
+  T* finish() {
+    tape_.release();
+    back_.take_back(0, 0);
+    return tape_.bar(space_.b().version);
+  }
+
+ private:
+  template <class Part>
+  static constexpr bool is_number = std::is_same_v<std::decay_t<Part>, Number>;
+  struct Bar {
+    T* vector;
+    bool holds;
+    T number;
+  };
+  /// A state as versions and nodes; at each place one of the two.
+  struct Parts {
+    std::array<Vector, kVectors + kNumbers> vectors;
+    std::array<Number, kVectors + kNumbers> numbers;
+  };
+  static void put(const Vector& part, Parts& parts, size_t i) { parts.vectors[i] = part; }
+  static void put(const Number& part, Parts& parts, size_t i) { parts.numbers[i] = part; }
+  static void pull(Vector& part, const Parts& parts, size_t i) { part.version = parts.vectors[i].version; }
+  static void pull(Number& part, const Parts& parts, size_t i) { part = parts.numbers[i]; }
+  static void forget(Vector&) {}
+  static void forget(Number& part) { part = part.value; }
+
+  bool reads(const Vector& part) const { return &part != &method_.x || carries_x_ || stop_.rtol > 0.0; }
+  /// Of x and what the method carries, each once.
+  template <class Body>
+  void each(const Body& body) {
+    size_t i = 0;
+    auto carried = method_.carried();
+    carries_x_ = std::apply([&](auto&... part) { return ((static_cast<void*>(&part) == &method_.x) || ...); }, carried);
+    if (!carries_x_) body(method_.x, i++);
+    std::apply([&](auto&... part) { (body(part, i++), ...); }, carried);
+  }
+  /// As iterate() takes it: a method whose own residual claimed convergence before, in vain, goes on from the true one.
+  void iterate_once() {
+    if constexpr (detail::kHasRecursiveResidual<Method>) {
+      const double own2 = method_.residual2().value;
+      if (stop_.rtol > 0.0 && done_ > 0 && detail::is_within(own2, stop_.rtol, stop_.b2)) method_.recompute_residual();
+    }
+    if constexpr (detail::kTakesStrides<Method>) method_.step(1);
+    else method_.step();
+    if constexpr (detail::kLeastResidual<Method>) method_.residual2();
+  }
+
+  Tape<T>& tape_;
+  Space& space_;
+  TapeBack<Kernel>& back_;
+  Method method_;
+  KeptStates<T>& kept_;
+  Stop stop_;
+  std::array<Bar, kVectors + kNumbers> bars_{};  // of the state after the iterations that are not taken back yet
+  Parts begin_;
+  int64_t done_ = 0;
+  bool carries_x_ = false;
+};
+
+}  // namespace prdp

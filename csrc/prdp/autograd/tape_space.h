@@ -1,0 +1,298 @@
+#pragma once
+#include <algorithm>
+#include <array>
+#include <vector>
+
+#include "prdp/autograd/tape.h"
+#include "prdp/solvers/sample_space.h"
+
+namespace prdp {
+
+/// A sample as a space whose operations can be taken back. A method runs in it as in any other. While it records, every
+/// operation writes to new memory and notes on the tape what it did; so no method needs a derivative of its own.
+template <class Kernel>
+class TapeSpace {
+ public:
+  using T = typename Kernel::Scalar;
+  using Scalar = TapeNumber<T>;
+  using States = std::array<SampleState, 1>;
+  /// The version that it holds now, and the one whose memory it uses while nothing is recorded.
+  struct Vector {
+    int32_t version = -1, home = -1;
+  };
+
+  TapeSpace(Tape<T>& tape, SampleSpace<Kernel>& values) : tape_(tape), values_(values) {
+    b_.version = tape_.add_version(values.b());
+    for (auto& t : temporaries_) t = vector();
+    b2_ = number(Kind::kSquare, values.b2(), b_.version);
+  }
+  TapeSpace(const TapeSpace&) = delete;
+
+  void record(bool on) { recording_ = on; }
+  const T* value(const Vector& v) const { return tape_.value(v.version); }
+  T* value(const Vector& v) { return tape_.value(v.version); }
+  /// Puts a state back, as the beginning of what comes next; null: nobody reads its value.
+  void set(Vector& v, const T* from) {
+    v.version = v.home;
+    tape_.begin_version(v.home, from != nullptr);
+    if (from) copy_values(from, value(v));
+  }
+  void set(Scalar& number, T value) { number = recording_ ? Scalar(value, tape_.numbers) : Scalar(value); }
+
+  // ---- the operations (solvers/space.h)
+  Vector vector() {
+    const auto home = tape_.add_version();
+    return {home, home};
+  }
+  Vector b() const { return b_; }
+  Scalar b2() const { return b2_; }
+  int64_t unknowns() const { return values_.unknowns(); }
+  double epsilon() const { return values_.epsilon(); }
+  bool started() const { return values_.started(); }
+  int derivatives() const { return recording_ ? 1 : 0; }
+
+  void fill_zero(Vector& v) {
+    if (recording_) v.version = Tape<T>::kZero;
+    else values_.fill_zero(fresh(v));
+  }
+  void copy(const Vector& from, Vector& to) {
+    if (recording_) to.version = from.version;
+    else copy_values(value(from), fresh(to));
+  }
+  void assign(const Scalar& from, Scalar& to) { to = from; }
+  void advance(Vector& x, Vector& next) { std::swap(x, next); }
+  void add(const Vector& d, Vector& x) {
+    const auto before = x.version;
+    values_.add(value(d), changed(x));
+    note({.kind = Kind::kAxpy, .out = x.version, .a = before, .b = d.version});
+  }
+  void xpby(const Vector& x, const Scalar& beta, Vector& y) {
+    const auto before = y.version;
+    values_.xpby(value(x), beta.value, changed(y));
+    note({.kind = Kind::kAxpy, .out = y.version, .a = x.version, .b = before, .factor_node = beta.node,
+          .factor = beta.value});
+  }
+  Scalar dot(const Vector& a, const Vector& b) {
+    return number(Kind::kDot, values_.dot(value(a), value(b)), a.version, b.version);
+  }
+  Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
+    const auto p_then = p.version, x_before = x.version, r_before = r.version;
+    const T* direction = value(p);
+    T* const x_now = changed(x);
+    const T rr = values_.descend(alpha.value, direction, value(q), x_now, changed(r));
+    note({.kind = Kind::kAxpy, .out = x.version, .a = x_before, .b = p_then, .factor_node = alpha.node,
+          .factor = alpha.value});
+    note({.kind = Kind::kAxpy, .out = r.version, .a = r_before, .b = q.version, .factor_node = alpha.node,
+          .factor = alpha.value, .sign = -1});
+    return number(Kind::kSquare, rr, r.version);
+  }
+
+  void apply(const Vector& v, Vector& out) {
+    const T* from = value(v);
+    const auto of = v.version;
+    values_.apply(from, fresh(out));
+    note({.kind = Kind::kApply, .out = out.version, .a = of});
+  }
+  std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
+    const T* from = value(v);
+    const auto of = v.version;
+    const auto dots = values_.apply_with_dots(from, fresh(out));
+    note({.kind = Kind::kApply, .out = out.version, .a = of});
+    const auto first = number(Kind::kDot, dots[0], of, out.version);
+    return {first, number(Kind::kSquare, dots[1], out.version)};
+  }
+  void apply(const Vector& v, Vector& out, Preconditioner preconditioner) {
+    if (preconditioner == Preconditioner::kNone) return apply(v, out);
+    Vector divided = temporary();
+    divide_by_diagonal(v, divided);
+    apply(divided, out);
+  }
+  void divide_by_diagonal(const Vector& b, Vector& c) {
+    const T* from = value(b);
+    const auto of = b.version;
+    values_.divide_by_diagonal(from, fresh(c));
+    note({.kind = Kind::kDivide, .out = c.version, .a = of});
+  }
+  void inverse_diagonal(Vector& w) {
+    values_.inverse_diagonal(fresh(w));
+    note({.kind = Kind::kInverseDiagonal, .out = w.version});
+  }
+  void weigh(const Vector& w, const Vector& v, Vector& z) {
+    const T *weights = value(w), *from = value(v);
+    const auto of_w = w.version, of_v = v.version;
+    values_.weigh(weights, from, fresh(z));
+    note({.kind = Kind::kWeigh, .out = z.version, .a = of_w, .b = of_v});
+  }
+  Scalar weighted_square(const Vector& w, const Vector& v) {
+    return number(Kind::kWeightedSquare, values_.weighted_square(value(w), value(v)), w.version, v.version);
+  }
+  std::array<Scalar, 2> descend(const Scalar& alpha, const Vector& p, const Vector& q, const Vector& w, Vector& x,
+                                Vector& r) {
+    const auto plain = descend(alpha, p, q, x, r);
+    return {plain, weighted_square(w, r)};
+  }
+  void xpby(const Vector& w, const Vector& r, const Scalar& beta, Vector& p) {
+    Vector weighted = temporary();
+    weigh(w, r, weighted);
+    xpby(weighted, beta, p);
+  }
+  void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar*) {
+    if (recording_) {
+      TORCH_INTERNAL_ASSERT(n == 1, "one sweep at a time is recorded");
+      const auto before = x.version;
+      values_.measured_sweep(value(c), value(x), fresh(next), nullptr);
+      note({.kind = Kind::kSweep, .out = next.version, .a = c.version, .b = before});
+      return std::swap(x, next);
+    }
+    T* now = changed(x);
+    T* other = fresh(next);
+    const T* const home = now;
+    values_.sweeps(value(c), now, other, n, nullptr);
+    if (now != home) std::swap(x, next);
+  }
+  Scalar measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar*) {
+    return values_.measured_sweep(value(c), value(x), fresh(next), nullptr);  // a residual alone; no derivative
+  }
+  Scalar radius2() const { return values_.radius2(); }
+  static constexpr bool sweeps_contract() { return false; }
+  Scalar residual(const Vector& x, Vector& r) {
+    const T* from = value(x);
+    const auto of = x.version;
+    const T rr = values_.residual(from, fresh(r));
+    note({.kind = Kind::kResidual, .out = r.version, .a = of});
+    return number(Kind::kSquare, rr, r.version);
+  }
+  Scalar solution2(const Vector& x) { return values_.solution2(value(x)); }
+  void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
+
+  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
+    const T length = values_.step_length(num.value, den.value, a2.value, b2.value);
+    return length == T(0) ? Scalar(length) : num / den;
+  }
+  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Vector& w, const Vector& q,
+                     const Scalar& plain2) {
+    const T length = values_.step_length(num.value, den.value, a2.value, value(w), value(q), plain2.value);
+    return length == T(0) ? Scalar(length) : num / den;
+  }
+  Scalar ratio(const Scalar& num, const Scalar& den) const {
+    const T value = values_.ratio(num.value, den.value);
+    return value == T(0) ? Scalar(value) : num / den;
+  }
+
+  Scalar constant(const Scalar& a) const { return a.value; }
+  void scale(const Vector& v, const Scalar& factor, Vector& out) {
+    const T* from = value(v);
+    const auto of = v.version;
+    values_.scale(from, factor.value, fresh(out));
+    note({.kind = Kind::kScale, .out = out.version, .a = of, .factor_node = factor.node, .factor = factor.value});
+  }
+  void dots(const std::vector<Vector>& v, int64_t count, const Vector& w, Scalar* h) {
+    plain_.resize(count);
+    values_.dots(pointers(v, count), count, value(w), plain_.data());
+    std::copy(plain_.begin(), plain_.end(), h);
+  }
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) {
+    return combine(-1, h, v, count, w);
+  }
+  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
+                       Preconditioner preconditioner) {
+    if (preconditioner == Preconditioner::kNone) {
+      combine(1, y.data(), v, count, x);
+      return;
+    }
+    Vector sum = temporary(), divided = temporary();
+    fill_zero(sum);
+    combine(1, y.data(), v, count, sum);
+    divide_by_diagonal(sum, divided);
+    add(divided, x);
+  }
+  bool lost_orthogonality(const Scalar& left2, const Scalar& taken2, Scalar& loss) const {
+    return values_.lost_orthogonality(left2.value, taken2.value, loss.value);
+  }
+  Scalar inverse(const Scalar& a, const Scalar& scale) const { return values_.inverse(a.value, scale.value); }
+  Scalar larger(const Scalar& a, const Scalar& b) const { return values_.larger(a.value, b.value); }
+  Scalar is_larger(const Scalar& a, const Scalar& b) const { return values_.is_larger(a.value, b.value); }
+  void restore(const Scalar& where, const Vector& from, Vector& to) {
+    if (where.value != 0) copy(from, to);
+  }
+  void restore(const Scalar& where, const Scalar& from, Scalar& to) const {
+    if (where.value != 0) to = from;
+  }
+  Scalar is_zero(const Scalar& a) const { return values_.is_zero(a.value); }
+  Scalar is_not_zero(const Scalar& a) const { return values_.is_not_zero(a.value); }
+  bool all_exhausted(const Scalar& a) const { return values_.all_exhausted(a.value); }
+
+  std::array<double, 1> lanes(const Scalar& a) const { return values_.lanes(a.value); }
+  std::array<bool, 1> broken() const { return values_.broken(); }
+  std::array<double, 1> operator_norm() const { return values_.operator_norm(); }
+  template <class Predicate>
+  void freeze_unless(const States&, const Predicate&) {}
+  void restart() {}
+
+ private:
+  using Kind = typename Tape<T>::Kind;
+  using Op = typename Tape<T>::Op;
+
+  void copy_values(const T* from, T* to) { std::copy_n(from, tape_.length(), to); }
+  /// Memory for a new value of v.
+  T* fresh(Vector& v) {
+    v.version = recording_ ? tape_.add_version() : v.home;
+    return value(v);
+  }
+  /// The same with what v holds, for an operation that changes that.
+  T* changed(Vector& v) {
+    T* const before = value(v);
+    if (recording_ && !tape_.is_read(v.version)) {
+      v.version = tape_.add_unread(before);
+      return before;
+    }
+    T* const after = fresh(v);
+    if (after != before) copy_values(before, after);
+    return after;
+  }
+  /// One of two that are used up before the next but one.
+  Vector temporary() {
+    std::swap(temporaries_[0], temporaries_[1]);
+    return temporaries_[0];
+  }
+  C10_ALWAYS_INLINE void note(Op op) {
+    if (!recording_) return;
+    op.numbers = tape_.numbers.size();
+    tape_.ops.push(op);
+  }
+  Scalar number(Kind kind, T value, int32_t a, int32_t b = -1) {
+    if (!recording_) return value;
+    note({.kind = kind, .a = a, .b = b, .made = tape_.numbers.size()});
+    return {value, tape_.numbers};
+  }
+  const std::vector<T*>& pointers(const std::vector<Vector>& v, int64_t count) {
+    pointers_.resize(count);
+    for (int64_t i = 0; i < count; ++i) pointers_[i] = value(v[i]);
+    return pointers_;
+  }
+  Scalar combine(int8_t sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) {
+    const auto before = w.version, first = tape_.terms.size();
+    plain_.resize(count);
+    for (int64_t i = 0; i < count; ++i) {
+      plain_[i] = h[i].value;
+      if (recording_) tape_.terms.push({v[i].version, h[i].node, sign * h[i].value});
+    }
+    const auto& from = pointers(v, count);
+    const T left2 = loops_.multi_axpy(T(sign), plain_.data(), from.data(), count, changed(w), tape_.length());
+    note({.kind = Kind::kCombination, .out = w.version, .a = before, .sign = sign, .first_term = first,
+          .count = static_cast<int32_t>(count)});
+    return left2;
+  }
+
+  const kernels::Loops<T>& loops_ = kernels::loops<T>();
+  Tape<T>& tape_;
+  SampleSpace<Kernel>& values_;
+  bool recording_ = true;
+  Vector b_;
+  Scalar b2_;
+  Vector temporaries_[2];
+  std::vector<T*> pointers_;
+  std::vector<T> plain_;
+};
+
+}  // namespace prdp
