@@ -2,7 +2,8 @@
 
     python tests/python/kills.py --kills 100 --out docs/stability/kills.json
 
-kills each trainer so many times in each task, prints a table and keeps it. test_kills.py does so a few times.
+kills each trainer so many times in each task, prints a table and keeps its rows, each in the place of an older one of
+the same trainer and task. test_kills.py does so a few times.
 """
 
 import argparse
@@ -148,15 +149,22 @@ def _is_whole(path):
     return mark.endswith(_C.fingerprint(rest).encode())
 
 
+def keep(path, row):
+    rows = json.loads(path.read_text()) if path.exists() else []
+    others = [old for old in rows if (old["trainer"], old["task"]) != (row["trainer"], row["task"])]
+    records.write(path, [*others, row])
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=100, help="of each trainer in each task")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--trainers", nargs="+", choices=TRAINERS, default=TRAINERS)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--out", type=Path, help="a file for the record, in JSON")
+    parser.add_argument("--out", type=Path, help="a file for the record, in JSON; rows of other kills in it stay")
     given = parser.parse_args()
-    record = {**records.environment(), "seed": given.seed, "rows": []}
+    rows, environment = [], records.environment()
+    environment["command"] = f"kills.py --kills {given.kills} --seed {given.seed}"
     print("| trainer | task | kills | with files | trainings | lost | damaged files |\n|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for trainer in given.trainers:
@@ -166,10 +174,10 @@ def main():
                 count = asdict(kill(trainer, task, given.kills, Path(folder) / f"{trainer}_{task}", dice))
                 print("|", " | ".join(map(str, (trainer, task, *count.values()))), "|", flush=True)
                 seconds = round(time.monotonic() - started, 1)
-                record["rows"].append({"trainer": trainer, "task": task, **count, "seconds": seconds})
+                rows.append({"trainer": trainer, "task": task, **count, "seconds": seconds, **environment})
                 if given.out:
-                    records.write(given.out, record)
-    return 1 if any(row["lost"] or row["damaged"] for row in record["rows"]) else 0
+                    keep(given.out, rows[-1])
+    return 1 if any(row["lost"] or row["damaged"] for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ using TensorMap = std::map<std::string, at::Tensor>;
 /// The tensors as bytes.
 std::string pack(const TensorMap& tensors);
 /// The tensors in such bytes, or in those of a dict or a state_dict that torch.save has written in Python. No code in
-/// them is run, and no more memory is taken than they are long. Raises ValueError for other bytes.
+/// them is run, and memory is taken in proportion to their length. Raises ValueError for other bytes.
 TensorMap unpack(std::string_view bytes);
 
 /// The tensor of this name. Raises ValueError if there is none of this dtype and these sizes.
