@@ -14,7 +14,7 @@ PAGES = (DOCS.parent / "README.md", DOCS / "refinement.md", DOCS / "results.md")
 TABLE = page_tables.places("result_tables.py")
 
 SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
-SCENES = (*SCENES, "diffusion_inverse")
+SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 BOLD = ("auto", "prdp")
 
 
