@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import torch
+from matplotlib.ticker import NullLocator
 
 from benchmarks.studies.evaluation import spread
 from benchmarks.studies.trainings import variant
@@ -176,6 +177,7 @@ def chart(rows):
                 axes.axhline(alone[0][n], color="#999999", ls=line, label=f"coarse solver alone, {n} steps")
         axes.set(xscale="log", yscale="log", xlabel="steps that are trained through", title=name)
         axes.set_xticks(STEPS, STEPS)
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.grid(alpha=0.3, lw=0.4)
     panels[0].set_ylabel(f"error, {VALID} samples")
     entries = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
