@@ -42,7 +42,10 @@ at::ScalarType dtype_of(const Name& storage) {
 class Pickle {
  public:
   Pickle(const Files& files, std::string folder)
-      : files_(files), folder_(std::move(folder)), left_(files.at(folder_ + "data.pkl")) {}
+      : files_(files), folder_(std::move(folder)), left_(files.at(folder_ + "data.pkl")) {
+    const auto order = files.find(folder_ + "byteorder");
+    TORCH_CHECK_VALUE(order == files.end() || order->second == "little", "pickle: of a machine with another byte order");
+  }
 
   TensorMap run() {
     for (char instruction = take(1)[0]; instruction != '.'; instruction = take(1)[0]) follow(instruction);
