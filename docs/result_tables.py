@@ -14,7 +14,7 @@ PAGES = (DOCS.parent / "README.md", DOCS / "refinement.md", DOCS / "results.md")
 TABLE = page_tables.places("result_tables.py")
 
 SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
-SCENES = (*SCENES, "diffusion_inverse")
+SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 BOLD = ("auto", "prdp")
 
 
@@ -187,8 +187,8 @@ def navier_stokes():
         products = row["operator_applications"]
         saved = "–" if row["kind"] == "converged" else _percent(1 - products / base["operator_applications"], 1)
         cells = f"{mean:.2e} ± {deviation:.0e}", f"{row['last_k']:.3g}", f"{row['iterations']:,.0f}", f"{products:,.0f}"
-        body.append([title, f"{row['metric']:.2e}", *cells, saved])
-    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved"]
+        body.append([title, error(row), *cells, saved, f"{row['seconds']:,.0f}" if "commit" not in row else "–"])
+    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved", "s"]
     return _table(head, body)
 
 
