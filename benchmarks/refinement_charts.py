@@ -67,8 +67,9 @@ def time_against_products(found):
             saved = [100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds")]
             axes.scatter(*saved, color=colour, marker=marker, s=36, label=title)
             title = None  # once in the legend
-            if label == "auto":
-                axes.annotate(name, saved, xytext=(0, 6), textcoords="offset points", rotation=60, fontsize=8)
+            if label == "auto":  # those below zero are named to the right, out of the way of the others
+                place = {"xytext": (0, 6), "rotation": 60} if saved[1] > -3 else {"xytext": (7, -3)}
+                axes.annotate(name, saved, **place, textcoords="offset points", fontsize=8)
     axes.axline((0, 0), slope=1, color="#888888", lw=1, ls="--")
     axes.set(xlabel="products saved, %", ylabel="time saved, %", xlim=(0, 100), ylim=(None, 100))
     axes.axhline(0, color="#888888", lw=1)
