@@ -44,7 +44,8 @@ class Pickle {
   Pickle(const Files& files, std::string folder)
       : files_(files), folder_(std::move(folder)), left_(files.at(folder_ + "data.pkl")) {
     const auto order = files.find(folder_ + "byteorder");
-    TORCH_CHECK_VALUE(order == files.end() || order->second == "little", "pickle: of a machine with another byte order");
+    TORCH_CHECK_VALUE(order == files.end() || order->second == "little",
+                      "pickle: of a machine with another byte order");
   }
 
   TensorMap run() {
