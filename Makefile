@@ -24,6 +24,7 @@ test: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc)
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
+	find csrc tests benchmarks -name '*.h' -o -name '*.cpp' | xargs $(BIN)/clang-format --dry-run -Werror
 	$(BIN)/ctest --test-dir build --output-on-failure
 	$(BIN)/pytest
 

@@ -187,8 +187,8 @@ def navier_stokes():
         products = row["operator_applications"]
         saved = "–" if row["kind"] == "converged" else _percent(1 - products / base["operator_applications"], 1)
         cells = f"{mean:.2e} ± {deviation:.0e}", f"{row['last_k']:.3g}", f"{row['iterations']:,.0f}", f"{products:,.0f}"
-        body.append([title, f"{row['metric']:.2e}", *cells, saved])
-    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved"]
+        body.append([title, error(row), *cells, saved, f"{row['seconds']:,.0f}" if "commit" not in row else "–"])
+    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved", "s"]
     return _table(head, body)
 
 

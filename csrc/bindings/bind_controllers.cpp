@@ -57,9 +57,9 @@ py::dict as_dict(const ToleranceSettings& s) {
 }  // namespace
 
 py::dict as_dict(const PRDPSettings& s) {
-  return py::dict("tau_step"_a = s.tau_step, "tau_stop"_a = s.tau_stop, "delta"_a = s.delta,
-                  "window"_a = s.window, "initial"_a = s.initial, "increment"_a = s.increment,
-                  "maximum"_a = s.maximum, "growth"_a = s.growth, "adjoint_ratio"_a = s.adjoint_ratio);
+  return py::dict("tau_step"_a = s.tau_step, "tau_stop"_a = s.tau_stop, "delta"_a = s.delta, "window"_a = s.window,
+                  "initial"_a = s.initial, "increment"_a = s.increment, "maximum"_a = s.maximum, "growth"_a = s.growth,
+                  "adjoint_ratio"_a = s.adjoint_ratio);
 }
 
 void bind_controllers(py::module_& m) {

@@ -87,8 +87,7 @@ void bind_scenes(py::module_& m) {
       .def_property(
           "backward", [](const Scene& s) { return name(s.backward); }, &Scene::set_backward)
       .def_property_readonly("start", [](const Scene& s) { return name(s.start); })
-      .def_property_readonly("prdp",
-                             [](const Scene& s) { return as_dict(s.prdp); })
+      .def_property_readonly("prdp", [](const Scene& s) { return as_dict(s.prdp); })
       .def("learning_rate", &Scene::learning_rate, py::arg("update"));
 
   m.def("read_scene", &read_scene, py::arg("path"));
@@ -96,8 +95,8 @@ void bind_scenes(py::module_& m) {
     py::list keys;
     for (const auto& key : scene_keys())
       keys.append(py::dict(py::arg("table") = key.table, py::arg("name") = key.name, py::arg("value") = key.value,
-                           py::arg("unit") = key.unit, py::arg("default") = key.otherwise,
-                           py::arg("when") = key.when, py::arg("means") = key.means));
+                           py::arg("unit") = key.unit, py::arg("default") = key.otherwise, py::arg("when") = key.when,
+                           py::arg("means") = key.means));
     return keys;
   });
   m.def("parse_scene", &parse_scene, py::arg("text"), py::arg("path"));
@@ -122,8 +121,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("start", &ParameterProblem::start)
       .def_readonly("reference", &ParameterProblem::reference)
       .def_readonly("solution", &ParameterProblem::solution);
-  m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"),
-        py::call_guard<py::gil_scoped_release>());
+  m.def("make_parameter_problem", &make_parameter_problem, py::arg("scene"), py::call_guard<py::gil_scoped_release>());
   py::class_<FieldProblem>(m, "FieldProblem")
       .def_readonly("start", &FieldProblem::start)
       .def_readonly("snapshots", &FieldProblem::snapshots)
@@ -144,7 +142,8 @@ void bind_scenes(py::module_& m) {
   py::class_<Checkpoint>(m, "Checkpoint")
       .def(py::init<std::filesystem::path, std::string>(), py::arg("path"), py::arg("settings"))
       .def("due", &Checkpoint::due)
-      .def("write", [](Checkpoint& c, std::string state) { c.write(std::move(state)); }, py::arg("state"))
+      .def(
+          "write", [](Checkpoint& c, std::string state) { c.write(std::move(state)); }, py::arg("state"))
       .def("read",
            [](Checkpoint& c) {
              const auto state = c.read();

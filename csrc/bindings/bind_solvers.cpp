@@ -3,9 +3,9 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/solving.h"
+#include "prdp/threads/interruption.h"
 
 namespace py = pybind11;
 using namespace prdp;
@@ -115,11 +115,10 @@ void bind_solvers(py::module_& m) {
       .def(py::init([](py::function apply, std::optional<py::function> apply_transpose,
                        std::optional<py::function> diagonal, py::function transpose_in_transforms,
                        py::function product_rule) {
-             auto made = RegisteredProducts::make({PythonFunction<at::Tensor>(apply),
-                                                   optional_function<Products::Product>(apply_transpose),
-                                                   optional_function<Products::Diagonal>(diagonal),
-                                                   PythonFunction<at::Tensor>(transpose_in_transforms),
-                                                   PythonFunction<std::vector<at::Tensor>>(product_rule)});
+             auto made = RegisteredProducts::make(
+                 {PythonFunction<at::Tensor>(apply), optional_function<Products::Product>(apply_transpose),
+                  optional_function<Products::Diagonal>(diagonal), PythonFunction<at::Tensor>(transpose_in_transforms),
+                  PythonFunction<std::vector<at::Tensor>>(product_rule)});
              return std::const_pointer_cast<RegisteredProducts>(made);
            }),
            py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
@@ -129,22 +128,24 @@ void bind_solvers(py::module_& m) {
       "batched_axes", [](const std::string& kind) { return operator_kind(kind).batched_axes; }, py::arg("kind"),
       "The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 "
       "if it is shaped like a state. None if that is not known.");
-  m.def("check_operator",
-        [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
-           std::vector<at::Tensor> tensors) {
-          make_operator(spec(kind, shape, parameters, tensors))->check_parameters();
-        },
-        py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
-  m.def("check_solver",
-        [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart) {
-          Solver{method_from_name(method), max_iter, rtol, restart}.check(who.c_str());
-        },
-        py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"));
+  m.def(
+      "check_operator",
+      [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
+         std::vector<at::Tensor> tensors) {
+        make_operator(spec(kind, shape, parameters, tensors))->check_parameters();
+      },
+      py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
+  m.def(
+      "check_solver",
+      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart) {
+        Solver{method_from_name(method), max_iter, rtol, restart}.check(who.c_str());
+      },
+      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"));
   m.def(
       "check_options",
-      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
-         std::string backward, std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
-         std::string on_failure, int64_t checkpoint_every, std::string start) {
+      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
+         std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol, std::string on_failure,
+         int64_t checkpoint_every, std::string start) {
         SolveOptions{{method_from_name(method), max_iter, rtol, restart},
                      backward_from_name(backward),
                      adjoint_max_iter,
@@ -155,58 +156,62 @@ void bind_solvers(py::module_& m) {
                      start_from_name(start)}
             .check(who.c_str());
       },
-      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
-      py::arg("backward"), py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"),
-      py::arg("checkpoint_every"), py::arg("start") = "zero");
+      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"), py::arg("backward"),
+      py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"), py::arg("checkpoint_every"),
+      py::arg("start") = "zero");
 
   m.def("open_adjoint_log", &adjoint_log::open);
   m.def("close_adjoint_log", &adjoint_log::close, py::arg("log"));
-  m.def("read_adjoint_log",
-        [](int64_t log) -> std::optional<py::tuple> {
-          const auto info = adjoint_log::read(log);
-          if (!info) return std::nullopt;
-          return as_tuple(*info);
-        },
-        py::arg("log"));
+  m.def(
+      "read_adjoint_log",
+      [](int64_t log) -> std::optional<py::tuple> {
+        const auto info = adjoint_log::read(log);
+        if (!info) return std::nullopt;
+        return as_tuple(*info);
+      },
+      py::arg("log"));
 
-  m.def("join_adjoint_logs",
-        [](const std::vector<int64_t>& logs) -> std::optional<py::tuple> {
-          const auto info = join_adjoint_logs(logs);
-          if (!info) return std::nullopt;
-          return as_tuple(*info);
-        },
-        py::arg("logs"));
+  m.def(
+      "join_adjoint_logs",
+      [](const std::vector<int64_t>& logs) -> std::optional<py::tuple> {
+        const auto info = join_adjoint_logs(logs);
+        if (!info) return std::nullopt;
+        return as_tuple(*info);
+      },
+      py::arg("logs"));
   py::class_<StepOfRollout>(m, "StepOfRollout")
       .def(py::init<int64_t, int64_t>(), py::arg("step"), py::arg("steps"))
       .def("__enter__", &StepOfRollout::enter)
       .def("__exit__", [](StepOfRollout& self, const py::args&) { self.exit(); });
-  m.def("product_rule",
-        [](const at::Tensor& lambda, const at::Tensor& v, std::vector<at::Tensor> tensors, std::string kind,
-           std::vector<int64_t> shape, std::vector<double> parameters) {
-          return make_operator(spec(kind, shape, parameters, tensors))->product_rule(lambda, v);
-        },
-        "∂⟨lambda, A v⟩ with respect to each tensor of A, as the solves take it; None where there is none.",
-        py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"),
-        py::arg("kind"), py::arg("shape"), py::arg("parameters"));
+  m.def(
+      "product_rule",
+      [](const at::Tensor& lambda, const at::Tensor& v, std::vector<at::Tensor> tensors, std::string kind,
+         std::vector<int64_t> shape, std::vector<double> parameters) {
+        return make_operator(spec(kind, shape, parameters, tensors))->product_rule(lambda, v);
+      },
+      "∂⟨lambda, A v⟩ with respect to each tensor of A, as the solves take it; None where there is none.",
+      py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"), py::arg("kind"),
+      py::arg("shape"), py::arg("parameters"));
 
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
   m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");
-  m.def("solve_with_tensors",
-        [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind,
-           std::vector<int64_t> shape, std::vector<double> parameters, bool transposed,
-           std::string solver, int64_t max_iter, double rtol, int64_t restart, std::optional<at::Tensor> x0) {
-          auto a = spec(kind, shape, parameters, tensors);
-          a.transposed = transposed;
-          const auto result = [&] {
-            const py::gil_scoped_release no_gil;
-            return solve_with_tensors(*make_operator(a), b,
-                                      {method_from_name(solver), max_iter, rtol, restart, {}, true,
-                                       x0.value_or(at::Tensor())});
-          }();
-          return py::make_tuple(result.u, as_tuple(result.info));
-        },
-        "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.",
-        py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"),
-        py::arg("transposed"), py::arg("solver"), py::arg("max_iter"), py::arg("rtol"),
-        py::arg("restart") = kDefaultRestart, py::arg("x0") = py::none());
+  m.def(
+      "solve_with_tensors",
+      [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind, std::vector<int64_t> shape,
+         std::vector<double> parameters, bool transposed, std::string solver, int64_t max_iter, double rtol,
+         int64_t restart, std::optional<at::Tensor> x0) {
+        auto a = spec(kind, shape, parameters, tensors);
+        a.transposed = transposed;
+        const auto result = [&] {
+          const py::gil_scoped_release no_gil;
+          return solve_with_tensors(
+              *make_operator(a), b,
+              {method_from_name(solver), max_iter, rtol, restart, {}, true, x0.value_or(at::Tensor())});
+        }();
+        return py::make_tuple(result.u, as_tuple(result.info));
+      },
+      "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.", py::arg("b"),
+      py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("transposed"),
+      py::arg("solver"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart") = kDefaultRestart,
+      py::arg("x0") = py::none());
 }

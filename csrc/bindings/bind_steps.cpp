@@ -48,9 +48,8 @@ py::object call_step(const py::object& u, const std::vector<py::object>& tensors
   if (!nobody_in_python_watches(u, tensors)) return py::none();
   auto whole = equation;
   whole.tensors = unwrapped(tensors);
-  return report([&, state = THPVariable_Unpack(u.ptr())] {
-    return step(whole, state, with(options, max_iter, adjoint_log));
-  });
+  return report(
+      [&, state = THPVariable_Unpack(u.ptr())] { return step(whole, state, with(options, max_iter, adjoint_log)); });
   END_HANDLE_TH_ERRORS_PYBIND
 }
 
@@ -77,10 +76,10 @@ void bind_steps(py::module_& m) {
                          /*adjoint_log=*/0, checkpoint_every, from_state);
       }));
   py::class_<Equation>(m, "Equation", "An equation but for its tensors.")
-      .def(py::init([](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
-                       int64_t picard_steps) {
-        return Equation{std::move(kind), std::move(shape), std::move(parameters), {}, picard_steps};
-      }));
+      .def(py::init(
+          [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters, int64_t picard_steps) {
+            return Equation{std::move(kind), std::move(shape), std::move(parameters), {}, picard_steps};
+          }));
   m.def("step", &call_step, py::arg("u"), py::arg("tensors"), py::arg("equation"), py::arg("options"),
         py::arg("max_iter"), py::arg("adjoint_log"));
   m.def("linear_solve", &call_linear_solve, py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),

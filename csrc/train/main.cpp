@@ -72,14 +72,18 @@ Json record(const Identity& identity, const std::string& label, int64_t seed, co
 /// Beside the record to come; without --resume what an earlier run has left there is gone.
 prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const Identity& identity,
                                const std::string& label, int64_t seed) {
-  const Json all{{"trainer", "C++"}, {"label", label}, {"seed", seed}, {"settings", identity.settings()},
+  const Json all{{"trainer", "C++"},
+                 {"label", label},
+                 {"seed", seed},
+                 {"settings", identity.settings()},
                  {"versions", versions()}};
   prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), text_of(all));
   if (!options.resume) checkpoint.remove();
   return checkpoint;
 }
 
-/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on from.
+/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on
+/// from.
 bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
   const auto text = prdp::read_record(path);
   if (!text) return false;
@@ -200,8 +204,9 @@ int main(int argc, char** argv) {
   try {
     return run(options, command);
   } catch (const Interrupted&) {
-    std::fprintf(stderr, "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
-                         "last checkpoint\n");
+    std::fprintf(stderr,
+                 "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
+                 "last checkpoint\n");
     return 130;
   } catch (const c10::Error& error) {
     std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what_without_backtrace()).c_str());

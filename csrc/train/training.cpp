@@ -337,7 +337,9 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
   const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
   // The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
-  const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) { return std::sqrt(squared) / n; };
+  const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) {
+    return std::sqrt(squared) / n;
+  };
   auto curves = run.go({updates, metric, error, save_all, load_all}, on_interval);
   curves.weights = pack_weights(module);
   return curves;
@@ -384,8 +386,9 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
   std::vector<Solving*> solves;
   for (auto& stepper : steppers) solves.push_back(&stepper);
   Run run(scene, refinement, seed, checkpoint, solves);
-  return scene.task == Scene::Task::kParameters ? train_parameters(scene, run, steppers[0], on_interval)
-                                                : train_network(scene, run, steppers, seed, weights, on_interval, on_data);
+  return scene.task == Scene::Task::kParameters
+             ? train_parameters(scene, run, steppers[0], on_interval)
+             : train_network(scene, run, steppers, seed, weights, on_interval, on_data);
 }
 
 }  // namespace prdp::train

@@ -38,9 +38,7 @@ struct Flow {
   std::vector<T> values;
 
   int64_t cells() const { return shape.ny * shape.nx; }
-  int64_t at(int64_t j, int64_t i) const {
-    return (j + shape.ny) % shape.ny * shape.nx + (i + shape.nx) % shape.nx;
-  }
+  int64_t at(int64_t j, int64_t i) const { return (j + shape.ny) % shape.ny * shape.nx + (i + shape.nx) % shape.nx; }
   double u(int64_t channel, int64_t j, int64_t i) const {
     return static_cast<double>(values[channel * cells() + at(j, i)]);
   }
@@ -54,8 +52,8 @@ Flow<T> random_flow(Shape shape) {
 }
 
 /// Adds scale·(max(before, 0) B + min(after, 0) F)/dx - diffusion·L to one row, along one axis.
-inline void add_differences(Matrix& a, int64_t row, int64_t lower, int64_t upper, double n, double before,
-                     double after, double scale, double diffusion) {
+inline void add_differences(Matrix& a, int64_t row, int64_t lower, int64_t upper, double n, double before, double after,
+                            double scale, double diffusion) {
   const double backward = scale * std::max(before, 0.0) * n, forward = scale * std::min(after, 0.0) * n;
   a(row, row) += backward;
   a(row, lower) -= backward;
@@ -75,12 +73,10 @@ Matrix dense_burgers(const Flow<T>& w) {
       for (int64_t i = 0; i < nx; ++i) {
         const auto at = [&](int64_t dj, int64_t di) { return c * w.cells() + w.at(j + dj, i + di); };
         add_differences(a, at(0, 0), at(0, -1), at(0, 1), static_cast<double>(nx),
-                        (w.u(0, j, i - 1) + w.u(0, j, i)) / 2, (w.u(0, j, i) + w.u(0, j, i + 1)) / 2, kDt,
-                        kNu * kDt);
+                        (w.u(0, j, i - 1) + w.u(0, j, i)) / 2, (w.u(0, j, i) + w.u(0, j, i + 1)) / 2, kDt, kNu * kDt);
         if (Dim == 1) continue;
         add_differences(a, at(0, 0), at(-1, 0), at(1, 0), static_cast<double>(ny),
-                        (w.u(1, j - 1, i) + w.u(1, j, i)) / 2, (w.u(1, j, i) + w.u(1, j + 1, i)) / 2, kDt,
-                        kNu * kDt);
+                        (w.u(1, j - 1, i) + w.u(1, j, i)) / 2, (w.u(1, j, i) + w.u(1, j + 1, i)) / 2, kDt, kNu * kDt);
       }
   return a;
 }
@@ -98,10 +94,8 @@ Matrix dense_navier_stokes(const Flow<T>& w) {
       for (int64_t c = 0; c < 2; ++c) {
         const double along_x = c == 0 ? w.u(0, j, i) : u1_at_u2, along_y = c == 0 ? u2_at_u1 : w.u(1, j, i);
         a(c * n + here, c * n + here) += 1 / kDt;
-        add_differences(a, c * n + here, c * n + w.at(j, i - 1), c * n + w.at(j, i + 1), x, along_x, along_x,
-                        1.0, kNu);
-        add_differences(a, c * n + here, c * n + w.at(j - 1, i), c * n + w.at(j + 1, i), y, along_y, along_y,
-                        1.0, kNu);
+        add_differences(a, c * n + here, c * n + w.at(j, i - 1), c * n + w.at(j, i + 1), x, along_x, along_x, 1.0, kNu);
+        add_differences(a, c * n + here, c * n + w.at(j - 1, i), c * n + w.at(j + 1, i), y, along_y, along_y, 1.0, kNu);
       }
       a(here, 2 * n + here) += x;
       a(here, 2 * n + w.at(j, i - 1)) -= x;

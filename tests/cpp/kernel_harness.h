@@ -18,9 +18,7 @@ class Harness {
  public:
   using T = typename Kernel::Scalar;
 
-  explicit Harness(const Kernel& kernel) : kernel_(kernel) {
-    workspace_.prepare(3, kernel.length(), kernel.halo());
-  }
+  explicit Harness(const Kernel& kernel) : kernel_(kernel) { workspace_.prepare(3, kernel.length(), kernel.halo()); }
   T* vector(int64_t index) { return workspace_.vector(index); }
   void load(const std::vector<T>& v, int64_t index) { kernel_.load(v.data(), T(1), vector(index)); }
   std::vector<T> store(int64_t index) {
@@ -37,8 +35,7 @@ class Harness {
   void expect_clean_padding(int64_t index) {
     const Vector inside = as_vector(store(index));
     double all = 0;
-    for (int64_t i = -kernel_.halo(); i < kernel_.length() + kernel_.halo(); ++i)
-      all += vector(index)[i] != T(0);
+    for (int64_t i = -kernel_.halo(); i < kernel_.length() + kernel_.halo(); ++i) all += vector(index)[i] != T(0);
     EXPECT_EQ(static_cast<double>((inside.array() != 0).count()), all);
   }
 
@@ -82,8 +79,7 @@ void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
   harness.load(b, 2);
   kernel.divide_by_diagonal(harness.vector(2), harness.vector(0));
   harness.load(x, 1);
-  const T squared =
-      kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2));
+  const T squared = kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2));
   const Vector residual = as_vector(b) - a * as_vector(x);
   const Vector next = as_vector(x) + residual.cwiseQuotient(a.diagonal());
   const double scale = 30 * kTolerance<T>;

@@ -55,11 +55,9 @@ TEST(ImplicitStep, SolvesANonlinearRightHandSideWithItsGradient) {
 
 TEST(ImplicitStep, FailuresSayTheStepInBothDirections) {
   int steps = 0;
-  auto step = prdp::ImplicitStep({"heat", {5}, {0.1}, {viscosity()}},
-                                 [&](const at::Tensor& u) {
-                                   return ++steps == 2 ? u / 0.0 : u;
-                                 },
-                                 prdp::Jacobi{.max_iter = 3});
+  auto step = prdp::ImplicitStep(
+      {"heat", {5}, {0.1}, {viscosity()}}, [&](const at::Tensor& u) { return ++steps == 2 ? u / 0.0 : u; },
+      prdp::Jacobi{.max_iter = 3});
   const auto message = [](const auto& call) {
     try {
       call();
@@ -88,19 +86,20 @@ TEST(ImplicitStep, KeepsTheBudgetAndRefusesWhatDoesNotFit) {
   EXPECT_THROW(step(at::zeros({5})), c10::ValueError);
   EXPECT_THROW(step.rollout(random_field({5}, 2), -1), c10::ValueError);
   EXPECT_THROW(prdp::ImplicitStep(nullptr, nullptr, prdp::Solver(prdp::Direct{})), c10::ValueError);
-  auto shorter = prdp::ImplicitStep({"heat", {5}, {0.1}, {viscosity()}},
-                                    [](const at::Tensor& u) { return u.narrow(2, 0, 4); }, prdp::Direct{});
+  auto shorter = prdp::ImplicitStep(
+      {"heat", {5}, {0.1}, {viscosity()}}, [](const at::Tensor& u) { return u.narrow(2, 0, 4); }, prdp::Direct{});
   EXPECT_THROW(shorter(random_field({5}, 2)), c10::ValueError);
 }
 
 TEST(ImplicitStep, TakesProductsWithoutATransposeAndWithADiagonal) {
   const auto k = at::tensor({0.5, 1.5, 1.0, 2.0}, at::kDouble).requires_grad_();
   // (2 + k) v_i - v_{i-1}, without a neighbour at the first point
-  const auto products = prdp::RegisteredProducts::make(
-      {.apply = [](const at::Tensor& v, const std::vector<at::Tensor>& t) {
-         return (2 + t[0]) * v - at::constant_pad_nd(v, {1, 0}).narrow(1, 0, 4);
-       },
-       .diagonal = [](const std::vector<at::Tensor>& t) { return 2 + t[0]; }});
+  const auto products =
+      prdp::RegisteredProducts::make({.apply =
+                                          [](const at::Tensor& v, const std::vector<at::Tensor>& t) {
+                                            return (2 + t[0]) * v - at::constant_pad_nd(v, {1, 0}).narrow(1, 0, 4);
+                                          },
+                                      .diagonal = [](const std::vector<at::Tensor>& t) { return 2 + t[0]; }});
   auto step = prdp::ImplicitStep([&](const at::Tensor&) { return products->spec({k}); }, nullptr,
                                  prdp::Jacobi{.max_iter = 50, .rtol = 1e-14});
   const auto u = random_field({4}, 3).view({3, 4}).requires_grad_();
@@ -118,9 +117,7 @@ TEST(Length, ScalesViscosityAndLoad) {
   const double side = 2 * M_PI;
   const auto u = random_field({6, 5}, 2);
   const prdp::Solver cg = prdp::CG{.max_iter = 400, .rtol = 1e-13};
-  const auto difference = [](const at::Tensor& a, const at::Tensor& b) {
-    return (a - b).abs().max().item<double>();
-  };
+  const auto difference = [](const at::Tensor& a, const at::Tensor& b) { return (a - b).abs().max().item<double>(); };
   auto heat = prdp::Heat({6, 5}, 1e-2, 0.5, cg, prdp::Backward::kImplicit, side);
   auto unit = prdp::Heat({6, 5}, 1e-2 / (side * side), 0.5, cg);
   EXPECT_LT(difference(heat(u), unit(u)), 1e-12);

@@ -93,8 +93,7 @@ TEST(Laplacian, PaddingStaysZeroInEveryProduct) {
     double inside = 0, all = 0;
     kernel.store(workspace.vector(v), 1.0f, values.data());
     for (const float x : values) inside += std::abs(x);
-    for (int64_t i = -kernel.halo(); i < kernel.length() + kernel.halo(); ++i)
-      all += std::abs(workspace.vector(v)[i]);
+    for (int64_t i = -kernel.halo(); i < kernel.length() + kernel.halo(); ++i) all += std::abs(workspace.vector(v)[i]);
     EXPECT_EQ(inside, all);
   }
 }

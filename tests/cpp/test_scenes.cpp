@@ -86,8 +86,8 @@ TEST(Data, SeriesInSpaceSumsEveryProductOfSinesAndCosines) {
         for (int64_t x = 0; x < shape[2]; ++x)
           for (int64_t n = 1; n <= kModes; ++n)
             for (int64_t p = 0; p < 8; ++p)
-              expected[s][0][z][y][x] += drawn[s][0][n - 1][p] * wave(0, z, n, p & 1) * wave(1, y, n, p >> 1 & 1) *
-                                         wave(2, x, n, p >> 2);
+              expected[s][0][z][y][x] +=
+                  drawn[s][0][n - 1][p] * wave(0, z, n, p & 1) * wave(1, y, n, p >> 1 & 1) * wave(2, x, n, p >> 2);
   EXPECT_TRUE(at::allclose(u, expected, 0.0, 1e-13));
 }
 

@@ -3,8 +3,8 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/threads/interruption.h"
 
 /// The CPU loops against the plain-tensor solver, which share only the text of the methods.
 namespace {
@@ -36,8 +36,8 @@ void expect_same(const prdp::OperatorSpec& spec, const at::Tensor& b, const prdp
 }
 
 TEST(Solve, LoopsEqualPlainTensorsAtSizesAroundTheVectorWidth) {
-  const std::vector<std::vector<int64_t>> shapes{{1}, {2}, {7}, {8}, {15}, {16}, {17}, {33}, {1, 1},
-                                                 {5, 16}, {16, 5}, {31, 9}, {1, 17}, {2, 3, 4}, {7, 1, 9}};
+  const std::vector<std::vector<int64_t>> shapes{{1},    {2},     {7},     {8},     {15},    {16},      {17},     {33},
+                                                 {1, 1}, {5, 16}, {16, 5}, {31, 9}, {1, 17}, {2, 3, 4}, {7, 1, 9}};
   for (const auto& shape : shapes)
     for (const auto& [method, name] : kMethods) {
       SCOPED_TRACE(testing::Message() << name << " " << at::IntArrayRef(shape));

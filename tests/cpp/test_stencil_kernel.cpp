@@ -53,8 +53,8 @@ Stencil<T> make_kernel(const StencilGrid& grid, std::vector<Offset> offsets, con
   if (transposed)
     for (auto& offset : offsets)
       for (auto& cells : offset.along) cells = -cells;
-  return given_stencil(GivenStencil<T>{coefficients.data(), 0, std::make_shared<StencilPattern>(grid, offsets), transposed},
-                       channels);
+  return given_stencil(
+      GivenStencil<T>{coefficients.data(), 0, std::make_shared<StencilPattern>(grid, offsets), transposed}, channels);
 }
 
 template <class T>

@@ -54,8 +54,9 @@ TEST(Start, FromTheStateIsALinearSolveThatIsGivenTheState) {
     const auto nu = at::scalar_tensor(1e-2, at::kDouble).requires_grad_();
     const prdp::Solver jacobi = prdp::Jacobi{.max_iter = 3};
     auto burgers = prdp::Burgers({9}, nu, 0.1, jacobi, backward);
-    auto own = prdp::ImplicitStep(
-        [&](const at::Tensor& u) { return prdp::OperatorSpec{"burgers", {9}, {0.1}, {u, nu}}; }, nullptr, jacobi, backward);
+    auto own =
+        prdp::ImplicitStep([&](const at::Tensor& u) { return prdp::OperatorSpec{"burgers", {9}, {0.1}, {u, nu}}; },
+                           nullptr, jacobi, backward);
     const auto u = prdp_test::random_field({9}, 2).requires_grad_();
     const auto from_zero = burgers(u);
     burgers.options().start = own.options().start = prdp::Start::kState;
@@ -153,7 +154,9 @@ TEST(Burgers, RolloutEqualsItsStepsToTheLastBit) {
 TEST(NavierStokes, StepIsFreeOfDivergenceAndDifferentiable) {
   auto flow = prdp::NavierStokes({6, 5}, 1e-3, 0.1, prdp::Direct{}, prdp::Backward::kImplicit, 2);
   auto u = at::cat({prdp_test::random_field({6, 5}, 2), prdp_test::random_field({6, 5}, 2),
-                    prdp_test::random_field({6, 5}, 2)}, 1).requires_grad_();
+                    prdp_test::random_field({6, 5}, 2)},
+                   1)
+               .requires_grad_();
   const auto next = flow(u);
   EXPECT_TRUE(flow.info()->iterations.eq(2).all().item<bool>());  // two Picard steps
   const auto b = flow.rhs(u), residual = prdp::make_operator(flow.operator_at(u))->apply(next) - b;
@@ -177,8 +180,7 @@ TEST(Flows, NormIsTheLargestAbsoluteRowSumAndNaNWhereTheWindsAre) {
       auto bad = winds.clone();
       bad[batch - 1][1][2][3] = std::numeric_limits<double>::quiet_NaN();
       const auto norm = prdp::make_operator({kind, {4, 5}, {0.1}, {bad, nu}})->norm().reshape(-1);
-      for (int64_t i = 0; i < batch; ++i)
-        EXPECT_EQ(std::isnan(norm[i].item<double>()), i == batch - 1);
+      for (int64_t i = 0; i < batch; ++i) EXPECT_EQ(std::isnan(norm[i].item<double>()), i == batch - 1);
     }
   }
 }
@@ -191,10 +193,9 @@ TEST(Flows, ProjectionTakesOffTheMeanPressureAlone) {
     const auto a = prdp::make_operator({"navier_stokes", {4, 5}, {0.1}, {v, nu}, transposed});
     const auto projected = a->project(v);
     EXPECT_TRUE(at::equal(projected.narrow(1, 0, 2), v.narrow(1, 0, 2)));
-    EXPECT_TRUE(at::allclose(v.select(1, 2) - projected.select(1, 2),
-                             v.select(1, 2).mean({1, 2}, true).expand({2, 4, 5})));
-    EXPECT_TRUE(at::equal(prdp::make_operator({"burgers", {4, 5}, {0.1}, {v.narrow(1, 0, 2), nu}})
-                              ->project(v), v));
+    EXPECT_TRUE(
+        at::allclose(v.select(1, 2) - projected.select(1, 2), v.select(1, 2).mean({1, 2}, true).expand({2, 4, 5})));
+    EXPECT_TRUE(at::equal(prdp::make_operator({"burgers", {4, 5}, {0.1}, {v.narrow(1, 0, 2), nu}})->project(v), v));
   }
 }
 

@@ -8,8 +8,8 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/steppers/stepper.h"
+#include "prdp/threads/interruption.h"
 
 /// The loop over the samples of a batch, and callers that solve at the same time. `make sanitize` runs these under
 /// ThreadSanitizer.
@@ -60,7 +60,8 @@ std::vector<std::pair<prdp::OperatorSpec, at::Tensor>> problems() {
   const auto winds = at::cat({plane, plane.flip({3})}, 1);
   const auto flow = at::cat({winds, at::zeros_like(plane)}, 1);
   const auto b = field({40}).squeeze(1);
-  const auto matrix = at::rand({40, 40}, at::detail::createCPUGenerator(3), at::kDouble) + 40 * at::eye(40, at::kDouble);
+  const auto matrix =
+      at::rand({40, 40}, at::detail::createCPUGenerator(3), at::kDouble) + 40 * at::eye(40, at::kDouble);
   const auto sparse = matrix.masked_fill(matrix.lt(0.5), 0.0).to_sparse_csr();
   const auto coefficients = at::stack({at::full({16, 16}, 5.0, at::kDouble), -plane[0][0].abs(), -plane[1][0].abs()});
   return {{{"heat", {400}, {1.0}, {nu}}, line},

@@ -118,10 +118,19 @@ template <class T, class Parameters>
 at::Tensor solve_batch(const Parameters& a, const at::Tensor& b, prdp::Method method) {
   auto u = at::empty_like(b), residual = at::empty({b.size(0)}, b.options());
   std::vector<int64_t> iterations(b.size(0)), status(b.size(0)), applications(b.size(0));
-  const prdp::SampleBatch<T> batch{method,  500,  1e-5, prdp::kDefaultRestart,
-                                   nullptr, /*guarded=*/true, b.const_data_ptr<T>(), /*x0=*/nullptr,
-                                   u.mutable_data_ptr<T>(), iterations.data(), residual.mutable_data_ptr<T>(),
-                                   status.data(), applications.data()};
+  const prdp::SampleBatch<T> batch{method,
+                                   500,
+                                   1e-5,
+                                   prdp::kDefaultRestart,
+                                   nullptr,
+                                   /*guarded=*/true,
+                                   b.const_data_ptr<T>(),
+                                   /*x0=*/nullptr,
+                                   u.mutable_data_ptr<T>(),
+                                   iterations.data(),
+                                   residual.mutable_data_ptr<T>(),
+                                   status.data(),
+                                   applications.data()};
   prdp::solve_range(a, batch, 0, b.size(0));
   return u;
 }

@@ -112,7 +112,8 @@ at::Tensor tensor(Bytes& bytes, bool indices) {
 void operators(std::string_view input) {
   Bytes bytes(input);
   prdp::OperatorSpec spec;
-  spec.kind = bytes.one_of<std::string>({"csr", "stencil", "dense", "heat", "poisson", "burgers", "navier_stokes", "?"});
+  spec.kind =
+      bytes.one_of<std::string>({"csr", "stencil", "dense", "heat", "poisson", "burgers", "navier_stokes", "?"});
   for (auto n = bytes.below(4); n > 0; --n) spec.shape.push_back(bytes.below(8) ? bytes.below(6) : bytes.number());
   for (auto n = bytes.below(10); n > 0; --n)
     spec.parameters.push_back(bytes.below(4) ? static_cast<double>(bytes.below(5) - 2) : bytes.real());
@@ -123,7 +124,8 @@ void operators(std::string_view input) {
     auto crow = at::zeros({n + 1}, at::kLong), col = at::zeros({stored}, at::kLong);
     for (int64_t i = 1; i <= n; ++i) crow[i] = bytes.below(16) ? std::min(stored, 2 * i) : bytes.number();
     if (bytes.below(16)) crow[n] = stored;
-    for (int64_t i = 0; i < stored; ++i) col[i] = bytes.below(16) ? bytes.below(std::max<int64_t>(n, 1)) : bytes.number();
+    for (int64_t i = 0; i < stored; ++i)
+      col[i] = bytes.below(16) ? bytes.below(std::max<int64_t>(n, 1)) : bytes.number();
     spec.tensors = {crow, col, at::rand({stored}, at::kDouble)};
     spec.shape.clear();
     spec.parameters.clear();
@@ -131,8 +133,8 @@ void operators(std::string_view input) {
   spec.transposed = bytes.below(2);
   const auto b = tensor(bytes, false);
   const auto method = prdp::kTraits[static_cast<size_t>(bytes.below(prdp::kTraits.size()))].method;
-  prdp::SolveOptions options{{method, std::min<int64_t>(bytes.number(), 30), bytes.real(),
-                              std::min<int64_t>(bytes.number(), 30)}};
+  prdp::SolveOptions options{
+      {method, std::min<int64_t>(bytes.number(), 30), bytes.real(), std::min<int64_t>(bytes.number(), 30)}};
   options.on_failure = prdp::OnFailure::kReturn;
   refused_or_done([&] { prdp::linear_solve(spec, b, options); });
 }

@@ -3,8 +3,8 @@
 #include <string_view>
 #include <vector>
 
-/// What the library reads from outside, given any bytes. Each function returns whatever the bytes are, unless there is a
-/// fault in the library: it lets the library's errors of arguments pass, and no others.
+/// What the library reads from outside, given any bytes. Each function returns whatever the bytes are, unless there is
+/// a fault in the library: it lets the library's errors of arguments pass, and no others.
 namespace prdp_fuzz {
 
 struct Target {

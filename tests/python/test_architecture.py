@@ -18,6 +18,15 @@ def test_a_folder_includes_only_folders_above_it():
             assert above, f"{path.name} includes {included}"
 
 
+def test_the_folders_have_as_many_lines_as_the_page_says():
+    rows = re.findall(r"^\| (`.*?`) \| .* \| ([\d,]+) \|$", PAGE, re.MULTILINE)
+    assert len(rows) > 10
+    for folders, said in rows:
+        files = [file for folder in re.findall(r"`(.*?)`", folders) for file in (ROOT / folder).glob("*.*")]
+        lines = sum(len(file.read_text().splitlines()) for file in files if file.suffix in (".h", ".cpp", ".py"))
+        assert abs(lines - int(said.replace(",", ""))) <= max(100, lines / 10), f"{folders}: {lines}"
+
+
 def test_the_files_of_the_page_exist():
     named = re.findall(r"`([\w/]+\.(?:h|cpp|py|toml|txt))`", PAGE)
     assert len(named) > 30

@@ -98,51 +98,46 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
     assert status == 2 and "weights: the scene 'poisson_1p' trains no network" in errors
 
 
-def patched(saved, change, **sizes):
-    """The file of torch.save with its pickle changed, and with other sizes in its directory than its files have."""
+def patched(saved, *changes, **sizes):
+    """The file of torch.save with texts in its files replaced, and with other sizes in its directory than they have."""
     with zipfile.ZipFile(io.BytesIO(saved)) as whole:
-        files = {file.filename: whole.read(file) for file in whole.infolist()}
+        files = {file.filename.removeprefix("archive/"): whole.read(file) for file in whole.infolist()}
+    for name, old, new in changes:
+        assert old in files[name]
+        files[name] = files[name].replace(old, new, 1)
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive:
         for name, content in files.items():
-            archive.writestr(name, change(content) if name.endswith("data.pkl") else content)
+            archive.writestr(f"archive/{name}", content)
         for file in archive.infolist():
-            for name, size in sizes.items():
-                if file.filename.endswith(f"data/{name.removeprefix('file_')}"):
-                    file.file_size = file.compress_size = size
+            size = sizes.get(file.filename.replace("archive/data/", "file_"), file.file_size)
+            file.file_size = file.compress_size = size
     return made.getvalue()
 
 
-def replaced(*pairs):
-    def change(pickle):
-        for old, new in pairs:
-            assert old in pickle
-            pickle = pickle.replace(old, new, 1)
-        return pickle
-
-    return change
-
-
+PICKLE = "data.pkl"
 LENGTH = b"M\x80\x07t"  # of the first storage, 64 · 30 numbers
 FAR, FARTHER = (b"J" + number.to_bytes(4, "little") for number in (1 << 30, 1 << 30 | 1 << 11))
+FAR_AWAY = (PICKLE, b"QK\x00", b"Q" + FAR)  # where the first tensor begins
 FORGERIES = {
-    "a tensor beyond its storage": (replaced((b"QK\x00", b"Q" + FAR)), {}),
-    "a storage beyond its file": (replaced((LENGTH, FAR + b"t")), {}),
-    "a tensor beyond its file": (replaced((LENGTH, FARTHER + b"t"), (b"QK\x00", b"Q" + FAR)), {}),
-    "a text of 4 GB": (replaced((b"X\x0f\0\0\0layers", b"X\xf0\xff\xff\xfflayers")), {}),
-    "the last memo of 32 bits": (replaced((b"q\x02", b"r\xff\xff\xff\xff")), {}),
-    "a file of 3 GB": (bytes, {"file_0": 3 << 30}),
-    "a file without end": (bytes, {"file_1": 1 << 62}),
+    "a tensor beyond its storage": ([FAR_AWAY], {}),
+    "a storage beyond its file": ([(PICKLE, LENGTH, FAR + b"t")], {}),
+    "a tensor beyond its file": ([(PICKLE, LENGTH, FARTHER + b"t"), FAR_AWAY], {}),
+    "a text of 4 GB": ([(PICKLE, b"X\x0f\0\0\0layers", b"X\xf0\xff\xff\xfflayers")], {}),
+    "the last memo of 32 bits": ([(PICKLE, b"q\x02", b"r\xff\xff\xff\xff")], {}),
+    "another byte order": ([("byteorder", b"little", b"big")], {}),
+    "a file of 3 GB": ([], {"file_0": 3 << 30}),
+    "a file without end": ([], {"file_1": 1 << 62}),
 }
 
 
 @pytest.mark.parametrize("forgery", FORGERIES)
 def test_forged_weights_are_refused_and_take_no_memory(tmp_path, forgery):
     path = written(tmp_path)
-    change, sizes = FORGERIES[forgery]
+    changes, sizes = FORGERIES[forgery]
     saved = io.BytesIO()
     torch.save(dict(make_network(scenes.load(path), 0).state_dict()), saved)
-    (tmp_path / "given.pt").write_bytes(patched(saved.getvalue(), change, **sizes))
+    (tmp_path / "given.pt").write_bytes(patched(saved.getvalue(), *changes, **sizes))
     command = [ROOT / "build" / "prdp_train", path, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as trainer:
         errors = trainer.stderr.read()
@@ -161,7 +156,7 @@ def test_archives_with_numbers_of_64_bits_are_read(tmp_path, monkeypatch):
     curves = []
     for limit in (zipfile.ZIP64_LIMIT, 0):
         monkeypatch.setattr(zipfile, "ZIP64_LIMIT", limit)
-        (tmp_path / "given.pt").write_bytes(patched(saved.getvalue(), bytes))
+        (tmp_path / "given.pt").write_bytes(patched(saved.getvalue()))
         assert (b"PK\6\6" in (tmp_path / "given.pt").read_bytes()) == (limit == 0)
         given = ("--intervals", 1, "--weights", tmp_path / "given.pt")
         assert prdp_train(path, "--out", tmp_path / str(limit), *given)[0] == 0

@@ -10,11 +10,12 @@ namespace prdp {
 
 at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status) {
   const bool rollout = status.dim() == 2;
-  TORCH_CHECK_VALUE(status.dim() == 1 || rollout, "detach_failed: status must have shape (batch,) or (batch, steps), got ",
-                    status.sym_sizes());
+  TORCH_CHECK_VALUE(status.dim() == 1 || rollout,
+                    "detach_failed: status must have shape (batch,) or (batch, steps), got ", status.sym_sizes());
   TORCH_CHECK_VALUE(u.dim() > status.dim() && u.sym_size(0) == status.sym_size(0) &&
                         (!rollout || u.sym_size(1) == status.sym_size(1) + 1),
-                    "detach_failed: u of shape ", u.sym_sizes(), " does not fit a status of shape ", status.sym_sizes());
+                    "detach_failed: u of shape ", u.sym_sizes(), " does not fit a status of shape ",
+                    status.sym_sizes());
   auto failed = status.lt(static_cast<int64_t>(SolveStatus::kStagnated));
   if (!at::isTensorSubclassLike(failed) && !failed.any().item<bool>()) return u;
   if (rollout) failed = at::constant_pad_nd(failed.cumsum(1), {1, 0}).gt(0);

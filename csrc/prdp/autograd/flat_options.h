@@ -12,7 +12,7 @@ namespace prdp {
 #define PRDP_X0_SCHEMA ", Tensor? x0=None"
 #define PRDP_FROM_STATE_SCHEMA ", bool from_state=False"
 
-#define PRDP_OPTIONS_SCHEMA                                                                         \
+#define PRDP_OPTIONS_SCHEMA                                                                        \
   "str solver, SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, " \
   "float? adjoint_rtol, str on_failure, int adjoint_log, int checkpoint_every=0"
 
@@ -38,8 +38,8 @@ using WithOptionsAndX0 = typename detail::AddOptions<Signature, const std::optio
 /// Raises ValueError for names that do not exist.
 inline SolveOptions unflatten(c10::string_view solver, c10::SymInt max_iter, double rtol, int64_t restart,
                               c10::string_view backward, std::optional<c10::SymInt> adjoint_max_iter,
-                              std::optional<double> adjoint_rtol, c10::string_view on_failure,
-                              int64_t adjoint_log, int64_t checkpoint_every, bool from_state) {
+                              std::optional<double> adjoint_rtol, c10::string_view on_failure, int64_t adjoint_log,
+                              int64_t checkpoint_every, bool from_state) {
   return {{method_from_name(solver), std::move(max_iter), rtol, restart},
           backward_from_name(backward),
           std::move(adjoint_max_iter),
@@ -68,9 +68,8 @@ namespace detail {
 
 template <class Op, class Last, class... Front>
 auto call_with(const Op& op, const SolveOptions& o, const Last& last, const Front&... front) {
-  return op.call(front..., name(o.solver.method), o.solver.max_iter, o.solver.rtol, o.solver.restart,
-                 name(o.backward), o.adjoint_max_iter, o.adjoint_rtol, name(o.on_failure), o.adjoint_log,
-                 o.checkpoint_every, last);
+  return op.call(front..., name(o.solver.method), o.solver.max_iter, o.solver.rtol, o.solver.restart, name(o.backward),
+                 o.adjoint_max_iter, o.adjoint_rtol, name(o.on_failure), o.adjoint_log, o.checkpoint_every, last);
 }
 
 }  // namespace detail

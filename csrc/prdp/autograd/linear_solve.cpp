@@ -18,8 +18,9 @@ namespace {
 using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
 constexpr const char* kSchema =
-    "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
-    PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> "
+    "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
+    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
+    ") -> "
     "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 
 /// The arguments of the op but b.
@@ -33,33 +34,32 @@ using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, at::TensorList, c1
                                            at::ArrayRef<double>, bool)>;
 
 Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
-  static const auto op = c10::Dispatcher::singleton()
-                             .findSchemaOrThrow("prdp::linear_solve", "")
-                             .typed<Signature>();
+  static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::linear_solve", "").typed<Signature>();
   return call_with_x0(op, o, x0, b, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
                       at::ArrayRef<double>(a.parameters), a.transposed);
 }
 
 /// The op's arguments as structures; raises for names that do not exist.
 template <class... Options>
-Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-            at::ArrayRef<double> parameters, bool transposed, Options... options) {
+Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+            bool transposed, Options... options) {
   auto [solve, x0] = unflatten_with_x0(std::move(options)...);
-  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed}, std::move(solve), std::move(x0)};
+  return {
+      {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed}, std::move(solve), std::move(x0)};
 }
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
 
-std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b,
-                                           const SolveOptions& options, const at::Tensor& x0) {
+std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
+                                           const at::Tensor& x0) {
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);
-  TORCH_CHECK_VALUE(!x0.defined() || (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() &&
-                                      x0.device() == b.device()),
-                    role_of(spec), ": x0 must have the shape, dtype and device of b, ", b.sym_sizes(), " in ",
-                    b.scalar_type(), " on ", b.device(), ", got ", x0.sym_sizes(), " in ", x0.scalar_type(), " on ",
-                    x0.device());
+  TORCH_CHECK_VALUE(
+      !x0.defined() ||
+          (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() && x0.device() == b.device()),
+      role_of(spec), ": x0 must have the shape, dtype and device of b, ", b.sym_sizes(), " in ", b.scalar_type(),
+      " on ", b.device(), ", got ", x0.sym_sizes(), " in ", x0.scalar_type(), " on ", x0.device());
   return a;
 }
 
@@ -76,8 +76,8 @@ Outputs fake_kernel(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack(std::move(args)...);
   checked_operator(a, b, options, x0);
   const auto counts = [&] { return at::empty_symint({b.sym_size(0)}, b.options().dtype(at::kLong)); };
-  return {at::empty_symint(b.sym_sizes(), b.options()), counts(),
-          at::empty_symint({b.sym_size(0)}, b.options()), counts(), counts()};
+  return {at::empty_symint(b.sym_sizes(), b.options()), counts(), at::empty_symint({b.sym_size(0)}, b.options()),
+          counts(), counts()};
 }
 
 /// The op below autograd.
@@ -100,8 +100,8 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
   const bool differentiable = options.backward != Backward::kNone;
   if (differentiable && at::GradMode::is_enabled() && a.kind == "function" && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
-  const bool reverse = differentiable && at::GradMode::is_enabled() &&
-                       (b.requires_grad() || any_requires_grad(a.tensors));
+  const bool reverse =
+      differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? c10::make_intrusive<SolveNode>(b, a, options) : nullptr;
   const auto out = call_below(b, a, options, x0);
@@ -165,15 +165,13 @@ OperatorSpec matrix(const at::Tensor& values) {
                     "linear_solve: A must have shape (n, n) or (batch, n, n), got ", values.sym_sizes());
   if (!sparse) return {"dense", {}, {}, {values}};
   const auto crow = values.crow_indices();
-  TORCH_CHECK_VALUE(crow.sym_size(-1) == values.sym_size(-1) + 1, "linear_solve: a CSR matrix of ",
-                    values.sym_size(-1), " rows needs a crow of one more, got ", crow.sym_size(-1));
+  TORCH_CHECK_VALUE(crow.sym_size(-1) == values.sym_size(-1) + 1, "linear_solve: a CSR matrix of ", values.sym_size(-1),
+                    " rows needs a crow of one more, got ", crow.sym_size(-1));
   return {"csr", {}, {}, {crow, values.col_indices(), values.values()}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
-  m.impl("linear_solve", Kernels<Signature>::solve);
-}
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", Kernels<Signature>::solve); }
 TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", Kernels<Signature>::fake); }
 TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", Kernels<Signature>::autograd); }
 

@@ -1,22 +1,25 @@
 #include "prdp/autograd/product_rows.h"
 
+#include <algorithm>
+
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
 
 namespace {
-constexpr int64_t kRows = 16;
-}
+/// Pairs that are summed at once: many of small vectors, where a tensor operation takes longer to call than to run.
+int64_t rows_of(int64_t unknowns) { return std::clamp<int64_t>(65536 / std::max<int64_t>(unknowns, 1), 16, 128); }
+}  // namespace
 
 ProductRows::ProductRows(std::unique_ptr<Operator> a, const at::Tensor& like) : a_(std::move(a)) {
   auto shape = like.sizes().vec();
-  shape[0] = kRows;
+  shape[0] = rows_of(like.numel() / std::max<int64_t>(like.size(0), 1));
   lambda_ = at::empty(shape, like.options());
   v_ = at::empty(shape, like.options());
 }
 
 void ProductRows::push() {
-  if (++count_ == kRows) flush();
+  if (++count_ == lambda_.size(0)) flush();
 }
 
 void ProductRows::flush() {

@@ -14,9 +14,13 @@ class ProductRows {
 
   /// Contiguous memory for the next pair. Call push() after writing it.
   template <class T>
-  T* lambda() const { return lambda_.select(0, count_).template mutable_data_ptr<T>(); }
+  T* lambda() const {
+    return lambda_.select(0, count_).template mutable_data_ptr<T>();
+  }
   template <class T>
-  T* v() const { return v_.select(0, count_).template mutable_data_ptr<T>(); }
+  T* v() const {
+    return v_.select(0, count_).template mutable_data_ptr<T>();
+  }
   void push();
   /// One per tensor of A; undefined where there is no derivative.
   std::vector<at::Tensor> finish();

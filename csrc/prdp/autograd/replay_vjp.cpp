@@ -20,8 +20,7 @@ class Replay {
 
   Replay(MakeOperator make, StepwiseSolve& solve, std::vector<at::Tensor> inputs, at::IntArrayRef needed,
          const at::Tensor& cotangent)
-      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)),
-        needed_(needed) {
+      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)), needed_(needed) {
     // u = P x / scale is linear in x, and its own transpose.
     bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent));
   }

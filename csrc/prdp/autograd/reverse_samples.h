@@ -130,23 +130,23 @@ template <class T>
 void reverse_range(const DenseParameters& a, const DenseParameters& transpose, const ReverseBatch<T>& batch,
                    int64_t begin, int64_t end);
 template <class T>
-void reverse_range(const CsrParameters& a, const CsrParameters& transpose, const ReverseBatch<T>& batch,
-                   int64_t begin, int64_t end);
+void reverse_range(const CsrParameters& a, const CsrParameters& transpose, const ReverseBatch<T>& batch, int64_t begin,
+                   int64_t end);
 template <class T>
-void reverse_range(const BurgersParameters& a, const BurgersParameters& transpose,
-                   const ReverseBatch<T>& batch, int64_t begin, int64_t end);
+void reverse_range(const BurgersParameters& a, const BurgersParameters& transpose, const ReverseBatch<T>& batch,
+                   int64_t begin, int64_t end);
 template <class T>
 void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters& transpose,
                    const ReverseBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>
-void reverse_range(const StencilParameters& a, const StencilParameters& transpose,
-                   const ReverseBatch<T>& batch, int64_t begin, int64_t end);
+void reverse_range(const StencilParameters& a, const StencilParameters& transpose, const ReverseBatch<T>& batch,
+                   int64_t begin, int64_t end);
 
 namespace detail {
 
 template <class T, class Parameters>
-void reverse_range(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch,
-                   int64_t begin, int64_t end) {
+void reverse_range(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t begin,
+                   int64_t end) {
   with_kernel<T>(a, [&](const auto& kernel) {
     with_kernel<T>(transpose, [&](const auto& transposed) {
       if constexpr (std::is_same_v<decltype(kernel), decltype(transposed)>)

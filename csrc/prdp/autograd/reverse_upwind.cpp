@@ -9,9 +9,9 @@ void reverse_range(const NavierStokesParameters& a, const NavierStokesParameters
   detail::reverse_range(a, transpose, batch, begin, end);
 }
 
-template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&,
-                            const ReverseBatch<float>&, int64_t, int64_t);
-template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&,
-                            const ReverseBatch<double>&, int64_t, int64_t);
+template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&, const ReverseBatch<float>&,
+                            int64_t, int64_t);
+template void reverse_range(const NavierStokesParameters&, const NavierStokesParameters&, const ReverseBatch<double>&,
+                            int64_t, int64_t);
 
 }  // namespace prdp

@@ -24,13 +24,11 @@ struct Checkpoints {
 
 /// Runs iterations forward, storing iterates as `plan` says, and then takes them back, one by one. The arithmetic does
 /// not depend on the plan, so the result is the same to the last bit. `run` has start(), step(), save(slot),
-/// load(slot, k) for the state after k iterations, and step_back(slot, k). This runs iteration k again from the state in
-/// the slot, which has just been loaded, and takes the cotangents after it to those before it.
+/// load(slot, k) for the state after k iterations, and step_back(slot, k). This runs iteration k again from the state
+/// in the slot, which has just been loaded, and takes the cotangents after it to those before it.
 template <class Run>
 void run_back(Run& run, const Checkpoints& plan) {
-  const auto length = [&](int64_t segment) {
-    return std::min(plan.stride, plan.iterations - segment * plan.stride);
-  };
+  const auto length = [&](int64_t segment) { return std::min(plan.stride, plan.iterations - segment * plan.stride); };
   run.start();
   for (int64_t segment = 0; segment < plan.segments(); ++segment) {
     run.save(plan.stride + segment);

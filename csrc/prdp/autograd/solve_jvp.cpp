@@ -30,13 +30,11 @@ at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpe
   rhs = without_lost(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
   const auto tangent = linear_solve(primal(a), rhs, options);
-  return options.on_failure == OnFailure::kZeroGrad
-             ? without_lost(tangent.u, tangent.info.status, options.on_failure)
-             : tangent.u;
+  return options.on_failure == OnFailure::kZeroGrad ? without_lost(tangent.u, tangent.info.status, options.on_failure)
+                                                    : tangent.u;
 }
 
-at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
-                    const SolveOptions& options) {
+at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, const SolveOptions& options) {
   std::vector<at::Tensor> tangents;
   std::vector<int64_t> needed;
   const auto take = [&](const at::Tensor& t) {
@@ -47,16 +45,13 @@ at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpe
   for (const auto& t : a.tensors) take(t);
   auto plain = solved;
   plain.b = primal(b);
-  return without_lost(unrolled_jvp(tangents, plain, primal(a), options, needed), solved.status,
-                      options.on_failure);
+  return without_lost(unrolled_jvp(tangents, plain, primal(a), options, needed), solved.status, options.on_failure);
 }
 
 }  // namespace
 
-at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
-                     const SolveOptions& options) {
-  return options.backward == Backward::kUnrolled ? unrolled(b, solved, a, options)
-                                                 : implicit(b, solved, a, options);
+at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, const SolveOptions& options) {
+  return options.backward == Backward::kUnrolled ? unrolled(b, solved, a, options) : implicit(b, solved, a, options);
 }
 
 }  // namespace prdp

@@ -8,7 +8,6 @@ namespace prdp {
 ///   implicit: A u̇ = ḃ - Ȧ u, by the same method and budget
 ///   unrolled: the exact derivative of the iterations that ran; itself without derivatives
 /// Differentiable in implicit mode.
-at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a,
-                     const SolveOptions& options);
+at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, const SolveOptions& options);
 
 }  // namespace prdp

@@ -28,8 +28,7 @@ void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   } else if (any_requires_grad(a_.tensors)) {
     u_ = SavedVariable(solved.u, /*is_output=*/true);
   }
-  if (unrolled || options_.on_failure != OnFailure::kRaise)
-    status_ = SavedVariable(solved.status, /*is_output=*/false);
+  if (unrolled || options_.on_failure != OnFailure::kRaise) status_ = SavedVariable(solved.status, /*is_output=*/false);
   for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
   a_.tensors.clear();
 }
@@ -51,8 +50,7 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
     const auto unpack = [](const SavedVariable& saved, c10::intrusive_ptr<Node> of = nullptr) {
       return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
     };
-    solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_),
-              unpack(residual_), unpack(x0_)};
+    solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_), unpack(residual_), unpack(x0_)};
     for (const auto& saved : tensors_) a.tensors.push_back(unpack(saved));
   }
   const WithoutAutocast full_precision;
@@ -62,14 +60,12 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
   return gradients(cotangent, solved, a);
 }
 
-variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved,
-                                   const OperatorSpec& a) const {
+variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a) const {
   std::vector<int64_t> needed(a.tensors.size() + 1);
   for (size_t i = 0; i < needed.size(); ++i) needed[i] = task_should_compute_output(i);
   const bool by_kernel = !at::GradMode::is_enabled() && is_plain(cotangent) && all_plain(a.tensors) &&
                          !has_tangent(cotangent) && !any_tangent(a.tensors);
-  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_kernel : linear_solve)
-      .gradients;
+  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_kernel : linear_solve).gradients;
 }
 
 }  // namespace prdp

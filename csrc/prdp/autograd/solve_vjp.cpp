@@ -47,8 +47,7 @@ void report_overflow(SolveInfo& info, const Rows& rows, const OperatorSpec& tran
 }  // namespace
 
 SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
-                      const SolveOptions& options, at::IntArrayRef needed,
-                      decltype(linear_solve)& adjoint_solve) {
+                      const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
   auto transpose = a;
   transpose.transposed = !a.transposed;
   auto o = options;
@@ -82,16 +81,15 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   return found;
 }
 
-SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
-                   const SolveOptions& options, at::IntArrayRef needed,
-                   decltype(linear_solve)& adjoint_solve) {
+SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a, const SolveOptions& options,
+                   at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
   cotangent = without_lost(cotangent, solved.status, options.on_failure);
   if (options.backward == Backward::kImplicit)
     return implicit_vjp(cotangent, solved.u, a, options, needed, adjoint_solve);
   // With create_graph=True the derivative is itself recorded; else it is one op, as a compiled graph and
   // torch.func need it.
-  bool recorded = at::GradMode::is_enabled() && !in_torch_func() && !has_tangent(cotangent) &&
-                  !has_tangent(solved.b) && !any_tangent(a.tensors);
+  bool recorded = at::GradMode::is_enabled() && !in_torch_func() && !has_tangent(cotangent) && !has_tangent(solved.b) &&
+                  !any_tangent(a.tensors);
   for (size_t i = 0; i < needed.size(); ++i)  // not where they did so in a transform that has ended
     if (needed[i]) recorded = recorded && (i == 0 ? solved.b : a.tensors[i - 1]).requires_grad();
   const auto vjp = recorded ? unrolled_vjp_recorded : unrolled_vjp;

@@ -18,9 +18,8 @@ struct SolveVjp {
   std::vector<at::Tensor> gradients;
   SolveInfo info;
 };
-SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a,
-                   const SolveOptions& options, at::IntArrayRef needed,
-                   decltype(linear_solve)& adjoint_solve = linear_solve);
+SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a, const SolveOptions& options,
+                   at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve = linear_solve);
 
 /// A cotangent or tangent with zeros for the samples that carry none: the refused ones, whose u is the constant
 /// zero, and with kZeroGrad all that failed. With kRaise there are no such samples.
@@ -28,7 +27,6 @@ at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, 
 /// The implicit one: Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Without u, b̄ alone. A sample whose share of ḡ
 /// leaves the range of the dtype fails: OVERFLOW, and zeros.
 SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,
-                      const SolveOptions& options, at::IntArrayRef needed,
-                      decltype(linear_solve)& adjoint_solve);
+                      const SolveOptions& options, at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve);
 
 }  // namespace prdp

@@ -60,9 +60,7 @@ class TapeBack {
     const T *const a = tape_.value(op.a), *const b = op.b < 0 ? nullptr : tape_.value(op.b);
     switch (op.kind) {
       case Kind::kSquare: return tape_.add_bar(op.a, 2 * bar, a);
-      case Kind::kDot:
-        tape_.add_bar(op.a, bar, b);
-        return tape_.add_bar(op.b, bar, a);
+      case Kind::kDot: tape_.add_bar(op.a, bar, b); return tape_.add_bar(op.b, bar, a);
       default:  // kWeightedSquare
         values_.weigh(a, b, scratch_);
         tape_.add_bar(op.b, 2 * bar, scratch_);
@@ -84,9 +82,7 @@ class TapeBack {
           tape_.add_bar(term.of, term.factor, bar);
         }
         return tape_.move_bar(op.out, op.a);
-      case Kind::kScale:
-        add_to_number(op.factor_node, 1, bar, op.a);
-        return tape_.add_bar(op.a, op.factor, bar);
+      case Kind::kScale: add_to_number(op.factor_node, 1, bar, op.a); return tape_.add_bar(op.a, op.factor, bar);
       case Kind::kWeigh:
         values_.weigh(tape_.value(op.a), bar, scratch_);
         tape_.add_bar(op.b, 1, scratch_);

@@ -69,7 +69,11 @@ class TapeSpace {
   void xpby(const Vector& x, const Scalar& beta, Vector& y) {
     const auto before = y.version;
     values_.xpby(value(x), beta.value, changed(y));
-    note({.kind = Kind::kAxpy, .out = y.version, .a = x.version, .b = before, .factor_node = beta.node,
+    note({.kind = Kind::kAxpy,
+          .out = y.version,
+          .a = x.version,
+          .b = before,
+          .factor_node = beta.node,
           .factor = beta.value});
   }
   Scalar dot(const Vector& a, const Vector& b) {
@@ -80,10 +84,19 @@ class TapeSpace {
     const T* direction = value(p);
     T* const x_now = changed(x);
     const T rr = values_.descend(alpha.value, direction, value(q), x_now, changed(r));
-    note({.kind = Kind::kAxpy, .out = x.version, .a = x_before, .b = p_then, .factor_node = alpha.node,
+    note({.kind = Kind::kAxpy,
+          .out = x.version,
+          .a = x_before,
+          .b = p_then,
+          .factor_node = alpha.node,
           .factor = alpha.value});
-    note({.kind = Kind::kAxpy, .out = r.version, .a = r_before, .b = q.version, .factor_node = alpha.node,
-          .factor = alpha.value, .sign = -1});
+    note({.kind = Kind::kAxpy,
+          .out = r.version,
+          .a = r_before,
+          .b = q.version,
+          .factor_node = alpha.node,
+          .factor = alpha.value,
+          .sign = -1});
     return number(Kind::kSquare, rr, r.version);
   }
 
@@ -227,7 +240,7 @@ class TapeSpace {
   std::array<double, 1> operator_norm() const { return values_.operator_norm(); }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}
-  void restart() {}
+  void run_again() {}
 
  private:
   using Kind = typename Tape<T>::Kind;
@@ -279,7 +292,11 @@ class TapeSpace {
     }
     const auto& from = pointers(v, count);
     const T left2 = loops_.multi_axpy(T(sign), plain_.data(), from.data(), count, changed(w), tape_.length());
-    note({.kind = Kind::kCombination, .out = w.version, .a = before, .sign = sign, .first_term = first,
+    note({.kind = Kind::kCombination,
+          .out = w.version,
+          .a = before,
+          .sign = sign,
+          .first_term = first,
           .count = static_cast<int32_t>(count)});
     return left2;
   }

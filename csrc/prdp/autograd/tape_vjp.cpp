@@ -3,8 +3,8 @@
 #include "prdp/autograd/reverse_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -19,8 +19,8 @@ void add_sample(at::Tensor& gradient, const at::Tensor& tensor, const at::Tensor
 
 /// ∂⟨D̄, D(g)⟩/∂g for the diagonal D of A, of the samples that took an iteration: a refused operator
 /// would send NaN even from behind zeros.
-void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagonal_bar,
-                   const UnrolledSolve& solve, at::IntArrayRef needed) {
+void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagonal_bar, const UnrolledSolve& solve,
+                   at::IntArrayRef needed) {
   const auto index = solve.iterations.gt(0).nonzero().flatten();
   if (index.numel() == 0) return;
   auto spec = solve.a;
@@ -40,7 +40,7 @@ void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagona
 
 template <class T, class Parameters>
 void reverse(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
-           int64_t grain) {
+             int64_t grain) {
   interruption::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
     const at::NoGradGuard no_grad;
     reverse_range(a, transpose, batch, begin, end);
@@ -50,12 +50,11 @@ void reverse(const Parameters& a, const Parameters& transpose, const ReverseBatc
 }  // namespace
 
 bool can_use_tape(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
-  return b.is_cpu() && has_tape(traits(solve.solver.method)) &&
-         !std::holds_alternative<std::monostate>(a.kernel(b));
+  return b.is_cpu() && has_tape(traits(solve.solver.method)) && !std::holds_alternative<std::monostate>(a.kernel(b));
 }
 
 UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
-                      at::IntArrayRef needed) {
+                     at::IntArrayRef needed) {
   const auto a = make_operator(solve.a);
   auto transposed = solve.a;
   transposed.transposed = !transposed.transposed;
@@ -86,9 +85,7 @@ UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Unr
                           {},
                           {}};
     if (for_a) {
-      batch.rows = [&](int64_t s) {
-        return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs);
-      };
+      batch.rows = [&](int64_t s) { return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs); };
       batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };
     }
     std::visit(

@@ -16,10 +16,9 @@ constexpr const char* kSchema =
     "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] needed, "
     "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
     ") -> Tensor";
-using Signature =
-    WithOptionsAndX0<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                           const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef,
-                           at::ArrayRef<double>, bool)>;
+using Signature = WithOptionsAndX0<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                              const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
+                                              at::IntArrayRef, at::ArrayRef<double>, bool)>;
 
 /// The product with the cotangent is linear in it; the transpose of that is the product with the tangents.
 template <class... Options>
@@ -53,8 +52,8 @@ at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Te
 
 template <class... Options>
 at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                       at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
-                       bool, Options...) {
+                       at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool,
+                       Options...) {
   return at::empty_symint(b.sym_sizes(), b.options());
 }
 
@@ -70,10 +69,9 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
       for (const at::Tensor& t : argument.toTensorVector()) inputs.push_back(t);
   }
   TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(inputs), kRefusal);
-  const bool record =
-      at::GradMode::is_enabled() && std::any_of(inputs.begin(), inputs.end(), [](const at::Tensor& t) {
-        return t.defined() && t.requires_grad();
-      });
+  const bool record = at::GradMode::is_enabled() && std::any_of(inputs.begin(), inputs.end(), [](const at::Tensor& t) {
+                        return t.defined() && t.requires_grad();
+                      });
   {
     const at::AutoDispatchBelowADInplaceOrView below;
     op.callBoxed(stack);
@@ -90,11 +88,10 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
 
 at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
                         const SolveOptions& options, at::IntArrayRef needed) {
-  static const auto op =
-      c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
-  return call_with_x0(op, options, solved.x0, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
-                           at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-                           at::ArrayRef<double>(a.parameters), a.transposed);
+  static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
+  return call_with_x0(op, options, solved.x0, tangents, solved.b, solved.iterations, solved.status, solved.residual,
+                      needed, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
+                      at::ArrayRef<double>(a.parameters), a.transposed);
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

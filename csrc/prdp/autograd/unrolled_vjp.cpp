@@ -19,14 +19,14 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
-    "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, "
-    PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
+    "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
+    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
+    ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
     "Tensor operator_applications)";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-using Signature =
-    WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                        const at::Tensor&, at::IntArrayRef, at::TensorList,
-                        c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool)>;
+using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                           const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
+                                           at::IntArrayRef, at::ArrayRef<double>, bool)>;
 
 /// Residuals up to so many units of rounding are rounding.
 constexpr double kRoundings = 8.0;
@@ -89,12 +89,12 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
     for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != count || kept[i]);
   };
   const Rows none(batch, false);
-  if (traits(solver.method).is_polynomial)
-    leave_out(solver.max_iter.expect_int(), none);
+  if (traits(solver.method).is_polynomial) leave_out(solver.max_iter.expect_int(), none);
   const int64_t unknowns = solved.b.numel() / batch;
   if (traits(solver.method).ends_at_unknowns &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
-    const auto one_less = solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
+    const auto one_less =
+        solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
     leave_out(unknowns, within_rounding(a, before, [&] { return one_less.u; }));
   }
@@ -149,9 +149,9 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
       if (rows[i] && !exact[i] && !lost[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
     std::vector<int64_t> applications(batch, 0);
     if (caps.any().item<bool>()) {
-      auto found = of_iterations(bar, solved.b, {spec, solved.x0, options.solver,
-                                                 caps.to(solved.iterations.device()), options.checkpoint_every},
-                                 needed);
+      auto found = of_iterations(
+          bar, solved.b,
+          {spec, solved.x0, options.solver, caps.to(solved.iterations.device()), options.checkpoint_every}, needed);
       sum = std::move(found.gradients);
       applications = to_host<int64_t>(found.operator_applications, batch);
     }
@@ -253,10 +253,10 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
 }
 
 template <class... Options>
-Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
-                   const at::Tensor& iterations, const at::Tensor& status, const at::Tensor& residual,
-                   at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                   at::ArrayRef<double> parameters, bool transposed, Options... flat) {
+Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::Tensor& iterations,
+                   const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, at::TensorList tensors,
+                   c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed,
+                   Options... flat) {
   const at::NoGradGuard no_grad;
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
@@ -274,9 +274,9 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b,
 }
 
 template <class... Options>
-Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&,
-                    const at::Tensor&, at::IntArrayRef needed, at::TensorList tensors, c10::string_view,
-                    at::IntArrayRef, at::ArrayRef<double>, bool, Options...) {
+Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                    at::IntArrayRef needed, at::TensorList tensors, c10::string_view, at::IntArrayRef,
+                    at::ArrayRef<double>, bool, Options...) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -291,12 +291,11 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
 
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed) {
-  static const auto op =
-      c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
-  const auto [gradients, iterations, residual, status, applications] = call_with_x0(
-      op, options, solved.x0, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
-      at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-      at::ArrayRef<double>(a.parameters), a.transposed);
+  static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
+  const auto [gradients, iterations, residual, status, applications] =
+      call_with_x0(op, options, solved.x0, cotangent, solved.b, solved.iterations, solved.status, solved.residual,
+                   needed, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
+                   at::ArrayRef<double>(a.parameters), a.transposed);
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
   SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications}};
   for (size_t i = 0, next = 0; i < needed.size(); ++i)
@@ -311,9 +310,7 @@ SolveVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const Solved& solved
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
-  m.impl("unrolled_vjp", static_cast<Signature*>(vjp_kernel));
-}
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("unrolled_vjp", static_cast<Signature*>(vjp_kernel)); }
 TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("unrolled_vjp", static_cast<Signature*>(fake_kernel)); }
 
 }  // namespace prdp

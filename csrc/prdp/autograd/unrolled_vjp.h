@@ -48,7 +48,7 @@ struct UnrolledVjp {
 /// operators that have such loops, and methods that run on all of them.
 bool can_use_tape(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b);
 UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
-                      at::IntArrayRef needed);
+                     at::IntArrayRef needed);
 /// Computes them by autograd, one iteration at a time, in plain tensor operations; for everything else.
 UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                        at::IntArrayRef needed);

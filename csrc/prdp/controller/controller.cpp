@@ -49,9 +49,8 @@ std::string Controller::about_metric() const {
     return text.str();
   }
   if (history.size() <= kGrown) return {};
-  const auto [least, most] = std::minmax_element(history.begin(), history.end(), [](const Record& a, const Record& b) {
-    return a.metric < b.metric;
-  });
+  const auto [least, most] = std::minmax_element(history.begin(), history.end(),
+                                                 [](const Record& a, const Record& b) { return a.metric < b.metric; });
   const double bound = std::max(kGrowth * least->metric, kRoundingOfMetric * most->metric);
   const bool grows =
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });

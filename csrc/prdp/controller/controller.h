@@ -32,7 +32,7 @@ class Controller {
   /// One call of step().
   struct Record {
     double metric;
-    double smoothed;   // L̃, the exponential mean with this metric; of a ToleranceController the smallest error so far
+    double smoothed;  // L̃, the exponential mean with this metric; of a ToleranceController the smallest error so far
     int64_t max_iter;  // K before the decision
     bool refined;
     std::optional<double> error{}, residual{};  // as in Solves

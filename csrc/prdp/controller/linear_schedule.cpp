@@ -6,17 +6,11 @@
 
 namespace prdp {
 
-LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum,
-                               std::optional<double> adjoint_ratio)
-    : initial_(initial),
-      increment_(increment),
-      maximum_(maximum),
-      adjoint_ratio_(adjoint_ratio),
-      state_{initial} {
+LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum, std::optional<double> adjoint_ratio)
+    : initial_(initial), increment_(increment), maximum_(maximum), adjoint_ratio_(adjoint_ratio), state_{initial} {
   TORCH_CHECK_VALUE(initial >= 0, "LinearSchedule: initial must be >= 0, got ", initial);
   TORCH_CHECK_VALUE(increment >= 0, "LinearSchedule: increment must be >= 0, got ", increment);
-  TORCH_CHECK_VALUE(maximum >= initial, "LinearSchedule: maximum must be >= initial = ", initial,
-                    ", got ", maximum);
+  TORCH_CHECK_VALUE(maximum >= initial, "LinearSchedule: maximum must be >= initial = ", initial, ", got ", maximum);
   budget();
 }
 
@@ -35,9 +29,8 @@ bool LinearSchedule::step(double metric, const Solves& solves) {
 }
 
 void LinearSchedule::load_state(State state) {
-  TORCH_CHECK_VALUE(state.max_iter >= initial_ && state.max_iter <= maximum_,
-                    "LinearSchedule: max_iter must lie in [", initial_, ", ", maximum_, "], got ",
-                    state.max_iter);
+  TORCH_CHECK_VALUE(state.max_iter >= initial_ && state.max_iter <= maximum_, "LinearSchedule: max_iter must lie in [",
+                    initial_, ", ", maximum_, "], got ", state.max_iter);
   state_ = std::move(state);
 }
 

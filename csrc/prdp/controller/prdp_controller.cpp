@@ -17,11 +17,10 @@ PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
   TORCH_CHECK_VALUE(s.window >= 1, "PRDPController: window must be >= 1, got ", s.window);
   TORCH_CHECK_VALUE(s.initial >= 0, "PRDPController: initial must be >= 0, got ", s.initial);
   TORCH_CHECK_VALUE(s.increment >= 1, "PRDPController: increment must be >= 1, got ", s.increment);
-  TORCH_CHECK_VALUE(!s.maximum || *s.maximum >= s.initial,
-                    "PRDPController: maximum must be >= initial = ", s.initial, ", got ",
-                    s.maximum.value_or(0));
-  TORCH_CHECK_VALUE(std::isfinite(s.growth) && s.growth >= 1.0,
-                    "PRDPController: growth must be finite and >= 1, got ", s.growth);
+  TORCH_CHECK_VALUE(!s.maximum || *s.maximum >= s.initial, "PRDPController: maximum must be >= initial = ", s.initial,
+                    ", got ", s.maximum.value_or(0));
+  TORCH_CHECK_VALUE(std::isfinite(s.growth) && s.growth >= 1.0, "PRDPController: growth must be finite and >= 1, got ",
+                    s.growth);
   state_.max_iter = s.initial;
   budget();
 }
@@ -69,15 +68,13 @@ bool PRDPController::step(double metric, const Solves& solves) {
 }
 
 void PRDPController::load_state(State state) {
-  TORCH_CHECK_VALUE(state.max_iter >= settings_.initial &&
-                        (!settings_.maximum || state.max_iter <= *settings_.maximum),
-                    "PRDPController: state has max_iter = ", state.max_iter,
-                    ", below initial or above maximum");
-  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "PRDPController: state has checkpoint = ",
-                    state.checkpoint, ", expected >= 0");
+  TORCH_CHECK_VALUE(state.max_iter >= settings_.initial && (!settings_.maximum || state.max_iter <= *settings_.maximum),
+                    "PRDPController: state has max_iter = ", state.max_iter, ", below initial or above maximum");
+  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "PRDPController: state has checkpoint = ", state.checkpoint,
+                    ", expected >= 0");
   for (const auto& record : state.history)
-    TORCH_CHECK_VALUE(std::isfinite(record.metric) && std::isfinite(record.smoothed) &&
-                          record.metric >= 0.0 && record.smoothed >= 0.0,
+    TORCH_CHECK_VALUE(std::isfinite(record.metric) && std::isfinite(record.smoothed) && record.metric >= 0.0 &&
+                          record.smoothed >= 0.0,
                       "PRDPController: state has a metric that is not finite and >= 0");
   state_ = std::move(state);
 }

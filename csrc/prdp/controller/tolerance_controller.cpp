@@ -7,8 +7,7 @@
 
 namespace prdp {
 
-ToleranceController::ToleranceController(ToleranceSettings settings)
-    : settings_(settings), state_{settings.maximum} {
+ToleranceController::ToleranceController(ToleranceSettings settings) : settings_(settings), state_{settings.maximum} {
   const auto& s = settings_;
   TORCH_CHECK_VALUE(s.ratio > 0.0 && s.ratio < 1.0, "ToleranceController: ratio must be > 0 and < 1, got ", s.ratio);
   TORCH_CHECK_VALUE(s.floor > 0.0 && s.floor < 1.0, "ToleranceController: floor must be > 0 and < 1, got ", s.floor);
@@ -42,8 +41,8 @@ bool ToleranceController::step(double error, const Solves& solves) {
 }
 
 void ToleranceController::load_state(State state) {
-  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "ToleranceController: state has a smallest error of ",
-                    state.checkpoint, ", expected >= 0");
+  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "ToleranceController: state has a smallest error of ", state.checkpoint,
+                    ", expected >= 0");
   for (const auto& record : state.history)
     TORCH_CHECK_VALUE(std::isfinite(record.metric) && record.metric >= 0.0,
                       "ToleranceController: state has an error that is not finite and >= 0");

@@ -15,8 +15,8 @@ Grid::Grid(const char* owner, std::vector<int64_t> shape, Boundary boundary, std
     TORCH_CHECK_VALUE(n >= least, owner_, ": every extent of shape must be >= ", least, ", got ",
                       at::IntArrayRef(shape_));
   if (lengths_.empty()) lengths_.assign(shape_.size(), 1.0);
-  TORCH_CHECK_VALUE(lengths_.size() == shape_.size(), owner_, ": length must be one number or one per axis, ",
-                    dim(), " here, got ", at::ArrayRef<double>(lengths_));
+  TORCH_CHECK_VALUE(lengths_.size() == shape_.size(), owner_, ": length must be one number or one per axis, ", dim(),
+                    " here, got ", at::ArrayRef<double>(lengths_));
   for (const double length : lengths_)
     TORCH_CHECK_VALUE(std::isfinite(length) && length > 0.0, owner_, ": length must be finite and > 0, got ",
                       at::ArrayRef<double>(lengths_));
@@ -38,8 +38,7 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
     for (const int64_t n : shape_) expected << ", " << n;
     std::ostringstream got;
     for (size_t i = 0; i < sizes.size(); ++i) got << (i ? ", " : "") << sizes[i];
-    TORCH_CHECK_VALUE(false, owner_, ": expected (batch, ", channels, expected.str(), "), got (",
-                      got.str(), ")");
+    TORCH_CHECK_VALUE(false, owner_, ": expected (batch, ", channels, expected.str(), "), got (", got.str(), ")");
   }
   TORCH_CHECK_TYPE(v.scalar_type() == at::kFloat || v.scalar_type() == at::kDouble, owner_,
                    ": expected float32 or float64, got ", v.scalar_type());
@@ -48,9 +47,7 @@ void Grid::check_field(const at::Tensor& v, int64_t channels) const {
 namespace {
 
 /// Where the grid's axis lies in v.
-int64_t tensor_axis(const at::Tensor& v, const Grid& grid, int64_t axis) {
-  return v.dim() - grid.dim() + axis;
-}
+int64_t tensor_axis(const at::Tensor& v, const Grid& grid, int64_t axis) { return v.dim() - grid.dim() + axis; }
 
 /// v_{i + offset} on a periodic grid.
 at::Tensor neighbour(const at::Tensor& v, const Grid& grid, int64_t axis, int64_t offset) {
@@ -59,8 +56,7 @@ at::Tensor neighbour(const at::Tensor& v, const Grid& grid, int64_t axis, int64_
 
 /// v_{i-1} + v_{i+1}.
 at::Tensor neighbour_sum(const at::Tensor& v, const Grid& grid, int64_t axis) {
-  if (grid.boundary() == Boundary::kPeriodic)
-    return neighbour(v, grid, axis, -1) + neighbour(v, grid, axis, 1);
+  if (grid.boundary() == Boundary::kPeriodic) return neighbour(v, grid, axis, -1) + neighbour(v, grid, axis, 1);
   const int64_t d = tensor_axis(v, grid, axis), n = grid.shape()[axis];
   std::vector<int64_t> pad(2 * (v.dim() - d), 0);
   pad[pad.size() - 2] = pad[pad.size() - 1] = 1;
@@ -72,8 +68,7 @@ at::Tensor neighbour_sum(const at::Tensor& v, const Grid& grid, int64_t axis) {
 
 at::Tensor laplacian(const at::Tensor& v, const Grid& grid) {
   auto sum = laplacian_diagonal(grid) * v;
-  for (int64_t d = 0; d < grid.dim(); ++d)
-    sum = sum + neighbour_sum(v, grid, d) * (1.0 / (grid.dx(d) * grid.dx(d)));
+  for (int64_t d = 0; d < grid.dim(); ++d) sum = sum + neighbour_sum(v, grid, d) * (1.0 / (grid.dx(d) * grid.dx(d)));
   return sum;
 }
 

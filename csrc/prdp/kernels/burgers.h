@@ -13,8 +13,7 @@ Stencil<T> burgers(const UpwindParameters<T>& parameters, int64_t dim) {
     if (!p.is_finite(dim)) return std::nullopt;
     const auto wind = [&p](int64_t channel, int64_t j) { return p.winds + (channel * p.ny + j) * p.nx; };
     const auto winds = [&](int axis, int64_t j, T* scratch) -> WindRow<T> {
-      if (axis == 1)
-        return {wind(1, j > 0 ? j - 1 : p.ny - 1), wind(1, j), wind(1, j + 1 < p.ny ? j + 1 : 0)};
+      if (axis == 1) return {wind(1, j > 0 ? j - 1 : p.ny - 1), wind(1, j), wind(1, j + 1 < p.ny ? j + 1 : 0)};
       const T* w = wind(0, j);
       scratch[0] = w[p.nx - 1];
       std::copy(w, w + p.nx, scratch + 1);

@@ -68,8 +68,7 @@ class LaplacianFactors {
       for (int64_t j = 1; j <= ny_; ++j)
         for (int64_t i = 1; i <= nx_; ++i) {
           // Along one axis, off (v_{i-1} + v_{i+1}) has the eigenvalues 2 off cos(π k / (N + 1)).
-          double value = p.centre + 2.0 * p.off[Dim - 1] * cosine(i, nx_) +
-                         2.0 * p.off[Dim - 2] * cosine(j, ny_);
+          double value = p.centre + 2.0 * p.off[Dim - 1] * cosine(i, nx_) + 2.0 * p.off[Dim - 2] * cosine(j, ny_);
           if constexpr (Dim > 2) value += 2.0 * p.off[0] * cosine(k, nz_);
           inverse_[at++] = static_cast<T>(1.0 / value);
         }
@@ -148,8 +147,8 @@ class CsrFactors {
  public:
   explicit CsrFactors(const Csr<T>& a) : n_(a.unknowns()), singular_(has_empty_line(a)) {
     if (singular_) return;
-    sparse_ = factor_cache::find_or_make<SparseFactors<T>>(
-        a.key(), [&] { return std::make_shared<SparseFactors<T>>(a, n_); });
+    sparse_ = factor_cache::find_or_make<SparseFactors<T>>(a.key(),
+                                                           [&] { return std::make_shared<SparseFactors<T>>(a, n_); });
   }
   bool solve(const T* r, T* d) const {
     if (singular_ || !sparse_->is_regular()) return false;

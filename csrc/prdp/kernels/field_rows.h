@@ -16,9 +16,7 @@ class FieldRows {
   int64_t halo() const { return kLanes<T>; }
 
   /// dst = scale·src, from a contiguous sample into the padded layout; and back.
-  void load(const T* src, T scale, T* dst) const {
-    loops_.copy_rows(scale, src, nx_, dst, row_, fields_ * rows_, nx_);
-  }
+  void load(const T* src, T scale, T* dst) const { loops_.copy_rows(scale, src, nx_, dst, row_, fields_ * rows_, nx_); }
   void store(const T* src, T scale, T* dst) const {
     loops_.copy_rows(scale, src, row_, dst, nx_, fields_ * rows_, nx_);
   }

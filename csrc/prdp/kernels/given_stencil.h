@@ -51,8 +51,7 @@ struct GivenStencil {
   void add(StencilRows<T>& a, int64_t k, const T* from, bool holds) const {
     const auto& [nz, ny, nx] = pattern->grid.shape;
     const auto along = [&](int axis) {
-      return runs(pattern->offsets[k].along[axis], pattern->grid.shape[axis], pattern->grid.periodic[axis],
-                  transposed);
+      return runs(pattern->offsets[k].along[axis], pattern->grid.shape[axis], pattern->grid.periodic[axis], transposed);
     };
     const auto& loops = kernels::loops<T>();
     for (const Run& z : along(0))

@@ -69,8 +69,7 @@ struct Loops {
   /// max |x_i|; NaN or Inf if any x_i is not finite; any n.
   T (*largest_magnitude)(const T* x, int64_t n);
   /// to = factor·from for rows of n values, which lie `stride` apart.
-  void (*copy_rows)(T factor, const T* from, int64_t from_stride, T* to, int64_t to_stride, int64_t rows,
-                    int64_t n);
+  void (*copy_rows)(T factor, const T* from, int64_t from_stride, T* to, int64_t to_stride, int64_t rows, int64_t n);
   /// Σ a_i b_i; any n.
   T (*dot)(const T* a, const T* b, int64_t n);
   /// out = factor·x; out may be x. From here on n is that of padded vectors where not said otherwise.
@@ -101,8 +100,8 @@ struct Loops {
   /// Upwind differences and diffusion along one axis: advection (max(w⁻, 0) B + min(w⁺, 0) F) plus
   /// diffusion times minus the second difference, with w⁻ and w⁺ the means of the winds here and on
   /// either side. Sets lower and upper, adds to centre; any n.
-  void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower,
-                     T* upper, T* centre, int64_t n);
+  void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower, T* upper,
+                     T* centre, int64_t n);
   /// By the number of dimensions less one. out = A v; dots += {v·out, ‖out‖²} unless it is null.
   void (*apply_neighbours[3])(const NeighbourStencil<T>& a, const T* v, T* out, T* dots);
   void (*apply_offsets)(const OffsetStencil<T>& a, const T* v, T* out, T* dots);

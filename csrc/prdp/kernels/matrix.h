@@ -112,10 +112,15 @@ class Dense : public MatrixBase<T, Dense<T>> {
 template <class T>
 class Csr : public MatrixBase<T, Csr<T>> {
  public:
-  Csr(const int64_t* crow, const int64_t* col, const T* values, int64_t n, int64_t stored,
-      bool is_shared, bool transposed)
-      : MatrixBase<T, Csr<T>>(n), crow_(crow), col_(col), values_(values), stored_(stored),
-        is_shared_(is_shared), transposed_(transposed) {
+  Csr(const int64_t* crow, const int64_t* col, const T* values, int64_t n, int64_t stored, bool is_shared,
+      bool transposed)
+      : MatrixBase<T, Csr<T>>(n),
+        crow_(crow),
+        col_(col),
+        values_(values),
+        stored_(stored),
+        is_shared_(is_shared),
+        transposed_(transposed) {
     if (!is_shared) return;
     diagonal_.assign(n, T(0));
     for_each_entry([&](int64_t i, int64_t j, T a) { diagonal_[i] += i == j ? a : T(0); });
@@ -123,8 +128,7 @@ class Csr : public MatrixBase<T, Csr<T>> {
 
   Csr sample(int64_t s) const {
     if (is_shared_) return *this;
-    return {crow_ + s * (n_ + 1), col_ + s * stored_, values_ + s * stored_, n_, stored_, true,
-            transposed_};
+    return {crow_ + s * (n_ + 1), col_ + s * stored_, values_ + s * stored_, n_, stored_, true, transposed_};
   }
   bool is_shared() const { return is_shared_; }
   /// As Dense has them.

@@ -18,7 +18,9 @@ class NavierStokes : public FieldRows<T> {
 
  public:
   explicit NavierStokes(const UpwindParameters<T>& p)
-      : Base(3, p.ny, p.nx), parameters_(p), inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
+      : Base(3, p.ny, p.nx),
+        parameters_(p),
+        inverse_dx_(inverse_spacing(p.nx, p.length_x, p.transposed)),
         inverse_dy_(inverse_spacing(p.ny, p.length_y, p.transposed)) {
     if (!is_shared() || !p.is_finite(2)) return;
     const auto pattern = p.pattern(2);
@@ -64,9 +66,7 @@ class NavierStokes : public FieldRows<T> {
     for (int64_t j = 0; j < ny(); ++j) loops_.axpy(-mean, weight(kOne), pressure(v, j), row_);
   }
   /// Norm of what project() takes off: how far a right-hand side v is from having a solution.
-  T inconsistency(const T* v) const {
-    return std::abs(pressure_mean(v)) * std::sqrt(static_cast<T>(ny() * nx()));
-  }
+  T inconsistency(const T* v) const { return std::abs(pressure_mean(v)) * std::sqrt(static_cast<T>(ny() * nx())); }
 
   /// Calls body(row, column, value) for the entries of A as applied; those that coincide one by one.
   template <class Body>
@@ -122,8 +122,7 @@ class NavierStokes : public FieldRows<T> {
   }
   T pressure_mean(const T* v) const {
     double sum = 0;
-    for (int64_t j = 0; j < ny(); ++j)
-      sum += static_cast<double>(loops_.dot(pressure(v, j), weight(kOne), row_));
+    for (int64_t j = 0; j < ny(); ++j) sum += static_cast<double>(loops_.dot(pressure(v, j), weight(kOne), row_));
     return static_cast<T>(sum / static_cast<double>(ny() * nx()));
   }
 

@@ -55,8 +55,7 @@ Register<T> lanes_from(const Register<T>& a, const Register<T>& b) {
   const auto low = reinterpret_cast<__m512i>(a), high = reinterpret_cast<__m512i>(b);
   if constexpr (sizeof(T) == 4)
     return reinterpret_cast<Register<T>>(_mm512_maskz_alignr_epi32(0xffff, high, low, First));
-  else
-    return reinterpret_cast<Register<T>>(_mm512_maskz_alignr_epi64(0xff, high, low, First));
+  else return reinterpret_cast<Register<T>>(_mm512_maskz_alignr_epi64(0xff, high, low, First));
 #else
   return lanes_from<First>(a, b, std::make_integer_sequence<int, kWidth<T>>());
 #endif

@@ -20,8 +20,7 @@ class SparseFactors {
   SparseFactors(const Kernel& kernel, int64_t n) {
     std::vector<Eigen::Triplet<T>> entries;
     kernel.for_each_entry([&](int64_t i, int64_t j, auto value) {
-      if (i < n && j < n)
-        entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<T>(value));
+      if (i < n && j < n) entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<T>(value));
     });
     Matrix m(n, n);
     m.setFromTriplets(entries.begin(), entries.end());
@@ -40,9 +39,9 @@ class SparseFactors {
     return lu_->solve(rhs);
   }
   int64_t bytes() const {
-    const int64_t stored = cholesky_           ? cholesky_->matrixL().nestedExpression().nonZeros()
+    const int64_t stored = cholesky_      ? cholesky_->matrixL().nestedExpression().nonZeros()
                            : is_regular() ? int64_t{lu_->nnzL()} + lu_->nnzU()
-                                               : 0;
+                                          : 0;
     return stored * static_cast<int64_t>(sizeof(T) + sizeof(int));
   }
 

@@ -17,8 +17,10 @@ class Stencil : public FieldRows<T> {
   using Assemble = std::function<std::optional<StencilRows<T>>(int64_t sample)>;
 
   Stencil(const StencilGrid& grid, int64_t channels, bool is_shared, Assemble assemble)
-      : FieldRows<T>(channels, grid.shape[0] * grid.shape[1], grid.shape[2]), grid_(grid),
-        is_shared_(is_shared), assemble_(std::move(assemble)) {
+      : FieldRows<T>(channels, grid.shape[0] * grid.shape[1], grid.shape[2]),
+        grid_(grid),
+        is_shared_(is_shared),
+        assemble_(std::move(assemble)) {
     if (is_shared) coefficients_ = assemble_(0);
   }
   Stencil sample(int64_t s) const {
@@ -26,9 +28,7 @@ class Stencil : public FieldRows<T> {
   }
   bool is_shared() const { return is_shared_; }
   bool operator_is_finite() const { return !is_shared_ || coefficients_.has_value(); }
-  double norm() const {
-    return coefficients_ ? coefficients_->norm() : std::numeric_limits<double>::quiet_NaN();
-  }
+  double norm() const { return coefficients_ ? coefficients_->norm() : std::numeric_limits<double>::quiet_NaN(); }
   int64_t channels() const { return this->fields_; }
   /// Of one channel.
   const StencilRows<T>& coefficients() const { return *coefficients_; }

@@ -21,8 +21,11 @@ class CyclicThomas {
     std::vector<double> pivot(n_), border(n_);
     // Where n is 2 or 3, entries coincide and add up.
     a.for_each_entry([&](int64_t i, int64_t j, T value) {
-      double& entry = i == last ? (j == last ? corner : border[j])
-                      : j == last ? column_[i] : j < i ? lower_[i] : j > i ? upper_[i] : pivot[i];
+      double& entry = i == last   ? (j == last ? corner : border[j])
+                      : j == last ? column_[i]
+                      : j < i     ? lower_[i]
+                      : j > i     ? upper_[i]
+                                  : pivot[i];
       entry += static_cast<double>(value);
     });
     is_dominant_ = is_dominant(pivot, border, corner, 8.0 * std::numeric_limits<T>::epsilon());
@@ -66,8 +69,7 @@ class CyclicThomas {
 
   /// v ← M⁻¹ v; leaves the last one alone.
   void solve_tridiagonal(double* v) const {
-    for (int64_t i = 0; i + 1 < n_; ++i)
-      v[i] = (v[i] - (i > 0 ? lower_[i] * v[i - 1] : 0.0)) * inverse_pivot_[i];
+    for (int64_t i = 0; i + 1 < n_; ++i) v[i] = (v[i] - (i > 0 ? lower_[i] * v[i - 1] : 0.0)) * inverse_pivot_[i];
     for (int64_t i = n_ - 3; i >= 0; --i) v[i] -= inverse_pivot_[i] * upper_[i] * v[i + 1];
   }
   double border_product(const double* v) const {

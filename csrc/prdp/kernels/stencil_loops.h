@@ -1,15 +1,15 @@
 #pragma once
 #include "prdp/kernels/vector_loops.h"
 
-/// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and for the same reason
-/// all of internal linkage.
+/// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and for the
+/// same reason all of internal linkage.
 namespace prdp::kernels {
 
 namespace {
 
 template <class T>
-void upwind_row(T advection, T diffusion, const T* before, const T* here, const T* after,
-                T* __restrict lower, T* __restrict upper, T* __restrict centre, int64_t n) {
+void upwind_row(T advection, T diffusion, const T* before, const T* here, const T* after, T* __restrict lower,
+                T* __restrict upper, T* __restrict centre, int64_t n) {
   const T half = advection / 2;
   for (int64_t i = 0; i < n; ++i) {
     const T sum_before = before[i] + here[i], sum_after = here[i] + after[i];
@@ -50,11 +50,15 @@ struct NeighbourRow {
   Line<T> line;
 
   NeighbourRow(const NeighbourStencil<T>& stencil, int64_t z, int64_t j, const T* field)
-      : a(stencil), row(a.row), last((a.nx - 1) / kWidth<T> * kWidth<T>),
+      : a(stencil),
+        row(a.row),
+        last((a.nx - 1) / kWidth<T> * kWidth<T>),
         w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
         ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
-        below(field + (z * a.ny + round(j - 1, a.ny)) * row), above(field + (z * a.ny + round(j + 1, a.ny)) * row),
-        back(field + (round(z - 1, a.nz) * a.ny + j) * row), front(field + (round(z + 1, a.nz) * a.ny + j) * row),
+        below(field + (z * a.ny + round(j - 1, a.ny)) * row),
+        above(field + (z * a.ny + round(j + 1, a.ny)) * row),
+        back(field + (round(z - 1, a.nz) * a.ny + j) * row),
+        front(field + (round(z + 1, a.nz) * a.ny + j) * row),
         line(field + (z * a.ny + j) * row) {}
 
   /// A v at register i, but for the ends.
@@ -127,8 +131,7 @@ void for_each_register(const OffsetStencil<T>& a, const T* v, T* out, Body& shar
         const auto& wrap = a.wraps[e];
         row[wrap.to] += wrap_values[e] * from[wrap.coefficient][wrap.from];
       }
-      for (int64_t i = 0; i < a.row; i += kWidth<T>)
-        body.finish(at + i, load(v + at + i), load(row + i), w + i);
+      for (int64_t i = 0; i < a.row; i += kWidth<T>) body.finish(at + i, load(v + at + i), load(row + i), w + i);
     }
   shared = body;
 }

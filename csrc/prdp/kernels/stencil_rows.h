@@ -17,11 +17,13 @@ class StencilRows {
  public:
   /// All zero; `pattern` says which neighbours there are.
   explicit StencilRows(std::shared_ptr<const StencilPattern> pattern)
-      : pattern_(std::move(pattern)), nx_(pattern_->grid.shape[2]), row_(round_up_to_lanes<T>(nx_)),
+      : pattern_(std::move(pattern)),
+        nx_(pattern_->grid.shape[2]),
+        row_(round_up_to_lanes<T>(nx_)),
         count_(static_cast<int64_t>(pattern_->offsets.size())),
-        coupled_(!pattern_->grid.periodic[2]   ? 0
-                 : pattern_->nearest           ? 2 * kLanes<T>
-                                               : static_cast<int64_t>(pattern_->wraps.size())),
+        coupled_(!pattern_->grid.periodic[2] ? 0
+                 : pattern_->nearest         ? 2 * kLanes<T>
+                                             : static_cast<int64_t>(pattern_->wraps.size())),
         memory_(rows() * (count_ * row_ + coupled_) + kLanes<T>, T(0)) {
     const auto address = reinterpret_cast<std::uintptr_t>(memory_.data());
     coefficients_ = reinterpret_cast<T*>((address + 63) / 64 * 64);
@@ -80,8 +82,11 @@ class StencilRows {
   std::string key() const {
     const auto& g = grid();
     std::string key;
-    factor_cache::append(key, std::array{g.shape[0], g.shape[1], g.shape[2], int64_t{g.periodic[0]},
-                                         int64_t{g.periodic[1]}, int64_t{g.periodic[2]}, count_}.data(), 7);
+    factor_cache::append(key,
+                         std::array{g.shape[0], g.shape[1], g.shape[2], int64_t{g.periodic[0]}, int64_t{g.periodic[1]},
+                                    int64_t{g.periodic[2]}, count_}
+                             .data(),
+                         7);
     factor_cache::append(key, pattern_->offsets.data(), count_);
     factor_cache::append(key, coefficients_, rows() * (stride() + coupled_));
     return key;
@@ -131,8 +136,9 @@ class StencilRows {
   T* coupled(int64_t r) { return coefficients_ + rows() * stride() + r * coupled_; }
   OffsetStencil<T> offsets() const {
     const auto& n = grid().shape;
-    return {n[0], n[1], nx_, row_, count_, pattern_->offsets.data(), coefficients_, coupled_,
-            pattern_->wraps.data(), coupled(0)};
+    return {
+        n[0],      n[1], nx_, row_, count_, pattern_->offsets.data(), coefficients_, coupled_, pattern_->wraps.data(),
+        coupled(0)};
   }
 
   /// What couples point i to the one at offset x along its own row, which leaves the row.

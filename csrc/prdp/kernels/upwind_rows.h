@@ -24,9 +24,7 @@ struct UpwindParameters {
     return p;
   }
   /// max(w, 0) loses a NaN: it must be seen here.
-  bool is_finite(int64_t channels) const {
-    return std::isfinite(largest_magnitude(winds, channels * ny * nx));
-  }
+  bool is_finite(int64_t channels) const { return std::isfinite(largest_magnitude(winds, channels * ny * nx)); }
   std::shared_ptr<const StencilPattern> pattern(int64_t dim) const {
     return std::make_shared<StencilPattern>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
                                             StencilPattern::nearest_neighbours(dim));
@@ -64,8 +62,8 @@ StencilRows<T> upwind_rows(std::shared_ptr<const StencilPattern> pattern, const 
     const auto couple = [&](int axis, double per_cell, T* below, T* above) {
       const WindRow<T> w = winds(axis, j, winds_memory);
       loops.upwind_row(static_cast<T>(terms.advection * per_cell),
-                       static_cast<T>(terms.diffusion * per_cell * per_cell), w.before, w.here, w.after,
-                       below, above, a.coefficient(j, 0), nx);
+                       static_cast<T>(terms.diffusion * per_cell * per_cell), w.before, w.here, w.after, below, above,
+                       a.coefficient(j, 0), nx);
     };
     std::fill_n(a.coefficient(j, 0), nx, static_cast<T>(terms.shift));
     // What couples a point to its neighbour belongs to the neighbour in the transpose.

@@ -12,8 +12,7 @@ namespace prdp::kernels {
 
 /// A singular operator that knows its null space: the kernel's project() takes it off a vector.
 template <class Kernel>
-inline constexpr bool kHasNullSpace =
-    requires(const Kernel& a, typename Kernel::Scalar* v) { a.project(v); };
+inline constexpr bool kHasNullSpace = requires(const Kernel& a, typename Kernel::Scalar* v) { a.project(v); };
 
 /// Whether the spectrum of I - D⁻¹A is known; there it is symmetric, so that norms of Jacobi's residuals
 /// are a convex sequence on a logarithmic scale.
@@ -63,9 +62,7 @@ class Workspace {
     for (int64_t i = 0; i < count; ++i) clear(i);
   }
   /// Zeroes a vector with its halos.
-  void clear(int64_t index) {
-    std::memset(vector(index) - halo_, 0, static_cast<size_t>(used_) * sizeof(T));
-  }
+  void clear(int64_t index) { std::memset(vector(index) - halo_, 0, static_cast<size_t>(used_) * sizeof(T)); }
   int64_t count() const { return count_; }
 
   T* vector(int64_t index) {

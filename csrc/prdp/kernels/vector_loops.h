@@ -80,9 +80,8 @@ template <class T>
 T multi_axpy(T sign, const T* alpha, const T* const* v, int64_t count, T* w, int64_t n) {
   if (count == 0) return dot(w, w, n);
   T norm2 = 0;
-  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) {
-    norm2 = axpy_block<size.value>(sign, alpha + j, v + j, w, n);
-  });
+  for_each_block<kBlock>(0, count,
+                         [&](int64_t j, auto size) { norm2 = axpy_block<size.value>(sign, alpha + j, v + j, w, n); });
   return norm2;
 }
 

@@ -45,8 +45,7 @@ ResNetImpl::ResNetImpl(int64_t dim, int64_t channels, int64_t blocks, int64_t wi
 
 torch::Tensor ResNetImpl::forward(const torch::Tensor& u) {
   auto x = lift_.forward(u);
-  for (size_t i = 0; i < blocks_->size(); ++i)
-    x = (x + blocks_->ptr<torch::nn::SequentialImpl>(i)->forward(x)).relu();
+  for (size_t i = 0; i < blocks_->size(); ++i) x = (x + blocks_->ptr<torch::nn::SequentialImpl>(i)->forward(x)).relu();
   return project_.forward(x);
 }
 

@@ -14,7 +14,8 @@ TensorMap read(std::string_view bytes) {
   try {
     return unpack(bytes);
   } catch (const c10::ValueError&) {
-    TORCH_CHECK_VALUE(false, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it");
+    TORCH_CHECK_VALUE(false,
+                      "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it");
   }
 }
 
@@ -23,8 +24,8 @@ const at::Tensor& found(const TensorMap& state, const std::string& name, const a
   const auto entry = state.find(name);
   TORCH_CHECK_VALUE(entry != state.end(), "weights: there is no tensor '", name, "'");
   const auto& tensor = entry->second;
-  TORCH_CHECK_VALUE(tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(),
-                    "weights: '", name, "' must be ", wanted.scalar_type(), " of sizes ", wanted.sizes());
+  TORCH_CHECK_VALUE(tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(), "weights: '",
+                    name, "' must be ", wanted.scalar_type(), " of sizes ", wanted.sizes());
   return tensor;
 }
 

@@ -12,8 +12,8 @@ at::Tensor negative_part_slope(const at::Tensor& w) { return 0.5 * (1.0 - w.sign
 
 }  // namespace
 
-AdvectionDiffusion::AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> winds, at::Tensor nu,
-                                       double alpha, double beta)
+AdvectionDiffusion::AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> winds, at::Tensor nu, double alpha,
+                                       double beta)
     : grid_(grid), winds_(std::move(winds)), nu_(std::move(nu)), alpha_(alpha), beta_(beta) {
   for (const auto& w : winds_) inflow_.push_back({positive_part(w.lower), negative_part(w.upper)});
 }
@@ -21,8 +21,8 @@ AdvectionDiffusion::AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> 
 at::Tensor AdvectionDiffusion::apply(const at::Tensor& v) const {
   auto sum = -nu_ * laplacian(v, grid_);
   for (int64_t d = 0; d < grid_.dim(); ++d)
-    sum = sum + inflow_[d].lower * backward_difference(v, grid_, d) +
-          inflow_[d].upper * forward_difference(v, grid_, d);
+    sum =
+        sum + inflow_[d].lower * backward_difference(v, grid_, d) + inflow_[d].upper * forward_difference(v, grid_, d);
   return alpha_ * v + beta_ * sum;
 }
 
@@ -30,20 +30,18 @@ at::Tensor AdvectionDiffusion::apply_transpose(const at::Tensor& v) const {
   // Bᵀ = -F, Fᵀ = -B
   auto sum = -nu_ * laplacian(v, grid_);
   for (int64_t d = 0; d < grid_.dim(); ++d)
-    sum = sum - forward_difference(inflow_[d].lower * v, grid_, d) -
-          backward_difference(inflow_[d].upper * v, grid_, d);
+    sum =
+        sum - forward_difference(inflow_[d].lower * v, grid_, d) - backward_difference(inflow_[d].upper * v, grid_, d);
   return alpha_ * v + beta_ * sum;
 }
 
 at::Tensor AdvectionDiffusion::diagonal() const {
   auto sum = -nu_ * laplacian_diagonal(grid_);
-  for (int64_t d = 0; d < grid_.dim(); ++d)
-    sum = sum + (inflow_[d].lower - inflow_[d].upper) * (1.0 / grid_.dx(d));
+  for (int64_t d = 0; d < grid_.dim(); ++d) sum = sum + (inflow_[d].lower - inflow_[d].upper) * (1.0 / grid_.dx(d));
   return alpha_ + beta_ * sum;
 }
 
-AdvectionDiffusion::Gradients AdvectionDiffusion::product_rule(const at::Tensor& lambda,
-                                                               const at::Tensor& u) const {
+AdvectionDiffusion::Gradients AdvectionDiffusion::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto weight = beta_ * lambda;
   Gradients gradients{{}, -(weight * laplacian(u, grid_)).sum()};
   const auto over_channels = [](const at::Tensor& t) { return t.sum(1, /*keepdim=*/true); };

@@ -15,8 +15,7 @@ struct AxisWinds {
 class AdvectionDiffusion {
  public:
   /// `winds` in the order of the grid's axes.
-  AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> winds, at::Tensor nu, double alpha,
-                     double beta);
+  AdvectionDiffusion(const Grid& grid, std::vector<AxisWinds> winds, at::Tensor nu, double alpha, double beta);
 
   at::Tensor apply(const at::Tensor& v) const;
   at::Tensor apply_transpose(const at::Tensor& v) const;

@@ -6,8 +6,7 @@ namespace prdp {
 
 BurgersOperator::BurgersOperator(const OperatorSpec& spec)
     : FlowOperator("Burgers", spec, static_cast<int64_t>(spec.shape.size())) {
-  TORCH_CHECK_VALUE(grid_.dim() <= 2, "Burgers: shape must have 1 or 2 extents, got ",
-                    at::IntArrayRef(grid_.shape()));
+  TORCH_CHECK_VALUE(grid_.dim() <= 2, "Burgers: shape must have 1 or 2 extents, got ", at::IntArrayRef(grid_.shape()));
   grid_.check_field(winds_, channels_);
 }
 
@@ -21,8 +20,7 @@ const AdvectionDiffusion& BurgersOperator::block() const {
   return *made_;
 }
 
-std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda,
-                                                      const at::Tensor& u) const {
+std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto [faces, nu] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;
   for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed

@@ -30,9 +30,7 @@ inline bool nobody_watches() {
 
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }
-inline bool any_tangent(at::TensorList tensors) {
-  return std::any_of(tensors.begin(), tensors.end(), has_tangent);
-}
+inline bool any_tangent(at::TensorList tensors) { return std::any_of(tensors.begin(), tensors.end(), has_tangent); }
 
 /// Whether a transform of torch.func is running.
 inline bool in_torch_func() { return at::functorch::maybeCurrentDynamicLayer().has_value(); }
@@ -55,9 +53,9 @@ std::vector<at::Tensor> for_each_cotangent(const at::Tensor& cotangents, const B
   }
   std::vector<at::Tensor> joined;
   for (const auto& of_input : found)
-    joined.push_back(of_input.empty() ? at::Tensor()
-                                      : physical.getPhysicalToLogicalMap().apply(
-                                            at::stack(of_input).unflatten(0, sizes)));
+    joined.push_back(of_input.empty()
+                         ? at::Tensor()
+                         : physical.getPhysicalToLogicalMap().apply(at::stack(of_input).unflatten(0, sizes)));
   return joined;
 }
 

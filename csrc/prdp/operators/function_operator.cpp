@@ -34,8 +34,8 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
   TORCH_CHECK_VALUE(result.device() == v.device(), "Function: ", name, " must return a tensor on ", v.device(),
                     ", got one on ", result.device());
   TORCH_CHECK_VALUE(result.sizes() == v.sizes() && result.scalar_type() == v.scalar_type(), "Function: ", name,
-                    " must return what it was given, ", v.sizes(), " in ", v.scalar_type(), ", got ",
-                    result.sizes(), " in ", result.scalar_type());
+                    " must return what it was given, ", v.sizes(), " in ", v.scalar_type(), ", got ", result.sizes(),
+                    " in ", result.scalar_type());
   return result;
 }
 
@@ -171,15 +171,17 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
     return torch::autograd::grad({at_zero->product}, {at_zero->point}, {create_graph ? v : v.detach()},
                                  /*retain_graph=*/true, create_graph, /*allow_unused=*/true)[0];
   });
-  TORCH_CHECK_VALUE(found.defined(), "Function: torch cannot differentiate matvec with respect to its vector; make "
-                                     "it of torch operations, or give transpose");
+  TORCH_CHECK_VALUE(found.defined(),
+                    "Function: torch cannot differentiate matvec with respect to its vector; make "
+                    "it of torch operations, or give transpose");
   return found;
 }
 
 at::Tensor FunctionOperator::diagonal() const {
   const auto& function = registered_->products().diagonal;
-  TORCH_CHECK_VALUE(function, "Function: its diagonal, which Jacobi and preconditioner=\"diagonal\" divide by, is not "
-                              "known; give diagonal, or take another method");
+  TORCH_CHECK_VALUE(function,
+                    "Function: its diagonal, which Jacobi and preconditioner=\"diagonal\" divide by, is not "
+                    "known; give diagonal, or take another method");
   const auto found = function(tensors_);
   TORCH_CHECK_TYPE(found.defined() && at::isFloatingType(found.scalar_type()),
                    "Function: diagonal must return a real tensor");
@@ -219,8 +221,8 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
     if (wanted.empty()) return gradients;
     const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, "matvec");
     if (!made.requires_grad()) return gradients;
-    const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()},
-                                             create_graph, create_graph, /*allow_unused=*/true);
+    const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()}, create_graph,
+                                             create_graph, /*allow_unused=*/true);
     for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
       if (arguments[i].requires_grad()) gradients[i] = found[next++];
     return gradients;

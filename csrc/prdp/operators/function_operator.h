@@ -76,8 +76,8 @@ class FunctionOperator final : public Operator {
  private:
   /// Whether a transform of torch.func runs, or a tensor belongs to one.
   bool in_transform(const at::Tensor& v) const;
-  at::Tensor product(const Products::Product& function, const at::Tensor& v,
-                     const std::vector<at::Tensor>& tensors, const char* name) const;
+  at::Tensor product(const Products::Product& function, const at::Tensor& v, const std::vector<at::Tensor>& tensors,
+                     const char* name) const;
   at::Tensor product_without_captures(const at::Tensor& v) const;
   at::Tensor derivative_transposed(const at::Tensor& v) const;
 

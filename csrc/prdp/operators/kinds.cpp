@@ -31,8 +31,6 @@ const std::vector<OperatorKind> kKinds{
 
 }  // namespace
 
-const OperatorKind& operator_kind(const std::string& kind) {
-  return row_of(kKinds, "operator", kind);
-}
+const OperatorKind& operator_kind(const std::string& kind) { return row_of(kKinds, "operator", kind); }
 
 }  // namespace prdp

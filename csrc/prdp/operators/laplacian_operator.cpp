@@ -51,12 +51,9 @@ HeatOperator::HeatOperator(const OperatorSpec& spec)
     : LaplacianOperator(Grid("Heat", spec.shape, Boundary::kDirichlet, lengths_of(spec, 1))),
       step_("Heat", spec, 1, "one tensor, nu") {}
 
-at::Tensor HeatOperator::apply(const at::Tensor& v) const {
-  return v - (step_.nu * step_.dt) * laplacian(v, grid_);
-}
+at::Tensor HeatOperator::apply(const at::Tensor& v) const { return v - (step_.nu * step_.dt) * laplacian(v, grid_); }
 
-std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda,
-                                                   const at::Tensor& u) const {
+std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, u - ν Δt L u⟩/∂ν = -Δt ⟨λ, L u⟩
   const auto derivative = (lambda * laplacian(u, grid_)).sum() * -step_.dt;
   return {derivative.to(step_.nu.options())};

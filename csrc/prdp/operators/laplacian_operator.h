@@ -40,9 +40,7 @@ class PoissonOperator final : public LaplacianOperator {
   std::unique_ptr<Operator> select(const at::Tensor&) const override {
     return std::make_unique<PoissonOperator>(*this);
   }
-  std::vector<at::Tensor> product_rule(const at::Tensor&, const at::Tensor&) const override {
-    return {};
-  }
+  std::vector<at::Tensor> product_rule(const at::Tensor&, const at::Tensor&) const override { return {}; }
 
  private:
   Coefficients coefficients() const override { return {0.0, 1.0}; }
@@ -56,9 +54,7 @@ class HeatOperator final : public LaplacianOperator {
   explicit HeatOperator(const OperatorSpec& spec);
   void check_parameters() const override { step_.check_values(); }
   at::Tensor apply(const at::Tensor& v) const override;
-  std::unique_ptr<Operator> select(const at::Tensor&) const override {
-    return std::make_unique<HeatOperator>(*this);
-  }
+  std::unique_ptr<Operator> select(const at::Tensor&) const override { return std::make_unique<HeatOperator>(*this); }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
 
  private:

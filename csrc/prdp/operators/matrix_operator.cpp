@@ -10,25 +10,23 @@ namespace {
 
 /// b must be (batch, n), of the matrix's dtype and device; `batched` tells whether A has a batch axis.
 void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t n, bool batched) {
-  TORCH_CHECK_VALUE(b.dim() == 2 && b.size(1) == n, "linear_solve: a matrix of ", n,
-                    " rows needs b of shape (", n, ",) or (batch, ", n, "), got ", b.sizes());
-  TORCH_CHECK_VALUE(!batched || b.size(0) == values.size(0), "linear_solve: A holds ",
-                    values.size(0), " matrices, b holds ", b.size(0), " right-hand sides");
+  TORCH_CHECK_VALUE(b.dim() == 2 && b.size(1) == n, "linear_solve: a matrix of ", n, " rows needs b of shape (", n,
+                    ",) or (batch, ", n, "), got ", b.sizes());
+  TORCH_CHECK_VALUE(!batched || b.size(0) == values.size(0), "linear_solve: A holds ", values.size(0),
+                    " matrices, b holds ", b.size(0), " right-hand sides");
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
                    "linear_solve: expected float32 or float64, got ", b.scalar_type());
-  TORCH_CHECK_TYPE(b.scalar_type() == values.scalar_type(), "linear_solve: A is ",
-                   values.scalar_type(), " but b is ", b.scalar_type());
-  TORCH_CHECK_VALUE(b.device() == values.device(), "linear_solve: A is on ", values.device(),
-                    " but b is on ", b.device());
+  TORCH_CHECK_TYPE(b.scalar_type() == values.scalar_type(), "linear_solve: A is ", values.scalar_type(), " but b is ",
+                   b.scalar_type());
+  TORCH_CHECK_VALUE(b.device() == values.device(), "linear_solve: A is on ", values.device(), " but b is on ",
+                    b.device());
 }
 
 at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
   return at::matmul(matrix, v.unsqueeze(-1)).squeeze(-1);
 }
 
-void check_has_rows(const c10::SymInt& n) {
-  TORCH_CHECK_VALUE(n >= 1, "linear_solve: A must have at least one row");
-}
+void check_has_rows(const c10::SymInt& n) { TORCH_CHECK_VALUE(n >= 1, "linear_solve: A must have at least one row"); }
 
 /// Raises ValueError unless these are the compressed rows of an n × n matrix: crow (n + 1), col (nnz).
 void check_rows(const int64_t* crow, const int64_t* col, int64_t n, int64_t stored) {
@@ -58,8 +56,7 @@ DenseOperator::DenseOperator(const OperatorSpec& spec) {
   matrix_ = spec.tensors[0];
   const auto dim = matrix_.dim();
   TORCH_CHECK_VALUE((dim == 2 || dim == 3) && matrix_.sym_size(-1) == matrix_.sym_size(-2),
-                    "linear_solve: A must have shape (n, n) or (batch, n, n), got ",
-                    matrix_.sym_sizes());
+                    "linear_solve: A must have shape (n, n) or (batch, n, n), got ", matrix_.sym_sizes());
   check_has_rows(matrix_.sym_size(-1));
 }
 
@@ -68,21 +65,14 @@ void DenseOperator::check_vector(const at::Tensor& b) const {
 }
 
 at::Tensor DenseOperator::apply(const at::Tensor& v) const { return matvec(matrix_, v); }
-at::Tensor DenseOperator::apply_transpose(const at::Tensor& v) const {
-  return matvec(matrix_.mT(), v);
-}
+at::Tensor DenseOperator::apply_transpose(const at::Tensor& v) const { return matvec(matrix_.mT(), v); }
 at::Tensor DenseOperator::diagonal() const { return matrix_.diagonal(0, -2, -1); }
 at::Tensor DenseOperator::norm() const { return matrix_.abs().sum(-1).amax(-1); }
 
-at::Tensor DenseOperator::solve_directly(const at::Tensor& b) const {
-  return solve_matrix(matrix_, b);
-}
-at::Tensor DenseOperator::solve_transpose_directly(const at::Tensor& b) const {
-  return solve_matrix(matrix_.mT(), b);
-}
+at::Tensor DenseOperator::solve_directly(const at::Tensor& b) const { return solve_matrix(matrix_, b); }
+at::Tensor DenseOperator::solve_transpose_directly(const at::Tensor& b) const { return solve_matrix(matrix_.mT(), b); }
 
-std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda,
-                                                    const at::Tensor& u) const {
+std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
   if (matrix_.dim() == 2) return {at::matmul(lambda.mT(), u)};
   if (matrix_.sym_size(0) == 1) return {at::matmul(lambda.mT(), u).unsqueeze(0)};
@@ -110,11 +100,13 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
   for (const auto* index : {&crow, &col})
     TORCH_CHECK_TYPE(index->scalar_type() == at::kInt || index->scalar_type() == at::kLong,
                      "linear_solve: indices of a CSR matrix must be int32 or int64, got ", index->scalar_type());
-  TORCH_CHECK_VALUE(col.sym_sizes() == values_.sym_sizes(), "linear_solve: a CSR matrix needs as many columns as "
-                    "values, got ", col.sym_sizes(), " and ", values_.sym_sizes());
+  TORCH_CHECK_VALUE(col.sym_sizes() == values_.sym_sizes(),
+                    "linear_solve: a CSR matrix needs as many columns as "
+                    "values, got ",
+                    col.sym_sizes(), " and ", values_.sym_sizes());
   TORCH_CHECK_VALUE(crow.device() == values_.device() && col.device() == values_.device(),
-                    "linear_solve: indices and values of a CSR matrix must be on one device, got ", crow.device(),
-                    ", ", col.device(), " and ", values_.device());
+                    "linear_solve: indices and values of a CSR matrix must be on one device, got ", crow.device(), ", ",
+                    col.device(), " and ", values_.device());
   const bool batched = values_.dim() == 2;
   TORCH_CHECK_VALUE(crow.dim() == values_.dim() && (!batched || crow.sym_size(0) == values_.sym_size(0)),
                     "linear_solve: crow and values of a CSR matrix must have the same batch axis, got ",
@@ -130,13 +122,10 @@ void CsrOperator::check_parameters() const {
   const auto crow = crow_.to(at::kCPU).contiguous(), col = col_.to(at::kCPU).contiguous();
   const int64_t matrices = values_.dim() == 2 ? values_.size(0) : 1, stored = values_.size(-1);
   for (int64_t m = 0; m < matrices; ++m)
-    check_rows(crow.const_data_ptr<int64_t>() + m * (n() + 1), col.const_data_ptr<int64_t>() + m * stored, n(),
-               stored);
+    check_rows(crow.const_data_ptr<int64_t>() + m * (n() + 1), col.const_data_ptr<int64_t>() + m * stored, n(), stored);
 }
 
-void CsrOperator::check_vector(const at::Tensor& b) const {
-  check_matrix_vector(b, values_, n(), values_.dim() == 2);
-}
+void CsrOperator::check_vector(const at::Tensor& b) const { check_matrix_vector(b, values_, n(), values_.dim() == 2); }
 
 at::Tensor CsrOperator::rows() const {
   // Row of each stored entry: how many row ends lie at or before its position.
@@ -181,15 +170,10 @@ at::Tensor CsrOperator::to_dense() const {
   return flat.view(shape);
 }
 
-at::Tensor CsrOperator::solve_directly(const at::Tensor& b) const {
-  return solve_matrix(to_dense(), b);
-}
-at::Tensor CsrOperator::solve_transpose_directly(const at::Tensor& b) const {
-  return solve_matrix(to_dense().mT(), b);
-}
+at::Tensor CsrOperator::solve_directly(const at::Tensor& b) const { return solve_matrix(to_dense(), b); }
+at::Tensor CsrOperator::solve_transpose_directly(const at::Tensor& b) const { return solve_matrix(to_dense().mT(), b); }
 
-std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda,
-                                                  const at::Tensor& u) const {
+std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A_ij = λ_i u_j at the stored entries, summed over the samples that share A
   const auto col = col_.expand({u.size(0), -1});
   const auto row = rows().expand({u.size(0), -1});

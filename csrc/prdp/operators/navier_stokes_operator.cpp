@@ -27,10 +27,8 @@ at::Tensor without_mean_pressure(const at::Tensor& u) {
   return at::cat({u.narrow(-3, 0, 2), p - p.mean({-2, -1}, /*keepdim=*/true)}, -3);
 }
 
-NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec)
-    : FlowOperator("NavierStokes", spec, 3) {
-  TORCH_CHECK_VALUE(grid_.dim() == 2, "NavierStokes: shape must have 2 extents, got ",
-                    at::IntArrayRef(grid_.shape()));
+NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec) : FlowOperator("NavierStokes", spec, 3) {
+  TORCH_CHECK_VALUE(grid_.dim() == 2, "NavierStokes: shape must have 2 extents, got ", at::IntArrayRef(grid_.shape()));
   grid_.check_field(winds_, winds_.dim() == 4 && winds_.sym_size(1) == 2 ? 2 : 3);
 }
 
@@ -39,8 +37,7 @@ const NavierStokesOperator::Momentum& NavierStokesOperator::momentum() const {
     const auto u1 = wind_along(kX), u2 = wind_along(kY);
     const auto v1 = at_u2_points(u1, grid_), v2 = at_u1_points(u2, grid_);
     const auto c = [&](const at::Tensor& along_y, const at::Tensor& along_x) {
-      return AdvectionDiffusion(grid_, {{along_y, along_y}, {along_x, along_x}}, step_.nu,
-                                1.0 / step_.dt, 1.0);
+      return AdvectionDiffusion(grid_, {{along_y, along_y}, {along_x, along_x}}, step_.nu, 1.0 / step_.dt, 1.0);
     };
     made_.emplace(Momentum{c(v2, u1), c(u2, v1)});
   }
@@ -51,9 +48,9 @@ at::Tensor NavierStokesOperator::couple(const at::Tensor& c1_u1, const at::Tenso
                                         const at::Tensor& v) const {
   const auto u1 = part(v, 0), u2 = part(v, 1), p = part(v, 2);
   const auto divergence = forward_difference(u1, grid_, kX) + forward_difference(u2, grid_, kY);
-  return at::cat({c1_u1 + s * backward_difference(p, grid_, kX),
-                  c2_u2 + s * backward_difference(p, grid_, kY), s * divergence},
-                 -3);
+  return at::cat(
+      {c1_u1 + s * backward_difference(p, grid_, kX), c2_u2 + s * backward_difference(p, grid_, kY), s * divergence},
+      -3);
 }
 
 at::Tensor NavierStokesOperator::apply(const at::Tensor& v) const {
@@ -79,8 +76,7 @@ at::Tensor NavierStokesOperator::norm() const {
   return largest(at::cat({n1, c2.row_norms() + y, at::full_like(n1, x + y)}, 1));
 }
 
-std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda,
-                                                           const at::Tensor& u) const {
+std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto& [c1, c2] = momentum();
   const auto g1 = c1.product_rule(part(lambda, 0), part(u, 0));
   const auto g2 = c2.product_rule(part(lambda, 1), part(u, 1));

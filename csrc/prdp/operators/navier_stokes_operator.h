@@ -32,9 +32,7 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor project(const at::Tensor& v) const override { return without_mean_pressure(v); }
   /// The solution of least norm to the projected right-hand side.
   at::Tensor solve_directly(const at::Tensor& b) const override { return solve(regular_matrix(), b); }
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
-    return solve(regular_matrix().mT(), b);
-  }
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve(regular_matrix().mT(), b); }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   KernelParameters kernel(const at::Tensor& b) const override;

@@ -65,19 +65,13 @@ class Transposed final : public Operator {
   at::Tensor jacobi_radius() const override { return a_->jacobi_radius(); }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
-  at::Tensor solve_directly(const at::Tensor& b) const override {
-    return a_->solve_transpose_directly(b);
-  }
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override {
-    return a_->solve_directly(b);
-  }
+  at::Tensor solve_directly(const at::Tensor& b) const override { return a_->solve_transpose_directly(b); }
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return a_->solve_directly(b); }
   std::unique_ptr<Operator> select(const at::Tensor& index) const override {
     auto chosen = a_->select(index);
     return chosen ? std::make_unique<Transposed>(std::move(chosen)) : nullptr;
   }
-  std::vector<int64_t> first_nonfinite(int64_t sample) const override {
-    return a_->first_nonfinite(sample);
-  }
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
   KernelParameters kernel(const at::Tensor& b) const override {
     auto k = a_->kernel(b);
     if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;

@@ -7,13 +7,13 @@ namespace prdp {
 
 namespace {
 
-OperatorSpec spec(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                  at::ArrayRef<double> parameters, bool transposed = false) {
+OperatorSpec spec(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                  bool transposed = false) {
   return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed};
 }
 
-at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view kind,
-                 at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed) {
+at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                 at::ArrayRef<double> parameters, bool transposed) {
   const auto a = make_operator(spec(tensors, kind, shape, parameters, transposed));
   a->check_vector(v);
   return a->apply(v);
@@ -24,19 +24,20 @@ at::Tensor diagonal(at::TensorList tensors, c10::string_view kind, at::IntArrayR
   return make_operator(spec(tensors, kind, shape, parameters))->diagonal();
 }
 
-at::Tensor dense(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                 at::ArrayRef<double> parameters, at::ScalarType dtype) {
+at::Tensor dense(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                 at::ScalarType dtype) {
   return make_operator(spec(tensors, kind, shape, parameters))->dense(at::TensorOptions().dtype(dtype));
 }
 
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
-  m.def("apply(Tensor v, Tensor[] tensors, str kind, int[] shape, float[] parameters, "
-        "bool transposed) -> Tensor", apply);
+  m.def(
+      "apply(Tensor v, Tensor[] tensors, str kind, int[] shape, float[] parameters, "
+      "bool transposed) -> Tensor",
+      apply);
   m.def("diagonal(Tensor[] tensors, str kind, int[] shape, float[] parameters) -> Tensor", diagonal);
-  m.def("dense(Tensor[] tensors, str kind, int[] shape, float[] parameters, ScalarType dtype) -> Tensor",
-        dense);
+  m.def("dense(Tensor[] tensors, str kind, int[] shape, float[] parameters, ScalarType dtype) -> Tensor", dense);
 }
 
 // torch.func.vmap goes through what they are made of.

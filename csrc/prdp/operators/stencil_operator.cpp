@@ -126,8 +126,8 @@ void StencilOperator::check_vector(const at::Tensor& b) const {
                     sizes[0]);
   TORCH_CHECK_TYPE(b.scalar_type() == coefficients_.scalar_type(), "Stencil: the coefficients are ",
                    coefficients_.scalar_type(), " but the vector is ", b.scalar_type());
-  TORCH_CHECK_VALUE(b.device() == coefficients_.device(), "Stencil: the coefficients are on ",
-                    coefficients_.device(), " but the vector is on ", b.device());
+  TORCH_CHECK_VALUE(b.device() == coefficients_.device(), "Stencil: the coefficients are on ", coefficients_.device(),
+                    " but the vector is on ", b.device());
 }
 
 at::Tensor StencilOperator::shifted(const at::Tensor& t, const kernels::Offset& offset, bool back) const {

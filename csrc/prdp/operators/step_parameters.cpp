@@ -11,25 +11,21 @@ std::vector<double> lengths_of(const OperatorSpec& spec, size_t others) {
   return {spec.parameters.begin() + static_cast<std::ptrdiff_t>(others), spec.parameters.end()};
 }
 
-StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t tensors,
-                               const char* expected)
+StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t tensors, const char* expected)
     : owner(who) {
   TORCH_CHECK_VALUE(!spec.parameters.empty() && spec.tensors.size() == tensors, owner,
                     ": takes the parameter dt, then the length of each axis if not 1, and ", expected);
   dt = spec.parameters[0];
   nu = spec.tensors.back();
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0.0, owner, ": dt must be finite and > 0, got ", dt);
-  TORCH_CHECK_VALUE(nu.dim() == 0, owner, ": nu must be a number or a 0-dimensional tensor, got shape ",
-                    nu.sizes());
-  TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ",
-                   nu.scalar_type());
+  TORCH_CHECK_VALUE(nu.dim() == 0, owner, ": nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
+  TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ", nu.scalar_type());
 }
 
 void StepParameters::check_values() const {
   if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
   const double value = nu.item<double>();
-  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ",
-                    value);
+  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ", value);
 }
 
 }  // namespace prdp

@@ -19,8 +19,7 @@ StokesSolve::StokesSolve(const Grid& grid, const at::Tensor& nu, double dt, at::
   const int64_t ny = grid.shape()[0], nx = grid.shape()[1];
   const auto real = nu.options().dtype(at::kDouble);
   const auto along_x = backward_symbol(at::arange(nx / 2 + 1, real), static_cast<double>(nx), grid.length(1));
-  const auto along_y =
-      backward_symbol(at::arange(ny, real), static_cast<double>(ny), grid.length(0)).unsqueeze(-1);
+  const auto along_y = backward_symbol(at::arange(ny, real), static_cast<double>(ny), grid.length(0)).unsqueeze(-1);
   const auto symbol = at::stack({along_x.expand({ny, -1}), along_y.expand({-1, nx / 2 + 1})});
   const auto laplacian = symbol.abs().square().sum(0);
   const auto mean = laplacian.eq(0);
@@ -30,8 +29,7 @@ StokesSolve::StokesSolve(const Grid& grid, const at::Tensor& nu, double dt, at::
   divergence_ = symbol.conj().neg().to(complex);
   momentum_ = (1.0 / dt + nu.to(at::kDouble) * laplacian).to(dtype);
   inverse_laplacian_ =
-      at::where(mean, at::zeros_like(laplacian), 1.0 / at::where(mean, at::ones_like(laplacian), laplacian))
-          .to(dtype);
+      at::where(mean, at::zeros_like(laplacian), 1.0 / at::where(mean, at::ones_like(laplacian), laplacian)).to(dtype);
 }
 
 at::Tensor StokesSolve::operator()(const at::Tensor& v, bool transposed) const {

@@ -9,8 +9,8 @@ namespace prdp {
 template <class Body>
 auto with_autograd(const Body& body) {
   const auto keys = c10::impl::tls_local_dispatch_key_set();
-  const c10::impl::ForceDispatchKeyGuard guard(
-      keys.included_, keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
+  const c10::impl::ForceDispatchKeyGuard guard(keys.included_,
+                                               keys.excluded_ - c10::autograd_dispatch_keyset_with_ADInplaceOrView);
   const at::AutoGradMode record(true);
   return body();
 }

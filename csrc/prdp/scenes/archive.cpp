@@ -9,7 +9,8 @@ namespace prdp {
 
 namespace {
 
-constexpr std::string_view kEntry = "PK\1\2", kFile = "PK\3\4", kEnd = "PK\5\6", kEnd64 = "PK\6\6", kLocator64 = "PK\6\7";
+constexpr std::string_view kEntry = "PK\1\2", kFile = "PK\3\4", kEnd = "PK\5\6", kEnd64 = "PK\6\6",
+                           kLocator64 = "PK\6\7";
 constexpr uint32_t kIn64 = 0xFFFFFFFF;  // the number is elsewhere, in 64 bits
 
 /// Bytes that are looked at where other bytes say.

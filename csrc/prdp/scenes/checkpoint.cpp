@@ -20,8 +20,8 @@ double seconds() {
   if (!chosen || !*chosen) return kSeconds;
   char* rest = nullptr;
   const double value = std::strtod(chosen, &rest);
-  TORCH_CHECK_VALUE(*rest == '\0' && value >= 0.0,
-                    "PRDP_CHECKPOINT_SECONDS: expected a number >= 0, got '", chosen, "'");
+  TORCH_CHECK_VALUE(*rest == '\0' && value >= 0.0, "PRDP_CHECKPOINT_SECONDS: expected a number >= 0, got '", chosen,
+                    "'");
   return value;
 }
 
@@ -108,7 +108,8 @@ void Checkpoint::check_length(int64_t done, int64_t intervals) const {
 void Checkpoint::remove() const {
   for (const auto& path : {before_, path_}) {  // a kill in between leaves the last one
     std::error_code error;
-    TORCH_CHECK_VALUE(!fs::is_directory(path, error), "checkpoint: cannot remove '", path.string(), "': it is a folder");
+    TORCH_CHECK_VALUE(!fs::is_directory(path, error), "checkpoint: cannot remove '", path.string(),
+                      "': it is a folder");
     fs::remove(path, error);
     TORCH_CHECK_VALUE(!error, "checkpoint: cannot remove '", path.string(), "': ", error.message());
   }

@@ -10,9 +10,7 @@
 
 namespace prdp {
 
-at::Generator make_generator(int64_t seed) {
-  return at::detail::createCPUGenerator(static_cast<uint64_t>(seed));
-}
+at::Generator make_generator(int64_t seed) { return at::detail::createCPUGenerator(static_cast<uint64_t>(seed)); }
 
 at::Tensor shuffled(int64_t samples, at::Generator& generator) {
   return at::randperm(samples, generator, at::TensorOptions().dtype(at::kLong));
@@ -147,7 +145,8 @@ at::Tensor trajectories_of(const char* who, const Scene& scene, int64_t first, i
                            const OnProgress& on_progress) {
   TORCH_CHECK_VALUE(scene.trains_network(), who, ": the task trains no network and has no samples");
   TORCH_CHECK_VALUE(steps >= 0, who, ": steps must be >= 0, got ", steps);
-  return follow(scene, starts(scene, scene.data.train + scene.data.valid).narrow(0, first, samples), steps, counted(steps * samples, on_progress));
+  return follow(scene, starts(scene, scene.data.train + scene.data.valid).narrow(0, first, samples), steps,
+                counted(steps * samples, on_progress));
 }
 
 }  // namespace
@@ -172,8 +171,8 @@ ParameterProblem make_parameter_problem(const Scene& scene) {
   const auto modes = at::stack(sines);
   const auto reference = at::tensor(scene.parameters.reference, real);
   const auto solution = scene.stepper(Direct{})(at::matmul(reference, modes).view({1, 1, n}));
-  return {modes.to(scene.dtype), at::tensor(scene.parameters.start, real).to(scene.dtype),
-          reference.to(scene.dtype), solution.to(scene.dtype)};
+  return {modes.to(scene.dtype), at::tensor(scene.parameters.start, real).to(scene.dtype), reference.to(scene.dtype),
+          solution.to(scene.dtype)};
 }
 
 }  // namespace prdp

@@ -29,8 +29,10 @@ fs::path cache_folder() {
 }
 
 TensorMap tensors_of(const Dataset& d) {
-  TensorMap tensors{{"train_start", d.train_start}, {"train_end", d.train_end},
-                    {"valid_start", d.valid_start}, {"valid_end", d.valid_end}};
+  TensorMap tensors{{"train_start", d.train_start},
+                    {"train_end", d.train_end},
+                    {"valid_start", d.valid_start},
+                    {"valid_end", d.valid_end}};
   if (d.train_first.defined()) tensors["train_first"] = d.train_first;
   return tensors;
 }

@@ -36,7 +36,9 @@ class Unfinished {
     }
   }
   Unfinished(Unfinished&& other) noexcept
-      : target_(std::move(other.target_)), path_(std::exchange(other.path_, {})), file_(std::exchange(other.file_, -1)) {}
+      : target_(std::move(other.target_)),
+        path_(std::exchange(other.path_, {})),
+        file_(std::exchange(other.file_, -1)) {}
   ~Unfinished() {
     if (file_ >= 0) close(file_);
     if (!path_.empty()) unlink(path_.c_str());
@@ -81,13 +83,13 @@ void write_whole(const std::vector<NewFile>& files) {
 
 std::string read_whole(const char* who, const fs::path& path) {
   std::error_code error;
-  TORCH_CHECK_VALUE(fs::is_regular_file(path, error), who, ": cannot read '", path.string(), "': ",
-                    error ? error.message() : "it is not a regular file");
+  TORCH_CHECK_VALUE(fs::is_regular_file(path, error), who, ": cannot read '", path.string(),
+                    "': ", error ? error.message() : "it is not a regular file");
   std::ifstream file(path, std::ios::binary);
   std::ostringstream content;
   if (file.is_open() && file.peek() != EOF) content << file.rdbuf();
-  TORCH_CHECK_VALUE(file.is_open() && !file.bad() && !content.fail(), who, ": cannot read '", path.string(), "': ",
-                    std::strerror(errno));
+  TORCH_CHECK_VALUE(file.is_open() && !file.bad() && !content.fail(), who, ": cannot read '", path.string(),
+                    "': ", std::strerror(errno));
   return std::move(content).str();
 }
 

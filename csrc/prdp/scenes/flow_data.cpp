@@ -50,9 +50,7 @@ at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64
   return at::cat({without_divergence(u, grid, symbol), pressure}, 1);
 }
 
-at::Tensor downsample(const at::Tensor& u) {
-  return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2);
-}
+at::Tensor downsample(const at::Tensor& u) { return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2); }
 
 at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
   auto fine = scene;

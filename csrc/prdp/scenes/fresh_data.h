@@ -18,7 +18,8 @@ class FreshData {
   FreshData(const FreshData&) = delete;
   FreshData& operator=(const FreshData&) = delete;
 
-  /// The samples of epoch `number`, counted from 0, in the train_ fields of a Dataset. Raises RuntimeError where a reference solve does not converge.
+  /// The samples of epoch `number`, counted from 0, in the train_ fields of a Dataset. Raises RuntimeError where a
+  /// reference solve does not converge.
   Dataset epoch(int64_t number);
 
  private:

@@ -15,9 +15,7 @@ at::Tensor loss(std::string_view kind, const at::Tensor& u, const at::Tensor& re
   return at::mse_loss(u, reference);
 }
 
-at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference) {
-  return 0.5 * at::mse_loss(u, reference);
-}
+at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference) { return 0.5 * at::mse_loss(u, reference); }
 
 at::Tensor relative_error(const at::Tensor& theta, const at::Tensor& reference) {
   return (theta - reference).norm() / reference.norm();

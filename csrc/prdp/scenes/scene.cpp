@@ -30,9 +30,7 @@ Stepper Scene::stepper(Solver with) const {
   return {std::move(equation), options(std::move(with))};
 }
 
-SolveOptions Scene::options(Solver with) const {
-  return {std::move(with), backward, {}, {}, on_failure, 0, 0, start};
-}
+SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, on_failure, 0, 0, start}; }
 
 double Scene::learning_rate(int64_t update) const {
   if (training.cosine_updates) {

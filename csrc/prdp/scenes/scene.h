@@ -68,17 +68,17 @@ struct Scene {
     int64_t modes = 0;
     int64_t states = 0, state_modes = 0;  // number and modes of the initial states, also random Fourier series
     int64_t steps = 0, every = 0;         // time steps of each state, and time steps between snapshots
-    double noise = 0.0;                   // its standard deviation, relative to the root mean square of the snapshots
-    double smoothing = 0.0;               // weight of the mean of |∇θ|² in the loss; length²
+    double noise = 0.0;  // its standard deviation, relative to the root mean square of the snapshots
+    double smoothing = 0.0;  // weight of the mean of |∇θ|² in the loss; length²
     int64_t seed = 0;
   };
   struct Compare {
     int64_t seeds = 1;
-    std::vector<int64_t> constant;       // the constant K, one row each
-    std::optional<double> growth;        // PRDP with K ← growth·K, as a row of its own
-    std::optional<double> rtol;          // the converged K with this tolerance, as a row of its own
-    std::vector<int64_t> schedule;       // manual schedule: start, and step per interval; empty if there is none
-    std::optional<double> target;        // iterations are counted until the metric reaches this value
+    std::vector<int64_t> constant;  // the constant K, one row each
+    std::optional<double> growth;  // PRDP with K ← growth·K, as a row of its own
+    std::optional<double> rtol;  // the converged K with this tolerance, as a row of its own
+    std::vector<int64_t> schedule;  // manual schedule: start, and step per interval; empty if there is none
+    std::optional<double> target;  // iterations are counted until the metric reaches this value
   };
 
   std::string name, path, text;  // text: the file as it was read
@@ -117,13 +117,13 @@ struct Scene {
 
 /// A key of a scene file, as the documentation lists it.
 struct SceneKey {
-  std::string table;                     // "physics"; empty at the top level
-  std::string name;                      // "nu"
-  std::string value;                     // "number >= 0"
-  std::string unit;                      // "length²/time"; empty: none
+  std::string table;  // "physics"; empty at the top level
+  std::string name;  // "nu"
+  std::string value;  // "number >= 0"
+  std::string unit;  // "length²/time"; empty: none
   std::optional<std::string> otherwise;  // the default; nullopt: the key must be given where it applies
-  std::string when;                      // "not for `poisson`"; empty: always
-  std::string means;                     // "viscosity or diffusivity"
+  std::string when;  // "not for `poisson`"; empty: always
+  std::string means;  // "viscosity or diffusivity"
 };
 /// Every key that a scene may have, in the order in which they are read.
 std::vector<SceneKey> scene_keys();

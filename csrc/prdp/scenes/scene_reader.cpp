@@ -36,8 +36,11 @@ template <class Section>
 void read_physics(Section& s, Scene& scene) {
   auto& p = scene.physics;
   const When grid{!field(scene).holds && !corrector(scene).holds, "only for `emulator` and `parameters`"};
-  const Choices equations{{"poisson", grid}, {"heat", grid}, {"burgers", grid},
-                          {"navier_stokes", corrector(scene)}, {"diffusion", field(scene)}};
+  const Choices equations{{"poisson", grid},
+                          {"heat", grid},
+                          {"burgers", grid},
+                          {"navier_stokes", corrector(scene)},
+                          {"diffusion", field(scene)}};
   s.choice(p.equation, equations, {"equation", "the equation"});
   s.wholes(p.shape, 1, {"shape", "unknowns per axis, in 1 to 3 axes: `[N]`, `[Ny, Nx]` or `[Nz, Ny, Nx]`"});
   s.check(!p.shape.empty() && p.shape.size() <= 3, "shape", "expected 1 to 3 extents");
@@ -58,8 +61,7 @@ void read_solver(Section& s, Scene& scene) {
   s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
   s.count(scene.solver.max_iter, 1,
           {"max_iter", "K of the converged solver, K_ε in the paper", "iterations (`gmres`: cycles)"});
-  s.at_least(scene.solver.rtol, 0.0,
-             {"rtol", "relative residual at which a solve stops; 0 runs exactly K iterations"});
+  s.at_least(scene.solver.rtol, 0.0, {"rtol", "relative residual at which a solve stops; 0 runs exactly K iterations"});
   const When gmres{traits(scene.solver.method).counts == Counts::kCycles, "only for `gmres`"};
   s.count(scene.solver.restart, 1, {"restart", "restart length", "products per cycle", gmres});
   s.choice(scene.backward, backward_from_name, backwards(scene), {"backward", "how gradients are computed"});
@@ -163,10 +165,10 @@ void read_prdp(Section& s, Scene& scene) {
   s.above(p.tau_step, 0.0,
           {"tau_step", "the metric is on a plateau if the last L̃ is above `tau_step` times the `delta`-th last one"});
   s.above(p.tau_stop, 0.0,
-          {"tau_stop", "on a plateau, K is raised only if L̃ is below `tau_stop` times its value at the last refinement, "
-                       "or has grown since"});
-  s.whole(p.delta, 2,
-          {"delta", "how far back the plateau test looks; 2 compares the last two values", "intervals"});
+          {"tau_stop",
+           "on a plateau, K is raised only if L̃ is below `tau_stop` times its value at the last refinement, "
+           "or has grown since"});
+  s.whole(p.delta, 2, {"delta", "how far back the plateau test looks; 2 compares the last two values", "intervals"});
   s.whole(p.window, 1,
           {"window", "length of the exponential mean, α = 2/(window + 1); 1 does not smooth", "intervals"});
   s.whole(p.initial, 0, {"initial", "K at the start", "iterations"});
@@ -199,8 +201,9 @@ template <class Section>
 void read_all(Section& s, Scene& scene) {
   s.text(scene.title, {"title", "one line for lists and reports"});
   s.choice(scene.task, task_from_name, {"emulator", "corrector", "parameters", "field"},
-           {"task", "what is trained: a network that replaces a time step, a network that corrects a coarse solver, "
-                    "amplitudes of the right-hand side, or a diffusivity field"});
+           {"task",
+            "what is trained: a network that replaces a time step, a network that corrects a coarse solver, "
+            "amplitudes of the right-hand side, or a diffusivity field"});
   s.choice(scene.dtype, dtype_from_name, {"float32", "float64"}, {"dtype", "type of all tensors"});
   s.section(scene, read_physics<Section>, {"physics", "the equation"});
   s.section(scene, read_solver<Section>, {"solver", "the solver in the training"});
@@ -259,7 +262,8 @@ Scene parse_scene(const std::string& text, const std::string& path) {
   } catch (const toml::parse_error& error) {
     TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
   } catch (const BrokenToml&) {
-    TORCH_CHECK_VALUE(false, path, ": not a TOML file; a key or the name of a table has a character that it cannot have");
+    TORCH_CHECK_VALUE(false, path,
+                      ": not a TOML file; a key or the name of a table has a character that it cannot have");
   }
 
   Scene scene;

@@ -38,7 +38,8 @@ std::string fingerprint(std::string_view content) {
 
 void refuse_finished(const fs::path& record, int64_t intervals, int64_t wanted) {
   TORCH_CHECK_VALUE(false, "record: '", record.string(), "' is of a finished training of ", intervals,
-                    " intervals, not ", wanted, "; it cannot go on: give another --out, or leave out --resume to "
+                    " intervals, not ", wanted,
+                    "; it cannot go on: give another --out, or leave out --resume to "
                     "train afresh");
 }
 

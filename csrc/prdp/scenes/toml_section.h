@@ -18,10 +18,11 @@ struct BrokenToml {};
 #pragma push_macro("NDEBUG")
 #undef NDEBUG
 #define TOML_ASSERT(condition) ((condition) ? void() : prdp::refuse_broken_toml())
-#include <toml++/impl/preprocessor.h>
 #include <toml++/impl/forward_declarations.h>
+#include <toml++/impl/preprocessor.h>
 #undef TOML_UNREACHABLE
-#define TOML_UNREACHABLE return {}
+#define TOML_UNREACHABLE \
+  return {}
 #include <toml++/impl/unicode.h>
 #undef TOML_UNREACHABLE
 #define TOML_UNREACHABLE prdp::refuse_broken_toml()
@@ -125,8 +126,8 @@ class TomlSection {
       if (asked_.count(std::string(key.str()))) continue;
       std::ostringstream allowed;
       for (const auto& name : asked_) allowed << (allowed.tellp() > 0 ? ", " : "") << name;
-      TORCH_CHECK_VALUE(false, file_, ":", key.source().begin.line, ": unknown name '",
-                        full(std::string(key.str())), "'; allowed: ", allowed.str());
+      TORCH_CHECK_VALUE(false, file_, ":", key.source().begin.line, ": unknown name '", full(std::string(key.str())),
+                        "'; allowed: ", allowed.str());
     }
   }
 

@@ -27,9 +27,9 @@ struct Items : std::vector<Value> {};
 
 at::ScalarType dtype_of(const Name& storage) {
   static const std::unordered_map<std::string_view, at::ScalarType> known{
-      {"DoubleStorage", at::kDouble}, {"FloatStorage", at::kFloat}, {"HalfStorage", at::kHalf},
-      {"BFloat16Storage", at::kBFloat16}, {"LongStorage", at::kLong}, {"IntStorage", at::kInt},
-      {"ShortStorage", at::kShort}, {"CharStorage", at::kChar}, {"ByteStorage", at::kByte},
+      {"DoubleStorage", at::kDouble},     {"FloatStorage", at::kFloat}, {"HalfStorage", at::kHalf},
+      {"BFloat16Storage", at::kBFloat16}, {"LongStorage", at::kLong},   {"IntStorage", at::kInt},
+      {"ShortStorage", at::kShort},       {"CharStorage", at::kChar},   {"ByteStorage", at::kByte},
       {"BoolStorage", at::kBool}};
   return known.at(storage.name);
 }
@@ -42,7 +42,11 @@ at::ScalarType dtype_of(const Name& storage) {
 class Pickle {
  public:
   Pickle(const Files& files, std::string folder)
-      : files_(files), folder_(std::move(folder)), left_(files.at(folder_ + "data.pkl")) {}
+      : files_(files), folder_(std::move(folder)), left_(files.at(folder_ + "data.pkl")) {
+    const auto order = files.find(folder_ + "byteorder");
+    TORCH_CHECK_VALUE(order == files.end() || order->second == "little",
+                      "pickle: of a machine with another byte order");
+  }
 
   TensorMap run() {
     for (char instruction = take(1)[0]; instruction != '.'; instruction = take(1)[0]) follow(instruction);
@@ -57,20 +61,27 @@ class Pickle {
   void follow(char instruction) {
     switch (instruction) {
       case '\x80': take(1); break;  // the version
-      case 'N': case '\x88': case '\x89': push({}); break;
+      case 'N':
+      case '\x88':
+      case '\x89': push({}); break;
       case 'K': push(number<uint8_t>()); break;
       case 'M': push(number<uint16_t>()); break;
       case 'J': push(number<int32_t>()); break;
       case '\x8a': push(long_number()); break;
       case 'X': push(take(number<uint32_t>())); break;
       case 'c': push(name()); break;
-      case '}': case ']': case ')': push(made({})); break;
+      case '}':
+      case ']':
+      case ')': push(made({})); break;
       case '(': marks_.push_back(stack_.size()); break;
       case 't': push(made(popped(since_mark()))); break;
-      case '\x85': case '\x86': case '\x87': push(made(popped(static_cast<uint8_t>(instruction) - 0x84u))); break;
+      case '\x85':
+      case '\x86':
+      case '\x87': push(made(popped(static_cast<uint8_t>(instruction) - 0x84u))); break;
       case 'a': add(popped(1)); break;
       case 's': add(popped(2)); break;
-      case 'e': case 'u': add(popped(since_mark())); break;
+      case 'e':
+      case 'u': add(popped(since_mark())); break;
       case 'b': pop(); break;  // attributes, of which a dict of tensors needs none
       case 'q': memo_[number<uint8_t>()] = top(); break;
       case 'r': memo_[number<uint32_t>()] = top(); break;

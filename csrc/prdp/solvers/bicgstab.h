@@ -20,8 +20,13 @@ class BiCGStabMethod {
   static constexpr bool kHasRecursiveResidual = true;
 
   explicit BiCGStabMethod(Space& space)
-      : x(space.vector()), space_(space), r_(space.vector()), hat_(space.vector()), p_(space.vector()),
-        v_(space.vector()), t_(space.vector()) {}
+      : x(space.vector()),
+        space_(space),
+        r_(space.vector()),
+        hat_(space.vector()),
+        p_(space.vector()),
+        v_(space.vector()),
+        t_(space.vector()) {}
 
   void start() {
     for (auto* vector : {&x, &p_, &v_}) space_.fill_zero(*vector);

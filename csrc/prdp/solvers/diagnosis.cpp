@@ -57,8 +57,7 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
-  if (made_for == MadeFor::kDefinite)
-    return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
+  if (made_for == MadeFor::kDefinite) return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, or Direct";
 }
 
@@ -69,7 +68,8 @@ std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!known && !a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>())
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
   return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
-         (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " + (std::isinf(norm_b) ? "above 1.8e+308" : number(norm_b)) + "); " +
+         (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " +
+         (std::isinf(norm_b) ? "above 1.8e+308" : number(norm_b)) + "); " +
          (single ? "take float64, or scale A and b" : "scale A and b");
 }
 
@@ -84,18 +84,21 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 }
 
 std::string zero_diagonal(const SolveRole& role) {
-  const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
-                                                          : "it divides by the diagonal of A, which has a zero there";
+  const std::string why = operator_kind(role.a.kind).has_pressure
+                              ? "the pressure rows have a zero diagonal"
+                              : "it divides by the diagonal of A, which has a zero there";
   return why + (traits(role.solver.method).label == "GMRES" ? "; take GMRES without it" : "; take GMRES");
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
-  if (!operator_kind(role.a.kind).has_pressure) return share + "b lie in the null space of A; take a b without that part";
+  if (!operator_kind(role.a.kind).has_pressure)
+    return share + "b lie in the null space of A; take a b without that part";
   if (role.adjoint)
-    return share + "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
-                   "pressure that the loss is made of";
+    return share +
+           "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
+           "pressure that the loss is made of";
   return share + "b are a mean of its pressure channel, which no flow can have; take it off";
 }
 

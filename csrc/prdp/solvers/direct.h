@@ -10,8 +10,7 @@ namespace prdp {
 template <FactorisedSpace Space>
 class DirectMethod {
  public:
-  explicit DirectMethod(Space& space)
-      : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
+  explicit DirectMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
 
   void start() {
     space_.fill_zero(x);

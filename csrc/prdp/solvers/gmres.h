@@ -23,9 +23,19 @@ class GmresMethod {
 
   /// Preconditioned from the right, A M⁻¹ y = b with x = M⁻¹ y: the residual is that of A u = b.
   GmresMethod(Space& space, int64_t restart, Preconditioner preconditioner)
-      : x(space.vector()), space_(space), preconditioner_(preconditioner),
-        m_(std::min(restart, space.unknowns())), r_(space.vector()), kept_x_(space.vector()),
-        kept_r_(space.vector()), h_(m_ * (m_ + 1)), inverse_(m_), cos_(m_), sin_(m_), g_(m_ + 1), y_(m_),
+      : x(space.vector()),
+        space_(space),
+        preconditioner_(preconditioner),
+        m_(std::min(restart, space.unknowns())),
+        r_(space.vector()),
+        kept_x_(space.vector()),
+        kept_r_(space.vector()),
+        h_(m_ * (m_ + 1)),
+        inverse_(m_),
+        cos_(m_),
+        sin_(m_),
+        g_(m_ + 1),
+        y_(m_),
         again_(m_ + 1) {
     for (int64_t j = 0; j <= m_; ++j) v_.push_back(space.vector());
     if (space.derivatives() > 0) products_.resize(m_);

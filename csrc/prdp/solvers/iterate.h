@@ -36,7 +36,7 @@ struct SampleState {
     active = false;
   }
   /// Back to the start, for another pass of at most `iterations_allowed`.
-  void restart(int64_t iterations_allowed) {
+  void run_again(int64_t iterations_allowed) {
     cap = iterations_allowed;
     active = cap > 0;
     settled = claims = false;
@@ -250,8 +250,8 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
     if (!lost(s)) judge(s, rtol);
   }
   stop_at_rounding_floor(space, method, states, [rtol](const SampleState& s) {
-    const bool unsolved = s.status == SolveStatus::kMaxIter ||
-                          (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
+    const bool unsolved =
+        s.status == SolveStatus::kMaxIter || (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
     return rtol > 0.0 && !s.settled && unsolved;
   });
   for (auto& s : states) {
@@ -274,9 +274,8 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
   if (!guarded) return;
-  const auto again = space.map(states, [&](const SampleState& s) {
-    return lost(s) || (!track && s.status == SolveStatus::kBreakdown);
-  });
+  const auto again = space.map(
+      states, [&](const SampleState& s) { return lost(s) || (!track && s.status == SolveStatus::kBreakdown); });
   if (std::find(again.begin(), again.end(), true) == again.end()) return;
 
   // The cold path. Where no residual was looked at, a watched pass finds the best iterate, or the
@@ -285,16 +284,16 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   const auto first = states;
   const auto kept = method.x;
   if (!track) {
-    for (size_t i = 0; i < states.size(); ++i) states[i].restart(again[i] ? caps[i] : 0);
-    space.restart();
+    for (size_t i = 0; i < states.size(); ++i) states[i].run_again(again[i] ? caps[i] : 0);
+    space.run_again();
     run(space, method, states, rtol, /*track=*/true);
   }
   const auto watched = states;
   for (size_t i = 0; i < states.size(); ++i) {
     const int64_t wanted = lost(first[i]) ? watched[i].best : watched[i].iterations;
-    states[i].restart(again[i] ? wanted : 0);
+    states[i].run_again(again[i] ? wanted : 0);
   }
-  space.restart();
+  space.run_again();
   run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
   for (size_t i = 0; i < states.size(); ++i) {

@@ -60,8 +60,7 @@ struct MethodRow : MethodTraits {
   auto make(Space& space, int64_t restart) const {
     if constexpr (std::is_constructible_v<Iteration<Space>, Space&, int64_t, Preconditioner>)
       return Iteration<Space>(space, restart, preconditioner);
-    else
-      return Iteration<Space>(space);
+    else return Iteration<Space>(space);
   }
 };
 
@@ -140,19 +139,19 @@ inline constexpr std::tuple kMethods{
                              .nanoseconds = 0.3,
                              .is_direct = true}}};
 
-inline constexpr auto kTraits = std::apply(
-    [](const auto&... row) { return std::array<MethodTraits, sizeof...(row)>{row...}; }, kMethods);
-static_assert([] {
-  for (size_t i = 0; i < kTraits.size(); ++i)
-    if (static_cast<size_t>(kTraits[i].method) != i) return false;
-  return true;
-}(), "the rows of the table are not in the order of the enumerators");
+inline constexpr auto kTraits =
+    std::apply([](const auto&... row) { return std::array<MethodTraits, sizeof...(row)>{row...}; }, kMethods);
+static_assert(
+    [] {
+      for (size_t i = 0; i < kTraits.size(); ++i)
+        if (static_cast<size_t>(kTraits[i].method) != i) return false;
+      return true;
+    }(),
+    "the rows of the table are not in the order of the enumerators");
 
 /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h).
 /// Else autograd does it, in plain tensor operations.
-constexpr bool has_tape(const MethodTraits& method) {
-  return method.runs_on == RunsOn::kAllLoops && !method.is_direct;
-}
+constexpr bool has_tape(const MethodTraits& method) { return method.runs_on == RunsOn::kAllLoops && !method.is_direct; }
 
 constexpr const MethodTraits& traits(Method method) { return kTraits[static_cast<size_t>(method)]; }
 
@@ -183,8 +182,7 @@ constexpr int64_t vectors_of(Method method, int64_t restart) {
 
 /// Iterations, or those vectors that so many cycles build up.
 constexpr double steps_of(Method method, int64_t iterations, int64_t restart) {
-  return static_cast<double>(iterations) *
-         static_cast<double>(traits(method).counts == Counts::kCycles ? restart : 1);
+  return static_cast<double>(iterations) * static_cast<double>(traits(method).counts == Counts::kCycles ? restart : 1);
 }
 
 }  // namespace prdp

@@ -15,7 +15,11 @@ class PreconditionedConjugateGradientMethod {
   static constexpr bool kHasRecursiveResidual = true;
 
   explicit PreconditionedConjugateGradientMethod(Space& space)
-      : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()),
+      : x(space.vector()),
+        space_(space),
+        r_(space.vector()),
+        p_(space.vector()),
+        q_(space.vector()),
         weights_(space.vector()) {}
 
   void start() {

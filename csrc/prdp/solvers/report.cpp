@@ -29,12 +29,12 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor
   if (status == SolveStatus::kNonfiniteInput) {
     const auto of_b = nonfinite(b.select(0, sample));
     const bool in_b = !x0.defined() || of_b.any().item<bool>();
-    text << (in_b ? "" : " in x0") << " at index " << position(first_true(in_b ? of_b : nonfinite(x0.select(0, sample))));
+    text << (in_b ? "" : " in x0") << " at index "
+         << position(first_true(in_b ? of_b : nonfinite(x0.select(0, sample))));
   }
   if (status == SolveStatus::kZeroDiagonal)
     text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
-  else if (status == SolveStatus::kNonfiniteOperator)
-    text << " at index " << position(a.first_nonfinite(sample));
+  else if (status == SolveStatus::kNonfiniteOperator) text << " at index " << position(a.first_nonfinite(sample));
   return text.str();
 }
 
@@ -61,14 +61,15 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   constexpr size_t named = 4;
   std::ostringstream text;
   if (step_now > 0) text << "step " << step_now << " of " << steps_in_all << ": ";
-  text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": " << failed.size() << " of " << batch << " samples failed";
+  text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": " << failed.size() << " of " << batch
+       << " samples failed";
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);
     text << (k ? "; " : ": ") << "sample " << i << " " << name(what) << whereabouts(a, b, role.x0, what, i);
     if (!is_refused(what))
-      text << " (the iterate handed out has relative residual " << info.residual[i].item<double>()
-           << " after " << info.iterations[i].item<int64_t>() << " iterations)";
+      text << " (the iterate handed out has relative residual " << info.residual[i].item<double>() << " after "
+           << info.iterations[i].item<int64_t>() << " iterations)";
     text << ", " << diagnosis(role, a, b, what, i);
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";

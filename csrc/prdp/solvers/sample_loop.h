@@ -41,9 +41,7 @@ void solve_sample(const Kernel& kernel, bool operator_is_finite, SampleSpace<Ker
   SampleState& state = states[0];
   state.cap = batch.caps ? batch.caps[s] : batch.max_iter;
 
-  [[maybe_unused]] const auto norm2 = [&](const T* v) {
-    return kernels::loops<T>().dot(v, v, kernel.length());
-  };
+  [[maybe_unused]] const auto norm2 = [&](const T* v) { return kernels::loops<T>().dot(v, v, kernel.length()); };
   const auto finish = [&](SolveStatus status, int64_t iterations, double residual) {
     batch.status[s] = static_cast<int64_t>(status);
     batch.iterations[s] = iterations;

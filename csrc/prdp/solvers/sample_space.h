@@ -8,9 +8,9 @@
 #include <vector>
 
 #include "prdp/kernels/direct_factors.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -205,9 +205,7 @@ class SampleSpace {
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
   static constexpr int derivatives() { return 0; }
   Scalar constant(Scalar value) const { return value; }
-  void scale(const T* v, Scalar factor, Vector out) {
-    loops_.scale(factor, v, out, length());
-  }
+  void scale(const T* v, Scalar factor, Vector out) { loops_.scale(factor, v, out, length()); }
   void dots(const std::vector<Vector>& v, int64_t count, const T* w, Scalar* h) {
     loops_.multi_dot(v.data(), count, w, h, length());
   }
@@ -256,7 +254,7 @@ class SampleSpace {
     return std::array{f(states[0])};
   }
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
-  void restart() {
+  void run_again() {
     broken_ = false;
     workspace_.clear(1);
     clear(own_);

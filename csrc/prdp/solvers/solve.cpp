@@ -2,9 +2,9 @@
 
 #include <ATen/EmptyTensor.h>
 
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_cpu.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -59,8 +59,8 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
   const double steps = steps_of(method, iterations, std::min(restart, unknowns));
-  const double work = traits(method).nanoseconds * static_cast<double>(samples * unknowns) *
-                      (std::min(steps, 1000.0) + 4.0);
+  const double work =
+      traits(method).nanoseconds * static_cast<double>(samples * unknowns) * (std::min(steps, 1000.0) + 4.0);
   const int64_t threads = std::max<int64_t>(1, static_cast<int64_t>(work / worthwhile));
   return at::divup(samples, threads);
 }

@@ -7,8 +7,7 @@ namespace prdp {
 
 /// Solves the samples [begin, end) of a batch; one translation unit a kind of operator.
 template <class T>
-void solve_range(const kernels::LaplacianParameters& a, const SampleBatch<T>& batch, int64_t begin,
-                 int64_t end);
+void solve_range(const kernels::LaplacianParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>
 void solve_range(const DenseParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end);
 template <class T>

@@ -4,8 +4,7 @@
 namespace prdp {
 
 template <class T>
-void solve_range(const kernels::LaplacianParameters& a, const SampleBatch<T>& batch, int64_t begin,
-                 int64_t end) {
+void solve_range(const kernels::LaplacianParameters& a, const SampleBatch<T>& batch, int64_t begin, int64_t end) {
   with_kernel<T>(a, [&](const auto& kernel) { solve_samples(kernel, batch, begin, end); });
 }
 

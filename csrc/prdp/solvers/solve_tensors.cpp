@@ -36,8 +36,8 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method, con
 SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOptions& real) {
   const auto batch = static_cast<int64_t>(states.size());
   const auto counts = at::TensorOptions().dtype(at::kLong);
-  SolveInfo info{at::empty({batch}, counts), at::empty({batch}, at::kDouble),
-                 at::empty({batch}, counts), at::empty({batch}, counts)};
+  SolveInfo info{at::empty({batch}, counts), at::empty({batch}, at::kDouble), at::empty({batch}, counts),
+                 at::empty({batch}, counts)};
   for (int64_t i = 0; i < batch; ++i) {
     const auto& s = states[i];
     double residual = s.b2 > 0.0 ? std::sqrt(s.residual2 / s.b2) : 0.0;
@@ -63,9 +63,7 @@ ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::
   return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
 }
 
-at::Tensor largest_magnitude(const at::Tensor& b) {
-  return b.detach().abs().flatten(1).amax(1);
-}
+at::Tensor largest_magnitude(const at::Tensor& b) { return b.detach().abs().flatten(1).amax(1); }
 
 /// Where the iterations of a batch start, and whether that took a product.
 struct TensorStart {
@@ -101,8 +99,7 @@ bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !
 
 /// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
 std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
-  const double bound =
-      b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
+  const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
   const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
   const auto found = (norm(b - projected) > bound * norm(b)).to(at::kCPU).contiguous();
   const bool* rows = found.const_data_ptr<bool>();
@@ -138,8 +135,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const at::NoGradGuard no_grad;
   const auto magnitude = largest_magnitude(b);
   const bool starts = takes_start(request.method, request.x0);
-  const auto status = settle_beforehand(a, request.method, magnitude,
-                                        starts ? largest_magnitude(request.x0) : at::Tensor());
+  const auto status =
+      settle_beforehand(a, request.method, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
   const auto is_open = [](SolveStatus s) { return s == SolveStatus::kMaxIter; };
   const bool iterates = request.max_iter > 0 && std::any_of(status.begin(), status.end(), is_open);
   if (traits(request.method).preconditioner == Preconditioner::kStokes && !iterates && b.size(0) > 0)
@@ -162,7 +159,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
   if (starts) {
-    const auto made = make_start(a, rhs, at::where(per_sample(takes_part.to(b.device()), b), request.x0, at::zeros_like(rhs)));
+    const auto made =
+        make_start(a, rhs, at::where(per_sample(takes_part.to(b.device()), b), request.x0, at::zeros_like(rhs)));
     const auto applied = made.applied.to(at::kCPU);
     for (size_t i = 0; i < states.size(); ++i) states[i].applications = applied.const_data_ptr<bool>()[i];
     space.start_from(made.x, made.r);
@@ -199,14 +197,13 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
     if (const auto part = a.select(index)) {
       const auto there = index.to(caps.device());
       const auto x0_there = x0.defined() ? x0.index_select(0, index) : x0;
-      const auto some =
-          solve_recorded(*part, b.index_select(0, index), x0_there, solver, caps.index_select(0, there));
+      const auto some = solve_recorded(*part, b.index_select(0, index), x0_there, solver, caps.index_select(0, there));
       return {zeros.index_copy(0, index, some.u), none.index_copy(0, there, some.operator_applications)};
     }
   }
   const auto host_caps = caps.to(at::kCPU).contiguous();
-  const int64_t most = *std::max_element(host_caps.const_data_ptr<int64_t>(),
-                                         host_caps.const_data_ptr<int64_t>() + host_caps.numel());
+  const int64_t most =
+      *std::max_element(host_caps.const_data_ptr<int64_t>(), host_caps.const_data_ptr<int64_t>() + host_caps.numel());
   std::vector<SampleState> states(b.size(0));
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   const auto whole = a.project(rhs);
@@ -248,8 +245,7 @@ StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::
 
 int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin(), caps_.end()); }
 
-StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rhs, const State& before,
-                                         int64_t done) {
+StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done) {
   std::vector<SampleState> states(caps_.size());
   TensorSpace space(a, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {

@@ -1,8 +1,8 @@
-#include "prdp/solvers/methods.h"
-
 #include <array>
 #include <sstream>
 #include <utility>
+
+#include "prdp/solvers/methods.h"
 
 namespace prdp {
 
@@ -16,12 +16,10 @@ constexpr auto kMethodNames = [] {
   for (size_t i = 0; i < names.size(); ++i) names[i] = {kTraits[i].method, kTraits[i].name};
   return names;
 }();
-constexpr Names<Preconditioner, 3> kPreconditioners{{{Preconditioner::kNone, "none"},
-                                                     {Preconditioner::kDiagonal, "diagonal"},
-                                                     {Preconditioner::kStokes, "stokes"}}};
-constexpr Names<Backward, 3> kBackwards{{{Backward::kImplicit, "implicit"},
-                                         {Backward::kUnrolled, "unrolled"},
-                                         {Backward::kNone, "none"}}};
+constexpr Names<Preconditioner, 3> kPreconditioners{
+    {{Preconditioner::kNone, "none"}, {Preconditioner::kDiagonal, "diagonal"}, {Preconditioner::kStokes, "stokes"}}};
+constexpr Names<Backward, 3> kBackwards{
+    {{Backward::kImplicit, "implicit"}, {Backward::kUnrolled, "unrolled"}, {Backward::kNone, "none"}}};
 constexpr Names<OnFailure, 4> kOnFailures{{{OnFailure::kRaise, "raise"},
                                            {OnFailure::kWarn, "warn"},
                                            {OnFailure::kReturn, "return"},
@@ -55,9 +53,7 @@ std::string_view name(OnFailure on_failure) { return to_name(kOnFailures, on_fai
 std::string_view name(Start start) { return to_name(kStarts, start); }
 Method method_from_name(std::string_view name) { return from_name(kMethodNames, name, "solver"); }
 Backward backward_from_name(std::string_view name) { return from_name(kBackwards, name, "backward"); }
-OnFailure on_failure_from_name(std::string_view name) {
-  return from_name(kOnFailures, name, "on_failure");
-}
+OnFailure on_failure_from_name(std::string_view name) { return from_name(kOnFailures, name, "on_failure"); }
 Start start_from_name(std::string_view name) { return from_name(kStarts, name, "start"); }
 
 namespace {

@@ -63,28 +63,27 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
 
 /// What a preconditioner by the diagonal needs beside: products with weights w, entry by entry.
 template <class S>
-concept WeightedSpace = VectorSpace<S> && requires(S s, typename S::Vector w, typename S::Vector x,
-                                                   typename S::Vector y, typename S::Vector p,
-                                                   typename S::Vector q, typename S::Scalar a, typename S::Scalar b) {
-  /// w = 1/|D|, times the power of two that brings its largest entry into [1, 2).
-  s.inverse_diagonal(w);
-  /// y = w∘x
-  s.weigh(w, x, y);
-  /// Σ w_i x_i²
-  { s.weighted_square(w, x) } -> std::same_as<typename S::Scalar>;
-  /// x += a p and y -= a q; returns ‖y‖² and Σ w_i y_i².
-  { s.descend(a, p, q, w, x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-  /// y = w∘x + a y
-  s.xpby(w, x, a, y);
-  /// step_length() with Σ w_i q_i² for the fourth; the last is ‖q‖².
-  { s.step_length(a, b, a, w, q, b) } -> std::same_as<typename S::Scalar>;
-};
+concept WeightedSpace =
+    VectorSpace<S> && requires(S s, typename S::Vector w, typename S::Vector x, typename S::Vector y,
+                               typename S::Vector p, typename S::Vector q, typename S::Scalar a, typename S::Scalar b) {
+      /// w = 1/|D|, times the power of two that brings its largest entry into [1, 2).
+      s.inverse_diagonal(w);
+      /// y = w∘x
+      s.weigh(w, x, y);
+      /// Σ w_i x_i²
+      { s.weighted_square(w, x) } -> std::same_as<typename S::Scalar>;
+      /// x += a p and y -= a q; returns ‖y‖² and Σ w_i y_i².
+      { s.descend(a, p, q, w, x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+      /// y = w∘x + a y
+      s.xpby(w, x, a, y);
+      /// step_length() with Σ w_i q_i² for the fourth; the last is ‖q‖².
+      { s.step_length(a, b, a, w, q, b) } -> std::same_as<typename S::Scalar>;
+    };
 
 /// What Jacobi's and Chebyshev's sweeps need beside.
 template <class S>
 concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, typename S::Vector x,
-                                                   typename S::Vector y, int64_t n,
-                                                   const typename S::Scalar* omega) {
+                                                   typename S::Vector y, int64_t n, const typename S::Scalar* omega) {
   /// y = D⁻¹ x
   s.divide_by_diagonal(x, y);
   /// x takes the value of y, and y that of x.
@@ -101,37 +100,36 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
 
 /// What GMRES needs beside: a basis, and numbers that may vanish.
 template <class S>
-concept KrylovSpace = VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y,
-                                                 std::vector<typename S::Vector> v, int64_t n,
-                                                 typename S::Scalar a, typename S::Scalar b,
-                                                 typename S::Scalar* h, std::vector<typename S::Scalar> w,
-                                                 Preconditioner preconditioner) {
-  /// y = A M⁻¹ x
-  s.apply(x, y, preconditioner);
-  /// y = a x
-  s.scale(x, a, y);
-  /// h_i = v_i·x for the first n of v, as constants.
-  s.dots(v, n, x, h);
-  /// x -= Σ h_i v_i; returns ‖x‖² as a constant.
-  { s.subtract_combination(h, v, n, x) } -> std::same_as<typename S::Scalar>;
-  /// x += M⁻¹ Σ w_i v_i
-  s.add_combination(w, v, n, x, preconditioner);
-  /// Whether a vector, of which a is left beside the b that went along the basis (both squared), is to be made
-  /// orthogonal once more; the last keeps count of the digits lost.
-  { s.lost_orthogonality(a, b, a) } -> std::same_as<bool>;
-  /// 1/a; 0 where a is rounding beside b.
-  { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
-  /// max(a, b)
-  { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
-  /// Whether no sample has a Krylov space left that could be extended.
-  { s.all_exhausted(a) } -> std::same_as<bool>;
-  /// a itself; its derivative is that of a constant.
-  { s.constant(a) } -> std::same_as<typename S::Scalar>;
-  /// How often the operations are recorded to be differentiated.
-  { s.derivatives() } -> std::same_as<int>;
-  /// Whether the samples have a start.
-  { s.started() } -> std::same_as<bool>;
-};
+concept KrylovSpace =
+    VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y, std::vector<typename S::Vector> v,
+                               int64_t n, typename S::Scalar a, typename S::Scalar b, typename S::Scalar* h,
+                               std::vector<typename S::Scalar> w, Preconditioner preconditioner) {
+      /// y = A M⁻¹ x
+      s.apply(x, y, preconditioner);
+      /// y = a x
+      s.scale(x, a, y);
+      /// h_i = v_i·x for the first n of v, as constants.
+      s.dots(v, n, x, h);
+      /// x -= Σ h_i v_i; returns ‖x‖² as a constant.
+      { s.subtract_combination(h, v, n, x) } -> std::same_as<typename S::Scalar>;
+      /// x += M⁻¹ Σ w_i v_i
+      s.add_combination(w, v, n, x, preconditioner);
+      /// Whether a vector, of which a is left beside the b that went along the basis (both squared), is to be made
+      /// orthogonal once more; the last keeps count of the digits lost.
+      { s.lost_orthogonality(a, b, a) } -> std::same_as<bool>;
+      /// 1/a; 0 where a is rounding beside b.
+      { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
+      /// max(a, b)
+      { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
+      /// Whether no sample has a Krylov space left that could be extended.
+      { s.all_exhausted(a) } -> std::same_as<bool>;
+      /// a itself; its derivative is that of a constant.
+      { s.constant(a) } -> std::same_as<typename S::Scalar>;
+      /// How often the operations are recorded to be differentiated.
+      { s.derivatives() } -> std::same_as<int>;
+      /// Whether the samples have a start.
+      { s.started() } -> std::same_as<bool>;
+    };
 
 /// What a direct method needs beside.
 template <class S>
@@ -142,20 +140,19 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
 
 /// All of it, and what the loop around the methods needs (iterate.h).
 template <class S>
-concept IterationSpace =
-    WeightedSpace<S> && SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S> &&
-    requires(S s, typename S::Vector x, typename S::Scalar a, typename S::States states,
-             bool (*wanted)(const typename S::States::value_type&)) {
-      /// One number per sample, on the host.
-      s.lanes(a);
-      /// Which samples broke down; ‖A‖ of each; ‖u‖², where u is x and the start.
-      s.broken();
-      s.operator_norm();
-      { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-      /// From here on, operations write to the samples alone that are wanted.
-      s.freeze_unless(states, wanted);
-      /// Forgets breakdowns and frozen samples, before the iterations run again.
-      s.restart();
-    };
+concept IterationSpace = WeightedSpace<S> && SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S> &&
+                         requires(S s, typename S::Vector x, typename S::Scalar a, typename S::States states,
+                                  bool (*wanted)(const typename S::States::value_type&)) {
+                           /// One number per sample, on the host.
+                           s.lanes(a);
+                           /// Which samples broke down; ‖A‖ of each; ‖u‖², where u is x and the start.
+                           s.broken();
+                           s.operator_norm();
+                           { s.solution2(x) } -> std::same_as<typename S::Scalar>;
+                           /// From here on, operations write to the samples alone that are wanted.
+                           s.freeze_unless(states, wanted);
+                           /// Forgets breakdowns and frozen samples, before the iterations run again.
+                           s.run_again();
+                         };
 
 }  // namespace prdp

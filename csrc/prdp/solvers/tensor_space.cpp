@@ -14,8 +14,7 @@ struct Limits {
 };
 
 Limits limits_of(const at::Tensor& t) {
-  if (t.scalar_type() == at::kFloat)
-    return {std::numeric_limits<float>::epsilon(), std::numeric_limits<float>::min()};
+  if (t.scalar_type() == at::kFloat) return {std::numeric_limits<float>::epsilon(), std::numeric_limits<float>::min()};
   return {std::numeric_limits<double>::epsilon(), std::numeric_limits<double>::min()};
 }
 
@@ -74,8 +73,7 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   d = at::where(every, solution, at::zeros_like(solution));
 }
 
-TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2,
-                                             const Scalar& b2) {
+TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
   // As SampleSpace::step_length; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
@@ -118,7 +116,7 @@ TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, co
   return at::where(mask_of(remade_rows), remade, kept);
 }
 
-void TensorSpace::restart() {
+void TensorSpace::run_again() {
   broken_ = at::Tensor();
   active_mask_ = at::Tensor();
   active_.clear();
@@ -133,8 +131,7 @@ void TensorSpace::set_active(const std::vector<bool>& active) {
 
 void TensorSpace::count() {
   interruption::Watch::local().look();
-  for (size_t i = 0; i < states_.size(); ++i)
-    states_[i].applications += active_.empty() || active_[i];
+  for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += active_.empty() || active_[i];
 }
 
 at::Tensor TensorSpace::mask_of(const std::vector<bool>& rows) const {

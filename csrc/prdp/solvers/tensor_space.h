@@ -5,9 +5,9 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -124,7 +124,9 @@ class TensorSpace {
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
-  void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const { to = at::where(where.ne(0), from, to); }
+  void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const {
+    to = at::where(where.ne(0), from, to);
+  }
   Scalar is_zero(const Scalar& value) const { return value.eq(0).to(b_.scalar_type()); }
   Scalar is_not_zero(const Scalar& value) const { return value.ne(0).to(b_.scalar_type()); }
   bool all_exhausted(const Scalar&) const { return false; }  // the basis goes on with zeros
@@ -146,7 +148,7 @@ class TensorSpace {
   }
   /// Rows of `remade` where a sample was solved again in the last pass, rows of `kept` elsewhere.
   Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
-  void restart();
+  void run_again();
 
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {

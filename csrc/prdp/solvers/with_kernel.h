@@ -28,8 +28,8 @@ void with_kernel(const DenseParameters& a, const Body& body) {
 
 template <class T, class Body>
 void with_kernel(const CsrParameters& a, const Body& body) {
-  body(kernels::Csr<T>(a.crow.const_data_ptr<int64_t>(), a.col.const_data_ptr<int64_t>(),
-                       a.values.const_data_ptr<T>(), a.crow.size(-1) - 1, a.values.size(-1),
+  body(kernels::Csr<T>(a.crow.const_data_ptr<int64_t>(), a.col.const_data_ptr<int64_t>(), a.values.const_data_ptr<T>(),
+                       a.crow.size(-1) - 1, a.values.size(-1),
                        /*is_shared=*/a.values.dim() == 1, a.transposed));
 }
 

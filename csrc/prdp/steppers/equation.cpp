@@ -77,11 +77,10 @@ Outputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_vie
   const auto [next, info] = step(equation, u, unflatten(std::move(options)...));
   return {next, info.iterations, info.residual, info.status, info.operator_applications};
 }
-using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
-                                          at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
+using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                          at::ArrayRef<double>, int64_t)>;
 
-at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape,
-                  at::ArrayRef<double> parameters) {
+at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters) {
   return equation_rhs({std::string(kind), shape.vec(), parameters.vec(), {}}, u);
 }
 
@@ -93,14 +92,17 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
-  m.def("step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-        PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
-        "Tensor operator_applications)",
-        static_cast<StepSignature*>(step_kernel));
+  m.def(
+      "step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
+      "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
+      ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
+      "Tensor operator_applications)",
+      static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
-  m.def("check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "
-        "int picard_steps) -> ()",
-        check_equation_op);
+  m.def(
+      "check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "
+      "int picard_steps) -> ()",
+      check_equation_op);
 }
 
 // torch.func.vmap goes through what they are made of.

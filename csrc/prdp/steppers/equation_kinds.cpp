@@ -30,8 +30,6 @@ const std::vector<EquationKind> kKinds{
 
 }  // namespace
 
-const EquationKind& equation_kind(const std::string& kind) {
-  return row_of(kKinds, "equation", kind);
-}
+const EquationKind& equation_kind(const std::string& kind) { return row_of(kKinds, "equation", kind); }
 
 }  // namespace prdp

@@ -14,8 +14,7 @@ ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, Solver solver, Backward back
     : ImplicitStep(std::move(a), std::move(rhs), SolveOptions{std::move(solver), backward}) {}
 
 ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward backward)
-    : ImplicitStep([a = std::move(a)](const at::Tensor&) { return a; }, std::move(rhs), std::move(solver),
-                   backward) {}
+    : ImplicitStep([a = std::move(a)](const at::Tensor&) { return a; }, std::move(rhs), std::move(solver), backward) {}
 
 SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
   TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());

@@ -11,11 +11,11 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/disguises.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/steppers/solving.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -29,29 +29,26 @@ using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::T
 // right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
 constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-    "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> "
+    "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
+    ") -> "
     "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
 constexpr const char* kVjpSchema =
     "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
-    "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, " PRDP_OPTIONS_SCHEMA
-    PRDP_FROM_STATE_SCHEMA ") -> Tensor[]";
+    "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
+    "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> Tensor[]";
 
-using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view,
-                                            at::IntArrayRef, at::ArrayRef<double>, int64_t, c10::SymInt)>;
+using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                            at::ArrayRef<double>, int64_t, c10::SymInt)>;
 using OptionalTensor = std::optional<at::Tensor>;
 using VjpSignature = WithOptions<std::vector<at::Tensor>(
-    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-    const OptionalTensor&, at::IntArrayRef,
-    at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
+    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
+    at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
-Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
-                    const SolveOptions& o) {
-  static const auto op = c10::Dispatcher::singleton()
-                             .findSchemaOrThrow("prdp::rollout_solves", "")
-                             .typed<SolvesSignature>();
-  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind),
-                           at::IntArrayRef(e.shape), at::ArrayRef<double>(e.parameters), e.picard_steps,
-                           solves);
+Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
+  static const auto op =
+      c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_solves", "").typed<SolvesSignature>();
+  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind), at::IntArrayRef(e.shape),
+                           at::ArrayRef<double>(e.parameters), e.picard_steps, solves);
 }
 
 Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
@@ -59,8 +56,7 @@ Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArray
   return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
 }
 
-void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
-           const SolveOptions& options) {
+void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
   options.check(equation.kind.c_str());
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);
@@ -69,9 +65,8 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
 
 /// Below autograd.
 template <class... Options>
-Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
-                      at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
-                      c10::SymInt count, Options... flat) {
+Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                      at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt count, Options... flat) {
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const auto options = unflatten(std::move(flat)...);
   check(equation, u, count, options);
@@ -95,29 +90,27 @@ Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_v
 
 template <class... Options>
 Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                    at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves,
-                    Options... flat) {
-  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves,
-        unflatten(std::move(flat)...));
+                    at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves, Options... flat) {
+  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves, unflatten(std::move(flat)...));
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, solves + 1);
   const auto of_dtype = [&](at::ScalarType dtype) {
     return at::empty_symint({u.sym_size(0), solves}, u.options().dtype(dtype));
   };
-  return {at::empty_symint(sizes, u.options()), of_dtype(at::kLong), of_dtype(u.scalar_type()),
-          of_dtype(at::kLong), of_dtype(at::kLong)};
+  return {at::empty_symint(sizes, u.options()), of_dtype(at::kLong), of_dtype(u.scalar_type()), of_dtype(at::kLong),
+          of_dtype(at::kLong)};
 }
 
 template <class... Options>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
-                                   const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors, c10::string_view kind,
-                                   at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                                   const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors,
+                                   c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
                                    int64_t picard_steps, Options... flat) {
   const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
-                  status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
+                        status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
   const auto found =
       vjp_of_solves(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
@@ -133,9 +126,8 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
 template <class... Options>
 std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
                                  const OptionalTensor&, const OptionalTensor&, at::IntArrayRef needed,
-                                 at::TensorList tensors,
-                                 c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t,
-                                 Options...) {
+                                 at::TensorList tensors, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
+                                 int64_t, Options...) {
   std::vector<at::Tensor> gradients;
   auto sizes = cotangent.sym_sizes().vec();
   sizes.erase(sizes.begin() + 1);
@@ -166,8 +158,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     const bool a_varies = equation_kind(call->equation.kind).linearised || any_requires_grad(tensors);
     const bool may_have_failed = options.on_failure != OnFailure::kRaise;
     variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
-                        unrolled || may_have_failed ? status : at::Tensor(),
-                        unrolled ? residual : at::Tensor()};
+                        unrolled || may_have_failed ? status : at::Tensor(), unrolled ? residual : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(saved);
     call->equation.tensors.clear();  // they are among the saved ones
@@ -190,8 +181,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
       return vjp(cotangent, kept, equation, call->options, needed);
     };
     const WithoutAutocast full_precision;
-    const auto found = is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], gradients)
-                                                        : gradients(grads[0]);
+    const auto found = is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], gradients) : gradients(grads[0]);
     std::copy(found.begin(), found.end(), out.begin());
     return out;
   }
@@ -203,9 +193,8 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     if (at::GradMode::is_enabled() || has_tangent(cotangent))
       return vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve);
     const auto optional = [](const at::Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
-    static const auto op = c10::Dispatcher::singleton()
-                               .findSchemaOrThrow("prdp::rollout_vjp", "")
-                               .typed<VjpSignature>();
+    static const auto op =
+        c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_vjp", "").typed<VjpSignature>();
     const auto found = call_with_options(
         op, options, cotangent, optional(kept.solutions), optional(kept.iterations), optional(kept.status),
         optional(kept.residual), needed, at::TensorList(equation.tensors), c10::string_view(equation.kind),
@@ -218,18 +207,16 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
 };
 
 template <class... Options>
-Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
-                        at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
-                        c10::SymInt solves, Options... flat) {
+Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                        at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves, Options... flat) {
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
   auto call = c10::make_intrusive<Call>();
   call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call->solves = std::move(solves);
   call->options = unflatten(std::move(flat)...);
-  const bool differentiable =
-      at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
-      (u.requires_grad() || any_requires_grad(tensors));
+  const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
+                              (u.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) {
     const at::AutoDispatchBelowADInplaceOrView below;
     return call_solves(call->equation, u, call->solves, call->options);
@@ -254,11 +241,10 @@ SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, 
 }
 
 template <class... Options>
-Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind,
-                       at::IntArrayRef shape, at::ArrayRef<double> parameters, int64_t picard_steps,
-                       c10::SymInt steps, Options... flat) {
-  const auto [states, info] = rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps,
-                                      unflatten(std::move(flat)...));
+Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                       at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt steps, Options... flat) {
+  const auto [states, info] =
+      rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps, unflatten(std::move(flat)...));
   return {states, info.iterations, info.residual, info.status, info.operator_applications};
 }
 
@@ -270,25 +256,26 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
     return chain(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;
-  TORCH_CHECK_VALUE(steps.is_symbolic() || picard < 1 ||
-                        steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
-                    "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  auto [solutions, iterations, residual, status, applications] =
-      call_solves(equation, u, steps * picard, options);
+  TORCH_CHECK_VALUE(
+      steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
+      "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
+  auto [solutions, iterations, residual, status, applications] = call_solves(equation, u, steps * picard, options);
   if (picard == 1) return {solutions, {iterations, residual, status, applications}};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
   return {solutions.slice_symint(1, 0, std::nullopt, picard),
-          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1),
-           of_steps(status).amin(-1), of_steps(applications).sum(-1)}};
+          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1), of_steps(status).amin(-1),
+           of_steps(applications).sum(-1)}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kSolvesSchema, {at::Tag::pt2_compliant_tag});
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
-  m.def("rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-        "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor states, Tensor iterations, Tensor residual, "
-        "Tensor status, Tensor operator_applications)",
-        static_cast<SolvesSignature*>(rollout_kernel));
+  m.def(
+      "rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
+      "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
+      ") -> (Tensor states, Tensor iterations, Tensor residual, "
+      "Tensor status, Tensor operator_applications)",
+      static_cast<SolvesSignature*>(rollout_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
   m.impl("rollout_solves", static_cast<SolvesSignature*>(solves_kernel));
@@ -298,9 +285,7 @@ TORCH_LIBRARY_IMPL(prdp, Meta, m) {
   m.impl("rollout_solves", static_cast<SolvesSignature*>(fake_solves));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(fake_vjp));
 }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
-  m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves));
-}
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves)); }
 
 TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
   m.impl("rollout", static_cast<SolvesSignature*>(rollout_kernel));

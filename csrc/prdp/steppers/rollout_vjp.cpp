@@ -5,10 +5,10 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/threads/interruption.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/solving.h"
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -34,8 +34,7 @@ void Reports::push(const SolveInfo& info) {
 }
 
 void Reports::reverse() {
-  for (auto* list : {&iterations_, &residual_, &status_, &applications_})
-    std::reverse(list->begin(), list->end());
+  for (auto* list : {&iterations_, &residual_, &status_, &applications_}) std::reverse(list->begin(), list->end());
 }
 
 SolveInfo Reports::joined(const at::Tensor& u) const {
@@ -43,9 +42,9 @@ SolveInfo Reports::joined(const at::Tensor& u) const {
           side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong)};
 }
 
-std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept,
-                                      const Equation& equation, const SolveOptions& options,
-                                      at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
+std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
+                                      const SolveOptions& options, at::IntArrayRef needed,
+                                      decltype(linear_solve)& adjoint_solve) {
   const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
   const auto& kind = equation_kind(equation.kind);
   const bool rhs_is_state = !kind.rhs;
@@ -62,9 +61,11 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     if (options.on_failure == OnFailure::kZeroGrad && s == first + picard - 1)  // whichever solve of the step failed
       bars[s + 1] = without_lost(bars[s + 1], kept.status.slice(1, first, s + 1).amin(1), options.on_failure);
     const auto a = equation_operator(equation, at_solve(kept.solutions, s));
-    Solved solved{
-        {}, at_solve(kept.solutions, s + 1), at_solve(kept.iterations, s), at_solve(kept.status, s),
-        at_solve(kept.residual, s)};
+    Solved solved{{},
+                  at_solve(kept.solutions, s + 1),
+                  at_solve(kept.iterations, s),
+                  at_solve(kept.status, s),
+                  at_solve(kept.residual, s)};
     if (options.backward == Backward::kUnrolled) {
       solved.b = equation_rhs(equation, at_solve(kept.solutions, first));
       solved.x0 = start_of_step(options, at_solve(kept.solutions, s));

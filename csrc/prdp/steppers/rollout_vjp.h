@@ -27,8 +27,8 @@ struct KeptSolves {
 /// (rollout.cpp) with its derivative: gradients of u and of each tensor of the equation, undefined where
 /// `needed` (u first) holds 0 or there is none. Sums run in the order in which autograd takes the steps
 /// of a chain. Where autograd records, it is differentiable, if `adjoint_solve` is.
-std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept,
-                                      const Equation& equation, const SolveOptions& options,
-                                      at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve);
+std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
+                                      const SolveOptions& options, at::IntArrayRef needed,
+                                      decltype(linear_solve)& adjoint_solve);
 
 }  // namespace prdp

@@ -47,8 +47,7 @@ std::optional<SolveInfo> Solving::adjoint_info() const {
 
 bool Solving::converged() const {
   const auto adjoint = adjoint_info();
-  return info_ && info_->status.gt(0).all().item<bool>() &&
-         (!adjoint || adjoint->status.gt(0).all().item<bool>());
+  return info_ && info_->status.gt(0).all().item<bool>() && (!adjoint || adjoint->status.gt(0).all().item<bool>());
 }
 
 }  // namespace prdp

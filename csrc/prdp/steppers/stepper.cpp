@@ -38,8 +38,7 @@ at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
 Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward, Length length)
     : Stepper({"poisson", shape, parameters({}, length, shape.size()), {}}, {std::move(solver), backward}) {}
 
-Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
-           Length length)
+Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward, Length length)
     : Stepper({"heat", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}},
               {std::move(solver), backward}) {}
 
@@ -48,10 +47,9 @@ Burgers::Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver sol
     : Stepper({"burgers", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}, picard_steps},
               {std::move(solver), backward}) {}
 
-NavierStokes::NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-                           Backward backward, int64_t picard_steps, Length length)
-    : Stepper({"navier_stokes", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)},
-               picard_steps},
+NavierStokes::NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
+                           int64_t picard_steps, Length length)
+    : Stepper({"navier_stokes", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}, picard_steps},
               {std::move(solver), backward}) {}
 
 }  // namespace prdp

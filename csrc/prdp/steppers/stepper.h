@@ -36,8 +36,7 @@ struct Length {
 /// Maps p to the solution u of Δu = -p, with u = 0 on the boundary (paper, appendix C.1).
 class Poisson : public Stepper {
  public:
-  Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit,
-          Length length = 1.0);
+  Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit, Length length = 1.0);
 };
 
 /// nu >= 0 in length²/time: a number, or a 0-dimensional tensor, which gets a gradient.
@@ -50,8 +49,8 @@ struct Viscosity {
 /// One implicit Euler step of u_t = ν Δu with u = 0 on the boundary; dt > 0 (paper, appendix C.2 to C.4).
 class Heat : public Stepper {
  public:
-  Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-       Backward backward = Backward::kImplicit, Length length = 1.0);
+  Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward = Backward::kImplicit,
+       Length length = 1.0);
 };
 
 /// One implicit Euler step of u_t + (u·∇)u = ν Δu on a periodic grid of shape (N) or (Ny, Nx) (paper, appendix C.5). u
@@ -59,8 +58,8 @@ class Heat : public Stepper {
 /// linearised about the state. A step makes picard_steps solves, each linearised about the solution of the one before.
 class Burgers : public Stepper {
  public:
-  Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-          Backward backward = Backward::kImplicit, int64_t picard_steps = 1, Length length = 1.0);
+  Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward = Backward::kImplicit,
+          int64_t picard_steps = 1, Length length = 1.0);
 };
 
 /// One implicit Euler step of u_t + (u·∇)u + ∇p = ν Δu, ∇·u = 0 on a periodic grid (Ny, Nx) (paper, appendix C.6). The
