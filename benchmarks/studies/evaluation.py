@@ -8,8 +8,9 @@ from prdp_torch.experiments.network_task import error, propagator
 
 
 def spread(values):
-    """Mean ± standard deviation, for a table."""
-    return f"{np.mean(values):.2e} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.0e}"
+    """Mean ± standard deviation, for a table; of a single value, the value."""
+    deviation = f" ± {np.std(values, ddof=1):.0e}" if len(values) > 1 else ""
+    return f"{np.mean(values):.2e}{deviation}"
 
 
 def validation_errors(scene, network):
