@@ -55,7 +55,8 @@ def table(rows):
     for precision in ("float32", "bfloat16"):
         chosen = [row for row in rows if row["precision"] == precision]
         error, products, seconds = (np.mean([row[key] for row in chosen]) for key in ("error", "products", "seconds"))
-        lines.append(f"| {precision}, {len(chosen)} seeds | {error:.2e} | {products:,.0f} | {seconds:.0f} |")
+        seeds = f", {len(chosen)} seeds" if len(chosen) > 1 else ""
+        lines.append(f"| {precision}{seeds} | {error:.2e} | {products:,.0f} | {seconds:.0f} |")
     return "\n".join(lines)
 
 
