@@ -54,9 +54,6 @@ struct MethodTraits {
 template <template <IterationSpace> class Iteration>
 struct MethodRow : MethodTraits {
   template <IterationSpace Space>
-  using In = Iteration<Space>;
-
-  template <IterationSpace Space>
   auto make(Space& space, int64_t restart) const {
     if constexpr (std::is_constructible_v<Iteration<Space>, Space&, int64_t, Preconditioner>)
       return Iteration<Space>(space, restart, preconditioner);

@@ -38,19 +38,19 @@ def burgers_of_amplitude(peclet, ratio=10.0, n=64):
 
 def flow(cfl, n=16, batch=8, dtype=torch.float64):
     """A Navier-Stokes step with cfl = dt max|u|/dx about random solenoidal velocities (nu = 1e-3)."""
-    u = fields.project(noise(batch, 3, n, n))
-    u = (u / u[:, :2].abs().amax((1, 2, 3), keepdim=True)).to(dtype)
-    dt = cfl / n
-    b = u / dt
-    b[:, 2] = 0.0
-    return operators.NavierStokes(u, 1e-3, dt), b
+    return _flow_step(noise(batch, 3, n, n), cfl / n, dtype)
 
 
 def flow_of_size(n, dt=0.1, batch=4):
     """A Navier-Stokes step about smooth random velocities with max|u| = 1 (nu = 1e-3), the same dt on all grids."""
     modes = (torch.fft.fftfreq(n, 1 / n).abs()[:, None] <= 3) & (torch.fft.rfftfreq(n, 1 / n) <= 3)
-    u = fields.project(torch.fft.irfft2(torch.fft.rfft2(noise(batch, 3, n, n)) * modes, s=(n, n)))
-    u = u / u[:, :2].abs().amax((1, 2, 3), keepdim=True)
+    return _flow_step(torch.fft.irfft2(torch.fft.rfft2(noise(batch, 3, n, n)) * modes, s=(n, n)), dt)
+
+
+def _flow_step(velocities, dt, dtype=torch.float64):
+    """Its operator and right-hand side, about these velocities without their divergence and scaled to max|u| = 1."""
+    u = fields.project(velocities)
+    u = (u / u[:, :2].abs().amax((1, 2, 3), keepdim=True)).to(dtype)
     b = u / dt
     b[:, 2] = 0.0
     return operators.NavierStokes(u, 1e-3, dt), b
