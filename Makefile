@@ -2,6 +2,7 @@
 # make test   set everything up, then run all C++ and Python tests
 # make docs   build the documentation as a site, site/index.html
 # make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
+# make tidy   install clang-tidy and run it on the C++ code, ten minutes; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
@@ -11,11 +12,11 @@ STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
 
-.PHONY: demo test docs sanitize fuzz bench-peers clean
+.PHONY: demo test docs tidy sanitize fuzz bench-peers clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
-	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
+	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/prdp compare heat_1d
 
@@ -25,13 +26,22 @@ test: $(STAMPS)/configure
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
 	find csrc tests benchmarks -name '*.h' -o -name '*.cpp' | xargs $(BIN)/clang-format --dry-run -Werror
+	[ ! -x $(BIN)/clang-tidy ] || $(MAKE) --no-print-directory tidy
 	$(BIN)/ctest --test-dir build --output-on-failure
 	$(BIN)/pytest
 
 bench-peers: $(STAMPS)/configure $(STAMPS)/peers
-	$(BIN)/cmake --build build --parallel $$(nproc) --target _C
+	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	.venv-peers/bin/python -m prdp_torch bench
+
+# A build folder of its own: clang cannot read the headers that g++ has precompiled.
+GCC_HEADERS := $$(g++ -print-file-name=include)
+tidy: $(STAMPS)/configure
+	$(BIN)/pip install --quiet --disable-pip-version-check clang-tidy==23.1.4
+	$(BIN)/cmake -S . -B build-tidy -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_TESTS=OFF -DCMAKE_DISABLE_PRECOMPILE_HEADERS=ON > build/tidy.log
+	find csrc -name '*.cpp' | xargs -P $$(nproc) -n 1 $(BIN)/clang-tidy -p build-tidy --quiet \
+	  --extra-arg=-idirafter --extra-arg=$(GCC_HEADERS) --extra-arg=-Wno-unknown-warning-option
 
 # ThreadSanitizer watches what has threads; csrc/prdp/threads/interruption.h shares loops in a way that it understands.
 sanitize: $(STAMPS)/configure
@@ -96,4 +106,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-docs .venv-peers .stamps build build-address build-thread build-fuzz runs site prdp_torch/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-docs .venv-peers .stamps build build-address build-thread build-fuzz build-tidy runs site prdp_torch/*.so prdp_torch/experiments/*.so prdp_torch/built_for_torch.txt *.egg-info

@@ -21,7 +21,7 @@ class CMakeBuild(build_ext):
         if shutil.which("ninja") and not (BUILD / "CMakeCache.txt").exists():
             configure += ["-G", "Ninja"]
         subprocess.run(configure, check=True)
-        subprocess.run(["cmake", "--build", BUILD, "--parallel", str(os.cpu_count()), "--target", "_C"], check=True)
+        subprocess.run(["cmake", "--build", BUILD, "--parallel", str(os.cpu_count()), "--target", "python"], check=True)
         subprocess.run(["cmake", "--install", BUILD, "--component", "python", "--prefix", package], check=True)
         if not self.editable_mode:  # an editable install finds them in examples/
             shutil.copytree(ROOT / "examples" / "scenes", package / "scenes", dirs_exist_ok=True)

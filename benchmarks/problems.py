@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 import prdp_torch as prdp
-from prdp_torch import _C, fields, operators
+from prdp_torch import fields, operators
+from prdp_torch.experiments import _C
 
 SMOOTHING = 3e-3  # nu dt of the heat step that turns noise into a state
 

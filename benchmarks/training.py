@@ -3,8 +3,7 @@
 import torch
 
 from benchmarks import measure
-from prdp_torch import _C
-from prdp_torch.experiments import scenes
+from prdp_torch.experiments import _C, scenes
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 

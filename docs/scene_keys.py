@@ -1,13 +1,13 @@
 """Write the tables of scene keys in docs/command_line.md, from what the reader of scenes declares.
 
-Run it after a change of csrc/prdp/scenes/scene_reader.cpp and a build: python -m docs.scene_keys
+Run it after a change of csrc/prdp_experiments/scenes/scene_reader.cpp and a build: python -m docs.scene_keys
 """
 
 import re
 from pathlib import Path
 
 from docs import page_tables
-from prdp_torch import _C
+from prdp_torch.experiments import _C
 
 PAGE = Path(__file__).with_name("command_line.md")
 TABLE = page_tables.places("scene_keys.py")

@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from prdp_torch import _C, fields
+from prdp_torch import fields
+from prdp_torch.experiments import _C
 from prdp_torch.experiments.network_task import error, propagator
 
 

@@ -9,8 +9,7 @@ import torch
 
 import prdp_torch as prdp
 from benchmarks.studies.trainings import variant
-from prdp_torch import _C
-from prdp_torch.experiments import records, trajectory_charts
+from prdp_torch.experiments import _C, records, trajectory_charts
 from prdp_torch.experiments.charts import make_figure
 from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.scenes import make_stepper

@@ -5,8 +5,7 @@ import math
 
 import torch
 
-from prdp_torch import _C
-from prdp_torch.experiments import records, scenes
+from prdp_torch.experiments import _C, records, scenes
 from prdp_torch.experiments.charts import make_figure
 
 SCENES = ("poisson_1p", "poisson_3p_sd", "heat_1d", "heat_2d", "heat_3d", "burgers_1d", "burgers_2d", "navier_stokes")

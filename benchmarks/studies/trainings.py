@@ -90,7 +90,7 @@ class Study:
     def _row(self, scene, how, seed, changes):
         network = make_network(scene, seed)
         refinement = REFINEMENTS[how](scene)
-        callbacks = refinement.callbacks() if how == "prdp_loss" else ()
+        callbacks = refinement.callbacks() if isinstance(refinement, PRDPOnLoss) else ()
         curves = train(scene, refinement, seed=seed, network=network, callbacks=callbacks)
         errors = evaluation.validation_errors(scene, network)
         return {

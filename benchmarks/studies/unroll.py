@@ -14,8 +14,7 @@ from matplotlib.ticker import NullLocator
 
 from benchmarks.studies.evaluation import spread
 from benchmarks.studies.trainings import variant
-from prdp_torch import _C
-from prdp_torch.experiments import records, scenes
+from prdp_torch.experiments import _C, records, scenes
 from prdp_torch.experiments.charts import make_figure
 from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.networks import make_network

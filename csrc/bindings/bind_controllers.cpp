@@ -1,4 +1,5 @@
 #include "bindings.h"
+#include "convert.h"
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
@@ -55,12 +56,6 @@ py::dict as_dict(const ToleranceSettings& s) {
 }
 
 }  // namespace
-
-py::dict as_dict(const PRDPSettings& s) {
-  return py::dict("tau_step"_a = s.tau_step, "tau_stop"_a = s.tau_stop, "delta"_a = s.delta, "window"_a = s.window,
-                  "initial"_a = s.initial, "increment"_a = s.increment, "maximum"_a = s.maximum, "growth"_a = s.growth,
-                  "adjoint_ratio"_a = s.adjoint_ratio);
-}
 
 void bind_controllers(py::module_& m) {
   m.attr("PRDP_DEFAULTS") = as_dict(PRDPSettings{});

@@ -1,6 +1,6 @@
 /// Trains a network through a heat step in C++: what the network makes of u0 shall, after one step of the solver,
 /// be where two steps lead. PRDP begins with one iteration per solve and adds more as the error stops falling.
-#include <prdp/networks/mlp.h>
+#include <prdp_experiments/networks/mlp.h>
 #include <prdp/prdp.h>
 #include <torch/optim/adam.h>
 

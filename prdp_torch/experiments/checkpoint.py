@@ -7,7 +7,8 @@ import warnings
 
 import torch
 
-from prdp_torch import _C, processes
+from prdp_torch import processes
+from prdp_torch.experiments import _C
 
 # What torch.load raises.
 _DAMAGED = (RuntimeError, EOFError, pickle.UnpicklingError)

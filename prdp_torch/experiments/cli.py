@@ -14,9 +14,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from prdp_torch import _C, processes
+from prdp_torch import processes
+from prdp_torch._C import sentence
+from prdp_torch.experiments import _C, datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import compare as comparison
-from prdp_torch.experiments import datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.tensorboard import TensorBoard
@@ -64,7 +65,7 @@ def command(function):
             raise
         except (ValueError, TypeError, OSError, ImportError, RuntimeError, OverflowError, MemoryError) as error:
             words = "std::bad_alloc" if isinstance(error, MemoryError) else str(error)
-            print(f"prdp: {_C.sentence(words)}", file=sys.stderr)
+            print(f"prdp: {sentence(words)}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return app.command(name=function.__name__)(guarded)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prdp_torch import _C, processes
-from prdp_torch.experiments import records
+from prdp_torch import processes
+from prdp_torch.experiments import _C, records
 from prdp_torch.experiments.checkpoint import Checkpoint
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement

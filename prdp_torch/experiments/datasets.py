@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C
-from prdp_torch.experiments import pdebench
+from prdp_torch._C import sentence
+from prdp_torch.experiments import _C, pdebench
 
 TRAINED_STEPS = 2  # that the loss looks ahead
 
@@ -114,7 +114,7 @@ def check_network(scene, network, states):
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             answer = network(states)
     except RuntimeError as error:
-        raise ValueError(f"train: network fails on states {tuple(states.shape)}: {_C.sentence(str(error))}") from error
+        raise ValueError(f"train: network fails on states {tuple(states.shape)}: {sentence(str(error))}") from error
     finally:
         for module, mode in modes:
             module.training = mode

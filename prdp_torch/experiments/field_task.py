@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from prdp_torch import _C, operators
+from prdp_torch import operators
+from prdp_torch.experiments import _C
 from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed

@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from prdp_torch import _C, fields, processes
-from prdp_torch.experiments import datasets
+from prdp_torch import fields, processes
+from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.task import Task

@@ -2,7 +2,7 @@
 
 import torch
 
-from prdp_torch import _C
+from prdp_torch.experiments import _C
 from prdp_torch.experiments.task import Task
 
 

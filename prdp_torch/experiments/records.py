@@ -12,14 +12,15 @@ from pathlib import Path
 
 import torch
 
-from prdp_torch import _C, processes
-from prdp_torch.experiments import datasets
+from prdp_torch import processes
+from prdp_torch._C import VERSION
+from prdp_torch.experiments import _C, datasets
 
 
 def environment():
     """Versions, machine and commit, as far as they can be found out."""
     return {
-        "versions": {"prdp_torch": _C.VERSION, "torch": torch.__version__, "python": platform.python_version()},
+        "versions": {"prdp_torch": VERSION, "torch": torch.__version__, "python": platform.python_version()},
         "machine": {
             "processor": _processor(),
             "cores": os.cpu_count(),

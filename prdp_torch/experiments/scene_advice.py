@@ -4,9 +4,8 @@ from statistics import median
 
 import torch
 
-from prdp_torch import _C
 from prdp_torch.advice import Update, advise_on, checked_limit, milliseconds
-from prdp_torch.experiments import datasets
+from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.trials import RUNS, now, random_cotangent, run

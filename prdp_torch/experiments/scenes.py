@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from prdp_torch import _C, solvers, steppers
-from prdp_torch.experiments import field_task
+from prdp_torch import solvers, steppers
+from prdp_torch.experiments import _C, field_task
 
 _PACKAGE = Path(__file__).parents[1]
 # In a checkout the scenes lie among the examples; a wheel carries them along.

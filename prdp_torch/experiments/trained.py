@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, fields
-from prdp_torch.experiments import network_task, records
+from prdp_torch import fields
+from prdp_torch.experiments import _C, network_task, records
 from prdp_torch.experiments.networks import make_network
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch import _C, processes
-from prdp_torch.experiments import datasets, field_task, network_task, parameter_task
+from prdp_torch import processes
+from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.solve import SolveStatus
 

@@ -5,7 +5,7 @@
 
 #include "helpers.h"
 #include "prdp/prdp.h"
-#include "prdp/scenes/failures.h"
+#include "prdp_experiments/training/failures.h"
 
 /// What failed samples say, and the gradient that they do not get.
 namespace {

@@ -9,8 +9,8 @@
 #include "../fuzz/targets.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
-#include "prdp/scenes/scene.h"
-#include "prdp/scenes/tensor_map.h"
+#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/scenes/scene.h"
 
 /// A short run of what `make fuzz` does at length: the corpus, and copies of it with bytes changed, moved or left out.
 /// A fault ends the process, or throws what the target does not let pass.

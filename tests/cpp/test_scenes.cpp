@@ -7,12 +7,12 @@
 #include <numbers>
 
 #include "prdp/grid/grid.h"
-#include "prdp/networks/resnet.h"
 #include "prdp/operators/navier_stokes_operator.h"
-#include "prdp/scenes/data.h"
-#include "prdp/scenes/flow_data.h"
-#include "prdp/scenes/loss.h"
-#include "prdp/scenes/scene.h"
+#include "prdp_experiments/data/data.h"
+#include "prdp_experiments/data/flow_data.h"
+#include "prdp_experiments/networks/resnet.h"
+#include "prdp_experiments/scenes/scene.h"
+#include "prdp_experiments/training/loss.h"
 
 namespace {
 

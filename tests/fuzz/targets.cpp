@@ -7,14 +7,14 @@
 #include <cstring>
 
 #include "prdp/autograd/linear_solve.h"
-#include "prdp/networks/mlp.h"
-#include "prdp/networks/weights.h"
 #include "prdp/operators/operator.h"
-#include "prdp/scenes/checkpoint.h"
-#include "prdp/scenes/scene.h"
-#include "prdp/scenes/seal.h"
-#include "prdp/scenes/tensor_map.h"
 #include "prdp/solvers/methods.h"
+#include "prdp_experiments/files/checkpoint.h"
+#include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/networks/mlp.h"
+#include "prdp_experiments/networks/weights.h"
+#include "prdp_experiments/scenes/scene.h"
 
 namespace prdp_fuzz {
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 import prdp_torch as prdp
-from prdp_torch import _C
-from prdp_torch.experiments import scenes
+from prdp_torch.experiments import _C, scenes
 
 DATA = Path(__file__).parents[1] / "data"
 ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES]

@@ -22,8 +22,7 @@ from pathlib import Path
 import torch
 from helpers import small_field, tiny, written
 
-from prdp_torch import _C
-from prdp_torch.experiments import cli, records
+from prdp_torch.experiments import _C, cli, records
 
 ROOT = Path(__file__).parents[2]
 # Python's trainer is forked from a process that has imported torch, so that kills hit the training.

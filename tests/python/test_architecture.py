@@ -3,19 +3,28 @@
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/architecture.md").read_text()
 
 
-def test_a_folder_includes_only_folders_above_it():
-    table = re.search(r"## The folders\n.*?\n\n(\|.*?)\n\n", PAGE, re.DOTALL)[1]
-    order = re.findall(r"`csrc/prdp/(\w+)`", table)
-    folders = {path.name for path in (ROOT / "csrc/prdp").iterdir() if path.is_dir()}
-    assert set(order) == folders
-    for path in sorted((ROOT / "csrc/prdp").glob("*/*.*")):
-        for included in re.findall(r'#include "prdp/(\w+/\w+\.h)"', path.read_text()):
+@pytest.mark.parametrize("home", ["prdp", "prdp_experiments"])
+def test_a_folder_includes_only_folders_above_it(home):
+    order = re.findall(rf"^\| `csrc/{home}/(\w+)` \|", PAGE, re.MULTILINE)
+    folders = {path.name for path in (ROOT / "csrc" / home).iterdir() if path.is_dir()}
+    assert set(order) == folders and len(order) == len(folders)
+    for path in sorted((ROOT / "csrc" / home).glob("*/*.*")):
+        for included in re.findall(rf'#include "{home}/(\w+/\w+\.h)"', path.read_text()):
             above = order.index(included.split("/")[0]) <= order.index(path.parent.name)
             assert above, f"{path.name} includes {included}"
+
+
+def test_the_library_knows_nothing_of_the_experiments():
+    sources = [*(ROOT / "csrc/prdp").rglob("*.*"), *(ROOT / "csrc/bindings").glob("*.*")]
+    assert [path.name for path in sources if "prdp_experiments" in path.read_text()] == []
+    naming = {path.name for path in (ROOT / "prdp_torch").glob("*.py") if "experiments" in path.read_text()}
+    assert naming == {"__init__.py", "__main__.py"}  # when they are asked for; the command
 
 
 def test_the_folders_have_as_many_lines_as_the_page_says():

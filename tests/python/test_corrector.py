@@ -11,8 +11,8 @@ import torch
 from helpers import assert_refused, tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import _C, fields
-from prdp_torch.experiments import charts, network_task, scenes
+from prdp_torch import fields
+from prdp_torch.experiments import _C, charts, network_task, scenes
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train

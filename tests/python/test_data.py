@@ -11,8 +11,7 @@ import pytest
 import torch
 from helpers import tiny, written
 
-from prdp_torch import _C
-from prdp_torch.experiments import compare, datasets, pdebench, records, scenes, trajectories
+from prdp_torch.experiments import _C, compare, datasets, pdebench, records, scenes, trajectories
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 

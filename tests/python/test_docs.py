@@ -129,7 +129,7 @@ def test_the_scenes_are_read(block, tmp_path):
 
 
 def test_the_page_of_the_command_line_names_every_option_of_the_cpp_trainer():
-    source = (ROOT / "csrc/train/main.cpp").read_text()
+    source = (ROOT / "csrc/prdp_experiments/training/main.cpp").read_text()
     page = PAGES["docs/command_line.md"]
     section = re.search(r"^### `prdp_train.*?(?=^##)", page, re.MULTILINE | re.DOTALL)[0]
     options = re.findall(r'add_(?:option|flag)\("(--[\w-]+)"', source)
@@ -138,9 +138,9 @@ def test_the_page_of_the_command_line_names_every_option_of_the_cpp_trainer():
 
 @pytest.mark.parametrize("block", blocks("cpp"), ids=lambda block: f"{block.page}:{block.line}")
 def test_the_cpp_blocks_use_public_names(block):
-    headers = re.findall(r"^  (csrc/prdp/\S+\.h)\)?$", (ROOT / "CMakeLists.txt").read_text(), re.MULTILINE)
+    headers = re.findall(r"^  (csrc/\S+\.h)\)?$", (ROOT / "CMakeLists.txt").read_text(), re.MULTILINE)
     public = "".join((ROOT / header).read_text() for header in headers)
-    for header in re.findall(r"#include <(prdp/[^>]+)>", block.code):
+    for header in re.findall(r"#include <(prdp\w*/[^>]+)>", block.code):
         assert f"csrc/{header}" in headers
     for name in re.findall(r"prdp::(\w+)", block.code):
         assert re.search(rf"\b(class|struct|namespace) {name}\b|\b{name}\(|TORCH_MODULE\({name}\)", public), name

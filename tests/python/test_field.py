@@ -11,8 +11,8 @@ import pytest
 import torch
 from helpers import assert_refused, small_field
 
-from prdp_torch import _C, operators
-from prdp_torch.experiments import compare, field_task, scenes
+from prdp_torch import operators
+from prdp_torch.experiments import _C, compare, field_task, scenes
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 

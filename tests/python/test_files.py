@@ -15,8 +15,7 @@ import torch
 from helpers import reseal, tiny, written
 from typer.testing import CliRunner
 
-from prdp_torch import _C
-from prdp_torch.experiments import cli, compare, records, scenes
+from prdp_torch.experiments import _C, cli, compare, records, scenes
 from prdp_torch.experiments.checkpoint import Checkpoint
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement

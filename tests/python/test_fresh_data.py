@@ -9,8 +9,7 @@ import pytest
 import torch
 from helpers import assert_refused, tiny, written
 
-from prdp_torch import _C
-from prdp_torch.experiments import checkpoint, records, scenes
+from prdp_torch.experiments import _C, checkpoint, records, scenes
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 

@@ -7,6 +7,7 @@ import sys
 SETUP = """
 import os, signal, sys, threading, time, torch, prdp_torch as prdp
 from prdp_torch import _C
+from prdp_torch.experiments import _C as experiments_C
 from prdp_torch.experiments import scenes
 signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.manual_seed(0)
@@ -85,7 +86,7 @@ os.environ["PRDP_CACHE"] = "{tmp_path}"
 text = scenes.available()["burgers_2d"].read_text().replace("train = 400", "train = 4000")
 pathlib.Path("{tmp_path}/big.toml").write_text(text)
 scene = scenes.load("{tmp_path}/big.toml")
-interrupted("data", lambda: _C.make_dataset(scene))
+interrupted("data", lambda: experiments_C.make_dataset(scene))
 """)
     assert lines == ["data"] and [path.name for path in tmp_path.iterdir()] == ["big.toml"]
 

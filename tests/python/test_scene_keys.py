@@ -7,8 +7,7 @@ import pytest
 from helpers import as_toml
 
 from docs import scene_keys
-from prdp_torch import _C
-from prdp_torch.experiments import scenes
+from prdp_torch.experiments import _C, scenes
 
 KEYS = _C.scene_keys()
 

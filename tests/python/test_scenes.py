@@ -4,8 +4,8 @@ import pytest
 import torch
 from helpers import assert_refused, written
 
-from prdp_torch import _C, BiCGStab
-from prdp_torch.experiments import charts, scenes
+from prdp_torch import BiCGStab
+from prdp_torch.experiments import _C, charts, scenes
 
 
 def test_the_projects_scenes_hold_the_papers_settings():

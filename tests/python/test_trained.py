@@ -9,8 +9,7 @@ import torch
 from helpers import tiny, written
 
 import prdp_torch as prdp
-from prdp_torch import _C
-from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.experiments import _C, compare, records, scenes
 from prdp_torch.experiments.refinement import Refinement
 
 

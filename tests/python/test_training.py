@@ -11,8 +11,7 @@ import pytest
 import torch
 from helpers import written
 
-from prdp_torch import _C
-from prdp_torch.experiments import scenes
+from prdp_torch.experiments import _C, scenes
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 

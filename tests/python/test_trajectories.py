@@ -12,8 +12,8 @@ from PIL import Image
 from test_corrector import cache, tiny  # noqa: F401, cache is a fixture of every test here
 
 import prdp_torch as prdp
-from prdp_torch import _C, fields
-from prdp_torch.experiments import compare, report, scenes, trajectories, trajectory_charts
+from prdp_torch import fields
+from prdp_torch.experiments import _C, compare, report, scenes, trajectories, trajectory_charts
 from prdp_torch.experiments.networks import make_network
 
 PRDP = [sys.executable, "-m", "prdp_torch"]

@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from prdp_torch import _C, fields, operators
+from prdp_torch import fields, operators
+from prdp_torch.experiments import _C
 
 SEED = 0
 SAMPLES = 16

@@ -1,0 +1,21 @@
+#include "prdp/sentence.h"
+
+#include <algorithm>
+
+namespace prdp {
+
+std::string sentence(std::string_view what) {
+  what = what.substr(0, what.find("\nException raised from"));
+  if (what == "std::bad_alloc") return "out of memory";
+  constexpr std::string_view kTried = "you tried to allocate ";
+  if (const auto at = what.find(kTried); at != what.npos) {
+    const auto size = what.substr(at + kTried.size());
+    return "out of memory: cannot allocate " + std::string(size.substr(0, size.find('.')));
+  }
+  what = what.substr(0, what.find_last_not_of("\n ") + 1);
+  std::string line(what);
+  std::replace(line.begin(), line.end(), '\n', ' ');
+  return line;
+}
+
+}  // namespace prdp

@@ -1,0 +1,57 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <functional>
+
+#include "prdp_experiments/scenes/scene.h"
+
+namespace prdp {
+
+/// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of sin(2πn·) and cos(2πn·)
+/// over the axes, with amplitudes uniform in (-1, 1). Returns their values at the unknowns, (samples, channels,
+/// *shape). The same seed gives the same series in Python and C++.
+at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
+                          at::ScalarType dtype);
+
+/// One step of the reference solver. Raises RuntimeError if its solve does not converge.
+at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
+
+/// Called while data are made, with the number of steps done and of all steps. Steps are counted per sample.
+using OnProgress = std::function<void(int64_t, int64_t)>;
+
+/// The samples of a scene: initial states, and the states after converged steps from them, each
+/// (samples, channels, *shape). Training samples make two steps, validation samples data.valid_steps.
+struct Dataset {
+  at::Tensor train_start, train_end, valid_start, valid_end;
+  at::Tensor train_first;  // after one step; only for the task "corrector"
+};
+/// Makes the samples of a scene. Flows in two dimensions take seconds to minutes, because their reference solves are
+/// iterative. Their data are kept on disk (data_cache.h).
+Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
+/// The same without the cache on disk.
+Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
+
+/// The training samples alone, in the train_ fields.
+Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress = {});
+
+/// The trajectories of the validation samples: `steps` converged steps, (samples, steps + 1, channels, *shape). Their
+/// state number data.valid_steps is the valid_end of make_dataset(). Raises ValueError for steps < 0, and for a task
+/// that trains no network and so has no samples.
+at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
+/// The same for all samples, the training samples first.
+at::Tensor all_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
+
+/// The problem of the task "parameters": find the amplitudes θ of the load p(x) = Σ_i θ_i sin(2πi x).
+struct ParameterProblem {
+  at::Tensor modes;      // (P, N): the sines at the unknowns
+  at::Tensor start;      // (P,): θ at the beginning
+  at::Tensor reference;  // (P,): θ to be found
+  at::Tensor solution;   // (1, 1, N): the exact u for the reference
+};
+ParameterProblem make_parameter_problem(const Scene& scene);
+
+/// The order in which an epoch goes through the samples: a random permutation of 0 … samples - 1.
+at::Tensor shuffled(int64_t samples, at::Generator& generator);
+at::Generator make_generator(int64_t seed);
+
+}  // namespace prdp

@@ -1,0 +1,72 @@
+#include "prdp_experiments/data/data_cache.h"
+
+#include <unistd.h>
+
+#include <cstdlib>
+#include <filesystem>
+
+#include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/files/tensor_map.h"
+
+namespace prdp {
+
+namespace {
+
+namespace fs = std::filesystem;
+
+constexpr int kFormat = 3;
+
+fs::path cache_folder() {
+  const char *chosen = std::getenv("PRDP_CACHE"), *home = std::getenv("HOME");
+  const bool given = chosen && *chosen;
+  TORCH_CHECK_VALUE(given || home, "data: set PRDP_CACHE to a folder for the data set; there is no HOME");
+  const auto folder = given ? fs::path(chosen) : fs::path(home) / ".cache" / "prdp_torch";
+  std::error_code error;
+  fs::create_directories(folder, error);
+  TORCH_CHECK_VALUE(!error && access(folder.c_str(), W_OK) == 0, "data: cannot write to '", folder.string(),
+                    "'; set PRDP_CACHE to a folder for the data set");
+  return folder;
+}
+
+TensorMap tensors_of(const Dataset& d) {
+  TensorMap tensors{{"train_start", d.train_start},
+                    {"train_end", d.train_end},
+                    {"valid_start", d.valid_start},
+                    {"valid_end", d.valid_end}};
+  if (d.train_first.defined()) tensors["train_first"] = d.train_first;
+  return tensors;
+}
+
+Dataset dataset_of(const TensorMap& tensors, const Scene& scene) {
+  const auto states = [&](const char* name, int64_t samples) {
+    std::vector<int64_t> sizes{samples, scene.physics.channels()};
+    sizes.insert(sizes.end(), scene.physics.shape.begin(), scene.physics.shape.end());
+    return entry(tensors, name, scene.dtype, sizes);
+  };
+  const auto [train, valid] = std::pair(scene.data.train, scene.data.valid);
+  return {states("train_start", train), states("train_end", train), states("valid_start", valid),
+          states("valid_end", valid),
+          scene.task == Scene::Task::kCorrector ? states("train_first", train) : at::Tensor()};
+}
+
+}  // namespace
+
+Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
+  constexpr const char *kKind = "data", *kRemedy = "it is made again";
+  const auto settings = c10::str("prdp data ", kFormat, ": ", data_settings(scene));
+  const auto path = cache_folder() / (scene.physics.equation + '-' + fingerprint(settings) + ".data");
+  if (const auto found = read_sealed(path, kKind, kRemedy)) {
+    TORCH_CHECK_VALUE(found->settings == settings, "data: '", path.string(), "' holds '", found->settings, "', not '",
+                      settings, "'; delete it, and ", kRemedy);
+    try {
+      return dataset_of(unpack(found->content), scene);
+    } catch (const c10::ValueError&) {
+      refuse_damaged(path, kKind, kRemedy);
+    }
+  }
+  const auto data = make();
+  write_sealed(path, kKind, {settings, pack(tensors_of(data))});
+  return data;
+}
+
+}  // namespace prdp

@@ -1,0 +1,72 @@
+#include "prdp_experiments/data/flow_data.h"
+
+#include <numbers>
+
+#include "prdp/grid/grid.h"
+
+namespace prdp {
+
+namespace {
+
+constexpr int64_t kY = 0, kX = 1;  // the grid's axes
+constexpr int64_t kSamplesAtOnce = 25;
+constexpr double kSmoothing = 3e-3;  // ν Δt
+
+/// Eigenvalues of the periodic five-point Laplacian, as at::fft_rfft2 orders them.
+at::Tensor laplacian_symbol(const std::vector<int64_t>& shape) {
+  const auto along = [](int64_t n, int64_t waves) {
+    const auto k = at::arange(waves, at::TensorOptions().dtype(at::kDouble));
+    return -(2.0 * static_cast<double>(n) * (k * (std::numbers::pi / static_cast<double>(n))).sin()).square();
+  };
+  return along(shape[0], shape[0]).unsqueeze(1) + along(shape[1], shape[1] / 2 + 1);
+}
+
+/// v with its Fourier coefficients divided by `symbol`.
+at::Tensor divide_modes(const at::Tensor& v, const at::Tensor& symbol) {
+  return at::fft_irfft2(at::fft_rfft2(v) / symbol, v.sizes().slice(v.dim() - 2));
+}
+
+/// u - G φ with D G φ = D u.
+at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor symbol) {
+  symbol = symbol.clone();
+  symbol[0][0] = 1.0;  // the mean of φ, which G does not see
+  const auto divergence =
+      forward_difference(u.narrow(1, 0, 1), grid, kX) + forward_difference(u.narrow(1, 1, 1), grid, kY);
+  const auto phi = divide_modes(divergence, symbol);
+  return u - at::cat({backward_difference(phi, grid, kX), backward_difference(phi, grid, kY)}, 1);
+}
+
+}  // namespace
+
+at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
+  const Grid grid("random_flow", shape, Boundary::kPeriodic);
+  auto generator = make_generator(seed);
+  const auto real = at::TensorOptions().dtype(at::kDouble);
+  const auto symbol = laplacian_symbol(shape);
+  auto u = divide_modes(at::randn({samples, 2, shape[0], shape[1]}, generator, real), 1.0 - kSmoothing * symbol);
+  u = u - u.mean({-2, -1}, /*keepdim=*/true);
+  u = u / u.square().mean({-2, -1}, /*keepdim=*/true).sqrt();
+  const auto pressure = at::zeros({samples, 1, shape[0], shape[1]}, real);
+  return at::cat({without_divergence(u, grid, symbol), pressure}, 1);
+}
+
+at::Tensor downsample(const at::Tensor& u) { return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2); }
+
+at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
+  auto fine = scene;
+  fine.physics.shape = scene.data.reference_shape;
+  auto reference = fine.stepper(fine.reference_solver());
+  std::vector<at::Tensor> parts;
+  for (auto u : start.split(kSamplesAtOnce)) {
+    std::vector<at::Tensor> states{downsample(u)};
+    for (int64_t i = 0; i < steps; ++i) {
+      u = converged_step(reference, u);
+      states.push_back(downsample(u));
+      on_steps(u.size(0));
+    }
+    parts.push_back(at::stack(states, 1));
+  }
+  return at::cat(parts);
+}
+
+}  // namespace prdp

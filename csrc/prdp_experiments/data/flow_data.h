@@ -1,0 +1,22 @@
+#pragma once
+#include "prdp_experiments/data/data.h"
+
+namespace prdp {
+
+/// Random initial flows (samples, 3, Ny, Nx) in float64 (paper, appendix E): standard normal noise, smoothed by one
+/// implicit heat step with ν Δt = 3e-3, then scaled to mean 0 and standard deviation 1 for each sample and component,
+/// then projected to zero discrete divergence. The pressure is 0.
+at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed);
+
+/// Every second point of the last two axes, at the indices 1, 3, …
+at::Tensor downsample(const at::Tensor& u);
+
+/// Called with the number of samples that have just made a step.
+using OnSteps = std::function<void(int64_t)>;
+
+/// The reference of the task "corrector": `steps` converged steps from `start` on the grid data.reference_shape,
+/// downsampled to physics.shape. Returns all states, the start included, (samples, steps + 1, 3, Ny, Nx). Raises
+/// RuntimeError if a reference solve does not converge.
+at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps);
+
+}  // namespace prdp

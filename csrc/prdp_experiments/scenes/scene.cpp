@@ -1,0 +1,44 @@
+#include "prdp_experiments/scenes/scene.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+#include "prdp/steppers/equation_kinds.h"
+
+namespace prdp {
+
+// The list of scene keys is made from a scene without an equation.
+bool Scene::Physics::periodic() const { return !equation.empty() && equation_kind(equation).periodic; }
+
+int64_t Scene::Physics::channels() const {
+  const int64_t channels = equation_kind(equation).channels;
+  return channels == kPerAxis ? static_cast<int64_t>(shape.size()) : channels;
+}
+
+Solver Scene::reference_solver() const {
+  if (physics.direct_is_cheap()) return Direct{};
+  return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8};
+}
+
+Stepper Scene::stepper(Solver with) const {
+  Equation equation{physics.equation, physics.shape, {}, {}};
+  if (physics.equation != "poisson") {
+    equation.parameters = {physics.dt};
+    equation.tensors = {at::scalar_tensor(physics.nu, at::kDouble)};
+  }
+  return {std::move(equation), options(std::move(with))};
+}
+
+SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, on_failure, 0, 0, start}; }
+
+double Scene::learning_rate(int64_t update) const {
+  if (training.cosine_updates) {
+    const double part = std::min(1.0, static_cast<double>(update) / static_cast<double>(*training.cosine_updates));
+    return training.learning_rate * (0.1 + 0.45 * (1.0 + std::cos(std::numbers::pi * part)));
+  }
+  const double periods = static_cast<double>(update) / static_cast<double>(training.decay_steps);
+  return training.learning_rate * std::pow(training.decay, periods);
+}
+
+}  // namespace prdp

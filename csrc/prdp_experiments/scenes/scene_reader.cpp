@@ -1,0 +1,279 @@
+#include <algorithm>
+#include <filesystem>
+
+#include "prdp/solvers/methods.h"
+#include "prdp_experiments/files/files.h"
+#include "prdp_experiments/scenes/key_list.h"
+#include "prdp_experiments/scenes/key_values.h"
+#include "prdp_experiments/scenes/scene.h"
+#include "prdp_experiments/scenes/toml_section.h"
+
+/// Every key of a scene file is declared here, once: where it goes, what it may be, its unit and its meaning.
+/// The functions run on a TomlSection to read a file, and on a KeyList to list the keys.
+namespace prdp {
+
+namespace {
+
+using Task = Scene::Task;
+
+When corrector(const Scene& s) { return {s.task == Task::kCorrector, "only for `corrector`"}; }
+When field(const Scene& s) { return {s.task == Task::kField, "only for `field`"}; }
+When parameters(const Scene& s) { return {s.task == Task::kParameters, "only for `parameters`"}; }
+When network(const Scene& s) { return {s.trains_network(), "only for `emulator` and `corrector`"}; }
+When no_network(const Scene& s) { return {!s.trains_network(), "only for `parameters` and `field`"}; }
+
+Task task_from_name(const std::string& name) {
+  if (name == "corrector") return Task::kCorrector;
+  if (name == "field") return Task::kField;
+  return name == "emulator" ? Task::kEmulator : Task::kParameters;
+}
+at::ScalarType dtype_from_name(const std::string& name) { return name == "float32" ? at::kFloat : at::kDouble; }
+
+/// A corrector has a gradient of its own, the other tasks have the solver's alone.
+Choices backwards(const Scene& scene) { return {"implicit", "unrolled", {"none", corrector(scene)}}; }
+
+template <class Section>
+void read_physics(Section& s, Scene& scene) {
+  auto& p = scene.physics;
+  const When grid{!field(scene).holds && !corrector(scene).holds, "only for `emulator` and `parameters`"};
+  const Choices equations{{"poisson", grid},
+                          {"heat", grid},
+                          {"burgers", grid},
+                          {"navier_stokes", corrector(scene)},
+                          {"diffusion", field(scene)}};
+  s.choice(p.equation, equations, {"equation", "the equation"});
+  s.wholes(p.shape, 1, {"shape", "unknowns per axis, in 1 to 3 axes: `[N]`, `[Ny, Nx]` or `[Nz, Ny, Nx]`"});
+  s.check(!p.shape.empty() && p.shape.size() <= 3, "shape", "expected 1 to 3 extents");
+  s.check(p.shape.size() == 2 || !corrector(scene).holds, "shape", "expected 2 extents");
+  const When has_nu{p.equation != "poisson" && p.equation != "diffusion", "not for `poisson` and `diffusion`"};
+  const When has_dt{p.equation != "poisson", "not for `poisson`"};
+  s.at_least(p.nu, 0.0, {"nu", "viscosity or diffusivity", "length²/time", has_nu});
+  s.above(p.dt, 0.0, {"dt", "time step", "time", has_dt});
+}
+
+template <class Section>
+void read_solver(Section& s, Scene& scene) {
+  const When spectrum{!scene.physics.periodic(), "only for `heat` and `poisson`"};
+  Choices methods;
+  for (const auto& method : kTraits)
+    if (method.preconditioner == Preconditioner::kNone)
+      methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum : When{});
+  s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
+  s.count(scene.solver.max_iter, 1,
+          {"max_iter", "K of the converged solver, K_ε in the paper", "iterations (`gmres`: cycles)"});
+  s.at_least(scene.solver.rtol, 0.0, {"rtol", "relative residual at which a solve stops; 0 runs exactly K iterations"});
+  const When gmres{traits(scene.solver.method).counts == Counts::kCycles, "only for `gmres`"};
+  s.count(scene.solver.restart, 1, {"restart", "restart length", "products per cycle", gmres});
+  s.choice(scene.backward, backward_from_name, backwards(scene), {"backward", "how gradients are computed"});
+  s.choice(scene.on_failure, on_failure_from_name, {"return", "zero_grad"},
+           {.name = "on_failure", .means = "whether a sample whose solve failed gets a gradient", .optional = true});
+  s.choice(scene.start, start_from_name, {"zero", "state"},
+           {.name = "start", .means = "where the solves start", .optional = true});
+}
+
+template <class Section>
+void read_data(Section& s, Scene& scene) {
+  auto& d = scene.data;
+  s.text(d.file, {.name = "file",
+                  .means = "HDF5 file of trajectories, in place of random initial states",
+                  .unit = "path relative to the scene file",
+                  .optional = true});
+  const When random{d.file.empty(), "not with `file`"};
+  const When emulator{scene.task == Task::kEmulator, "only for `emulator`"};
+  const When flow = corrector(scene) && random;
+  s.wholes(d.reference_shape, 1,
+           {"reference_shape", "grid of the reference solution: 2 N + 1 for each N of `physics.shape`", "", flow});
+  auto finer = scene.physics.shape;
+  for (auto& n : finer) n = 2 * n + 1;
+  s.check(!flow.holds || d.reference_shape == finer, "reference_shape", "expected 2 N + 1 for each N of physics.shape");
+  s.whole(d.modes, 1, {"modes", "sine and cosine modes of the random initial states", "", emulator && random});
+  s.whole(d.seed, 0, {"seed", "seed of the data; every training of the scene uses the same data", "", random});
+  s.count(d.valid_max_iter, 1,
+          {"valid_max_iter", "K of the converged solves behind the validation metric", "iterations", corrector(scene)});
+  s.flag(d.fresh, {.name = "fresh",
+                   .means = "whether every epoch has new training samples, so that none is seen twice",
+                   .when = random,
+                   .optional = true});
+  s.whole(d.train, 1, {"train", "training samples, with `fresh` in each epoch; with `file`, trajectories"});
+  s.whole(d.valid, 1, {"valid", "validation samples"});
+  s.whole(d.valid_steps, 1,
+          {"valid_steps", "validation horizon: how many steps the network makes before its error is measured",
+           "time steps"});
+}
+
+template <class Section>
+void read_network(Section& s, Scene& scene) {
+  auto& n = scene.network;
+  s.choice(n.kind, {"mlp", "resnet"}, {"kind", "multilayer perceptron or residual convolution network"});
+  const When mlp{n.kind == "mlp", "only for `mlp`"}, resnet{n.kind == "resnet", "only for `resnet`"};
+  s.wholes(n.hidden, 1, {"hidden", "widths of the hidden layers", "", mlp});
+  s.whole(n.blocks, 1, {"blocks", "residual blocks", "", resnet});
+  s.whole(n.width, 1, {"width", "channels of the blocks", "", resnet});
+  s.flag(n.zero_output, {.name = "zero_output", .means = "whether the last layer starts at zero", .optional = true});
+}
+
+template <class Section>
+void read_training(Section& s, Scene& scene) {
+  auto& t = scene.training;
+  s.above(t.learning_rate, 0.0,
+          {"learning_rate", "initial learning rate of Adam, or of gradient descent for `parameters`"});
+  const When adam{!parameters(scene).holds, "not for `parameters`"};
+  s.whole(t.cosine_updates, 1,
+          {"cosine_updates",
+           "in place of `decay`: the learning rate falls to a tenth over this many updates, along a cosine", "updates",
+           adam});
+  const When exponential = adam && When{!t.cosine_updates, "not with `cosine_updates`"};
+  s.above(t.decay, 0.0,
+          {"decay", "factor of the learning rate over `decay_steps` updates, applied smoothly", "", exponential});
+  s.whole(t.decay_steps, 1, {"decay_steps", "see `decay`", "updates", exponential});
+  s.choice(t.loss, {"nmse", "mse"},
+           {"loss", "mean of ‖u - u_ref‖²/‖u_ref‖² over the samples, or mean squared error", "", network(scene)});
+  s.whole(t.batch, 1, {"batch", "samples per update", "", network(scene)});
+  s.count(t.intervals, 1, {"epochs", "length of the training", "", network(scene)});
+  s.count(t.intervals, 1, {"updates", "length of the training", "", no_network(scene)});
+}
+
+template <class Section>
+void read_parameters(Section& s, Scene& scene) {
+  auto& p = scene.parameters;
+  s.numbers(p.start, {"start", "θ at the beginning, at least one number"});
+  s.numbers(p.reference, {"reference", "θ that should be found, as many numbers as `start`"});
+  s.check(!p.start.empty(), "start", "expected at least one amplitude");
+  s.check(p.start.size() == p.reference.size(), "reference", "expected as many numbers as start");
+}
+
+template <class Section>
+void read_field(Section& s, Scene& scene) {
+  auto& f = scene.field;
+  s.above(f.mean, 0.0, {"mean", "geometric mean of κ, and the field to start from", "length²/time"});
+  s.at_least(f.contrast, 0.0, {"contrast", "largest |log(κ/mean)| of the field to be found"});
+  s.whole(f.modes, 1, {"modes", "sine and cosine modes of log κ"});
+  s.whole(f.states, 1, {"states", "initial states"});
+  s.whole(f.state_modes, 1, {"state_modes", "sine and cosine modes of the initial states"});
+  s.count(f.steps, 1, {"steps", "how far each state is followed", "time steps"});
+  s.whole(f.every, 1, {"every", "time between snapshots, at most `steps`", "time steps"});
+  s.check(f.every <= f.steps, "every", "must be <= steps, for there to be a snapshot");
+  s.at_least(f.noise, 0.0,
+             {"noise", "standard deviation of the noise, relative to the root mean square of the snapshots"});
+  s.at_least(f.smoothing, 0.0, {"smoothing", "weight of the mean of |∇ log κ|² in the loss", "length²"});
+  s.whole(f.seed, 0, {"seed", "seed of the field and of the initial states"});
+}
+
+template <class Section>
+void read_prdp(Section& s, Scene& scene) {
+  auto& p = scene.prdp;
+  s.above(p.tau_step, 0.0,
+          {"tau_step", "the metric is on a plateau if the last L̃ is above `tau_step` times the `delta`-th last one"});
+  s.above(p.tau_stop, 0.0,
+          {"tau_stop",
+           "on a plateau, K is raised only if L̃ is below `tau_stop` times its value at the last refinement, "
+           "or has grown since"});
+  s.whole(p.delta, 2, {"delta", "how far back the plateau test looks; 2 compares the last two values", "intervals"});
+  s.whole(p.window, 1,
+          {"window", "length of the exponential mean, α = 2/(window + 1); 1 does not smooth", "intervals"});
+  s.whole(p.initial, 0, {"initial", "K at the start", "iterations"});
+  s.whole(p.increment, 1, {"increment", "how much a refinement adds to K", "iterations"});
+  s.whole(p.maximum, {p.initial, "`initial`"}, {"maximum", "K is never raised beyond it", "iterations"});
+  s.at_least(p.growth, 1.0,
+             {.name = "growth",
+              .means = "a refinement raises K to `growth`·K where that is more than K + `increment`",
+              .optional = true});
+  s.above(p.adjoint_ratio, 0.0, {"adjoint_ratio", "the adjoint solve gets ⌈`adjoint_ratio`·K⌉ iterations; at most 1"});
+}
+
+template <class Section>
+void read_compare(Section& s, Scene& scene) {
+  auto& c = scene.compare;
+  s.count(c.seeds, 1, {"seeds", "seeds per row"});
+  s.wholes(c.constant, 0, {"constant", "one row for each constant K", "iterations"});
+  s.above(c.growth, 1.0, {"growth", "adds a row: PRDP with this `growth`"});
+  s.above(c.rtol, 0.0, {"rtol", "adds a row: the K of the converged solver with this tolerance"});
+  s.above(c.target, 0.0, {"target", "iterations are counted only until the metric reaches this value"});
+  s.wholes(c.schedule, 0,
+           {.name = "schedule",
+            .means = "two numbers, adds a row: K starts at the first and grows by the second in each interval",
+            .unit = "iterations",
+            .optional = true});
+  s.check(c.schedule.empty() || c.schedule.size() == 2, "schedule", "expected two whole numbers, start and step");
+}
+
+template <class Section>
+void read_all(Section& s, Scene& scene) {
+  s.text(scene.title, {"title", "one line for lists and reports"});
+  s.choice(scene.task, task_from_name, {"emulator", "corrector", "parameters", "field"},
+           {"task",
+            "what is trained: a network that replaces a time step, a network that corrects a coarse solver, "
+            "amplitudes of the right-hand side, or a diffusivity field"});
+  s.choice(scene.dtype, dtype_from_name, {"float32", "float64"}, {"dtype", "type of all tensors"});
+  s.section(scene, read_physics<Section>, {"physics", "the equation"});
+  s.section(scene, read_solver<Section>, {"solver", "the solver in the training"});
+  s.section(scene, read_data<Section>, {"data", "training and validation samples", "", network(scene)});
+  s.section(scene, read_network<Section>, {"network", "the network", "", network(scene)});
+  s.section(scene, read_training<Section>, {"training", "loss, optimiser and length"});
+  s.section(scene, read_field<Section>, {"field", "the diffusivity field and its snapshots", "", field(scene)});
+  s.section(scene, read_parameters<Section>, {"parameters", "the amplitudes", "", parameters(scene)});
+  s.check(scene.physics.shape.size() == 1 || !parameters(scene).holds, "physics",
+          "the task 'parameters' is one-dimensional");
+  s.section(scene, read_prdp<Section>,
+            {.name = "prdp",
+             .means = "settings of PRDP; without the table, the defaults of `PRDPController`",
+             .optional = true});
+  s.section(scene, read_compare<Section>, {"compare", "rows of `prdp compare`"});
+}
+
+}  // namespace
+
+void Scene::set_backward(const std::string& name) {
+  std::vector<std::string> known;
+  for (const auto& choice : backwards(*this))
+    if (choice.when.holds) known.emplace_back(choice.name);
+  TORCH_CHECK_VALUE(std::find(known.begin(), known.end(), name) != known.end(), "backward: unknown name '", name,
+                    "' for a scene; allowed: ", c10::Join(", ", known));
+  backward = backward_from_name(name);
+}
+
+std::vector<SceneKey> scene_keys() {
+  std::vector<SceneKey> keys;
+  KeyList list(keys, "");
+  Scene defaults;
+  read_all(list, defaults);
+  return keys;
+}
+
+std::string data_settings(const Scene& scene) {
+  KeyValues values;
+  Scene read = scene;
+  read_physics(values, read);
+  read_data(values, read);
+  return c10::str(scene.dtype, values.line());
+}
+
+Scene read_scene(const std::string& path) { return parse_scene(read_whole("scene", path), path); }
+
+Scene parse_scene(const std::string& text, const std::string& path) {
+  // toml++ ends the process on tables nested a hundred thousand deep; a file of this size cannot hold so many.
+  constexpr size_t kLongest = 65536;
+  TORCH_CHECK_VALUE(text.size() <= kLongest, "scene: '", path, "' has ", text.size(), " bytes; a scene has at most ",
+                    kLongest);
+
+  toml::table table;
+  try {
+    table = toml::parse(text, path);
+  } catch (const toml::parse_error& error) {
+    TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
+  } catch (const BrokenToml&) {
+    TORCH_CHECK_VALUE(false, path,
+                      ": not a TOML file; a key or the name of a table has a character that it cannot have");
+  }
+
+  Scene scene;
+  scene.path = path;
+  scene.name = std::filesystem::path(path).stem().string();
+  scene.text = text;
+  TomlSection s(table, path, "");
+  read_all(s, scene);
+  s.finish();
+  return scene;
+}
+
+}  // namespace prdp

@@ -1,0 +1,187 @@
+#pragma once
+#include <c10/util/Exception.h>
+
+#include <cmath>
+#include <optional>
+#include <set>
+#include <sstream>
+#include <string>
+#include <vector>
+
+/// Some files break what toml++ asserts or holds for unreachable, such as a table "[(]" and a letter that is not ASCII
+/// behind a number: undefined behaviour in a release. Here they throw this. That toml++ looks for such a letter among
+/// those of white space, where it does not find it, is no error.
+namespace prdp {
+struct BrokenToml {};
+[[noreturn]] inline void refuse_broken_toml() { throw BrokenToml{}; }
+}  // namespace prdp
+#pragma push_macro("NDEBUG")
+#undef NDEBUG
+#define TOML_ASSERT(condition) ((condition) ? void() : prdp::refuse_broken_toml())
+#include <toml++/impl/forward_declarations.h>
+#include <toml++/impl/preprocessor.h>
+#undef TOML_UNREACHABLE
+#define TOML_UNREACHABLE \
+  return {}
+#include <toml++/impl/unicode.h>
+#undef TOML_UNREACHABLE
+#define TOML_UNREACHABLE prdp::refuse_broken_toml()
+#include <toml++/toml.h>
+#pragma pop_macro("NDEBUG")
+
+#include "prdp_experiments/scenes/scene.h"
+#include "prdp_experiments/scenes/scene_key.h"
+
+namespace prdp {
+
+/// One table of a TOML file while it is read. KeyList has the same functions, so that one declaration of a key serves
+/// the reader and the documentation. Every key that is asked for is an allowed one; finish() refuses the others.
+class TomlSection {
+ public:
+  TomlSection(const toml::table& table, std::string file, std::string name)
+      : table_(table), file_(std::move(file)), name_(std::move(name)) {}
+
+  /// Reads an inner table by read(its section, scene).
+  template <class Read>
+  void section(Scene& scene, Read read, const Key& key) {
+    if (!given(key)) return;
+    const auto* inner = table_[key.name].as_table();
+    if (!inner) fail(key.name, "expected a table");
+    TomlSection section(*inner, file_, full(key.name));
+    read(section, scene);
+    section.finish();
+  }
+  void text(std::string& target, const Key& key) {
+    if (given(key)) target = value<std::string>(key.name, "a string");
+  }
+  void choice(std::string& target, const Choices& choices, const Key& key) {
+    choice(target, [](const std::string& name) { return name; }, choices, key);
+  }
+  template <class T, class FromName>
+  void choice(T& target, FromName from_name, const Choices& choices, const Key& key) {
+    if (!given(key)) return;
+    const auto chosen = value<std::string>(key.name, "a string");
+    std::ostringstream allowed;
+    for (const auto& [name, when] : choices) {
+      if (!when.holds) continue;
+      if (name == chosen) {
+        target = from_name(chosen);
+        return;
+      }
+      allowed << (allowed.tellp() > 0 ? ", " : "") << name;
+    }
+    fail(key.name, "unknown name '" + chosen + "'; allowed: " + allowed.str());
+  }
+  void flag(bool& target, const Key& key) {
+    if (!given(key)) return;
+    if (!table_[key.name].is_boolean()) fail(key.name, "expected true or false");
+    target = table_[key.name].value_or(target);
+  }
+  template <class T>
+  void at_least(T& target, double least, const Key& key) {
+    if (!given<T>(key)) return;
+    const double x = number(key.name);
+    if (x < least) fail(key.name, bound(">=", least, x));
+    target = x;
+  }
+  template <class T>
+  void above(T& target, double least, const Key& key) {
+    if (!given<T>(key)) return;
+    const double x = number(key.name);
+    if (!(x > least)) fail(key.name, bound(">", least, x));
+    target = x;
+  }
+  template <class T>
+  void whole(T& target, const Least<int64_t>& least, const Key& key) {
+    if (!given<T>(key)) return;
+    const auto k = value<int64_t>(key.name, "a whole number");
+    if (k < least.value) fail(key.name, bound(">=", least.value, k));
+    target = k;
+  }
+  /// A whole number that costs are multiples of.
+  template <class T>
+  void count(T& target, int64_t least, const Key& key) {
+    int64_t k = least;
+    whole(k, least, key);
+    if (k > kMostCounted) fail(key.name, bound("<=", kMostCounted, k));
+    if (key.when.holds) target = k;
+  }
+  void wholes(std::vector<int64_t>& target, int64_t least, const Key& key) {
+    if (!given(key)) return;
+    target = values<int64_t>(key.name, "whole numbers");
+    for (const auto k : target)
+      if (k < least) fail(key.name, bound(">=", least, k));
+  }
+  void numbers(std::vector<double>& target, const Key& key) {
+    if (given(key)) target = values<double>(key.name, "numbers");
+  }
+  /// A condition on what has been read already.
+  void check(bool holds, const char* key, const std::string& expected) const {
+    if (!holds) fail(key, expected);
+  }
+
+  /// Raises for keys that nobody asked for.
+  void finish() const {
+    for (const auto& [key, node] : table_) {
+      if (asked_.count(std::string(key.str()))) continue;
+      std::ostringstream allowed;
+      for (const auto& name : asked_) allowed << (allowed.tellp() > 0 ? ", " : "") << name;
+      TORCH_CHECK_VALUE(false, file_, ":", key.source().begin.line, ": unknown name '", full(std::string(key.str())),
+                        "'; allowed: ", allowed.str());
+    }
+  }
+
+ private:
+  std::string full(const std::string& key) const { return name_.empty() ? key : name_ + "." + key; }
+  [[noreturn]] void fail(const char* key, const std::string& what) const {
+    const auto* node = table_.get(key);
+    const auto line = node ? node->source().begin.line : table_.source().begin.line;
+    TORCH_CHECK_VALUE(false, file_, ":", line, ": ", full(key), ": ", what);
+  }
+  /// Whether there is a value to read. Raises if the key applies, is not optional and is missing.
+  template <class T = void>
+  bool given(const Key& key) {
+    if (!key.when.holds) return false;
+    asked_.insert(key.name);
+    if (table_.contains(key.name)) return true;
+    if (key.optional || is_optional<T>) return false;
+    std::ostringstream present;
+    for (const auto& [other, node] : table_) present << (present.tellp() > 0 ? ", " : "") << other.str();
+    fail(key.name, "missing; the table holds: " + (table_.empty() ? "nothing" : present.str()));
+  }
+  double number(const char* key) const {
+    const double x = value<double>(key, "a number");
+    if (!std::isfinite(x)) fail(key, "must be finite");
+    return x;
+  }
+  template <class T>
+  static std::string bound(const char* relation, T least, T got) {
+    std::ostringstream text;
+    text << "must be " << relation << " " << least << ", got " << got;
+    return text.str();
+  }
+  template <class T>
+  T value(const char* key, const char* expected) const {
+    return read<T>(key, *table_.get(key), std::string("expected ") + expected);
+  }
+  template <class T>
+  std::vector<T> values(const char* key, const char* expected) const {
+    const auto* array = table_[key].as_array();
+    if (!array) fail(key, std::string("expected a list of ") + expected);
+    std::vector<T> all;
+    for (const auto& node : *array) all.push_back(read<T>(key, node, std::string("expected a list of ") + expected));
+    return all;
+  }
+  template <class T>
+  T read(const char* key, const toml::node& node, const std::string& expected) const {
+    const auto x = node.value<T>();
+    if (!x || node.is_boolean()) fail(key, expected);  // toml++ takes true for 1
+    return *x;
+  }
+
+  const toml::table& table_;
+  std::string file_, name_;
+  std::set<std::string> asked_;
+};
+
+}  // namespace prdp

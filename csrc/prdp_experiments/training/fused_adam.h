@@ -1,0 +1,22 @@
+#pragma once
+#include <torch/optim/adam.h>
+
+#include "prdp_experiments/files/tensor_map.h"
+
+namespace prdp::train {
+
+/// torch's Adam with the state it has, updated by the fused kernel that `torch.optim.Adam(fused=True)` calls
+/// in Python: one pass over the weights, where torch's C++ step takes a dozen. Without weight decay and
+/// AMSGrad, which the trainers do not use.
+class FusedAdam : public torch::optim::Adam {
+ public:
+  using Adam::Adam;
+  torch::Tensor step(LossClosure closure = nullptr) override;
+
+  /// Steps and moments of the first group's parameters, by their order. Loading raises ValueError for tensors that
+  /// do not fit.
+  void save(TensorMap& tensors) const;
+  void load(const TensorMap& tensors);
+};
+
+}  // namespace prdp::train

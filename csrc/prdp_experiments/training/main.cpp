@@ -1,0 +1,217 @@
+/// prdp_train SCENE.toml: the trainings of `prdp train` as a pure C++ program.
+#include <ATen/Parallel.h>
+#include <torch/version.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <charconv>
+#include <csignal>
+#include <cstdio>
+#include <filesystem>
+#include <nlohmann/json.hpp>
+#include <thread>
+#include <utility>
+
+#include "prdp/sentence.h"
+#include "prdp_experiments/files/files.h"
+#include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/training/training.h"
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+namespace fs = std::filesystem;
+
+volatile std::sig_atomic_t interrupted = 0;
+struct Interrupted {};
+
+struct Options {
+  std::string scene, out, schedule, backward, weights;
+  int64_t seeds = 1, constant = -1, intervals = 0;
+  bool direct = false, automatic = false, resume = false;
+};
+
+/// What a record or a checkpoint must agree on to be of the same training, which may go on for more intervals.
+struct Identity {
+  const prdp::Scene& scene;
+  std::string weights;  // that the network begins with, as bytes; empty: those of the seed
+
+  Json settings() const {
+    Json all{{"scene", scene.name}, {"text", scene.text}, {"backward", prdp::name(scene.backward)}};
+    if (!weights.empty()) all["weights"] = prdp::fingerprint(weights);
+    return all;
+  }
+};
+
+/// The bytes of paths and arguments need not be text.
+std::string text_of(const Json& json, int indent = -1) {
+  return json.dump(indent, ' ', /*ensure_ascii=*/false, Json::error_handler_t::replace);
+}
+
+Json versions() { return {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}; }
+
+Json record(const Identity& identity, const std::string& label, int64_t seed, const std::string& command,
+            const prdp::train::Curves& c) {
+  auto all = identity.settings();
+  all["intervals"] = identity.scene.training.intervals;
+  Json curves;
+  prdp::train::each_curve(c, [&](const char* name, const auto& values) { curves[name] = values; });
+  if (!c.diverged.empty()) curves["diverged"] = c.diverged;
+  if (!c.warning.empty()) curves["warning"] = c.warning;
+  Json record{{"label", label},
+              {"seed", seed},
+              {"settings", all},
+              {"versions", versions()},
+              {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
+              {"command", command},
+              {"curves", curves}};
+  if (!c.weights.empty()) record["weights"] = prdp::fingerprint(c.weights);
+  return record;
+}
+
+/// Beside the record to come; without --resume what an earlier run has left there is gone.
+prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const Identity& identity,
+                               const std::string& label, int64_t seed) {
+  const Json all{{"trainer", "C++"},
+                 {"label", label},
+                 {"seed", seed},
+                 {"settings", identity.settings()},
+                 {"versions", versions()}};
+  prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), text_of(all));
+  if (!options.resume) checkpoint.remove();
+  return checkpoint;
+}
+
+/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on
+/// from.
+bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
+  const auto text = prdp::read_record(path);
+  if (!text) return false;
+  auto found = Json::parse(*text).value("settings", Json::object());
+  const auto intervals = found.value("intervals", int64_t{0});
+  found.erase("intervals");
+  const auto wanted = identity.scene.training.intervals;
+  if (found != identity.settings()) return false;
+  if (intervals == wanted) {
+    checkpoint.remove_before(path);
+    return true;
+  }
+  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, wanted);
+  return false;
+}
+
+std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
+  const char *begin = text.data(), *end = begin + text.size();
+  std::pair<int64_t, int64_t> schedule{};
+  const auto start = std::from_chars(begin, end, schedule.first);
+  const auto step = std::from_chars(std::min(start.ptr + 1, end), end, schedule.second);
+  if (start.ec != std::errc() || step.ec != std::errc() || *start.ptr != ':' || step.ptr != end ||
+      std::max(schedule.first, schedule.second) > prdp::kMostCounted)
+    throw std::runtime_error("--schedule: expected START:STEP, two whole numbers up to " +
+                             std::to_string(prdp::kMostCounted) + ", got '" + text + "'");
+  return schedule;
+}
+
+prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
+  if (options.constant >= 0) return prdp::train::constant(options.constant);
+  if (options.direct) return prdp::train::direct();
+  if (options.automatic) return prdp::train::automatic();
+  if (options.schedule.empty()) return prdp::train::prdp(scene);
+  const auto [start, step] = parse_schedule(options.schedule);
+  return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
+}
+
+/// Returns the exit status: 1 where a training diverged.
+int run(const Options& options, const std::string& command) {
+  auto scene = prdp::read_scene(options.scene);
+  if (!options.backward.empty()) scene.set_backward(options.backward);
+  if (options.intervals > 0) scene.training.intervals = options.intervals;
+  const auto refinement = refinement_of(options, scene);
+  const Identity identity{scene, options.weights.empty() ? "" : prdp::read_whole("weights", options.weights)};
+  const auto folder = fs::path(options.out.empty() ? "runs/" + scene.name + "-cpp" : options.out) / refinement.label;
+  std::error_code error;
+  fs::create_directories(folder, error);
+  if (error) throw std::runtime_error("--out: cannot write to '" + folder.string() + "': " + error.message());
+  const prdp::FolderLock lock(folder);
+
+  std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
+  int diverged = 0;
+  for (int64_t seed = 0; seed < options.seeds; ++seed) {
+    const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
+    auto checkpoint = checkpoint_of(file, options, identity, refinement.label, seed);
+    if (options.resume) {
+      if (is_done(file, identity, checkpoint)) continue;
+      checkpoint.read();
+      if (!checkpoint.notice().empty()) std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint.notice().c_str());
+    }
+    const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
+      if (interrupted) throw Interrupted{};
+      if (std::exchange(first, false) || done % 10 == 0)
+        std::printf("seed %ld  interval %4ld  metric %.4e  K %ld\n", seed, done, metric, k);
+    };
+    const auto on_data = [slow = !scene.physics.direct_is_cheap()](int64_t done, int64_t total) {
+      if (interrupted) throw Interrupted{};
+      if (slow) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
+    };
+    const auto curves = prdp::train::train(scene, refinement, seed, identity.weights, on_interval, checkpoint, on_data);
+    const auto text = prdp::seal_record(text_of(record(identity, refinement.label, seed, command, curves), 1));
+    std::vector<prdp::NewFile> files;
+    if (!curves.weights.empty()) files.push_back({fs::path(file).replace_extension(".pt"), curves.weights});
+    files.push_back({file, text});
+    prdp::write_whole(files);
+    checkpoint.remove();
+    if (curves.diverged.empty()) {
+      std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
+      if (!curves.warning.empty())
+        std::fprintf(stderr, "prdp_train: warning: seed %ld, %s\n", seed, curves.warning.c_str());
+    } else {
+      ++diverged;
+      std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, curves.diverged.c_str());
+    }
+  }
+  return diverged > 0 ? 1 : 0;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  CLI::App app("Train a scene through differentiable physics that stops early, in C++.");
+  Options options;
+  const auto positive = CLI::Range(int64_t{1}, prdp::kMostCounted);
+  app.add_option("scene", options.scene, "scene file (.toml)")->required();
+  app.add_option("--seeds", options.seeds, "how many seeds, from 0")->check(positive);
+  auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
+  auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
+  auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
+  auto* a = app.add_flag("--auto", options.automatic, "a tolerance tied to the error, with nothing to choose");
+  app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
+  app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
+  app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
+  app.add_option("--weights", options.weights, "file of weights that the network begins with, in place of the seed's");
+  app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
+  k->excludes(s)->excludes(d)->excludes(a);
+  s->excludes(d)->excludes(a);
+  d->excludes(a);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& error) {
+    return app.exit(error) == 0 ? 0 : 2;
+  }
+  std::signal(SIGINT, [](int) { interrupted = 1; });
+  std::string command;
+  for (int i = 0; i < argc; ++i) command += (i ? " " : "") + std::string(argv[i]);
+
+  try {
+    return run(options, command);
+  } catch (const Interrupted&) {
+    std::fprintf(stderr,
+                 "prdp_train: interrupted; --resume keeps finished trainings and goes on from the "
+                 "last checkpoint\n");
+    return 130;
+  } catch (const c10::Error& error) {
+    std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what_without_backtrace()).c_str());
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "prdp_train: %s\n", prdp::sentence(error.what()).c_str());
+  }
+  return 2;
+}

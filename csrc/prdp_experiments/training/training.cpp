@@ -1,0 +1,394 @@
+#include "prdp_experiments/training/training.h"
+
+#include <c10/util/accumulate.h>
+#include <torch/csrc/autograd/autograd.h>
+#include <torch/nn/modules/container/any.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+
+#include "prdp/autograd/detach_failed.h"
+#include "prdp/controller/attach.h"
+#include "prdp/controller/linear_schedule.h"
+#include "prdp/controller/tolerance_controller.h"
+#include "prdp/operators/navier_stokes_operator.h"
+#include "prdp/solvers/status.h"
+#include "prdp_experiments/data/data.h"
+#include "prdp_experiments/data/fresh_data.h"
+#include "prdp_experiments/networks/mlp.h"
+#include "prdp_experiments/networks/resnet.h"
+#include "prdp_experiments/networks/weights.h"
+#include "prdp_experiments/training/failures.h"
+#include "prdp_experiments/training/field.h"
+#include "prdp_experiments/training/fused_adam.h"
+#include "prdp_experiments/training/loss.h"
+#include "prdp_experiments/training/state.h"
+
+namespace prdp::train {
+
+Refinement automatic() {
+  Refinement refinement{"auto", [] { return std::make_unique<ToleranceController>(); }};
+  refinement.watches_error = true;
+  refinement.start = Start::kState;
+  return refinement;
+}
+
+Refinement prdp(const Scene& scene) {
+  return {"prdp", [settings = scene.prdp] { return std::make_unique<PRDPController>(settings); }};
+}
+
+Refinement schedule(int64_t start, int64_t step, int64_t maximum) {
+  return {"schedule_" + std::to_string(start) + "_" + std::to_string(step),
+          [=] { return std::make_unique<LinearSchedule>(start, step, maximum); }};
+}
+
+Refinement constant(int64_t k) {
+  auto refinement = schedule(k, 0, k);
+  refinement.label = "constant_" + std::to_string(k);
+  return refinement;
+}
+
+Refinement direct() {
+  auto refinement = constant(1);
+  refinement.label = "direct";
+  refinement.direct = true;
+  return refinement;
+}
+
+namespace {
+
+/// Of counts (batch), or (batch, steps) of a rollout, summed over the steps.
+double per_sample(const at::Tensor& counts) { return counts.to(at::kDouble).mean(0).sum().item<double>(); }
+
+struct Diverged {
+  std::string why;
+};
+
+/// Of an interval; iterations and products per sample.
+struct Costs {
+  int64_t max_iter;
+  double rtol;
+  int64_t solves = 0;
+  double iterations = 0.0, forward = 0.0, adjoint = 0.0, seconds = 0.0;
+  int64_t failed = 0;
+};
+
+/// What the tasks share: the intervals, their costs, and when a training is lost.
+class Run {
+ public:
+  /// `steppers`: of the solves of an update, one after the other.
+  Run(const Scene& scene, const Refinement& refinement, int64_t seed, Checkpoint& checkpoint,
+      std::vector<Solving*> steppers)
+      : who_(scene.name + ", " + refinement.label + ", seed " + std::to_string(seed)),
+        goes_on_(scene.on_failure == OnFailure::kZeroGrad),
+        intervals_(scene.training.intervals),
+        steppers_(std::move(steppers)),
+        watches_error_(refinement.watches_error),
+        controller_(refinement.controller()),
+        checkpoint_(checkpoint),
+        saved_(checkpoint.read()) {
+    if (refinement.start)
+      for (auto* stepper : steppers_) stepper->options().start = *refinement.start;
+    take_budget();
+  }
+
+  Curves go(const Task& task, const OnInterval& on_interval) {
+    const auto report = [&] { on_interval(done(), curves_.metric.back(), controller_->max_iter()); };
+    try {
+      if (saved_) {
+        restore(task);
+        report();
+      } else {
+        observe(task, 0);
+      }
+      while (done() < intervals_) {
+        run_interval(task, done() + 1);
+        observe(task, done());
+        if (done() < intervals_ && checkpoint_.due()) keep(task);
+        report();
+      }
+    } catch (const Diverged& divergence) {
+      give_up(divergence.why);
+    }
+    return curves_;
+  }
+
+ private:
+  void take_budget() {
+    for (auto* stepper : steppers_) set_budget(*stepper, controller_->budget());
+  }
+  double rtol() const { return steppers_[0]->options().solver.rtol; }
+
+  int64_t done() const { return static_cast<int64_t>(curves_.seconds.size()); }
+
+  void keep(const Task& task) {
+    TensorMap tensors;
+    task.save(tensors);
+    save(tensors, curves_, *controller_);
+    checkpoint_.write(pack(tensors));
+  }
+
+  void restore(const Task& task) {
+    if (!loads(task, *saved_)) {
+      if (!loads(task, checkpoint_.read_before())) checkpoint_.refuse();
+      std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint_.notice().c_str());
+    }
+    checkpoint_.check_length(done(), intervals_);
+    take_budget();
+  }
+
+  /// Whether the state is one of this training. Where it is not, some of it may have been taken.
+  bool loads(const Task& task, const std::string& state) {
+    try {
+      const auto tensors = unpack(state);
+      task.load(tensors);
+      load(tensors, curves_, *controller_);
+      return true;
+    } catch (const c10::Error&) {
+      return false;
+    }
+  }
+
+  void run_interval(const Task& task, int64_t done) {
+    Costs costs{.max_iter = controller_->max_iter(), .rtol = rtol()};
+    const auto started = std::chrono::steady_clock::now();
+    Failures failures;
+    task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss, const auto& samples) {
+      check(loss, done);
+      curves_.update_loss.push_back(loss);
+      std::vector<at::Tensor> forward, backward;
+      for (const auto* stepper : steppers_) {
+        const auto& info = *stepper->info();
+        forward.push_back(info.status);
+        costs.solves += info.iterations.numel() / info.iterations.size(0);
+        costs.iterations += per_sample(info.iterations);
+        costs.forward += per_sample(info.operator_applications);
+        if (const auto adjoint = stepper->adjoint_info()) {
+          backward.push_back(adjoint->status);
+          costs.adjoint += per_sample(adjoint->operator_applications);
+        }
+      }
+      failures.take(forward, backward, samples);
+    });
+    costs.failed = failures.count();
+    if (costs.failed > 0) std::fprintf(stderr, "prdp_train: %s, %s\n", who_.c_str(), failures.line(done).c_str());
+    const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - started;
+    costs.seconds = elapsed.count();
+    append(costs);
+  }
+
+  void append(const Costs& costs) {
+    curves_.max_iter.push_back(costs.max_iter);
+    curves_.budget.push_back(costs.max_iter * costs.solves);
+    curves_.iterations.push_back(costs.iterations);
+    curves_.operator_applications.push_back(costs.forward + costs.adjoint);
+    curves_.adjoint_applications.push_back(costs.adjoint);
+    curves_.rtol.push_back(costs.rtol);
+    curves_.failed.push_back(costs.failed);
+    curves_.seconds.push_back(costs.seconds);
+  }
+
+  void observe(const Task& task, int64_t done) {
+    const double metric = task.metric();
+    const auto interval = "interval " + std::to_string(done);
+    if (!std::isfinite(metric)) throw Diverged{interval + ": the metric is " + std::to_string(metric)};
+    curves_.metric.push_back(metric);
+    auto solves = last_solves({steppers_.begin(), steppers_.end()});
+    solves.error = task.error(metric);
+    curves_.error.push_back(*solves.error);
+    controller_->step(watches_error_ ? *solves.error : metric, solves);
+    curves_.warning = controller_->warning().value_or("");
+    take_budget();
+  }
+
+  void check(double loss, int64_t done) const {
+    const auto interval = "interval " + std::to_string(done);
+    if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
+    if (goes_on_) return;
+    const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
+    for (const auto* stepper : steppers_)
+      if (stepper->info()->status.le(nonfinite).any().item<bool>())
+        throw Diverged{interval + ": the solver was given NaN or Inf"};
+  }
+
+  /// The curves end with the interval that was lost.
+  void give_up(const std::string& why) {
+    curves_.diverged = why;
+    curves_.warning.clear();
+    const auto lost = std::max<size_t>(1, curves_.metric.size());
+    curves_.metric.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
+    curves_.error.resize(lost + 1, std::numeric_limits<double>::quiet_NaN());
+    if (curves_.seconds.size() < lost) append({.max_iter = controller_->max_iter(), .rtol = rtol()});
+  }
+
+  std::string who_;
+  bool goes_on_;  // past solves that were given NaN or Inf
+  int64_t intervals_;
+  std::vector<Solving*> steppers_;
+  bool watches_error_;
+  std::unique_ptr<Controller> controller_;
+  Checkpoint& checkpoint_;
+  std::optional<std::string> saved_;
+  Curves curves_;
+};
+
+/// The scene's network with the weights that belong to the seed, in every language.
+torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
+  using torch::nn::AnyModule;
+  const auto& p = scene.physics;
+  const auto& n = scene.network;
+  const auto dim = static_cast<int64_t>(p.shape.size());
+  torch::manual_seed(static_cast<uint64_t>(seed));
+  auto network = n.kind == "mlp" ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
+                                 : AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()));
+  if (n.zero_output) {
+    const torch::NoGradGuard no_grad;
+    const auto parameters = network.ptr()->parameters();
+    for (auto last = parameters.end() - 2; last != parameters.end(); ++last) last->zero_();
+  }
+  network.ptr()->to(scene.dtype);
+  return network;
+}
+
+using Steppers = std::vector<Stepper>;
+
+/// What training a network is about: the loss of a batch, and the metric.
+struct Objective {
+  std::function<at::Tensor(const at::Tensor& batch)> loss;
+  std::function<double()> metric;
+};
+
+Objective emulator(const Scene& scene, Steppers& steppers, const Dataset& data, torch::nn::AnyModule& network) {
+  const auto loss_of = [&](const at::Tensor& batch) {
+    const auto u2 = steppers[0](network.forward(data.train_start.index_select(0, batch)));
+    return loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+  };
+  const auto metric = [&] {
+    auto u = data.valid_start;
+    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = network.forward(u);
+    return normalised_mse(u, data.valid_end).item<double>();
+  };
+  return {loss_of, metric};
+}
+
+Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data, torch::nn::AnyModule& network) {
+  const auto corrected = [&](Stepper& stepper, const at::Tensor& u) {
+    const auto coarse = without_mean_pressure(stepper(u));
+    return coarse + network.forward(coarse);
+  };
+  const bool zero_grad = scene.on_failure == OnFailure::kZeroGrad;
+  const auto loss_of = [&, corrected, zero_grad](const at::Tensor& batch) {
+    auto u1 = corrected(steppers[0], data.train_start.index_select(0, batch));
+    auto u2 = corrected(steppers[1], u1);
+    if (zero_grad) {  // the network's share of a prediction is no better than the coarse step below it
+      const auto &first = steppers[0].info()->status, &second = steppers[1].info()->status;
+      u1 = detach_failed(u1, first);
+      u2 = detach_failed(u2, at::minimum(first, second));
+    }
+    return loss(scene.training.loss, u1, data.train_first.index_select(0, batch)) +
+           loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+  };
+  auto solver = scene.solver;
+  solver.max_iter = scene.data.valid_max_iter;
+  const auto metric = [&, corrected, converged = scene.stepper(solver)]() mutable {
+    auto u = data.valid_start;
+    for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = corrected(converged, u);
+    return normalised_mse(u.narrow(1, 0, 1), data.valid_end.narrow(1, 0, 1)).item<double>();
+  };
+  return {loss_of, metric};
+}
+
+Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed, const std::string& weights,
+                     const OnInterval& on_interval, const OnProgress& on_data) {
+  auto network = make_network(scene, seed);
+  if (!weights.empty()) unpack_weights(weights, *network.ptr());
+  auto data = make_dataset(scene, on_data);
+  FreshData fresh(scene, data);
+  const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
+                                                              : corrector(scene, steppers, data, network);
+  FusedAdam optimiser(network.ptr()->parameters(), scene.learning_rate(0));
+  auto generator = make_generator(seed);
+  const auto updates_of_epoch = (data.train_start.size(0) - 1) / scene.training.batch + 1;
+
+  const auto updates = [&](int64_t update, const OnUpdate& on_update) {
+    if (scene.data.fresh) {
+      const auto samples = fresh.epoch(update / updates_of_epoch);
+      std::tie(data.train_start, data.train_first, data.train_end) =
+          std::tie(samples.train_start, samples.train_first, samples.train_end);
+    }
+    for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
+      for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
+      optimiser.zero_grad();
+      const auto error = objective.loss(batch);
+      error.backward();
+      optimiser.step();
+      ++update;
+      on_update(error.item<double>(), batch);
+    }
+  };
+  const auto metric = [&] {
+    const torch::NoGradGuard no_grad;
+    return objective.metric();
+  };
+  auto& module = *network.ptr();
+  const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
+  const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
+  // The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
+  const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) {
+    return std::sqrt(squared) / n;
+  };
+  auto curves = run.go({updates, metric, error, save_all, load_all}, on_interval);
+  curves.weights = pack_weights(module);
+  return curves;
+}
+
+Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const OnInterval& on_interval) {
+  const auto problem = make_parameter_problem(scene);
+  auto theta = problem.start.clone().requires_grad_();
+  // What a user sees, who does not know θ; before the first solve nothing is explained yet.
+  double misfit = 1.0;
+
+  const auto updates = [&](int64_t update, const OnUpdate& on_update) {
+    const auto u = stepper(at::matmul(theta, problem.modes).view({1, 1, -1}));
+    const auto error = half_mse(u, problem.solution);
+    const auto gradient = torch::autograd::grad({error}, {theta})[0];
+    {
+      const torch::NoGradGuard no_grad;
+      theta.sub_(gradient, scene.learning_rate(update));
+    }
+    misfit = relative_error(u.detach(), problem.solution).item<double>();
+    on_update(error.item<double>(), std::nullopt);
+  };
+  const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
+  const auto save_theta = [&](TensorMap& tensors) { tensors["theta"] = theta; };
+  const auto load_theta = [&](const TensorMap& tensors) {
+    theta.detach().copy_(entry(tensors, "theta", theta.scalar_type(), theta.sizes()));
+  };
+  return run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
+}
+
+}  // namespace
+
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::string& weights,
+             const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data) {
+  TORCH_CHECK_VALUE(weights.empty() || scene.trains_network(), "weights: the scene '", scene.name,
+                    "' trains no network");
+  const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
+  if (scene.task == Scene::Task::kField) {
+    FieldTraining field(scene, solver, seed);
+    return Run(scene, refinement, seed, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
+  }
+  Steppers steppers;
+  for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene.stepper(solver));
+  std::vector<Solving*> solves;
+  for (auto& stepper : steppers) solves.push_back(&stepper);
+  Run run(scene, refinement, seed, checkpoint, solves);
+  return scene.task == Scene::Task::kParameters
+             ? train_parameters(scene, run, steppers[0], on_interval)
+             : train_network(scene, run, steppers, seed, weights, on_interval, on_data);
+}
+
+}  // namespace prdp::train
