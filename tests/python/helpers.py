@@ -60,6 +60,12 @@ def field(shape, batch=2, seed=0, dtype=torch.float64, channels=1):
     return torch.randn(batch, channels, *shape, generator=generator, dtype=dtype)
 
 
+def random(*shape, seed=0, dtype=torch.float64):
+    """Random numbers in this shape, the same in every dtype but for their rounding."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
+
+
 def dense_laplacian(shape):
     """The Dirichlet Laplacian as a matrix, by Kronecker sums of 1D matrices in numpy."""
     total = np.zeros((1, 1))
