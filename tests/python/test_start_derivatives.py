@@ -120,7 +120,7 @@ def test_the_iterations_are_the_textbook_ones(method):
         torch.testing.assert_close(found, truth, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.parametrize("method", [prdp.SteepestDescent, prdp.CG, prdp.CG])
+@pytest.mark.parametrize("method", [prdp.SteepestDescent, prdp.CG, prdp.BiCGStab])
 def test_the_derivative_follows_a_solve_that_went_on_from_its_true_residual(method):
     """In float32 and below its rounding, a recursive residual claims a tolerance that the true one does not meet."""
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
