@@ -1,6 +1,6 @@
 """Write the tables of scene keys in docs/command_line.md, from what the reader of scenes declares.
 
-Run it after a change of csrc/prdp_experiments/scenes/scene_reader.cpp and a build: python -m docs.scene_keys
+Run it after a change of csrc/prdp_experiments/scenes/scene_keys.cpp and a build: python -m docs.scene_keys
 """
 
 import re

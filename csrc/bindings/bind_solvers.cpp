@@ -4,7 +4,7 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 
 namespace py = pybind11;

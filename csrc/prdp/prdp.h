@@ -9,4 +9,4 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/implicit_step.h"
-#include "prdp/steppers/stepper.h"
+#include "prdp/steppers/steppers.h"

@@ -9,7 +9,7 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
 #include "prdp/steppers/implicit_step.h"
-#include "prdp/steppers/stepper.h"
+#include "prdp/steppers/steppers.h"
 
 namespace {
 

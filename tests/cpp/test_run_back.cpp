@@ -31,7 +31,7 @@ struct Counting {
 TEST(RunBack, TakesEveryIterationBackOnceAndKeepsWhatItWasAsked) {
   for (const int64_t k : {1, 2, 7, 16, 40})
     for (const int64_t every : {int64_t{0}, int64_t{1}, int64_t{3}, int64_t{100}, prdp::kCheckpointSqrt}) {
-      const prdp::Checkpoints plan(k, every);
+      const prdp::StoredIterates plan(k, every);
       Counting run;
       run_back(run, plan);
       ASSERT_EQ(static_cast<int64_t>(run.taken_back.size()), k);
@@ -43,10 +43,10 @@ TEST(RunBack, TakesEveryIterationBackOnceAndKeepsWhatItWasAsked) {
 }
 
 TEST(RunBack, SquareRootKeepsFewest) {
-  EXPECT_EQ(prdp::Checkpoints(160, prdp::kCheckpointSqrt).slots(), 13 + 13);
-  EXPECT_EQ(prdp::Checkpoints(160, 0).slots(), 160 + 1);
-  EXPECT_EQ(prdp::Checkpoints(160, 40).slots(), 40 + 4);
-  EXPECT_EQ(prdp::Checkpoints(5, 100).slots(), 5 + 1);
+  EXPECT_EQ(prdp::StoredIterates(160, prdp::kCheckpointSqrt).slots(), 13 + 13);
+  EXPECT_EQ(prdp::StoredIterates(160, 0).slots(), 160 + 1);
+  EXPECT_EQ(prdp::StoredIterates(160, 40).slots(), 40 + 4);
+  EXPECT_EQ(prdp::StoredIterates(5, 100).slots(), 5 + 1);
 }
 
 }  // namespace

@@ -8,7 +8,7 @@
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/steppers/stepper.h"
+#include "prdp/steppers/steppers.h"
 #include "prdp/threads/interruption.h"
 
 /// The loop over the samples of a batch, and callers that solve at the same time. `make sanitize` runs these under

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from docs import result_tables
+from docs import performance_tables, result_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -15,6 +15,12 @@ def test_the_tables_are_those_of_the_records(page):
     text = page.read_text()
     assert result_tables.TABLE.search(text)
     assert text == result_tables.with_tables(text), "run: python -m docs.result_tables"
+
+
+def test_the_tables_of_speed_are_those_of_the_records():
+    text = performance_tables.PAGE.read_text()
+    assert len(performance_tables.TABLE.findall(text)) == len(performance_tables.TABLES)
+    assert text == performance_tables.with_tables(text), "run: python -m docs.performance_tables"
 
 
 @pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)

@@ -9,10 +9,10 @@ namespace prdp {
 
 /// Which of K iterates are stored for the reverse: the first one of every segment,
 /// and all of the current segment.
-struct Checkpoints {
+struct StoredIterates {
   int64_t iterations, stride;
 
-  Checkpoints(int64_t k, int64_t every) : iterations(k), stride(std::max<int64_t>(k, 1)) {
+  StoredIterates(int64_t k, int64_t every) : iterations(k), stride(std::max<int64_t>(k, 1)) {
     if (every == kCheckpointSqrt) stride = static_cast<int64_t>(std::ceil(std::sqrt(static_cast<double>(k))));
     else if (every > 0) stride = std::min(every, k);
     stride = std::max<int64_t>(stride, 1);
@@ -27,7 +27,7 @@ struct Checkpoints {
 /// load(slot, k) for the state after k iterations, and step_back(slot, k). This runs iteration k again from the state
 /// in the slot, which has just been loaded, and takes the cotangents after it to those before it.
 template <class Run>
-void run_back(Run& run, const Checkpoints& plan) {
+void run_back(Run& run, const StoredIterates& plan) {
   const auto length = [&](int64_t segment) { return std::min(plan.stride, plan.iterations - segment * plan.stride); };
   run.start();
   for (int64_t segment = 0; segment < plan.segments(); ++segment) {

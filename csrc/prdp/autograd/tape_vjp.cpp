@@ -1,6 +1,6 @@
 #include <torch/csrc/autograd/autograd.h>
 
-#include "prdp/autograd/reverse_samples.h"
+#include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"

@@ -5,7 +5,7 @@
 
 namespace prdp {
 
-void set_budget(Solving& stepper, const Budget& budget) {
+void set_budget(StepperBase& stepper, const Budget& budget) {
   stepper.set_max_iter(budget.max_iter);
   auto& options = stepper.options();
   if (budget.adjoint_max_iter) options.adjoint_max_iter = *budget.adjoint_max_iter;
@@ -13,7 +13,7 @@ void set_budget(Solving& stepper, const Budget& budget) {
   if (budget.adjoint_rtol) options.adjoint_rtol = *budget.adjoint_rtol;
 }
 
-Solves last_solves(const std::vector<const Solving*>& steppers) {
+Solves last_solves(const std::vector<const StepperBase*>& steppers) {
   Solves solves(!steppers.empty());
   for (const auto* stepper : steppers) {
     solves.converged = solves.converged && stepper->converged();

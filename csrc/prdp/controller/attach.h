@@ -3,20 +3,20 @@
 #include <vector>
 
 #include "prdp/controller/controller.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/steppers/stepper.h"
 
 namespace prdp {
 
 /// Sets K and the tolerances of a stepper for the next interval. What the budget does not give stays as it is.
-void set_budget(Solving& stepper, const Budget& budget);
+void set_budget(StepperBase& stepper, const Budget& budget);
 
 /// The outcome of the last solves of the steppers; of several steppers, the worst. Its `error` is empty, because only
 /// the training knows it.
-Solves last_solves(const std::vector<const Solving*>& steppers);
+Solves last_solves(const std::vector<const StepperBase*>& steppers);
 /// The same for steppers of one class.
-template <std::derived_from<Solving> Kind>
+template <std::derived_from<StepperBase> Kind>
 Solves last_solves(const std::vector<Kind>& steppers) {
-  std::vector<const Solving*> each;
+  std::vector<const StepperBase*> each;
   for (const auto& stepper : steppers) each.push_back(&stepper);
   return last_solves(each);
 }

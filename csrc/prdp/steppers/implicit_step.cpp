@@ -6,7 +6,7 @@
 namespace prdp {
 
 ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, SolveOptions options)
-    : Solving("ImplicitStep", std::move(options)), operator_(std::move(a)), rhs_(std::move(rhs)) {
+    : StepperBase("ImplicitStep", std::move(options)), operator_(std::move(a)), rhs_(std::move(rhs)) {
   TORCH_CHECK_VALUE(operator_, who_, ": needs an operator");
 }
 

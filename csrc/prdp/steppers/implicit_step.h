@@ -2,7 +2,7 @@
 #include <functional>
 
 #include "prdp/autograd/linear_solve.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/steppers/stepper.h"
 
 namespace prdp {
 
@@ -13,7 +13,7 @@ namespace prdp {
 ///   auto allen_cahn = prdp::ImplicitStep(
 ///       prdp::OperatorSpec{"heat", {30}, {dt}, {nu}},
 ///       [=](const at::Tensor& u) { return u + dt * (u - u * u * u); }, prdp::CG{.max_iter = 20});
-class ImplicitStep : public Solving {
+class ImplicitStep : public StepperBase {
  public:
   using OperatorAt = std::function<OperatorSpec(const at::Tensor& u)>;
   using RhsAt = std::function<at::Tensor(const at::Tensor& u)>;

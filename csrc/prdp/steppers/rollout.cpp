@@ -14,7 +14,7 @@
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/rollout_vjp.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {

@@ -7,7 +7,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {

@@ -1,55 +1,53 @@
 #include "prdp/steppers/stepper.h"
 
-#include <algorithm>
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/solvers/status.h"
+#include "prdp/steppers/rollout_vjp.h"
 
 namespace prdp {
 
-namespace {
-
-/// The parameters of an equation: those before the lengths, and a length per axis unless all are 1.
-std::vector<double> parameters(std::vector<double> first, const Length& length, size_t axes) {
-  auto sides = length.sides;
-  if (sides.size() == 1) sides.resize(axes, sides[0]);
-  if (std::any_of(sides.begin(), sides.end(), [](double side) { return side != 1.0; }))
-    first.insert(first.end(), sides.begin(), sides.end());
-  return first;
+AdjointLog open_adjoint_log() {
+  return {new int64_t(adjoint_log::open()), [](const int64_t* log) {
+            adjoint_log::close(*log);
+            delete log;
+          }};
 }
 
-}  // namespace
-
-Stepper::Stepper(Equation equation, SolveOptions options)
-    : Solving(equation.kind, std::move(options)), equation_(std::move(equation)) {
-  options_.adjoint_log = *log_;
-  equation_.check();
+std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs) {
+  std::vector<std::optional<SolveInfo>> found;
+  const SolveInfo* any = nullptr;
+  for (const int64_t log : logs) found.push_back(adjoint_log::read(log));
+  for (const auto& info : found)
+    if (info) any = &*info;
+  if (!any) return std::nullopt;
+  const SolveInfo none{at::zeros_like(any->iterations), at::zeros_like(any->residual),
+                       at::full_like(any->status, static_cast<int64_t>(SolveStatus::kConverged)),
+                       at::zeros_like(any->operator_applications)};
+  Reports reports;
+  for (const auto& info : found) reports.push(info.value_or(none));
+  return reports.joined(any->residual);
 }
 
-at::Tensor Stepper::operator()(const at::Tensor& u) {
-  auto [next, info] = step(equation_, u, options_);
-  info_ = std::move(info);
-  return next;
+StepperBase::StepperBase(std::string who, SolveOptions options)
+    : who_(std::move(who)), options_(std::move(options)), log_(open_adjoint_log()) {
+  options_.check(who_.c_str());
 }
 
-at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
-  auto [states, info] = prdp::rollout(equation_, u, steps, options_);
-  info_ = std::move(info);
-  return states;
+void StepperBase::set_max_iter(int64_t k) {
+  Solver{options_.solver.method, k}.check(who_.c_str());
+  options_.solver.max_iter = k;
 }
 
-Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward, Length length)
-    : Stepper({"poisson", shape, parameters({}, length, shape.size()), {}}, {std::move(solver), backward}) {}
+std::optional<SolveInfo> StepperBase::adjoint_info() const {
+  if (logs_of_steps_.empty()) return adjoint_log::read(*log_);
+  std::vector<int64_t> numbers;
+  for (const auto& log : logs_of_steps_) numbers.push_back(*log);
+  return join_adjoint_logs(numbers);
+}
 
-Heat::Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward, Length length)
-    : Stepper({"heat", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}},
-              {std::move(solver), backward}) {}
-
-Burgers::Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
-                 int64_t picard_steps, Length length)
-    : Stepper({"burgers", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}, picard_steps},
-              {std::move(solver), backward}) {}
-
-NavierStokes::NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward,
-                           int64_t picard_steps, Length length)
-    : Stepper({"navier_stokes", shape, parameters({dt}, length, shape.size()), {std::move(nu.tensor)}, picard_steps},
-              {std::move(solver), backward}) {}
+bool StepperBase::converged() const {
+  const auto adjoint = adjoint_info();
+  return info_ && info_->status.gt(0).all().item<bool>() && (!adjoint || adjoint->status.gt(0).all().item<bool>());
+}
 
 }  // namespace prdp

@@ -1,74 +1,50 @@
 #pragma once
+#include <memory>
+#include <optional>
+#include <string>
 #include <vector>
 
-#include "prdp/steppers/rollout.h"
-#include "prdp/steppers/solving.h"
+#include "prdp/solvers/solver.h"
 
 namespace prdp {
 
-/// One time step, or one elliptic solve, as a function u → u_next. States are (batch, channel, *shape) in float32 or
-/// float64. options().backward chooses how gradients are computed.
-class Stepper : public Solving {
+/// A log of adjoint solves (adjoint_log.h). It is closed when its last owner goes.
+using AdjointLog = std::shared_ptr<const int64_t>;
+AdjointLog open_adjoint_log();
+
+/// The reports of the adjoint solves of consecutive steps, each with its own log, as tensors (batch, steps); nothing
+/// before the first backward pass. A step that the loss does not depend on counts as solved in 0 iterations.
+std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs);
+
+/// The x0 of linear_solve() in a step from `state`; undefined if the solves start from zero.
+inline at::Tensor start_of_step(const SolveOptions& options, const at::Tensor& state) {
+  return options.start == Start::kState ? state : at::Tensor();
+}
+
+/// The base of all steppers: the options of its solves, and their reports. Copies share the adjoint reports.
+class StepperBase {
  public:
-  /// Raises ValueError for bad shapes, parameters or budgets, before any work. So does a step for a bad u.
-  Stepper(Equation equation, SolveOptions options);
+  /// K >= 0 (else ValueError), for the forward solve, and for the adjoint one unless options().adjoint_max_iter is set.
+  int64_t max_iter() const { return options_.solver.max_iter.expect_int(); }
+  void set_max_iter(int64_t k);
+  SolveOptions& options() { return options_; }
 
-  at::Tensor operator()(const at::Tensor& u);
-  /// Repeats the step. Returns all states, u included: (batch, steps + 1, channel, *shape). info() and adjoint_info()
-  /// then hold tensors (batch, steps). One node of autograd (rollout.h).
-  at::Tensor rollout(const at::Tensor& u, int64_t steps);
+  /// The report of the last step or rollout; nothing before the first.
+  const std::optional<SolveInfo>& info() const { return info_; }
+  /// The report of the last backward pass; nothing before the first.
+  std::optional<SolveInfo> adjoint_info() const;
+  /// Whether all samples met the tolerance, in the last step and in its adjoint solve if there was one.
+  bool converged() const;
 
-  OperatorSpec operator_at(const at::Tensor& u) const { return equation_operator(equation_, u); }
-  at::Tensor rhs(const at::Tensor& u) const { return equation_rhs(equation_, u); }
+ protected:
+  /// Raises ValueError, in the name of `who`, for options out of range.
+  StepperBase(std::string who, SolveOptions options);
 
- private:
-  Equation equation_;
-};
-
-/// The sides of the domain, > 0: one number for all axes, or one per axis in the order of `shape`.
-struct Length {
-  Length(double all) : sides{all} {}
-  Length(std::vector<double> of_axes) : sides(std::move(of_axes)) {}
-  Length(std::initializer_list<double> of_axes) : sides(of_axes) {}
-  std::vector<double> sides;
-};
-
-/// Maps p to the solution u of Δu = -p, with u = 0 on the boundary (paper, appendix C.1).
-class Poisson : public Stepper {
- public:
-  Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit, Length length = 1.0);
-};
-
-/// nu >= 0 in length²/time: a number, or a 0-dimensional tensor, which gets a gradient.
-struct Viscosity {
-  Viscosity(double nu) : tensor(at::scalar_tensor(nu, at::kDouble)) {}
-  Viscosity(at::Tensor nu) : tensor(std::move(nu)) {}
-  at::Tensor tensor;
-};
-
-/// One implicit Euler step of u_t = ν Δu with u = 0 on the boundary; dt > 0 (paper, appendix C.2 to C.4).
-class Heat : public Stepper {
- public:
-  Heat(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward = Backward::kImplicit,
-       Length length = 1.0);
-};
-
-/// One implicit Euler step of u_t + (u·∇)u = ν Δu on a periodic grid of shape (N) or (Ny, Nx) (paper, appendix C.5). u
-/// has one channel per axis; channel 0 is the velocity along x, the last axis. Advection is first-order upwind,
-/// linearised about the state. A step makes picard_steps solves, each linearised about the solution of the one before.
-class Burgers : public Stepper {
- public:
-  Burgers(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver, Backward backward = Backward::kImplicit,
-          int64_t picard_steps = 1, Length length = 1.0);
-};
-
-/// One implicit Euler step of u_t + (u·∇)u + ∇p = ν Δu, ∇·u = 0 on a periodic grid (Ny, Nx) (paper, appendix C.6). The
-/// state (batch, 3, Ny, Nx) holds u₁ on the left face of each cell, u₂ on its lower face, and the pressure p of mean
-/// zero in its centre. Linearised as Burgers.
-class NavierStokes : public Stepper {
- public:
-  NavierStokes(std::vector<int64_t> shape, Viscosity nu, double dt, Solver solver,
-               Backward backward = Backward::kImplicit, int64_t picard_steps = 1, Length length = 1.0);
+  std::string who_;
+  SolveOptions options_;
+  std::optional<SolveInfo> info_;
+  AdjointLog log_;
+  std::vector<AdjointLog> logs_of_steps_;  // of the last rollout, where each step has its own
 };
 
 }  // namespace prdp

@@ -2,8 +2,8 @@
 
 #include "prdp_experiments/bindings/bindings.h"
 #include "prdp_experiments/files/checkpoint.h"
-#include "prdp_experiments/files/files.h"
 #include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/files/whole_files.h"
 
 namespace py = pybind11;
 using namespace prdp;

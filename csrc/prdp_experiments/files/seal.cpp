@@ -6,7 +6,7 @@
 #include <cinttypes>
 #include <cstdio>
 
-#include "prdp_experiments/files/files.h"
+#include "prdp_experiments/files/whole_files.h"
 
 namespace prdp {
 

@@ -3,8 +3,8 @@
 #include <caffe2/serialize/inline_container.h>
 #include <torch/csrc/jit/serialization/pickler.h>
 
-#include "prdp_experiments/files/files.h"
 #include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/files/whole_files.h"
 
 namespace prdp {
 

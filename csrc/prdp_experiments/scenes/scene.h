@@ -5,7 +5,7 @@
 
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/solvers/solver.h"
-#include "prdp/steppers/stepper.h"
+#include "prdp/steppers/steppers.h"
 
 namespace prdp {
 

@@ -34,8 +34,8 @@ struct BrokenToml {};
 
 namespace prdp {
 
-/// One table of a TOML file while it is read. KeyList has the same functions, so that one declaration of a key serves
-/// the reader and the documentation. Every key that is asked for is an allowed one; finish() refuses the others.
+/// One table of a TOML file while it is read. KeyRecorder has the same functions, so that one declaration of a key
+/// serves the reader and the documentation. Every key that is asked for is an allowed one; finish() refuses the others.
 class TomlSection {
  public:
   TomlSection(const toml::table& table, std::string file, std::string name)

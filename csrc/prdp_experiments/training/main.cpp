@@ -13,8 +13,8 @@
 #include <utility>
 
 #include "prdp/sentence.h"
-#include "prdp_experiments/files/files.h"
 #include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/files/whole_files.h"
 #include "prdp_experiments/training/training.h"
 
 namespace {

@@ -81,7 +81,7 @@ class Run {
  public:
   /// `steppers`: of the solves of an update, one after the other.
   Run(const Scene& scene, const Refinement& refinement, int64_t seed, Checkpoint& checkpoint,
-      std::vector<Solving*> steppers)
+      std::vector<StepperBase*> steppers)
       : who_(scene.name + ", " + refinement.label + ", seed " + std::to_string(seed)),
         goes_on_(scene.on_failure == OnFailure::kZeroGrad),
         intervals_(scene.training.intervals),
@@ -227,7 +227,7 @@ class Run {
   std::string who_;
   bool goes_on_;  // past solves that were given NaN or Inf
   int64_t intervals_;
-  std::vector<Solving*> steppers_;
+  std::vector<StepperBase*> steppers_;
   bool watches_error_;
   std::unique_ptr<Controller> controller_;
   Checkpoint& checkpoint_;
@@ -383,7 +383,7 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
   }
   Steppers steppers;
   for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene.stepper(solver));
-  std::vector<Solving*> solves;
+  std::vector<StepperBase*> solves;
   for (auto& stepper : steppers) solves.push_back(&stepper);
   Run run(scene, refinement, seed, checkpoint, solves);
   return scene.task == Scene::Task::kParameters

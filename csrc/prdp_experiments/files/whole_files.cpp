@@ -1,4 +1,4 @@
-#include "prdp_experiments/files/files.h"
+#include "prdp_experiments/files/whole_files.h"
 
 #include <c10/util/Exception.h>
 #include <fcntl.h>

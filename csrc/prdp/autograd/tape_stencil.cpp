@@ -1,4 +1,4 @@
-#include "prdp/autograd/reverse_samples.h"
+#include "prdp/autograd/tape_samples.h"
 #include "prdp/kernels/stencil_factors.h"
 
 namespace prdp {

@@ -2,14 +2,14 @@
 #include <filesystem>
 
 #include "prdp/solvers/methods.h"
-#include "prdp_experiments/files/files.h"
-#include "prdp_experiments/scenes/key_list.h"
+#include "prdp_experiments/files/whole_files.h"
+#include "prdp_experiments/scenes/key_recorder.h"
 #include "prdp_experiments/scenes/key_values.h"
 #include "prdp_experiments/scenes/scene.h"
 #include "prdp_experiments/scenes/toml_section.h"
 
 /// Every key of a scene file is declared here, once: where it goes, what it may be, its unit and its meaning.
-/// The functions run on a TomlSection to read a file, and on a KeyList to list the keys.
+/// The functions run on a TomlSection to read a file, and on a KeyRecorder to list the keys.
 namespace prdp {
 
 namespace {
@@ -234,7 +234,7 @@ void Scene::set_backward(const std::string& name) {
 
 std::vector<SceneKey> scene_keys() {
   std::vector<SceneKey> keys;
-  KeyList list(keys, "");
+  KeyRecorder list(keys, "");
   Scene defaults;
   read_all(list, defaults);
   return keys;

@@ -10,14 +10,14 @@ namespace prdp {
 
 /// Writes down the keys that the reader declares: it has the functions of TomlSection, reads nothing, and enters every
 /// key, whether it applies or not.
-class KeyList {
+class KeyRecorder {
  public:
-  KeyList(std::vector<SceneKey>& keys, std::string table) : keys_(keys), table_(std::move(table)) {}
+  KeyRecorder(std::vector<SceneKey>& keys, std::string table) : keys_(keys), table_(std::move(table)) {}
 
   template <class Read>
   void section(Scene& scene, Read read, const Key& key) {
     add(key, "table", "none", false);
-    KeyList inner(keys_, key.name);
+    KeyRecorder inner(keys_, key.name);
     read(inner, scene);
   }
   void text(const std::string& target, const Key& key) { add(key, "text", quoted(target), false); }

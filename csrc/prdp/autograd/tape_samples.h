@@ -34,7 +34,7 @@ struct ReverseBatch {
 /// Runs the iterations of a sample in `space` and takes them back, from x̄ in memory of the tape; returns where b̄ is.
 template <class Kernel, class T>
 T* run_and_take_back(Tape<T>& tape, TapeSpace<Kernel>& space, TapeBack<Kernel>& back, KeptStates<T>& kept, T* x_bar,
-                     const ReverseBatch<T>& batch, const Checkpoints& plan, double b2) {
+                     const ReverseBatch<T>& batch, const StoredIterates& plan, double b2) {
   return with_row(batch.method, [&](auto at) -> T* {
     if constexpr (!has_tape(at.row)) {
       TORCH_INTERNAL_ASSERT(false, at.row.name, " is differentiated by autograd alone");
@@ -76,7 +76,7 @@ void reverse_sample(const NearOne<Kernel>& near, const Kernel& transpose, kernel
   T* x_bar = tape.new_memory();
   a.load(cotangent, bar_scale, x_bar);
   values.project(x_bar);
-  const Checkpoints plan{batch.iterations[s], batch.checkpoint_every};
+  const StoredIterates plan{batch.iterations[s], batch.checkpoint_every};
   T* result = run_and_take_back(tape, space, back, kept, x_bar, batch, plan, b2);
   values.project(result);
   if (const T* start = values.started_from()) back.differentiate(-1, result, start);  // r₀ = b - A start

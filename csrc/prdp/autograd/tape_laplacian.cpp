@@ -1,4 +1,4 @@
-#include "prdp/autograd/reverse_samples.h"
+#include "prdp/autograd/tape_samples.h"
 
 namespace prdp {
 

@@ -1,4 +1,4 @@
-#include "prdp/autograd/reverse_samples.h"
+#include "prdp/autograd/tape_samples.h"
 #include "prdp/kernels/navier_stokes_factors.h"
 
 namespace prdp {

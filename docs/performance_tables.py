@@ -1,0 +1,138 @@
+"""Write the tables of docs/performance.md from the records in docs/performance.
+
+Run it after new records: python -m docs.performance_tables
+"""
+
+import json
+from pathlib import Path
+
+from docs import page_tables
+
+DOCS = Path(__file__).parent
+PAGE = DOCS / "performance.md"
+TABLE = page_tables.places("performance_tables.py")
+
+
+def record(suite):
+    return json.loads((DOCS / "performance" / f"{suite}.json").read_text())[suite]
+
+
+def _table(head, body):
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("  ", " ") + "\n"
+
+
+def _short(x):
+    """Two digits, or all before the point."""
+    return f"{x:.2g}" if x < 10 else f"{x:,.0f}"
+
+
+def _both(point):
+    """The time of a solve with its implicit gradient; in brackets, of the solve alone."""
+    both, forward = (point[name]["min"] for name in ("both_seconds", "forward_seconds"))
+    return f"{_short(1e3 * both)} ({_short(1e3 * forward)})"
+
+
+# The rows: suite, title, our method, K; the other libraries' method and K; the targets for eager and JAX.
+ACCURACY = [
+    ("heat_1d", "heat 1D, Jacobi, K = 25", "Jacobi", 25, "Jacobi", 25, "40, 1.5"),
+    ("heat_2d", "heat 2D, Jacobi, K = 43", "Jacobi", 43, "Jacobi", 43, "40, 8"),
+    ("heat_3d", "heat 3D, Jacobi, K = 50", "Jacobi", 50, "Jacobi", 50, "25, 5"),
+    ("heat_3d", "heat 3D, Chebyshev, K = 25", "Chebyshev", 25, "Jacobi", 50, ""),
+    ("burgers_1d", "Burgers, GMRES(2), K = 23", "GMRES(2)", 23, "GMRES(2)", 23, "35, 4"),
+    ("navier_stokes", "Navier–Stokes, GMRES(8), K = 15", "GMRES(8)", 15, "GMRES(8)", 15, "14, 6"),
+]
+
+
+def beside_others():
+    """Our time, and the times of others as multiples of it."""
+    found, body = record("accuracy"), []
+    for suite, title, method, k, theirs, their_k, targets in ACCURACY:
+        points = {(p["label"], p["k"]): p for p in found[suite]["points"] if p["mode"] == "implicit"}
+        ours = points[method, k]
+        errors = f"{ours['residual']:.1e}", f"{ours['gradient_error']:.1e}"
+        others = [
+            _ratio(points.get((f"{peer}, {theirs}", their_k)), ours)
+            for peer in ("torch eager", "torch.compile", "JAX jit")
+        ]
+        body.append([title, *errors, f"{_both(ours)} ms", *others, targets])
+    head = ["", "residual", "gradient error", "ours", "torch eager", "torch.compile", "JAX jit", "targets (eager, JAX)"]
+    return _table(head, body)
+
+
+def _ratio(theirs, ours):
+    if theirs is None:
+        return "–"
+    both, forward = (theirs[name]["min"] / ours[name]["min"] for name in ("both_seconds", "forward_seconds"))
+    return f"{_short(both)} ({_short(forward)})"
+
+
+# The rows of variable diffusion: title, label of the record; K is that of the iterative ones.
+DIFFUSION = [
+    ("**CG on `Stencil`**", "CG"),
+    ("CG, diagonal", "CG, diagonal"),
+    ("`Direct` (sparse Cholesky)", "direct"),
+    ("CG on `Function`", "CG, Function"),
+    ("torch eager, CG", "torch eager, CG"),
+    ("torch eager with a CSR matrix, CG", "torch eager CSR, CG"),
+    ("torch.compile, CG", "torch.compile, CG"),
+    ("JAX jit, CG", "JAX jit, CG"),
+    ("lineax, CG", "lineax, CG"),
+    ("SciPy, sparse LU", "SciPy, sparse LU"),
+]
+
+
+def diffusion():
+    found = record("diffusion")
+    body = [[title, *_on("diffusion_64", 40, label, found), *_on("diffusion_256", 150, label, found)]
+            for title, label in DIFFUSION]  # fmt: skip
+    head = ["", "64², K = 40", "residual", "gradient error", "256², K = 150", "residual", "gradient error"]
+    return _table(head, body)
+
+
+def _on(grid, k, label, found):
+    for point in found[grid]["points"]:
+        asked = point["k"] == k or label in ("direct", "lineax, CG", "SciPy, sparse LU")  # which choose their own
+        if point["label"] == label and point["mode"] == "implicit" and asked:
+            return _both(point), f"{point['residual']:.1e}", f"{point['gradient_error']:.1e}"
+    return "failed" if label in found[grid]["failures"] else "–", "", ""
+
+
+CASES = {
+    "heat_3d": "heat 3D 20³, Jacobi",
+    "heat_3d_chebyshev": "heat 3D 20³, Chebyshev",
+    "navier_stokes": "Navier–Stokes 48², GMRES(8)",
+}
+MODES = {
+    "unrolled, checkpoint_every='sqrt'": '`checkpoint_every="sqrt"`',
+    "unrolled, recorded by autograd": "recorded by autograd (`create_graph=True`)",
+}
+
+
+def memory():
+    """Peak resident memory that a solve with its gradients adds, in MB."""
+    found = record("memory")
+    budgets = sorted({point["k"] for point in found})
+    body = []
+    for case in dict.fromkeys(point["case"] for point in found):
+        for mode in dict.fromkeys(point["mode"] for point in found):
+            title = f"**{CASES[case]}**: {mode}" if mode == "implicit" else MODES.get(mode, mode)
+            of_k = {p["k"]: p["bytes"] for p in found if (p["case"], p["mode"]) == (case, mode)}
+            body.append([title, *(_short(of_k[k] / 1e6) for k in budgets)])
+    return _table(["", *(f"K = {k}" for k in budgets)], body)
+
+
+TABLES = {"other libraries": beside_others, "diffusion": diffusion, "memory": memory}
+
+
+def table(what):
+    return TABLES[what]()
+
+
+def with_tables(page):
+    """Return the text of the page with its tables written anew."""
+    return page_tables.with_tables(page, "performance_tables.py", table)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_tables(PAGE.read_text()))
