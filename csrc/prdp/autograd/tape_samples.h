@@ -115,7 +115,8 @@ void reverse_samples(const Kernel& a, const Kernel& transpose, const ReverseBatc
     } else if (shared) {
       reverse(*shared, *shared_transpose, s);
     } else {
-      const Kernel own = a.sample(s), own_transpose = transpose.sample(s);
+      const Kernel& own = a.sample(s);
+      const Kernel& own_transpose = transpose.sample(s);
       reverse(NearOne<Kernel>(own), NearOne<Kernel>(own_transpose), s);
     }
   }

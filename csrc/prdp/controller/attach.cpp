@@ -10,7 +10,7 @@ void set_budget(StepperBase& stepper, const Budget& budget) {
   auto& options = stepper.options();
   if (budget.adjoint_max_iter) options.adjoint_max_iter = *budget.adjoint_max_iter;
   if (budget.rtol) options.solver.rtol = *budget.rtol;
-  if (budget.adjoint_rtol) options.adjoint_rtol = *budget.adjoint_rtol;
+  if (budget.adjoint_rtol) options.adjoint_rtol = budget.adjoint_rtol;
 }
 
 Solves last_solves(const std::vector<const StepperBase*>& steppers) {

@@ -1,6 +1,7 @@
 #include "prdp/operators/stencil_operator.h"
 
 #include <ATen/TensorSubclassLikeUtils.h>
+#include <ATen/core/grad_mode.h>
 
 #include <algorithm>
 #include <cmath>
@@ -67,7 +68,7 @@ OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vect
                       " entries, one for each axis of shape, got ", as_tuple(offset));
     spec.parameters.insert(spec.parameters.end(), offset.begin(), offset.end());
   }
-  StencilOperator{spec};  // checks the rest
+  [[maybe_unused]] const StencilOperator checks_the_rest(spec);
   return spec;
 }
 
