@@ -1,5 +1,7 @@
 #include "prdp_experiments/data/field_problem.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/implicit_step.h"
 #include "prdp_experiments/data/data.h"
