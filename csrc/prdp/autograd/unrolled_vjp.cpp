@@ -55,10 +55,10 @@ std::vector<double> growth(const at::Tensor& u, const at::Tensor& b) {
   return to_host<double>(u_norm / b_norm * (u_largest / b_largest), b.size(0));
 }
 
-/// The samples whose residual is no more than the rounding errors of computing it, and less than √ε; of those
-/// that may be, u is asked for.
+/// Those of the candidates whose residual is no more than the rounding errors of computing it, and less than √ε; where
+/// one may be, u is asked for.
 template <class MakeU>
-Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_u) {
+Rows within_rounding(const Operator& a, const Solved& solved, const Rows& candidates, const MakeU& make_u) {
   const int64_t batch = solved.b.size(0);
   const double epsilon = epsilon_of(solved.b);
   const auto residual = to_host<double>(solved.residual, batch);
@@ -66,7 +66,7 @@ Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_
   Rows rows(batch, false), near(batch, false);
   for (int64_t i = 0; i < batch; ++i) {
     const auto s = static_cast<SolveStatus>(status[i]);
-    if (is_refused(s)) continue;
+    if (!candidates[i] || is_refused(s)) continue;
     rows[i] = s == SolveStatus::kConvergedBreakdown || residual[i] == 0.0;
     near[i] = !rows[i] && residual[i] <= std::sqrt(epsilon);
   }
@@ -81,22 +81,21 @@ Rows within_rounding(const Operator& a, const Solved& solved, const MakeU& make_
 /// up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
 template <class MakeU>
 Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeU& make_u) {
-  auto rows = within_rounding(a, solved, make_u);
-  if (!any(rows)) return rows;
-  const auto batch = static_cast<int64_t>(rows.size());
+  const int64_t batch = solved.b.size(0);
   const auto iterations = to_host<int64_t>(solved.iterations, batch);
-  const auto leave_out = [&](int64_t count, const Rows& kept) {
-    for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != count || kept[i]);
-  };
-  const Rows none(batch, false);
-  if (traits(solver.method).is_polynomial) leave_out(solver.max_iter.expect_int(), none);
+  Rows candidates(batch, true);
+  if (traits(solver.method).is_polynomial)
+    for (int64_t i = 0; i < batch; ++i) candidates[i] = iterations[i] != solver.max_iter.expect_int();
+  auto rows = within_rounding(a, solved, candidates, make_u);
+  if (!any(rows)) return rows;
   const int64_t unknowns = solved.b.numel() / batch;
   if (traits(solver.method).ends_at_unknowns &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
     const auto one_less =
         solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
-    leave_out(unknowns, within_rounding(a, before, [&] { return one_less.u; }));
+    const auto sufficed = within_rounding(a, before, rows, [&] { return one_less.u; });
+    for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != unknowns || sufficed[i]);
   }
   return rows;
 }
