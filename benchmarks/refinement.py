@@ -58,8 +58,10 @@ def main():
         rows.append(row)
         table = compare.summarise(scene, rows)
         print(f"{row.title}: {table[-1]['metric']:.2e}, {table[-1]['operator_applications']:,.0f} products", flush=True)
-    first = records.read(folder / rows[0].label / "seed_0.json")  # resumed trainings were run by its commit
-    summary = {"settings": records.settings(scene), **{name: first[name] for name in environment}}
+    trained = [records.read(path) for row in rows for path in sorted((folder / row.label).glob("seed_*.json"))]
+    environment["commit"] = ", ".join(dict.fromkeys(record["commit"] for record in trained))  # some were resumed
+    environment["machine"] = trained[0]["machine"]
+    summary = {"settings": records.settings(scene), **environment}
     curves = {row.label: _curves(row) for row in rows}
     records.write(folder / "summary.json", {**summary, "seeds": options.seeds, "rows": table, "curves": curves})
 

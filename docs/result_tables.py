@@ -65,6 +65,7 @@ def parts_of_auto():
         seeds = f", {found['seeds']} seeds" if found["seeds"] > 1 else ""
         for i, row in enumerate(found["rows"]):
             title = "**auto**" if row["label"] == "auto" else row["title"]
+            title += ", one seed" if row["seeds"] == 1 < found["seeds"] else ""
             body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *_products(row), _seconds(row)])
     return _table(["scene", "", "error", "forward", "adjoint", "in all", "s"], body)
 
@@ -98,14 +99,16 @@ def time_and_products():
     return _table(head, body)
 
 
-def comparison(name):
-    """The rows of `prdp compare`."""
+def comparison(name, seconds=True):
+    """The rows of `prdp compare`, or of a record of `python -m benchmarks.refinement`."""
     body = []
     for row in record(name)["rows"]:
         title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
+        title += ", one seed" if row["seeds"] == 1 < record(name)["seeds"] else ""
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
-        body.append([title, error(row), last, *_products(row), _saved(row), _seconds(row)])
-    return _table(["", "error", "last K", "forward", "adjoint", "in all", "products saved", "s"], body)
+        body.append([title, error(row), last, *_products(row), _saved(row), *([_seconds(row)] if seconds else [])])
+    head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if seconds else [])]
+    return _table(head, body)
 
 
 def _saved(row):
@@ -117,7 +120,7 @@ def _saved(row):
 def readme():
     """Converged, auto and PRDP of the scenes that train a network, or a field."""
     body = []
-    for name in ("heat_1d", "burgers_1d", "burgers_2d", "heat_2d", "diffusion_inverse"):
+    for name in ("heat_1d", "burgers_1d", "burgers_2d", "heat_2d", "navier_stokes", "diffusion_inverse"):
         found = rows(f"refinement_{name}")
         base = found["converged"]
         body.append([f"{name}, {base['seeds']} seeds", "converged", _with_spread(base), "–", "–"])
@@ -139,7 +142,12 @@ PAPER = {
     "heat_2d": ("[Heat 2D](#heat-2d-and-3d-emulators)", "86 %", "1.4e-02 ± 8e-04", "1.1e-02 ± 6e-04"),
     "heat_3d": ("[Heat 3D](#heat-2d-and-3d-emulators)", "81 %", "4e-03 ± 9e-04", "5e-03 ± 1.0e-03"),
     "burgers_1d": ("[Burgers 1D](#burgers-1d-an-emulator)", "59 %", "5.5e-02 ± 1.4e-02", "6.2e-02 ± 2.1e-02"),
-    "navier_stokes": ("[Navier–Stokes](#navier-stokes-a-corrector)", "81 %", "6e-03 ± 5e-04", "7e-03 ± 4e-04"),
+    "refinement_navier_stokes": (
+        "[Navier–Stokes](#navier-stokes-a-corrector)",
+        "81 %",
+        "6e-03 ± 5e-04",
+        "7e-03 ± 4e-04",
+    ),
     "poisson_1p_implicit": ("[Poisson, one parameter](#poisson-one-parameter)", "33 %", "", ""),
     "poisson_3p_implicit": ("[Poisson, three parameters](#poisson-three-parameters)", "48 %", "", ""),
     "poisson_3p_sd_implicit": ("the same with steepest descent", "43 %", "", ""),
@@ -147,12 +155,9 @@ PAPER = {
 
 
 def beside_the_paper():
-    """Of every scene that the paper has; heat_3d has no record."""
+    """Of every scene that the paper has."""
     body = []
     for name, (title, saved, converged, prdp) in PAPER.items():
-        if name == "heat_3d":
-            body.append([title, "–", "not trained", saved, "–", converged, "–", prdp])
-            continue
         base, ours = record(name)["rows"][0], rows(name)["prdp"]
         seeds = str(record(name)["seeds"])
         body.append([title, seeds, _percent(ours["saved"], 1), saved, error(base), converged, error(ours), prdp])
@@ -175,25 +180,7 @@ def three_parameters():
     return _table(head, body)
 
 
-def navier_stokes():
-    """One seed of each row, and how much the metric varies over the last epochs."""
-    found = record("navier_stokes")
-    base, body = found["rows"][0], []
-    for row in found["rows"]:
-        last = found["curves"][row["label"]]["metric"][-10:]
-        mean = sum(last) / len(last)
-        deviation = (sum((x - mean) ** 2 for x in last) / (len(last) - 1)) ** 0.5
-        title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        products = row["operator_applications"]
-        saved = "–" if row["kind"] == "converged" else _percent(1 - products / base["operator_applications"], 1)
-        cells = f"{mean:.2e} ± {deviation:.0e}", f"{row['last_k']:.3g}", f"{row['iterations']:,.0f}", f"{products:,.0f}"
-        body.append([title, error(row), *cells, saved, f"{row['seconds']:,.0f}" if "commit" not in row else "–"])
-    head = ["", "error at t = 5", "mean of the last ten epochs", "last K", "cycles", "products", "products saved", "s"]
-    return _table(head, body)
-
-
 TABLES = {
-    "Navier–Stokes": navier_stokes,
     "the parts of auto": parts_of_auto,
     "the shares of auto": shares_of_auto,
     "the README's table": readme,
@@ -211,8 +198,12 @@ def study(name):
 
 def table(name):
     kind, _, what = name.partition(" of ")
-    if kind in ("the comparison", "the study"):
-        return (comparison if kind == "the comparison" else study)(what)
+    if kind == "the comparison":
+        return comparison(what)
+    if kind == "the comparison, without seconds,":
+        return comparison(what, seconds=False)
+    if kind == "the study":
+        return study(what)
     return TABLES[name]()
 
 
