@@ -2,7 +2,7 @@
 # make test   set everything up, then run all C++ and Python tests
 # make docs   build the documentation as a site, site/index.html
 # make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
-# make tidy   install clang-tidy and run it on the C++ code, ten minutes; from then on make test runs it as well
+# make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
@@ -37,11 +37,14 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)
-tidy: $(STAMPS)/configure
-	$(BIN)/pip install --quiet --disable-pip-version-check clang-tidy==23.1.4
+tidy: $(STAMPS)/configure $(BIN)/clang-tidy
 	$(BIN)/cmake -S . -B build-tidy -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_TESTS=OFF -DCMAKE_DISABLE_PRECOMPILE_HEADERS=ON > build/tidy.log
 	find csrc -name '*.cpp' | xargs -P $$(nproc) -n 1 $(BIN)/clang-tidy -p build-tidy --quiet \
 	  --extra-arg=-idirafter --extra-arg=$(GCC_HEADERS) --extra-arg=-Wno-unknown-warning-option
+
+$(BIN)/clang-tidy: $(STAMPS)/python
+	$(BIN)/pip install --quiet --disable-pip-version-check clang-tidy==23.1.4
+	@touch $@
 
 # ThreadSanitizer watches what has threads; csrc/prdp/threads/interruption.h shares loops in a way that it understands.
 sanitize: $(STAMPS)/configure

@@ -50,8 +50,8 @@ def error_against_cost(found):
 
 def _ratios(summary, label, cost):
     base = summary["rows"][0]
-    row = next((row for row in summary["rows"] if row["label"] == label), None)
-    if row is None or row["diverged"]:
+    row = next(row for row in summary["rows"] if row["label"] == label)
+    if row["diverged"]:
         return None
     return row[cost] / base[cost], row["metric"] / base["metric"]
 

@@ -3,6 +3,12 @@
 import re
 
 
+def markdown(head, body):
+    """A table of these cells, as text."""
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("  ", " ") + "\n"
+
+
 def places(script):
     """The pattern of such a table; group 2 is WHAT."""
     return re.compile(rf"^(<!-- docs/{script} writes ([^\n]+) -->\n).*?^(<!-- end -->)$", re.M | re.S)

@@ -17,11 +17,6 @@ def record(suite):
     return json.loads((DOCS / "performance" / f"{suite}.json").read_text())[suite]
 
 
-def _table(head, body):
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("  ", " ") + "\n"
-
-
 def _short(x):
     """Two digits, or all before the point."""
     return f"{x:.2g}" if x < 10 else f"{x:,.0f}"
@@ -57,7 +52,7 @@ def beside_others():
         ]
         body.append([title, *errors, f"{_both(ours)} ms", *others, targets])
     head = ["", "residual", "gradient error", "ours", "torch eager", "torch.compile", "JAX jit", "targets (eager, JAX)"]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def _ratio(theirs, ours):
@@ -87,7 +82,7 @@ def diffusion():
     body = [[title, *_on("diffusion_64", 40, label, found), *_on("diffusion_256", 150, label, found)]
             for title, label in DIFFUSION]  # fmt: skip
     head = ["", "64², K = 40", "residual", "gradient error", "256², K = 150", "residual", "gradient error"]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def _on(grid, k, label, found):
@@ -119,7 +114,7 @@ def memory():
             title = f"**{CASES[case]}**: {mode}" if mode == "implicit" else MODES.get(mode, mode)
             of_k = {p["k"]: p["bytes"] for p in found if (p["case"], p["mode"]) == (case, mode)}
             body.append([title, *(_short(of_k[k] / 1e6) for k in budgets)])
-    return _table(["", *(f"K = {k}" for k in budgets)], body)
+    return page_tables.markdown(["", *(f"K = {k}" for k in budgets)], body)
 
 
 TABLES = {"other libraries": beside_others, "diffusion": diffusion, "memory": memory}

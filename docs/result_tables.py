@@ -52,11 +52,6 @@ def _seconds(row):
     return f"{row['seconds']:.2g}" if row["seconds"] < 10 else f"{row['seconds']:.0f}"
 
 
-def _table(head, body):
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("|  |", "| |") + "\n"
-
-
 def parts_of_auto():
     """Converged, PRDP and the parts of auto, of every scene."""
     body = []
@@ -67,7 +62,7 @@ def parts_of_auto():
             title = "**auto**" if row["label"] == "auto" else row["title"]
             title += ", one seed" if row["seeds"] == 1 < found["seeds"] else ""
             body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *_products(row), _seconds(row)])
-    return _table(["scene", "", "error", "forward", "adjoint", "in all", "s"], body)
+    return page_tables.markdown(["scene", "", "error", "forward", "adjoint", "in all", "s"], body)
 
 
 def shares_of_auto():
@@ -81,7 +76,7 @@ def shares_of_auto():
         ]
         body.append([name, *over])
     head = ["scene", "error: auto / converged", "auto / tuned PRDP", "products: auto / converged", "auto / tuned PRDP"]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def time_and_products():
@@ -96,7 +91,7 @@ def time_and_products():
         body.append([name, _seconds(base), *cells])
     of_each = ("products saved", "time saved", "error / converged")
     head = ["scene", "converged, s", *(f"{who}: {what}" for who in ("PRDP", "auto") for what in of_each)]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def comparison(name, seconds=True):
@@ -108,7 +103,7 @@ def comparison(name, seconds=True):
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
         body.append([title, error(row), last, *_products(row), _saved(row), *([_seconds(row)] if seconds else [])])
     head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if seconds else [])]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def _saved(row):
@@ -128,7 +123,7 @@ def readme():
             row = found[label]
             costs = ("operator_applications", "seconds")
             body.append(["", title, _with_spread(row), *(_percent(1 - row[cost] / base[cost]) for cost in costs)])
-    return _table(["scene", "", "error", "products saved", "time saved"], body)
+    return page_tables.markdown(["scene", "", "error", "products saved", "time saved"], body)
 
 
 def _percent(share, digits=0):
@@ -162,7 +157,7 @@ def beside_the_paper():
         seeds = str(record(name)["seeds"])
         body.append([title, seeds, _percent(ours["saved"], 1), saved, error(base), converged, error(ours), prdp])
     head = ["scene", "seeds", "PRDP saves", "paper", "error, converged", "paper", "error, PRDP", "paper"]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 def three_parameters():
@@ -177,7 +172,7 @@ def three_parameters():
                 [f"{title}, {backward}", error(base), f"{base['budget']:,.0f}", *ours, error(auto), error(direct)]
             )
     head = ["", "converged: error", "iterations", "PRDP: error", "iterations", "saved", "auto: error", "direct: error"]
-    return _table(head, body)
+    return page_tables.markdown(head, body)
 
 
 TABLES = {

@@ -5,7 +5,7 @@
 
 /// What both Python modules need.
 
-/// Makes Python's errors of the library's, as torch does, but without a C++ backtrace.
+/// Turns the library's exceptions into the Python errors that torch would raise, without a C++ backtrace.
 inline void translate_errors() {
   pybind11::register_local_exception_translator([](std::exception_ptr p) {
     try {

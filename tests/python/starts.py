@@ -1,9 +1,6 @@
-"""What the tests of starts share: both modes, and the methods for symmetric systems and for others."""
-
-import pytest
+"""What the tests of starts share: the methods for symmetric systems and for others."""
 
 import prdp_torch as prdp
 
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 SYMMETRIC = [prdp.Jacobi, prdp.Chebyshev, prdp.SteepestDescent, prdp.CG, prdp.GMRES]
 GENERAL = [prdp.Jacobi, prdp.SteepestDescent, prdp.GMRES]

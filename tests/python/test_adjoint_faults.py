@@ -3,13 +3,12 @@
 import pytest
 import torch
 from adjoints import F64, METHODS, gradients, matrices, of_b_alone
-from helpers import field, golden, random, statuses
+from helpers import field, golden, modes, random, statuses
 from torch.autograd import grad
 
 import prdp_torch as prdp
 from prdp_torch import operators
 
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 methods = pytest.mark.parametrize("method", METHODS)
 
 

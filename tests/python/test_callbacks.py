@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainings import without_seconds
 
 from prdp_torch.experiments import records, scenes
 from prdp_torch.experiments.checkpoint import Checkpoint
@@ -25,10 +26,6 @@ def short(intervals=6, name="heat_1d"):
 
 def stop_at(number):
     return lambda interval: interval.number == number
-
-
-def without_seconds(curves):
-    return {name: values for name, values in curves.items() if name != "seconds"}
 
 
 @pytest.mark.parametrize("name, updates", [("heat_1d", 8), ("poisson_1p", 1)])

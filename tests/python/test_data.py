@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import tiny, written
+from trainings import without_seconds
 
 from prdp_torch.experiments import _C, compare, datasets, pdebench, records, scenes, trajectories
 from prdp_torch.experiments.refinement import Refinement
@@ -27,10 +28,6 @@ def heat(tmp_path, *changes):
 
 def heat_from_file(tmp_path, *changes):
     return scenes.load(written(tmp_path, *SMALL, *FROM_FILE, *changes, name="read"))
-
-
-def without_seconds(curves):
-    return {name: values for name, values in curves.items() if name != "seconds"}
 
 
 def random_trajectories(scene, times=3, samples=None):

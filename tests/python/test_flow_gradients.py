@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers import dense_burgers, field, golden
+from helpers import dense_burgers, field, golden, modes
 from torch.autograd import gradcheck, gradgradcheck
 
 import prdp_torch as prdp
@@ -19,7 +19,6 @@ CASES = {
     "navier_stokes_direct": (prdp.NavierStokes, operators.NavierStokes, (3, 2), 3, DIRECT),
 }
 cases = pytest.mark.parametrize("name", CASES)
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 
 
 def viscosity():

@@ -6,14 +6,13 @@ import pickle
 import pytest
 import torch
 import torch._dynamo.testing
-from helpers import dense_heat, dense_laplacian, field
+from helpers import dense_heat, dense_laplacian, field, modes
 from torch.autograd import gradcheck, gradgradcheck
 
 import prdp_torch as prdp
 from prdp_torch import fields, operators
 
 N = 9
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 
 
 def viscosity():

@@ -4,6 +4,7 @@ import warnings
 
 import pytest
 import torch
+from helpers import modes
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -11,7 +12,6 @@ from prdp_torch import operators
 N = 6
 CROW = torch.tensor([0, 2, 5, 8, 11, 14, 16])
 COL = torch.tensor([0, 1, 0, 1, 2, 1, 2, 3, 2, 3, 4, 3, 4, 5, 4, 5])
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 
 
 def entries(batch=None, seed=0):

@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 import torch._dynamo.testing
-from helpers import field, statuses
+from helpers import field, modes, statuses
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
 
@@ -21,7 +21,6 @@ STEPPERS = {
     "navier_stokes": (prdp.NavierStokes, (3, 4), 3, {"dt": 0.1}),
 }
 steppers = pytest.mark.parametrize("name", STEPPERS)
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 
 
 def make(name, nu, solver, **options):

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from helpers import dense_laplacian, field, random, spd_matrices
-from starts import GENERAL, SYMMETRIC, modes
+from helpers import dense_laplacian, field, modes, random, spd_matrices
+from starts import GENERAL, SYMMETRIC
 
 import prdp_torch as prdp
 from prdp_torch import operators

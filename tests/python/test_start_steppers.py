@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from helpers import field, random
-from starts import modes
+from helpers import field, modes, random
 from torch.library import opcheck
 
 import prdp_torch as prdp

@@ -2,14 +2,13 @@
 
 import pytest
 import torch
-from helpers import field, golden, statuses
+from helpers import field, golden, modes, statuses
 from torch.func import grad, jvp, vmap
 
 import prdp_torch as prdp
 from prdp_torch import fields, operators
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script")
-modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 F = golden("failures")
 DIVERGES = torch.tensor(F["A07__A"])  # under Jacobi
 FINE = torch.tensor([[3.0, 1.0, 0.0], [1.0, 4.0, -1.0], [0.5, 0.0, 2.0]], dtype=torch.float64)
