@@ -75,19 +75,20 @@ class Study:
         self.report = report
         self.rows = []
 
-    def train(self, name, how, seed, changes):
+    def train(self, name, how, seed, changes, keep=()):
+        """The row of one training; `keep` names curves of the trainer that the row holds as well."""
         scene = variant(name, changes)
         label = "_".join([name, how, *(f"{key.split('.')[1]}{value}" for key, value in changes.items()), f"seed{seed}"])
         path = self.folder / f"{label}.json"
         row = records.read(path)
         if row is None or row["text"] != scene.text:
-            row = self._row(scene, how, seed, changes)
+            row = self._row(scene, how, seed, changes, keep)
             records.write_training(path, row)
         self.report(f"{label}: {row['error']:.3e}")
         self.rows.append(row)
         return row
 
-    def _row(self, scene, how, seed, changes):
+    def _row(self, scene, how, seed, changes, keep):
         network = make_network(scene, seed)
         refinement = REFINEMENTS[how](scene)
         callbacks = refinement.callbacks() if isinstance(refinement, PRDPOnLoss) else ()
@@ -110,6 +111,7 @@ class Study:
             "seconds": sum(curves["seconds"]),
             "warning": curves.get("warning"),
             "diverged": curves.get("diverged"),
+            **{key: [float(f"{value:.4g}") for value in curves[key]] for key in keep},
             **records.environment(),
         }
 
