@@ -39,7 +39,7 @@ def chart(rows):
     for updates, colour in zip(_updates(rows), ("#0072B2", "#D55E00"), strict=False):
         for row in _of(rows, updates):
             title = f"{updates:,} updates" if row["seed"] == 0 else None
-            done = np.linspace(0, updates, len(row["metric"]) + 1)[1:]
+            done = np.linspace(0, updates, len(row["metric"]))  # from before the first update to after the last
             axes.plot(done, row["metric"], color=colour, lw=1, label=title)
     axes.set(yscale="log", xlabel="update", ylabel=f"validation error on {VALID} samples, at t = 5")
     axes.grid(alpha=0.3, lw=0.4)
