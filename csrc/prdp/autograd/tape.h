@@ -51,8 +51,7 @@ class Tape {
  public:
   enum class Kind : int8_t {
     kAxpy,             // out = a + sign factor b
-    kCombination,      // out = a + sign Σ of the terms
-    kScale,            // out = factor a
+    kCombination,      // out = factor a + sign Σ of the terms
     kWeigh,            // out = a∘b
     kApply,            // out = A a
     kResidual,         // out = the right-hand side - A a

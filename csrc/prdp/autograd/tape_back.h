@@ -81,8 +81,8 @@ class TapeBack {
           add_to_number(term.node, op.sign, bar, term.of);
           tape_.add_bar(term.of, term.factor, bar);
         }
+        if (op.factor != T(1)) return tape_.add_bar(op.a, op.factor, bar);
         return tape_.move_bar(op.out, op.a);
-      case Kind::kScale: add_to_number(op.factor_node, 1, bar, op.a); return tape_.add_bar(op.a, op.factor, bar);
       case Kind::kWeigh:
         values_.weigh(tape_.value(op.a), bar, scratch_);
         tape_.add_bar(op.b, 1, scratch_);

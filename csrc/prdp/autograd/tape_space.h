@@ -193,29 +193,24 @@ class TapeSpace {
   }
 
   Scalar constant(const Scalar& a) const { return a.value; }
-  void scale(const Vector& v, const Scalar& factor, Vector& out) {
-    const T* from = value(v);
-    const auto of = v.version;
-    values_.scale(from, factor.value, fresh(out));
-    note({.kind = Kind::kScale, .out = out.version, .a = of, .factor_node = factor.node, .factor = factor.value});
-  }
-  void dots(const std::vector<Vector>& v, int64_t count, const Vector& w, Scalar* h) {
+  void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
     plain_.resize(count);
-    values_.dots(pointers(v, count), count, value(w), plain_.data());
+    values_.dots(pointers(v, count), count, factor.value, value(w), plain_.data());
     std::copy(plain_.begin(), plain_.end(), h);
   }
-  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) {
-    return combine(-1, h, v, count, w);
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar& factor,
+                              Vector& w) {
+    return combine(-1, h, v, count, factor.value, w);
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
                        Preconditioner preconditioner) {
     if (preconditioner == Preconditioner::kNone) {
-      combine(1, y.data(), v, count, x);
+      combine(1, y.data(), v, count, 1, x);
       return;
     }
     Vector sum = temporary(), divided = temporary();
     fill_zero(sum);
-    combine(1, y.data(), v, count, sum);
+    combine(1, y.data(), v, count, 1, sum);
     divide_by_diagonal(sum, divided);
     add(divided, x);
   }
@@ -233,7 +228,7 @@ class TapeSpace {
   }
   Scalar is_zero(const Scalar& a) const { return values_.is_zero(a.value); }
   Scalar is_not_zero(const Scalar& a) const { return values_.is_not_zero(a.value); }
-  bool all_exhausted(const Scalar& a) const { return values_.all_exhausted(a.value); }
+  bool surely_all(const Scalar& a) const { return values_.surely_all(a.value); }
 
   std::array<double, 1> lanes(const Scalar& a) const { return values_.lanes(a.value); }
   std::array<bool, 1> broken() const { return values_.broken(); }
@@ -283,7 +278,7 @@ class TapeSpace {
     for (int64_t i = 0; i < count; ++i) pointers_[i] = value(v[i]);
     return pointers_;
   }
-  Scalar combine(int8_t sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) {
+  Scalar combine(int8_t sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, T factor, Vector& w) {
     const auto before = w.version, first = tape_.terms.size();
     plain_.resize(count);
     for (int64_t i = 0; i < count; ++i) {
@@ -291,10 +286,11 @@ class TapeSpace {
       if (recording_) tape_.terms.push({v[i].version, h[i].node, sign * h[i].value});
     }
     const auto& from = pointers(v, count);
-    const T left2 = loops_.multi_axpy(T(sign), plain_.data(), from.data(), count, changed(w), tape_.length());
+    const T left2 = loops_.multi_axpy(T(sign), plain_.data(), from.data(), count, factor, changed(w), tape_.length());
     note({.kind = Kind::kCombination,
           .out = w.version,
           .a = before,
+          .factor = factor,
           .sign = sign,
           .first_term = first,
           .count = static_cast<int32_t>(count)});

@@ -84,9 +84,10 @@ struct Loops {
   T (*weighted_descend)(T alpha, const T* p, const T* q, const T* w, T* x, T* r, int64_t n, T* weighted);
   void (*weighted_xpby)(const T* w, const T* x, T beta, T* y, int64_t n);
   T (*weighted_square)(const T* w, const T* x, int64_t n);
-  /// h_j = v_j·w for `count` vectors; and w += sign·Σ alpha_j v_j, which returns ‖w‖². Any count.
-  void (*multi_dot)(const T* const* v, int64_t count, const T* w, T* h, int64_t n);
-  T (*multi_axpy)(T sign, const T* alpha, const T* const* v, int64_t count, T* w, int64_t n);
+  /// For `count` vectors, at least one: h_j = v_j·(factor·w); and w = factor·w + sign·Σ alpha_j v_j, which returns
+  /// ‖w‖².
+  void (*multi_dot)(const T* const* v, int64_t count, T factor, const T* w, T* h, int64_t n);
+  T (*multi_axpy)(T sign, const T* alpha, const T* const* v, int64_t count, T factor, T* w, int64_t n);
 
   /// By the number of dimensions less one. out = A v; dots = {v·out, ‖out‖²}.
   void (*apply[3])(const PaddedStencil<T>& a, const T* v, T* out, T* dots);

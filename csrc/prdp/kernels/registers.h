@@ -61,10 +61,17 @@ Register<T> lanes_from(const Register<T>& a, const Register<T>& b) {
 #endif
 }
 
-template <class T, int Half = kWidth<T> / 2>
-T sum_lanes(const Register<T>& v) {
-  if constexpr (Half == 0) return v[0];
-  else return sum_lanes<T, Half / 2>(v + lanes_from<T, Half>(v, v));
+/// The upper half of a vector added to its lower half.
+template <class V, int... Lane>
+auto fold(const V& v, std::integer_sequence<int, Lane...>) {
+  return __builtin_shufflevector(v, v, Lane...) +
+         __builtin_shufflevector(v, v, (static_cast<int>(sizeof...(Lane)) + Lane)...);
+}
+template <class T, class V>
+T sum_lanes(const V& v) {
+  constexpr int lanes = sizeof(V) / sizeof(T);
+  if constexpr (lanes == 2) return v[0] + v[1];
+  else return sum_lanes<T>(fold(v, std::make_integer_sequence<int, lanes / 2>()));
 }
 
 }  // namespace

@@ -21,19 +21,19 @@ void for_each_block(int64_t first, int64_t count, const Body& body) {
 /// Vectors that one pass takes at once.
 constexpr int kBlock = kRegisterBytes == 64 ? 8 : 4;
 
-/// h_j = v_j·w for the first Count vectors of v, in as many partial sums as hide the latency of an addition.
+/// h_j = v_j·(factor·w) for the first Count vectors of v, in as many partial sums as hide the latency of an addition.
 template <int Count, class T>
-void dot_block(const T* const* v, const T* w, T* h, int64_t n) {
+void dot_block(const T* const* v, T factor, const T* w, T* h, int64_t n) {
   constexpr int chains = Count > 2 ? 1 : 4 / Count;
   Register<T> sums[Count][chains] = {};
   int64_t i = 0;
   for (; i + chains * kWidth<T> <= n; i += chains * kWidth<T>)
     for (int k = 0; k < chains; ++k) {
-      const auto wk = load(w + i + k * kWidth<T>);
+      const auto wk = factor * load(w + i + k * kWidth<T>);
       for (int j = 0; j < Count; ++j) sums[j][k] += wk * load(v[j] + i + k * kWidth<T>);
     }
   for (; i < n; i += kWidth<T>)
-    for (int j = 0; j < Count; ++j) sums[j][0] += load(w + i) * load(v[j] + i);
+    for (int j = 0; j < Count; ++j) sums[j][0] += factor * load(w + i) * load(v[j] + i);
   for (int j = 0; j < Count; ++j) {
     for (int k = 1; k < chains; ++k) sums[j][0] += sums[j][k];
     h[j] = sum_lanes<T>(sums[j][0]);
@@ -41,28 +41,28 @@ void dot_block(const T* const* v, const T* w, T* h, int64_t n) {
 }
 
 template <class T>
-void multi_dot(const T* const* v, int64_t count, const T* w, T* h, int64_t n) {
-  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) { dot_block<size.value>(v + j, w, h + j, n); });
+void multi_dot(const T* const* v, int64_t count, T factor, const T* w, T* h, int64_t n) {
+  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) { dot_block<size.value>(v + j, factor, w, h + j, n); });
 }
 
 template <class T>
 T dot(const T* a, const T* b, int64_t n) {
   const int64_t whole = n / kWidth<T> * kWidth<T>;
   T sum;
-  dot_block<1>(&a, b, &sum, whole);
+  dot_block<1>(&a, T(1), b, &sum, whole);
   for (int64_t i = whole; i < n; ++i) sum += a[i] * b[i];
   return sum;
 }
 
-/// w += sign·Σ alpha_j v_j over the first Count vectors of v; returns ‖w‖².
+/// w = factor·w + sign·Σ alpha_j v_j over the first Count vectors of v; returns ‖w‖².
 template <int Count, class T>
-T axpy_block(T sign, const T* alpha, const T* const* v, T* w, int64_t n) {
+T axpy_block(T sign, const T* alpha, const T* const* v, T factor, T* w, int64_t n) {
   T a[Count];  // of their own, as w might overwrite those of the caller for all the compiler knows
   const T* from[Count];
   for (int j = 0; j < Count; ++j) a[j] = sign * alpha[j], from[j] = v[j];
   Register<T> squares[2] = {};
   const auto add = [&](int64_t i, int k) {
-    auto wi = load(w + i);
+    auto wi = factor * load(w + i);
     for (int j = 0; j < Count; ++j) wi += a[j] * load(from[j] + i);
     store(w + i, wi);
     squares[k] += wi * wi;
@@ -77,11 +77,11 @@ T axpy_block(T sign, const T* alpha, const T* const* v, T* w, int64_t n) {
 }
 
 template <class T>
-T multi_axpy(T sign, const T* alpha, const T* const* v, int64_t count, T* w, int64_t n) {
-  if (count == 0) return dot(w, w, n);
+T multi_axpy(T sign, const T* alpha, const T* const* v, int64_t count, T factor, T* w, int64_t n) {
   T norm2 = 0;
-  for_each_block<kBlock>(0, count,
-                         [&](int64_t j, auto size) { norm2 = axpy_block<size.value>(sign, alpha + j, v + j, w, n); });
+  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) {
+    norm2 = axpy_block<size.value>(sign, alpha + j, v + j, j == 0 ? factor : T(1), w, n);
+  });
   return norm2;
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <tuple>
 #include <vector>
@@ -11,6 +12,8 @@ namespace prdp {
 /// GMRES(m), restarted (Saad and Schultz 1986), for any operator. An iteration is a cycle: m products,
 /// then the least residual over their Krylov space, so that the residual never grows. Gram–Schmidt
 /// runs over all vectors at once, a second time where the first lost orthogonality; Givens rotations.
+/// The basis v_j = u_j/‖u_j‖ is kept as the u_j, of which u_0 is the residual, and their inverse lengths:
+/// no pass over memory is spent on scaling, and the next product need not wait for the length.
 ///
 /// Where autograd records the cycle, the coefficients h of the basis are constants: the least residual
 /// belongs to the space, whatever its basis. The minimiser's own dependence enters by Newton steps that
@@ -30,14 +33,12 @@ class GmresMethod {
         r_(space.vector()),
         kept_x_(space.vector()),
         kept_r_(space.vector()),
+        u_(m_ + 1),
         h_(m_ * (m_ + 1)),
-        inverse_(m_),
-        cos_(m_),
-        sin_(m_),
-        g_(m_ + 1),
-        y_(m_),
-        again_(m_ + 1) {
-    for (int64_t j = 0; j <= m_; ++j) v_.push_back(space.vector());
+        columns_(m_ + 1),
+        again_(m_ + 1),
+        weights_(m_ + 1) {
+    for (int64_t j = 1; j <= m_; ++j) u_[j] = space.vector();
     if (space.derivatives() > 0) products_.resize(m_);
   }
 
@@ -47,16 +48,18 @@ class GmresMethod {
     residual2_ = space_.b2();
     exhausted_ = space_.is_zero(residual2_);
     scale_ = residual2_ * 0;
+    one_ = space_.is_zero(scale_);
     ready_ = true;
     confirmed_ = !space_.started();
   }
   void step() {
     residual2();
     space_.copy(x, kept_x_);
-    space_.copy(r_, kept_r_);
-    columns_ = extend_basis();
-    minimise(columns_);
-    space_.add_combination(y_, v_, columns_, x, preconditioner_);
+    space_.advance(r_, kept_r_);
+    u_[0] = kept_r_;
+    const int64_t columns = extend_basis();
+    minimise(columns);
+    space_.add_combination(weights_, u_, columns, x, preconditioner_);
     ready_ = false;
     confirmed_ = true;
   }
@@ -91,62 +94,84 @@ class GmresMethod {
   Vector x;
 
  protected:
+  /// What belongs to number j of the basis. In one place, as a vector load of several would wait for their stores.
+  struct Column {
+    Scalar inverse_length{};  // 1/‖u_j‖, or zero
+    Scalar inverse{};         // 1/R_jj, or zero
+    Scalar g{}, y{};
+    std::array<Scalar, 2> rotation{};  // cosine and sine
+  };
   Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
 
-  /// v₀ = r/‖r‖ and A v_j = Σ h_ij v_i, rotated into R as they come. Returns how many columns there are.
+  /// v₀ = r/‖r‖ and A v_j = Σ h_ij v_i, the h rotated into R as they come. Returns how many columns there are.
   int64_t extend_basis() {
     using std::sqrt;
-    g_[0] = space_.constant(sqrt(residual2_));
-    space_.scale(r_, space_.inverse(g_[0], g_[0]), v_[0]);
-    exhausted_ = space_.is_zero(g_[0]);
+    const Scalar length = space_.constant(sqrt(residual2_));
+    columns_[0].g = length;
+    columns_[0].inverse_length = space_.inverse(length, length);
+    exhausted_ = space_.is_zero(length);
     loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
-      space_.apply(v_[j], v_[j + 1], preconditioner_);
-      if (space_.derivatives() > 0) products_[j] = v_[j + 1];
+      space_.apply(u_[j], u_[j + 1], preconditioner_);
+      if (space_.derivatives() > 0) products_[j] = u_[j + 1];
       scale_ = space_.larger(scale_, orthogonalise(j));
       const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
       h(j + 1, j) = h(j + 1, j) * space_.is_not_zero(inverse);
       exhausted_ = exhausted_ + space_.is_zero(inverse);
-      space_.scale(v_[j + 1], inverse, v_[j + 1]);
+      columns_[j + 1].inverse_length = inverse;
       rotate(j);
-      if (space_.all_exhausted(exhausted_)) return j + 1;
+      if (space_.surely_all(exhausted_)) return j + 1;
     }
     return m_;
   }
 
-  /// w = v_{j+1} ← w - Σ h_ij v_i; fills column j of h. Returns the length that w had.
+  /// u_{j+1} = A v_j - Σ h_ij v_i, where A u_j was; fills column j of h. Returns the length of A v_j.
   Scalar orthogonalise(int64_t j) {
     using std::sqrt;
     Scalar* column = &h(0, j);
-    space_.dots(v_, j + 1, v_[j + 1], column);
-    Scalar left2 = space_.subtract_combination(column, v_, j + 1, v_[j + 1]);
-    Scalar taken2 = column[0] * column[0];
-    for (int64_t i = 1; i <= j; ++i) taken2 = taken2 + column[i] * column[i];
+    auto [left2, taken2] = take_off_basis(columns_[j].inverse_length, j, column);
     const Scalar length = sqrt(taken2 + left2);
     if (space_.lost_orthogonality(left2, taken2, loss_)) {
-      space_.dots(v_, j + 1, v_[j + 1], again_.data());
-      left2 = space_.subtract_combination(again_.data(), v_, j + 1, v_[j + 1]);
+      left2 = take_off_basis(one_, j, again_.data())[0];
       for (int64_t i = 0; i <= j; ++i) column[i] = column[i] + again_[i];
     }
     column[j + 1] = sqrt(left2);
     return length;
   }
 
+  /// w = factor u_{j+1}; along_i = v_i·w and u_{j+1} ← w - Σ along_i v_i, for i ≤ j. Returns the squares of u_{j+1}
+  /// and of what was taken off.
+  std::array<Scalar, 2> take_off_basis(const Scalar& factor, int64_t j, Scalar* along) {
+    space_.dots(u_, j + 1, factor, u_[j + 1], along);
+    Scalar taken2{};
+    for (int64_t i = 0; i <= j; ++i) {
+      along[i] = along[i] * columns_[i].inverse_length;
+      weights_[i] = along[i] * columns_[i].inverse_length;
+      taken2 = i == 0 ? along[i] * along[i] : taken2 + along[i] * along[i];
+    }
+    return {space_.subtract_combination(weights_.data(), u_, j + 1, factor, u_[j + 1]), taken2};
+  }
+  /// The weights of the u_j that belong to y.
+  void weigh(int64_t columns) {
+    for (int64_t j = 0; j < columns; ++j) weights_[j] = columns_[j].y * columns_[j].inverse_length;
+  }
+
   /// Turns column j of h into one of R, and g along with it.
   void rotate(int64_t j) {
     using std::sqrt;
     for (int64_t i = 0; i < j; ++i) {
-      const Scalar upper = cos_[i] * h(i, j) + sin_[i] * h(i + 1, j);
-      h(i + 1, j) = cos_[i] * h(i + 1, j) - sin_[i] * h(i, j);
+      const auto& [cos, sin] = columns_[i].rotation;
+      const Scalar upper = cos * h(i, j) + sin * h(i + 1, j);
+      h(i + 1, j) = cos * h(i + 1, j) - sin * h(i, j);
       h(i, j) = upper;
     }
+    Column& c = columns_[j];
     const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
-    inverse_[j] = space_.inverse(diagonal, scale_);  // 0 where A is singular on the space
-    cos_[j] = h(j, j) * inverse_[j];
-    sin_[j] = h(j + 1, j) * inverse_[j];
+    c.inverse = space_.inverse(diagonal, scale_);  // 0 where A is singular on the space
+    c.rotation = {h(j, j) * c.inverse, h(j + 1, j) * c.inverse};
     h(j, j) = diagonal;
-    g_[j + 1] = -(sin_[j] * g_[j]);
-    g_[j] = cos_[j] * g_[j];
+    columns_[j + 1].g = -(c.rotation[1] * c.g);
+    c.g = c.rotation[0] * c.g;
   }
 
   /// y = argmin ‖r - A V y‖. A column that would take so long a step that its rounding exceeds r is
@@ -155,23 +180,27 @@ class GmresMethod {
     using std::sqrt;
     const Scalar size = space_.constant(sqrt(residual2_));
     for (int64_t j = columns - 1; j >= 0; --j) {
-      y_[j] = g_[j];
-      for (int64_t k = j + 1; k < columns; ++k) y_[j] = y_[j] - h(j, k) * y_[k];
-      y_[j] = y_[j] * inverse_[j];
-      const Scalar kept = space_.is_not_zero(space_.inverse(size, scale_ * y_[j]));
+      Column& c = columns_[j];
+      c.y = c.g;
+      for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
+      c.y = c.y * c.inverse;
+      const Scalar kept = space_.is_not_zero(space_.inverse(size, scale_ * c.y));
+      if (space_.surely_all(kept)) continue;
       for (int64_t k = j; k < columns; ++k) {
-        y_[k] = y_[k] * kept;
-        inverse_[k] = inverse_[k] * kept;
+        columns_[k].y = columns_[k].y * kept;
+        columns_[k].inverse = columns_[k].inverse * kept;
       }
     }
     for (int derivative = 1; derivative <= space_.derivatives(); ++derivative) {
-      Vector e = r_;
-      space_.subtract_combination(y_.data(), products_, columns, e);
+      Vector e = kept_r_;
+      weigh(columns);
+      space_.subtract_combination(weights_.data(), products_, columns, one_, e);
       std::vector<Scalar> change(columns);
-      for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e);
+      for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e) * columns_[j].inverse_length;
       solve_normal(change);
-      for (int64_t j = 0; j < columns; ++j) y_[j] = y_[j] + change[j];
+      for (int64_t j = 0; j < columns; ++j) columns_[j].y = columns_[j].y + change[j];
     }
+    weigh(columns);
   }
 
   /// z ← (RᵀR)⁻¹ z
@@ -179,11 +208,11 @@ class GmresMethod {
     const auto columns = static_cast<int64_t>(z.size());
     for (int64_t j = 0; j < columns; ++j) {
       for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
-      z[j] = z[j] * inverse_[j];
+      z[j] = z[j] * columns_[j].inverse;
     }
     for (int64_t j = columns - 1; j >= 0; --j) {
       for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
-      z[j] = z[j] * inverse_[j];
+      z[j] = z[j] * columns_[j].inverse;
     }
   }
 
@@ -191,14 +220,15 @@ class GmresMethod {
   Preconditioner preconditioner_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_;
-  std::vector<Vector> v_, products_;  // orthonormal basis; A v_j, kept while recording
-  std::vector<Scalar> h_, inverse_;   // by columns, R once rotated; 1/R_jj
-  std::vector<Scalar> cos_, sin_, g_, y_, again_;
+  std::vector<Vector> u_, products_;    // orthogonal basis; A u_j, kept while recording
+  std::vector<Scalar> h_;               // by columns, R once rotated
+  std::vector<Column> columns_;
+  std::vector<Scalar> again_, weights_;  // of a second pass; of the u_j
   Scalar residual2_{}, exhausted_{}, grew_{};
   Scalar loss_{};   // of orthogonality, in units of rounding
   Scalar scale_{};  // largest ‖A v‖ so far: what is rounding beside it is zero
-  int64_t columns_ = 0;  // of the last cycle
-  bool ready_ = false;   // r_ and residual2_ belong to x
+  Scalar one_{};
+  bool ready_ = false;     // r_ and residual2_ belong to x
   bool confirmed_ = true;  // and were computed from it: those of a start were not
 };
 

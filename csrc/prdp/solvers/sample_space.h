@@ -168,7 +168,9 @@ class SampleSpace {
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(solution(x), r);
-    loops_.xpby(started_ ? whole_b() : b(), T(-1), r, length());
+    const T *const b_u = started_ ? whole_b() : b(), one = 1;
+    const Scalar rr = loops_.multi_axpy(T(1), &one, &b_u, 1, T(-1), r, length());
+    if constexpr (!kernels::kHasNullSpace<Kernel>) return rr;
     project(r);
     return dot(r, r);
   }
@@ -205,19 +207,17 @@ class SampleSpace {
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
   static constexpr int derivatives() { return 0; }
   Scalar constant(Scalar value) const { return value; }
-  void scale(const T* v, Scalar factor, Vector out) { loops_.scale(factor, v, out, length()); }
-  void dots(const std::vector<Vector>& v, int64_t count, const T* w, Scalar* h) {
-    loops_.multi_dot(v.data(), count, w, h, length());
+  void dots(const std::vector<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
+    loops_.multi_dot(v.data(), count, factor, w, h, length());
   }
-  /// w -= Σ h_i v_i; returns ‖w‖².
-  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector w) {
-    return loops_.multi_axpy(T(-1), h, v.data(), count, w, length());
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Scalar factor, Vector w) {
+    return loops_.multi_axpy(T(-1), h, v.data(), count, factor, w, length());
   }
   void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x,
                        Preconditioner preconditioner) {
     const bool plain = preconditioner == Preconditioner::kNone;
     if (!plain) fill_zero(scratch());
-    loops_.multi_axpy(T(1), y.data(), v.data(), count, plain ? x : scratch(), length());
+    loops_.multi_axpy(T(1), y.data(), v.data(), count, T(1), plain ? x : scratch(), length());
     if (plain) return;
     kernel_->divide_by_diagonal(scratch(), scratch());
     add(scratch(), x);
@@ -242,7 +242,7 @@ class SampleSpace {
   void restore(Scalar where, Scalar from, Scalar& to) const { to = where != 0 ? from : to; }
   Scalar is_zero(Scalar value) const { return value == 0; }
   Scalar is_not_zero(Scalar value) const { return value != 0; }
-  bool all_exhausted(Scalar exhausted) const { return exhausted != 0; }
+  bool surely_all(Scalar value) const { return value != 0; }
 
   std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }

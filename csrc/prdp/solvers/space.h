@@ -30,6 +30,8 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   s.copy(x, y);
   /// b = a
   s.assign(a, b);
+  /// x takes the value of y, and y that of x.
+  s.advance(x, y);
   /// y += x
   s.add(x, y);
   /// y = x + a y
@@ -86,8 +88,6 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
                                                    typename S::Vector y, int64_t n, const typename S::Scalar* omega) {
   /// y = D⁻¹ x
   s.divide_by_diagonal(x, y);
-  /// x takes the value of y, and y that of x.
-  s.advance(x, y);
   /// n sweeps x ← c + x - D⁻¹A x, of which y keeps the last but one; Chebyshev's with their weights omega.
   s.sweeps(c, x, y, n, omega);
   /// One sweep from x to y; returns ‖b - A x‖².
@@ -106,12 +106,10 @@ concept KrylovSpace =
                                std::vector<typename S::Scalar> w, Preconditioner preconditioner) {
       /// y = A M⁻¹ x
       s.apply(x, y, preconditioner);
-      /// y = a x
-      s.scale(x, a, y);
-      /// h_i = v_i·x for the first n of v, as constants.
-      s.dots(v, n, x, h);
-      /// x -= Σ h_i v_i; returns ‖x‖² as a constant.
-      { s.subtract_combination(h, v, n, x) } -> std::same_as<typename S::Scalar>;
+      /// h_i = v_i·(a x) for the first n of v, as constants.
+      s.dots(v, n, a, x, h);
+      /// x = a x - Σ h_i v_i with a constant a; returns ‖x‖² as a constant.
+      { s.subtract_combination(h, v, n, a, x) } -> std::same_as<typename S::Scalar>;
       /// x += M⁻¹ Σ w_i v_i
       s.add_combination(w, v, n, x, preconditioner);
       /// Whether a vector, of which a is left beside the b that went along the basis (both squared), is to be made
@@ -121,8 +119,8 @@ concept KrylovSpace =
       { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
       /// max(a, b)
       { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
-      /// Whether no sample has a Krylov space left that could be extended.
-      { s.all_exhausted(a) } -> std::same_as<bool>;
+      /// Whether a is not zero for any sample; a space that would have to look closely may say no.
+      { s.surely_all(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.
       { s.constant(a) } -> std::same_as<typename S::Scalar>;
       /// How often the operations are recorded to be differentiated.

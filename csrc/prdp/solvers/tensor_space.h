@@ -106,11 +106,13 @@ class TensorSpace {
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
   int derivatives() const { return recording_ ? 2 : 0; }
   Scalar constant(const Scalar& value) const { return value.detach(); }
-  void scale(const Vector& v, const Scalar& factor, Vector& out) const { out = factor * v; }
-  void dots(const std::vector<Vector>& v, int64_t count, const Vector& w, Scalar* h) const {
-    for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), w.detach());
+  void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) const {
+    const auto scaled = factor * w.detach();
+    for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
   }
-  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& w) const {
+  Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar& factor,
+                              Vector& w) const {
+    w = factor * w;
     for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
     return dot(w.detach(), w.detach());
   }
@@ -129,7 +131,7 @@ class TensorSpace {
   }
   Scalar is_zero(const Scalar& value) const { return value.eq(0).to(b_.scalar_type()); }
   Scalar is_not_zero(const Scalar& value) const { return value.ne(0).to(b_.scalar_type()); }
-  bool all_exhausted(const Scalar&) const { return false; }  // the basis goes on with zeros
+  bool surely_all(const Scalar&) const { return false; }  // the basis goes on with zeros
 
   std::vector<double> lanes(const Scalar& value) const;
   std::vector<bool> broken() const;
