@@ -15,12 +15,12 @@ VALID = 20
 def run(study, seeds, quick):
     for seed in range(seeds):
         for epochs in (1,) if quick else EPOCHS:
-            changes = {
-                "data.valid": VALID,
-                "training.epochs": epochs,
-                "training.cosine_updates": UPDATES_PER_EPOCH * epochs,
-            }
-            study.train("navier_stokes", "converged", seed, changes, keep=("metric",))
+            study.train("navier_stokes", "converged", seed, changes_for(epochs), keep=("metric",))
+
+
+def changes_for(epochs):
+    cosine_updates = UPDATES_PER_EPOCH * epochs
+    return {"data.valid": VALID, "training.epochs": epochs, "training.cosine_updates": cosine_updates}
 
 
 def table(rows):
@@ -41,7 +41,7 @@ def chart(rows):
             title = f"{updates:,} updates" if row["seed"] == 0 else None
             done = np.linspace(0, updates, len(row["metric"]))  # from before the first update to after the last
             axes.plot(done, row["metric"], color=colour, lw=1, label=title)
-    axes.set(yscale="log", xlabel="update", ylabel=f"validation error on {VALID} samples, at t = 5")
+    axes.set(yscale="log", ylim=(None, 0.1), xlabel="update", ylabel=f"validation error on {VALID} samples, at t = 5")
     axes.grid(alpha=0.3, lw=0.4)
     axes.legend(frameon=False)
     return figure

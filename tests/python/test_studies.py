@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from benchmarks.studies import unroll
+from benchmarks.studies import unroll, updates
 from benchmarks.studies.trainings import PRDPOnLoss, variant
 from prdp_torch.experiments.training import train
 
@@ -27,3 +27,10 @@ def test_two_unrolled_steps_tell_the_gradients_apart():
     exact, few, none = (unroll.train("burgers_1d", 2, gradient, 0, 3) for gradient in unroll.GRADIENTS)
     assert len({tuple(row["errors"]) for row in (exact, few, none)}) == 3
     assert exact["adjoint_products"] > few["adjoint_products"] > none["adjoint_products"] == 0
+
+
+@pytest.mark.parametrize("epochs", updates.EPOCHS)
+def test_a_longer_training_lowers_its_learning_rate_over_all_updates(epochs):
+    scene = variant("navier_stokes", updates.changes_for(epochs))
+    per_epoch = scene.data.train // scene.training.batch
+    assert (scene.training.epochs, scene.training.cosine_updates) == (epochs, epochs * per_epoch)
