@@ -94,12 +94,14 @@ class GmresMethod {
   Vector x;
 
  protected:
-  /// What belongs to number j of the basis. In one place, as a vector load of several would wait for their stores.
+  /// What belongs to number j of the basis. Numbers that are computed alike lie apart: compilers would combine
+  /// neighbours in a vector load, which has to wait for the stores of each.
   struct Column {
+    Scalar cos{};
     Scalar inverse_length{};  // 1/‖u_j‖, or zero
-    Scalar inverse{};         // 1/R_jj, or zero
+    Scalar sin{};
+    Scalar inverse{};  // 1/R_jj, or zero
     Scalar g{}, y{};
-    std::array<Scalar, 2> rotation{};  // cosine and sine
   };
   Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
 
@@ -160,18 +162,19 @@ class GmresMethod {
   void rotate(int64_t j) {
     using std::sqrt;
     for (int64_t i = 0; i < j; ++i) {
-      const auto& [cos, sin] = columns_[i].rotation;
-      const Scalar upper = cos * h(i, j) + sin * h(i + 1, j);
-      h(i + 1, j) = cos * h(i + 1, j) - sin * h(i, j);
+      const Column& c = columns_[i];
+      const Scalar upper = c.cos * h(i, j) + c.sin * h(i + 1, j);
+      h(i + 1, j) = c.cos * h(i + 1, j) - c.sin * h(i, j);
       h(i, j) = upper;
     }
     Column& c = columns_[j];
     const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
     c.inverse = space_.inverse(diagonal, scale_);  // 0 where A is singular on the space
-    c.rotation = {h(j, j) * c.inverse, h(j + 1, j) * c.inverse};
+    c.cos = h(j, j) * c.inverse;
+    c.sin = h(j + 1, j) * c.inverse;
     h(j, j) = diagonal;
-    columns_[j + 1].g = -(c.rotation[1] * c.g);
-    c.g = c.rotation[0] * c.g;
+    columns_[j + 1].g = -(c.sin * c.g);
+    c.g = c.cos * c.g;
   }
 
   /// y = argmin ‖r - A V y‖. A column that would take so long a step that its rounding exceeds r is
