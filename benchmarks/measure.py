@@ -1,5 +1,5 @@
-"""Times of calls, side by side: all in turn, many rounds, minimum and median. It is the processor's time, that of
-all threads, which is the time that passes on one core with nothing else to do."""
+"""Times of calls, side by side: all in turn, many rounds, minimum and median. If not said otherwise, it is
+the processor's time, that of all threads, which is the time that passes on one core with nothing else to do."""
 
 import statistics
 import time
@@ -8,22 +8,22 @@ ROUNDS = 5
 SAMPLE_SECONDS = 0.02  # what a reading takes at least; a call is repeated to reach it
 
 
-def interleaved(calls, rounds=ROUNDS, sample_seconds=SAMPLE_SECONDS):
+def interleaved(calls, rounds=ROUNDS, sample_seconds=SAMPLE_SECONDS, clock=time.process_time):
     """Seconds a call, {name: {"min": …, "median": …}}, of callables {name: call} that end when their work
     has ended. Neighbours on the machine disturb all of them alike."""
     repeats = {}
     for name, call in calls.items():
         call()  # warm-up: caches, workspaces, compilers
-        repeats[name] = max(1, round(sample_seconds / max(_seconds(call, 1), 1e-7)))
+        repeats[name] = max(1, round(sample_seconds / max(_seconds(call, 1, clock), 1e-7)))
     readings = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            readings[name].append(_seconds(call, repeats[name]))
+            readings[name].append(_seconds(call, repeats[name], clock))
     return {name: {"min": min(r), "median": statistics.median(r)} for name, r in readings.items()}
 
 
-def _seconds(call, repeats):
-    started = time.process_time()
+def _seconds(call, repeats, clock):
+    started = clock()
     for _ in range(repeats):
         call()
-    return (time.process_time() - started) / repeats
+    return (clock() - started) / repeats

@@ -2,7 +2,7 @@
 coefficients, from smooth random states."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -150,9 +150,9 @@ def diffusion(shape, k, batch=25, mean=0.01, contrast=1.0, dt=0.01):
 
 
 PROBLEMS = {
-    "heat_1d": lambda: heat((30,), 25),
-    "heat_2d": lambda: heat((30, 30), 43),
-    "heat_3d": lambda: heat((20, 20, 20), 50),
+    "heat_1d": partial(heat, (30,), 25),
+    "heat_2d": partial(heat, (30, 30), 43),
+    "heat_3d": partial(heat, (20, 20, 20), 50),
     "burgers_1d": burgers,
     "navier_stokes": navier_stokes,
 }

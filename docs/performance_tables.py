@@ -117,7 +117,26 @@ def memory():
     return page_tables.markdown(["", *(f"K = {k}" for k in budgets)], body)
 
 
-TABLES = {"other libraries": beside_others, "diffusion": diffusion, "memory": memory}
+PROBLEMS = {
+    "heat_1d": "heat 1D",
+    "heat_2d": "heat 2D",
+    "heat_3d": "heat 3D",
+    "burgers_1d": "Burgers",
+    "navier_stokes": "Navier–Stokes",
+}
+
+
+def threads():
+    """How many times as fast two threads are as one."""
+    found = record("calls")["threads"]
+    body = []
+    for batch in dict.fromkeys(row["batch"] for row in found):
+        of_problem = {row["problem"]: row["one"] / row["two"] for row in found if row["batch"] == batch}
+        body.append([str(batch), *(f"{of_problem[name]:.1f}" for name in PROBLEMS)])
+    return page_tables.markdown(["batch", *PROBLEMS.values()], body)
+
+
+TABLES = {"other libraries": beside_others, "diffusion": diffusion, "memory": memory, "threads": threads}
 
 
 def table(what):
