@@ -223,8 +223,8 @@ class GmresMethod {
   Preconditioner preconditioner_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_;
-  std::vector<Vector> u_, products_;    // orthogonal basis; A u_j, kept while recording
-  std::vector<Scalar> h_;               // by columns, R once rotated
+  std::vector<Vector> u_, products_;  // orthogonal basis; A u_j, kept while recording
+  std::vector<Scalar> h_;             // by columns, R once rotated
   std::vector<Column> columns_;
   std::vector<Scalar> again_, weights_;  // of a second pass; of the u_j
   Scalar residual2_{}, exhausted_{}, grew_{};

@@ -119,7 +119,7 @@ concept KrylovSpace =
       { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
       /// max(a, b)
       { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
-      /// Whether a is not zero for any sample; a space that would have to look closely may say no.
+      /// Whether a differs from zero in every sample; a space that would have to look closely may say no.
       { s.surely_all(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.
       { s.constant(a) } -> std::same_as<typename S::Scalar>;
