@@ -28,11 +28,11 @@ def with_two_threads(name, batch):
     return {"problem": name, "batch": batch, "residual": residual, "gradient_error": gradient_error, **seconds}
 
 
-def in_a_rollout(name="heat_1d", k=25):
-    """Seconds of a step and its gradient, in one operation and in single calls."""
+def in_a_rollout():
+    """Seconds of a step of heat_1d and its gradient, in one operation and in single calls."""
     torch.set_num_threads(1)
-    problem = problems.PROBLEMS[name]()
-    step = prdp.Heat(problem.shape, problem.nu, problem.dt, solver=problem.solver(k))
+    problem = problems.PROBLEMS["heat_1d"]()
+    step = prdp.Heat(problem.shape, problem.nu, problem.dt, solver=problem.solver(problem.k))
 
     def single(u):
         for _ in range(STEPS):
@@ -46,9 +46,10 @@ def in_a_rollout(name="heat_1d", k=25):
 
     ways = {"rollout": lambda u: step.rollout(u, STEPS)[:, -1], "single": single}
     first, second = (gradient(way) for way in ways.values())
+    difference = float((first - second).norm() / second.norm())
     seconds = _seconds({name: lambda way=way: gradient(way) for name, way in ways.items()})
     return {
-        "problem": name, "steps": STEPS, "k": k, "difference": float((first - second).norm() / second.norm()),
+        "problem": problem.name, "steps": STEPS, "k": problem.k, "difference": difference,
         **{way: passed / STEPS for way, passed in seconds.items()},
     }  # fmt: skip
 
@@ -63,6 +64,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("runs/calls.json"))
     options = parser.parse_args()
     records.prepare_folder(options.out.parent)
+    environment = records.environment()  # before the number of threads changes
     threads = []
     for batch in BATCHES:
         for name in problems.PROBLEMS:
@@ -71,7 +73,7 @@ def main():
             print(f"{name}, batch {batch}: two threads {row['one'] / row['two']:.2f} times as fast", flush=True)
     row = in_a_rollout()
     print(f"a step: {1e6 * row['rollout']:.0f} µs in a rollout, {1e6 * row['single']:.0f} µs in single calls")
-    records.write(options.out, {**records.environment(), "calls": {"threads": threads, "rollout": row}})
+    records.write(options.out, {**environment, "calls": {"threads": threads, "rollout": row}})
 
 
 if __name__ == "__main__":

@@ -13,13 +13,9 @@ STEPS = 6  # K, K + 1, …: what a controller does
 LONGEST = 120.0  # seconds after which no further K is tried
 
 
+@fresh_cache()  # else torch.compile finds what earlier runs of the benchmark have left
 def run(report, quick=False):
     """[{problem, label, k, first_seconds, later_seconds}] of the solve with its gradient."""
-    with fresh_cache():  # else torch.compile finds what earlier runs of the benchmark have left
-        return of_problems(report, quick)
-
-
-def of_problems(report, quick):
     found = []
     for name in ["heat_1d"] if quick else ["heat_1d", "heat_2d", "burgers_1d", "navier_stokes"]:
         problem = PROBLEMS[name]()

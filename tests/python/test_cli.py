@@ -7,9 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+import types
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
+
+from prdp_torch.experiments import records
 
 ROOT = Path(__file__).parents[2]
 PRDP = [sys.executable, "-m", "prdp_torch"]
@@ -174,3 +178,18 @@ def test_the_quickstart_tightens_its_tolerance(tmp_path):
     assert done.returncode == 0 and done.stdout.endswith("The solves were accurate enough.\n"), done.stderr
     tolerances = [float(rtol) for rtol in re.findall(r"tolerance (\S+)", done.stdout)]
     assert len(tolerances) > 5 and tolerances == sorted(tolerances, reverse=True) and tolerances[-1] < 0.07
+
+
+@pytest.mark.parametrize(
+    "module, file, program",
+    [
+        (None, "bin/prdp", "prdp"),
+        ("pack.tool.__main__", "__main__.py", "python -m pack.tool"),
+        ("pack.tool", "tool.py", "python -m pack.tool"),
+    ],
+)
+def test_a_record_names_the_command_so_that_it_can_be_given_again(monkeypatch, module, file, program):
+    main = types.SimpleNamespace(__spec__=module and ModuleSpec(module, None))
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{file}", "compare", "heat_1d"])
+    assert records.environment()["command"] == f"{program} compare heat_1d"

@@ -112,15 +112,15 @@ def test_the_loops_and_plain_tensors_agree(name, method):
     a, _, b, exact = problem(name)
     x0 = exact + random(*b.shape, seed=3) * torch.tensor([0.0, 1e-2, 1.0]).view(3, *[1] * (b.dim() - 1))
     for k, rtol in ((3, 0.0), (300, 1e-7)):
-        solver = method(k, rtol=rtol)
+        # One cycle of as many vectors as there are unknowns would end at rounding, and might end at exactly zero.
+        solver = prdp.GMRES(k, rtol=rtol, restart=2) if method is prdp.GMRES else method(k, rtol=rtol)
         u, info = prdp.linear_solve(a, b, solver, x0=x0, on_failure="return")
         v, said = _C.solve_with_tensors(
             b, a.tensors, a.kind, a.shape, a.parameters, False, solver.method, k, rtol, solver.restart, x0
         )
         torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10)
         said = prdp.SolveInfo(*said)
-        inexact = (info.residual > 0) & (said.residual > 0)  # else rounding errors happened to cancel
-        assert info.status[inexact].tolist() == said.status[inexact].tolist()
+        assert info.status.tolist() == said.status.tolist()
         assert info.iterations.tolist() == said.iterations.tolist()
         if method is not prdp.GMRES:  # whose last cycle may be shorter in the loops
             assert info.operator_applications.tolist() == said.operator_applications.tolist()

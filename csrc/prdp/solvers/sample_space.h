@@ -168,8 +168,9 @@ class SampleSpace {
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(solution(x), r);
-    const T *const b_u = started_ ? whole_b() : b(), one = 1;
-    const Scalar rr = loops_.multi_axpy(T(1), &one, &b_u, 1, T(-1), r, length());
+    const T* const of = started_ ? whole_b() : b();
+    const T one = 1;
+    const Scalar rr = loops_.multi_axpy(T(1), &one, &of, 1, T(-1), r, length());
     if constexpr (!kernels::kHasNullSpace<Kernel>) return rr;
     project(r);
     return dot(r, r);
