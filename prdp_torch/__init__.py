@@ -18,7 +18,7 @@ from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceContr
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
-from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, SteepestDescent  # noqa: E402
+from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Multigrid, SteepestDescent  # noqa: E402
 from prdp_torch.stepper import Stepper  # noqa: E402
 from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson  # noqa: E402
 
@@ -36,6 +36,7 @@ __all__ = [
     "ImplicitStep",
     "Jacobi",
     "LinearSchedule",
+    "Multigrid",
     "NavierStokes",
     "PRDPController",
     "Poisson",

@@ -72,7 +72,7 @@ class _Attached:
         """(metric, converged, residual, error), the same in every process: means, and whether all have converged. The
         residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
         ended = [getattr(stepper, "info", None) for stepper in self.steppers]
-        residuals = [torch.zeros(0) if info is None else info.residual.double() for info in ended]
+        residuals = [torch.zeros(0) if info is None else _beyond_rounding(info) for info in ended]
         many = processes.count(self.process_group)
         if many > 1:
             # One that is refused must be refused in every process.
@@ -103,6 +103,11 @@ class _Attached:
         if self.process_group is not None:
             raise TypeError(f"{type(self).__name__}: only a controller of the default process group can be copied")
         return _remade, (type(self), self.steppers, self.settings, self.state_dict())
+
+
+def _beyond_rounding(info):
+    """The residuals of a report, with 0 where it is rounding alone."""
+    return info.residual.double().masked_fill(info.floor > 0, 0.0)
 
 
 def _remade(kind, steppers, settings, state):

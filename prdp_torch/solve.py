@@ -7,13 +7,20 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import Kept, check_options, checkpoint_number
+from prdp_torch.solvers import (
+    Kept,
+    check_options,
+    checkpoint_number,
+    flat_preconditioner,
+    solve_options,
+    tensors_of,
+)
 
 SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
 SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
 
 
-_last_options = Kept(_C.SolveOptions)
+_last_options = Kept(solve_options)
 
 
 class AdjointLog:
@@ -59,6 +66,9 @@ class SolveInfo(NamedTuple):
     """Why the solve stopped (int64). `SolveStatus(int(info.status[0])).name` is its name."""
     operator_applications: torch.Tensor
     """Number of products with A (int64)."""
+    floor: torch.Tensor
+    """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖; 0 elsewhere.
+    Such a sample is STAGNATED, and u is as accurate as the dtype allows. For a smaller residual take float64."""
     log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self):
@@ -75,6 +85,11 @@ class SolveInfo(NamedTuple):
     def failed(self):
         """Which samples failed (bool): their status is below STAGNATED."""
         return self.status < SolveStatus.STAGNATED
+
+    @property
+    def solved(self):
+        """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows."""
+        return (self.status > 0) | (self.floor > 0)
 
     @property
     def adjoint(self):
@@ -172,10 +187,13 @@ def linear_solve(
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     rhs = b.unsqueeze(0) if lone_vector else b
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
-    settings = solver.rtol, solver.restart, backward, adjoint_max_iter, adjoint_rtol, on_failure
+    settings = backward, adjoint_max_iter, adjoint_rtol, on_failure
     every = checkpoint_number(checkpoint_every)
     if not compiling:
-        options = _last_options.of(solver.method, *settings, every, False)
+        preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
+        options = _last_options.of(
+            solver.method, solver.rtol, solver.restart, *preconditioner, *settings, every, False
+        )
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
@@ -189,6 +207,9 @@ def linear_solve(
             False,
             solver.method,
             solver.max_iter,
+            solver.rtol,
+            solver.restart,
+            *flat_preconditioner(solver.preconditioner),
             *settings,
             0 if log is None else log.number,
             every,

@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 
 from prdp_torch import _C, _check
+from prdp_torch.operators import Operator
 
 
 @dataclass
@@ -20,7 +21,10 @@ class Solver:
     Args:
         max_iter: K >= 0, the maximum number of iterations.
         rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
-        preconditioner: None, or the name of one; only for `CG` and `GMRES`.
+        preconditioner: only for `CG`, `BiCGStab` and `GMRES`. M ≈ A, whose inverse they apply in every iteration:
+            None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of `prdp_torch.operators` whose product is M⁻¹ r, such as
+            `Function(apply, transpose)`. The adjoint solve applies its transpose. Derivatives take it for a constant,
+            except the diagonal in unrolled mode.
 
     Raises:
         ValueError, TypeError: an argument is out of range or of a wrong type.
@@ -28,30 +32,42 @@ class Solver:
 
     max_iter: int
     rtol: float = _C.DEFAULT_RTOL
-    preconditioner: str | None = field(default=None, kw_only=True)
+    preconditioner: str | Operator | None = field(default=None, kw_only=True)
 
     restart: ClassVar[int] = _C.DEFAULT_RESTART
     method: ClassVar[str]
-    preconditioners: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self):
-        self._check_preconditioner()
-        if self.preconditioner is not None:
-            self.method = f"{type(self).method}_{self.preconditioner}"
+        who = type(self).__name__
+        check_preconditioner(who, self.preconditioner)
         if not torch.compiler.is_compiling():
-            who = type(self).__name__
             self.max_iter = _check.whole(who, "max_iter", self.max_iter)
             self.rtol = _check.real(who, "rtol", self.rtol)
-            _C.check_solver(who, self.method, self.max_iter, self.rtol, self.restart)
+            kind = flat_preconditioner(self.preconditioner)[0]
+            _C.check_solver(who, self.method, self.max_iter, self.rtol, self.restart, kind)
 
-    def _check_preconditioner(self):
-        who, name, allowed = type(self).__name__, self.preconditioner, self.preconditioners
-        if name is None or name in allowed:
-            return
-        if not allowed:
-            raise ValueError(f"{who}: takes no preconditioner, got {name!r}; CG and GMRES take one")
-        names = ", ".join(map(repr, (None, *allowed)))
-        raise ValueError(f"{who}: unknown preconditioner {name!r}; allowed: {names}")
+
+PRECONDITIONERS = ("diagonal", "multigrid")
+
+
+def check_preconditioner(who, preconditioner):
+    """Raise ValueError or TypeError for what no solver takes."""
+    if isinstance(preconditioner, str) and preconditioner not in PRECONDITIONERS:
+        names = ", ".join(map(repr, (None, *PRECONDITIONERS)))
+        raise ValueError(f"{who}: unknown preconditioner {preconditioner!r}; allowed: {names}, or an operator")
+    if not isinstance(preconditioner, str | Operator | Multigrid | None):
+        raise TypeError(
+            f"{who}: preconditioner must be a name or an operator of prdp_torch.operators, got {preconditioner!r:.80}"
+        )
+
+
+def flat_preconditioner(preconditioner):
+    """Kind, shape, parameters and tensors of a preconditioner, and whether it is transposed, for the compiled library."""
+    if isinstance(preconditioner, Operator):
+        return preconditioner.kind, preconditioner.shape, preconditioner.parameters, preconditioner.tensors, False
+    if isinstance(preconditioner, Multigrid):
+        return "multigrid", [preconditioner.smoothing], [], [], False
+    return preconditioner or "", [], [], [], False
 
 
 @dataclass
@@ -85,15 +101,15 @@ class SteepestDescent(Solver):
 class CG(Solver):
     """Conjugate gradients, for symmetric definite operators.
 
-    `preconditioner="diagonal"` divides by the magnitude of the diagonal. Where the diagonal varies much, as with a
-    diffusivity that varies in space, this saves most of the iterations. If the diagonal is constant, it saves
-    none. A zero on the diagonal is refused (ZERO_DIAGONAL).
+    `preconditioner="diagonal"` divides by the diagonal. Where the diagonal varies much, as with a diffusivity that
+    varies in space, this saves most of the iterations. If the diagonal is constant, it saves none. A zero on the
+    diagonal is refused (ZERO_DIAGONAL). A preconditioner of your own must be symmetric and definite; where it is not,
+    a sample ends with BREAKDOWN.
 
     Source: Hestenes and Stiefel 1952.
     """
 
     method: ClassVar[str] = "cg"
-    preconditioners: ClassVar[tuple[str, ...]] = ("diagonal",)
 
 
 @dataclass
@@ -111,11 +127,8 @@ class BiCGStab(Solver):
 class GMRES(Solver):
     """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, and `max_iter` counts cycles.
 
-    The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit ones.
-
-    Two preconditioners are applied from the right. "diagonal" divides by the diagonal, which must have no zero
-    (ZERO_DIAGONAL). "stokes", for `NavierStokes` only, solves the same step without winds by FFTs; GMRES then
-    reaches 1e-5 in few products, but in more time, as these run as tensor operations.
+    The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit ones. A preconditioner
+    is applied from the right, so the residual stays that of A u = b.
 
     Source: Saad and Schultz 1986.
     """
@@ -123,11 +136,43 @@ class GMRES(Solver):
     restart: int = _C.DEFAULT_RESTART
 
     method: ClassVar[str] = "gmres"
-    preconditioners: ClassVar[tuple[str, ...]] = ("diagonal", "stokes")
 
     def __post_init__(self):
         if not torch.compiler.is_compiling():
             self.restart = _check.whole("GMRES", "restart", self.restart)
+        super().__post_init__()
+
+
+@dataclass
+class Multigrid(Solver):
+    """Multigrid, as a method and as a preconditioner: the number of iterations does not grow with the grid.
+
+    An iteration is one V-cycle. It is for `Heat`, `Poisson`, `Burgers`, and for `Stencil` with neighbours at most one
+    cell away, in one to three dimensions, of any size and with any coefficients. As a preconditioner of `CG`, or of
+    `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust; there, `max_iter` and `rtol`
+    have no influence.
+
+    Args:
+        smoothing: >= 1, the smoothing steps before and after each coarse grid.
+
+    Examples:
+        >>> solver = prdp.CG(max_iter=50, preconditioner="multigrid")
+        >>> solver = prdp.CG(max_iter=50, preconditioner=prdp.Multigrid(smoothing=3))
+
+    Source: black-box multigrid (Dendy 1982, 1983), coarsened one axis at a time.
+    """
+
+    max_iter: int = 20
+    preconditioner: object = field(init=False, repr=False, compare=False)
+    smoothing: int = field(default=2, kw_only=True)
+
+    method: ClassVar[str] = "multigrid"
+
+    def __post_init__(self):
+        self.smoothing = _check.whole("Multigrid", "smoothing", self.smoothing)
+        if self.smoothing < 1:
+            raise ValueError(f"Multigrid: smoothing must be >= 1, got {self.smoothing}")
+        self.preconditioner = self
         super().__post_init__()
 
 
@@ -159,6 +204,17 @@ class Kept:
 
     def __reduce__(self):
         return Kept, (self.make,)
+
+
+def solve_options(method, rtol, restart, preconditioner, _, backward, *others):
+    """The options as the compiled library takes them past the dispatcher. The one that is left out tells when the
+    tensors of the preconditioner are new."""
+    return _C.SolveOptions(method, rtol, restart, *flat_preconditioner(preconditioner), backward, *others)
+
+
+def tensors_of(preconditioner):
+    """What tells whether the tensors of a preconditioner are others than before."""
+    return tuple(map(id, preconditioner.tensors)) if isinstance(preconditioner, Operator) else ()
 
 
 def checkpoint_number(checkpoint_every):

@@ -5,7 +5,14 @@ import torch
 from prdp_torch import _C, _check, operators
 from prdp_torch.batching import outlive_transforms
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
-from prdp_torch.solvers import Kept, check_options, checkpoint_number
+from prdp_torch.solvers import (
+    Kept,
+    check_options,
+    checkpoint_number,
+    flat_preconditioner,
+    solve_options,
+    tensors_of,
+)
 
 
 class Stepper(torch.nn.Module):
@@ -57,6 +64,7 @@ class Stepper(torch.nn.Module):
         self.method = solver.method
         self.rtol = float(solver.rtol)
         self.restart = solver.restart
+        self.preconditioner = solver.preconditioner
         self.backward = backward
         self.adjoint_max_iter = adjoint_max_iter
         self.adjoint_rtol = adjoint_rtol
@@ -66,7 +74,7 @@ class Stepper(torch.nn.Module):
         self._max_iter = int(solver.max_iter)
         self._adjoint_log = AdjointLog()
         self._last_log = self._adjoint_log
-        self._kept_options = Kept(_C.SolveOptions)
+        self._kept_options = Kept(solve_options)
         self.info = None
 
     def operator(self, u):
@@ -108,7 +116,7 @@ class Stepper(torch.nn.Module):
         if steps > 0:
             report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=True)]
         else:
-            report = [u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64)]
+            report = [u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)]
         self._keep(report, log)
         # A rollout without gradients, such as a validation, leaves the report of the last backward pass.
         if states.requires_grad:
@@ -151,23 +159,17 @@ class Stepper(torch.nn.Module):
 
     def _options_kept(self):
         """The options as the compiled library takes them past the dispatcher."""
-        return self._kept_options.of(*self._settings(), checkpoint_number(self.checkpoint_every), self.start == "state")
+        solver = self.method, self.rtol, self.restart, self.preconditioner, tensors_of(self.preconditioner)
+        every = checkpoint_number(self.checkpoint_every)
+        return self._kept_options.of(*solver, *self._settings(), every, self.start == "state")
 
     def _options(self, log_number):
         k = self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self)
-        method, *settings = self._settings()
-        return method, k, *settings, log_number, checkpoint_number(self.checkpoint_every)
+        solver = self.method, k, self.rtol, self.restart, *flat_preconditioner(self.preconditioner)
+        return *solver, *self._settings(), log_number, checkpoint_number(self.checkpoint_every)
 
     def _settings(self):
-        return (
-            self.method,
-            self.rtol,
-            self.restart,
-            self.backward,
-            self.adjoint_max_iter,
-            self.adjoint_rtol,
-            self.on_failure,
-        )
+        return self.backward, self.adjoint_max_iter, self.adjoint_rtol, self.on_failure
 
     @property
     def max_iter(self):
@@ -185,9 +187,10 @@ class Stepper(torch.nn.Module):
 
     @property
     def converged(self):
-        """Whether all samples met the tolerance, in the last forward pass and in the last backward pass if any."""
+        """Whether all samples met the tolerance, or came as near as their dtype allows, in the last forward pass and in
+        the last backward pass if any."""
         reports = [report for report in (self.info, self.adjoint_info) if report is not None]
-        return self.info is not None and all(bool((report.status > 0).all()) for report in reports)
+        return self.info is not None and all(bool(report.solved.all()) for report in reports)
 
     def extra_repr(self):
         return f"solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"

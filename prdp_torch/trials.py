@@ -29,6 +29,8 @@ class Solve:
     """Of the whole batch; the median of up to five runs."""
     status: str
     """The worst of the samples, a name of `SolveStatus`."""
+    solved: bool
+    """Whether all samples met the tolerance, or came as near as their dtype allows."""
 
 
 @dataclass
@@ -52,7 +54,7 @@ class Row:
 
     @property
     def solved(self):
-        return all(SolveStatus[solve.status] > 0 for solve in self.solves)
+        return all(solve.solved for solve in self.solves)
 
     @property
     def status(self):
@@ -73,9 +75,7 @@ def candidates(step):
     restarts = sorted({*RESTARTS, *own})
     every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), *(GMRES(1, restart=m) for m in restarts)]
     kind = getattr(step, "kind", None)
-    if kind == "navier_stokes":
-        every.append(GMRES(1, restart=8, preconditioner="stokes"))
-    elif kind not in ("heat", "poisson"):  # whose diagonals are constant
+    if kind not in ("heat", "poisson", "navier_stokes"):  # whose diagonals are constant
         every += [CG(1, preconditioner="diagonal"), GMRES(1, restart=8, preconditioner="diagonal")]
     return [*every, Direct(1)]
 
@@ -157,7 +157,7 @@ def run(trial, sample, cotangent, solver=None, max_runs=1, deadline=float("inf")
 
 def _solve(info, seconds):
     worst = SolveStatus(int(info.status.min())).name
-    return Solve(int(info.iterations.max()), int(info.operator_applications.max()), median(seconds), worst)
+    return Solve(int(info.iterations.max()), int(info.operator_applications.max()), median(seconds), worst, bool(info.solved.all()))
 
 
 def _copy(step):
@@ -169,6 +169,7 @@ def _copy(step):
 
 def set_solver(trial, solver, max_iter, rtol):
     trial.method, trial.restart, trial.rtol = solver.method, solver.restart, rtol
+    trial.preconditioner = solver.preconditioner
     trial.max_iter = max_iter
 
 

@@ -13,13 +13,16 @@ using namespace prdp;
 namespace {
 
 py::tuple as_tuple(const SolveInfo& info) {
-  return py::make_tuple(info.iterations, info.residual, info.status, info.operator_applications);
+  return py::make_tuple(info.iterations, info.residual, info.status, info.operator_applications, info.floor);
 }
 
 OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
                   std::vector<at::Tensor> tensors) {
   return {std::move(kind), std::move(shape), std::move(parameters), std::move(tensors)};
 }
+
+/// One that is not an operator.
+Preconditioner preconditioner_of_kind(std::string kind) { return OperatorSpec{std::move(kind), {}, {}, {}}; }
 
 /// FailuresOfStep for Python's `with`.
 class StepOfRollout {
@@ -137,10 +140,13 @@ void bind_solvers(py::module_& m) {
       py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
   m.def(
       "check_solver",
-      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart) {
-        Solver{method_from_name(method), max_iter, rtol, restart}.check(who.c_str());
+      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
+         std::string preconditioner) {
+        Solver{method_from_name(method), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))}
+            .check(who.c_str());
       },
-      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"));
+      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
+      py::arg("preconditioner") = "");
   m.def(
       "check_options",
       [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
@@ -199,19 +205,22 @@ void bind_solvers(py::module_& m) {
       "solve_with_tensors",
       [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind, std::vector<int64_t> shape,
          std::vector<double> parameters, bool transposed, std::string solver, int64_t max_iter, double rtol,
-         int64_t restart, std::optional<at::Tensor> x0) {
+         int64_t restart, std::optional<at::Tensor> x0, std::string preconditioner) {
         auto a = spec(kind, shape, parameters, tensors);
         a.transposed = transposed;
         const auto result = [&] {
           const py::gil_scoped_release no_gil;
           return solve_with_tensors(
               *make_operator(a), b,
-              {method_from_name(solver), max_iter, rtol, restart, {}, true, x0.value_or(at::Tensor())});
+              {{method_from_name(solver), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))},
+               {},
+               true,
+               x0.value_or(at::Tensor())});
         }();
         return py::make_tuple(result.u, as_tuple(result.info));
       },
       "The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.", py::arg("b"),
       py::arg("tensors"), py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("transposed"),
       py::arg("solver"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart") = kDefaultRestart,
-      py::arg("x0") = py::none());
+      py::arg("x0") = py::none(), py::arg("preconditioner") = "");
 }

@@ -39,7 +39,7 @@ py::object report(const Solve& solve) {
     const py::gil_scoped_release no_gil;
     return solve();
   }();
-  return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications);
+  return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications, info.floor);
 }
 
 py::object call_step(const py::object& u, const std::vector<py::object>& tensors, const Equation& equation,
@@ -69,11 +69,13 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
 
 void bind_steps(py::module_& m) {
   py::class_<SolveOptions>(m, "SolveOptions", "The options of a solve but for max_iter and the log.")
-      .def(py::init([](const std::string& method, double rtol, int64_t restart, const std::string& backward,
+      .def(py::init([](const std::string& method, double rtol, int64_t restart, const std::string& preconditioner,
+                       const std::vector<int64_t>& shape, const std::vector<double>& parameters,
+                       const std::vector<at::Tensor>& tensors, bool transposed, const std::string& backward,
                        std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
                        const std::string& on_failure, int64_t checkpoint_every, bool from_state) {
-        return unflatten(method, 0, rtol, restart, backward, adjoint_max_iter, adjoint_rtol, on_failure,
-                         /*adjoint_log=*/0, checkpoint_every, from_state);
+        return unflatten(method, 0, rtol, restart, preconditioner, shape, parameters, tensors, transposed, backward,
+                         adjoint_max_iter, adjoint_rtol, on_failure, /*adjoint_log=*/0, checkpoint_every, from_state);
       }));
   py::class_<Equation>(m, "Equation", "An equation but for its tensors.")
       .def(py::init(

@@ -43,7 +43,7 @@ struct Flow {
     return static_cast<double>(values[channel * cells() + at(j, i)]);
   }
   prdp::kernels::UpwindParameters<T> parameters(bool transposed) const {
-    return {values.data(), 0, shape.ny, shape.nx, kNu, kDt, transposed};
+    return {values.data(), shape.ny, shape.nx, kNu, kDt, transposed};
   }
 };
 template <class T>

@@ -4,7 +4,7 @@
 #include <functional>
 
 #include "dense_upwind.h"
-#include "prdp/kernels/direct_factors.h"
+#include "prdp/kernels/navier_stokes.h"
 #include "prdp/kernels/stencil.h"
 
 /// What every kernel on padded rows must do, held against a dense matrix.
@@ -13,17 +13,17 @@ namespace prdp_test {
 using namespace prdp::kernels;
 
 /// A kernel's operations on plain vectors, in padded memory as the solvers use it.
-template <class Kernel>
+template <class T>
 class Harness {
  public:
-  using T = typename Kernel::Scalar;
-
-  explicit Harness(const Kernel& kernel) : kernel_(kernel) { workspace_.prepare(3, kernel.length(), kernel.halo()); }
+  explicit Harness(const Kernel<T>& kernel) : kernel_(kernel) {
+    workspace_.prepare(3, kernel.length(), kernel.layout().halo);
+  }
   T* vector(int64_t index) { return workspace_.vector(index); }
-  void load(const std::vector<T>& v, int64_t index) { kernel_.load(v.data(), T(1), vector(index)); }
+  void load(const std::vector<T>& v, int64_t index) { kernel_.layout().load(v.data(), T(1), vector(index)); }
   std::vector<T> store(int64_t index) {
     std::vector<T> values(kernel_.unknowns());
-    kernel_.store(vector(index), T(1), values.data());
+    kernel_.layout().store(vector(index), T(1), values.data());
     return values;
   }
   std::vector<T> apply(const std::vector<T>& v) {
@@ -35,23 +35,31 @@ class Harness {
   void expect_clean_padding(int64_t index) {
     const Vector inside = as_vector(store(index));
     double all = 0;
-    for (int64_t i = -kernel_.halo(); i < kernel_.length() + kernel_.halo(); ++i) all += vector(index)[i] != T(0);
+    const int64_t halo = kernel_.layout().halo;
+    for (int64_t i = -halo; i < kernel_.length() + halo; ++i) all += vector(index)[i] != T(0);
     EXPECT_EQ(static_cast<double>((inside.array() != 0).count()), all);
   }
 
  private:
-  const Kernel& kernel_;
+  const Kernel<T>& kernel_;
   Workspace<T> workspace_;
 };
 
 template <class T>
 constexpr double kTolerance = sizeof(T) == 4 ? 1e-6 : 1e-14;
 
-template <class Kernel>
-void expect_matrix(const Kernel& kernel, const Matrix& a) {
-  using T = typename Kernel::Scalar;
+/// Entries of the block that a kernel's channels share, or of all of it.
+template <class T, class Body>
+void for_each_entry(const Kernel<T>& kernel, const Body& body) {
+  if (const auto* stencil = dynamic_cast<const Stencil<T>*>(&kernel)) stencil->coefficients().for_each_entry(body);
+  else dynamic_cast<const NavierStokes<T>&>(kernel).for_each_entry(body);
+}
+
+template <class T>
+void expect_matrix(const Kernel<T>& kernel, const Matrix& a) {
   ASSERT_EQ(kernel.unknowns(), a.rows());
-  Harness<Kernel> harness(kernel);
+  ASSERT_EQ(kernel.factor(), T(1));
+  Harness<T> harness(kernel);
   const auto v = random_values<T>(kernel.unknowns(), 11);
   const double norm = a.cwiseAbs().rowwise().sum().maxCoeff();
   EXPECT_LT((as_vector(harness.apply(v)) - a * as_vector(v)).cwiseAbs().maxCoeff(), 8 * kTolerance<T> * norm);
@@ -61,25 +69,20 @@ void expect_matrix(const Kernel& kernel, const Matrix& a) {
 
   Matrix entries = Matrix::Zero(a.rows(), a.cols());
   const auto add = [&](int64_t i, int64_t j, T value) { entries(i, j) += static_cast<double>(value); };
-  int64_t block = a.rows();
-  if constexpr (std::is_same_v<Kernel, Stencil<T>>) {
-    block /= kernel.channels();
-    kernel.coefficients().for_each_entry(add);
-  } else {
-    kernel.for_each_entry(add);
-  }
+  for_each_entry(kernel, add);
+  const bool of_channels = dynamic_cast<const Stencil<T>*>(&kernel) != nullptr;
+  const int64_t block = a.rows() / (of_channels ? kernel.layout().planes : 1);
   EXPECT_LT((entries - a).topLeftCorner(block, block).cwiseAbs().maxCoeff(), 8 * kTolerance<T> * norm);
 }
 
-template <class Kernel>
-void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
-  using T = typename Kernel::Scalar;
-  Harness<Kernel> harness(kernel);
+template <class T>
+void expect_jacobi_sweep(const Kernel<T>& kernel, const Matrix& a) {
+  Harness<T> harness(kernel);
   const auto b = random_values<T>(kernel.unknowns(), 2), x = random_values<T>(kernel.unknowns(), 3);
   harness.load(b, 2);
   kernel.divide_by_diagonal(harness.vector(2), harness.vector(0));
   harness.load(x, 1);
-  const T squared = kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2));
+  const T squared = kernel.jacobi_sweep(harness.vector(0), harness.vector(1), harness.vector(2), nullptr);
   const Vector residual = as_vector(b) - a * as_vector(x);
   const Vector next = as_vector(x) + residual.cwiseQuotient(a.diagonal());
   const double scale = 30 * kTolerance<T>;
@@ -90,24 +93,23 @@ void expect_jacobi_sweep(const Kernel& kernel, const Matrix& a) {
 }
 
 /// `expected`: what the factors must give for the right-hand side of as many random values.
-template <class Kernel>
-void expect_solution(const Kernel& kernel, const std::function<Vector(const Vector&)>& expected) {
-  using T = typename Kernel::Scalar;
-  const typename FactorsOf<Kernel>::Type factors(kernel);
-  Harness<Kernel> harness(kernel);
+template <class T>
+void expect_solution(const Kernel<T>& kernel, const std::function<Vector(const Vector&)>& expected) {
+  const auto factors = kernel.factorise();
+  Harness<T> harness(kernel);
   for (const unsigned seed : {21u, 22u}) {
     const auto r = random_values<T>(kernel.unknowns(), seed);
     harness.load(r, 0);
-    ASSERT_TRUE(factors.solve(harness.vector(0), harness.vector(1)));
+    ASSERT_TRUE(factors->solve(harness.vector(0), harness.vector(1)));
     const Vector x = expected(as_vector(r));
     EXPECT_LT((as_vector(harness.store(1)) - x).norm(), 1e3 * kTolerance<T> * (1 + x.norm()));
     harness.expect_clean_padding(1);
   }
 }
 
-template <class Kernel, class T = typename Kernel::Scalar>
-void expect_adjoint(const Kernel& a, const Kernel& transpose) {
-  Harness<Kernel> forward(a), backward(transpose);
+template <class T>
+void expect_adjoint(const Kernel<T>& a, const Kernel<T>& transpose) {
+  Harness<T> forward(a), backward(transpose);
   const auto x = random_values<T>(a.unknowns(), 7), y = random_values<T>(a.unknowns(), 8);
   const Vector ax = as_vector(forward.apply(x)), aty = as_vector(backward.apply(y));
   const double scale = ax.norm() * as_vector(y).norm() + aty.norm() * as_vector(x).norm();

@@ -84,17 +84,18 @@ TEST(Laplacian, PaddingStaysZeroInEveryProduct) {
   const LaplacianParameters p{3, {3, 4, 5}, 7.0, {-1.0, -2.0, -3.0}};
   const Laplacian<float, 3> kernel(p);
   auto& workspace = Workspace<float>::local();
-  workspace.prepare(3, kernel.length(), kernel.halo());
+  const int64_t halo = kernel.layout().halo;
+  workspace.prepare(3, kernel.length(), halo);
   const std::vector<float> ones(kernel.unknowns(), 1.0f);
-  kernel.load(ones.data(), 1.0f, workspace.vector(0));
+  kernel.layout().load(ones.data(), 1.0f, workspace.vector(0));
   kernel.apply(workspace.vector(0), workspace.vector(1));
-  kernel.jacobi_sweep(workspace.vector(0), workspace.vector(1), workspace.vector(2));
+  kernel.jacobi_sweep(workspace.vector(0), workspace.vector(1), workspace.vector(2), nullptr);
   std::vector<float> values(kernel.unknowns());
   for (const int64_t v : {1, 2}) {
     double inside = 0, all = 0;
-    kernel.store(workspace.vector(v), 1.0f, values.data());
+    kernel.layout().store(workspace.vector(v), 1.0f, values.data());
     for (const float x : values) inside += std::abs(x);
-    for (int64_t i = -kernel.halo(); i < kernel.length() + kernel.halo(); ++i) all += std::abs(workspace.vector(v)[i]);
+    for (int64_t i = -halo; i < kernel.length() + halo; ++i) all += std::abs(workspace.vector(v)[i]);
     EXPECT_EQ(inside, all);
   }
 }

@@ -2,6 +2,7 @@
 
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/operator.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/threads/interruption.h"
@@ -11,11 +12,21 @@ namespace {
 
 using prdp::Method;
 
-const std::vector<std::pair<Method, const char*>> kMethods{{Method::kJacobi, "jacobi"},
-                                                           {Method::kSteepestDescent, "steepest_descent"},
-                                                           {Method::kConjugateGradient, "cg"},
-                                                           {Method::kConjugateGradientDiagonal, "cg_diagonal"},
-                                                           {Method::kDirect, "direct"}};
+using prdp::Preconditioner;
+using prdp::Solver;
+
+const std::vector<std::pair<Solver, const char*>> kSolvers{
+    {{Method::kJacobi, 0}, "jacobi"},
+    {{Method::kSteepestDescent, 0}, "steepest_descent"},
+    {{Method::kConjugateGradient, 0}, "cg"},
+    {prdp::CG{.max_iter = 0, .preconditioner = Preconditioner::diagonal()}, "cg, diagonal"},
+    {{Method::kDirect, 0}, "direct"}};
+
+Solver with(Solver solver, int64_t max_iter, double rtol) {
+  solver.max_iter = max_iter;
+  solver.rtol = rtol;
+  return solver;
+}
 
 prdp::OperatorSpec heat(std::vector<int64_t> shape) {
   return {"heat", std::move(shape), {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}};
@@ -29,7 +40,7 @@ void expect_same(const prdp::OperatorSpec& spec, const at::Tensor& b, const prdp
   EXPECT_LT((loops.u - tensors.u).abs().max().item<double>(), tolerance * scale);
   EXPECT_TRUE(at::equal(loops.info.iterations, tensors.info.iterations));
   // Without a tolerance, converged means a residual of exactly zero: a matter of the last bit.
-  if (request.rtol > 0.0) {
+  if (request.solver.rtol > 0.0) {
     EXPECT_TRUE(at::equal(loops.info.status, tensors.info.status));
   }
   EXPECT_TRUE(at::equal(loops.info.operator_applications, tensors.info.operator_applications));
@@ -39,20 +50,20 @@ TEST(Solve, LoopsEqualPlainTensorsAtSizesAroundTheVectorWidth) {
   const std::vector<std::vector<int64_t>> shapes{{1},    {2},     {7},     {8},     {15},    {16},      {17},     {33},
                                                  {1, 1}, {5, 16}, {16, 5}, {31, 9}, {1, 17}, {2, 3, 4}, {7, 1, 9}};
   for (const auto& shape : shapes)
-    for (const auto& [method, name] : kMethods) {
+    for (const auto& [solver, name] : kSolvers) {
       SCOPED_TRACE(testing::Message() << name << " " << at::IntArrayRef(shape));
       const auto b = prdp_test::random_field(shape, 4);
-      const int64_t k = method == Method::kDirect ? 1 : 3;
-      expect_same(heat(shape), b, {method, k, 0.0}, 1e-13);
-      expect_same(heat(shape), b.to(at::kFloat), {method, k, 0.0}, 2e-6);
+      const int64_t k = solver.method == Method::kDirect ? 1 : 3;
+      expect_same(heat(shape), b, {with(solver, k, 0.0)}, 1e-13);
+      expect_same(heat(shape), b.to(at::kFloat), {with(solver, k, 0.0)}, 2e-6);
     }
 }
 
 TEST(Solve, LoopsEqualPlainTensorsUpToTheSameStop) {
-  for (const auto& [method, name] : kMethods) {
+  for (const auto& [solver, name] : kSolvers) {
     SCOPED_TRACE(name);
-    expect_same(heat({30}), prdp_test::random_field({30}, 5), {method, 200, 1e-8}, 1e-9);
-    expect_same(heat({12, 9}), prdp_test::random_field({12, 9}, 5), {method, 200, 1e-8}, 1e-9);
+    expect_same(heat({30}), prdp_test::random_field({30}, 5), {with(solver, 200, 1e-8)}, 1e-9);
+    expect_same(heat({12, 9}), prdp_test::random_field({12, 9}, 5), {with(solver, 200, 1e-8)}, 1e-9);
   }
 }
 
@@ -60,13 +71,13 @@ TEST(Solve, EachSampleStopsAtItsOwnCap) {
   const auto a = prdp::make_operator(heat({20}));
   const auto b = prdp_test::random_field({20}, 4);
   const auto caps = at::tensor({0, 1, 5, 9}, at::kLong);
-  for (const auto& [method, name] : kMethods) {
+  for (const auto& [solver, name] : kSolvers) {
     SCOPED_TRACE(name);
-    const prdp::SolveRequest request{method, 99, 0.0, prdp::kDefaultRestart, caps};
+    const prdp::SolveRequest request{with(solver, 99, 0.0), caps};
     for (const auto& result : {prdp::solve(*a, b, request), prdp::solve_with_tensors(*a, b, request)}) {
       EXPECT_TRUE(at::equal(result.info.iterations, caps));
       for (int64_t i = 0; i < 4; ++i) {
-        const auto alone = prdp::solve(*a, b.narrow(0, i, 1), {method, caps[i].item<int64_t>(), 0.0});
+        const auto alone = prdp::solve(*a, b.narrow(0, i, 1), {with(solver, caps[i].item<int64_t>(), 0.0)});
         EXPECT_LT((alone.u[0] - result.u[i]).abs().max().item<double>(), 1e-13);
       }
     }
@@ -77,7 +88,7 @@ TEST(Solve, CountsProductsWithTheOperator) {
   const auto a = prdp::make_operator(heat({20}));
   const auto b = prdp_test::random_field({20}, 1);
   const auto products = [&](Method method, int64_t k, double rtol) {
-    return prdp::solve(*a, b, {method, k, rtol}).info.operator_applications[0].item<int64_t>();
+    return prdp::solve(*a, b, {{method, k, rtol}}).info.operator_applications[0].item<int64_t>();
   };
   // From zero the first Jacobi iterate is free, and each solve ends with its true residual.
   EXPECT_EQ(products(Method::kJacobi, 10, 0.0), 10);
@@ -87,15 +98,26 @@ TEST(Solve, CountsProductsWithTheOperator) {
   EXPECT_EQ(products(Method::kJacobi, 10, 1e-30), 11);
 }
 
-TEST(Solve, PreconditionersAreMethodsOfTheirOwn) {
-  using prdp::Preconditioner;
-  const auto of = [](const prdp::Solver& solver) { return prdp::name(solver.method); };
-  EXPECT_EQ(of(prdp::CG{.max_iter = 3}), "cg");
-  EXPECT_EQ(of(prdp::CG{.max_iter = 3, .preconditioner = Preconditioner::kDiagonal}), "cg_diagonal");
-  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3}), "gmres");
-  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3, .preconditioner = Preconditioner::kDiagonal}), "gmres_diagonal");
-  EXPECT_EQ(of(prdp::GMRES{.max_iter = 3, .preconditioner = Preconditioner::kStokes}), "gmres_stokes");
-  EXPECT_THROW(of(prdp::CG{.max_iter = 3, .preconditioner = Preconditioner::kStokes}), c10::ValueError);
+TEST(Solve, APreconditionerIsRefusedByMethodsThatTakeNone) {
+  const auto a = heat({20});
+  const auto b = prdp_test::random_field({20}, 1);
+  Solver solver = prdp::Jacobi{.max_iter = 3};
+  solver.preconditioner = Preconditioner::diagonal();
+  EXPECT_THROW(prdp::linear_solve(a, b, {solver}), c10::ValueError);
+}
+
+TEST(Solve, AnOperatorOfOnesOwnPreconditions) {
+  // One iteration is enough where M is A itself.
+  const auto a = heat({20});
+  const auto b = prdp_test::random_field({20}, 2);
+  const auto products = prdp::RegisteredProducts::make(
+      {[&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); },
+       [&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); }});
+  const Preconditioner inverse = products->spec({});
+  for (const Solver& solver : {Solver(prdp::CG{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
+                               Solver(prdp::BiCGStab{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
+                               Solver(prdp::GMRES{.restart = 1, .max_iter = 1, .rtol = 1e-10, .preconditioner = inverse})})
+    EXPECT_TRUE((prdp::linear_solve(a, b, {solver}).info.status > 0).all().item<bool>());
 }
 
 TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
@@ -105,7 +127,7 @@ TEST(Solve, AFailedSampleLeavesNothingBehindForTheNextOne) {
   const auto matrices = at::stack({first, at::eye(3, at::kDouble) * 2.0, first, at::eye(3, at::kDouble) * 4.0});
   const auto a = prdp::make_operator({"dense", {}, {}, {matrices}});
   const auto b = at::ones({4, 3}, at::kDouble);
-  const auto result = prdp::solve(*a, b, {Method::kJacobi, 500, 0.0});
+  const auto result = prdp::solve(*a, b, {{Method::kJacobi, 500, 0.0}});
   EXPECT_EQ(result.info.status[0].item<int64_t>(), -3);
   EXPECT_TRUE(result.u.isfinite().all().item<bool>());
   EXPECT_TRUE(result.u[1].eq(0.5).all().item<bool>());
@@ -116,11 +138,11 @@ TEST(Solve, AnInterruptionEndsAllThreadsAndLeavesNothingBehind) {
   struct Interrupted {};
   const auto a = prdp::make_operator(heat({64, 64}));
   const auto b = at::randn({16, 1, 64, 64}, at::kDouble);
-  const prdp::SolveRequest request{Method::kConjugateGradient, 200, 1e-10};
+  const prdp::SolveRequest request{{Method::kConjugateGradient, 200, 1e-10}};
   const auto wanted = prdp::solve(*a, b, request).u;
   prdp::interruption::set_check([] { throw Interrupted{}; });
   for (const auto method : {Method::kJacobi, Method::kConjugateGradient})
-    EXPECT_THROW(prdp::solve(*a, b, {method, int64_t{1} << 50, 0.0}), Interrupted);
+    EXPECT_THROW(prdp::solve(*a, b, {{method, int64_t{1} << 50, 0.0}}), Interrupted);
   prdp::interruption::set_check(nullptr);
   EXPECT_TRUE(at::equal(prdp::solve(*a, b, request).u, wanted));
 
@@ -150,7 +172,7 @@ TEST(Matrix, OnlySquareOnesWithIndicesInRangeAreTaken) {
 
 TEST(Solve, EmptyBatchIsNoTrouble) {
   const auto a = prdp::make_operator(heat({20}));
-  const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {Method::kJacobi, 3, 1e-5});
+  const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {{Method::kJacobi, 3, 1e-5}});
   EXPECT_EQ(result.u.size(0), 0);
   EXPECT_EQ(result.info.status.numel(), 0);
 }

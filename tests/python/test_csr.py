@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from helpers import statuses
+from helpers import NO_PRECONDITIONER, statuses
 
 import prdp_torch as prdp
 
@@ -63,7 +63,7 @@ for i in range(count):
     try:
         if through_op:  # past Python's checks
             torch.ops.prdp.linear_solve(b, parts, "csr", [], [], draw.random() < 0.5, solver.method, 3, 1e-5, 3,
-                                        backward, None, None, "return", 0)
+                                        *NO_PRECONDITIONER, backward, None, None, "return", 0)
         else:
             size = (2, n, n) if batched else (n, n)
             matrix = torch.sparse_csr_tensor(*parts, size=size, check_invariants=False)
@@ -96,7 +96,7 @@ def csr(crow, col, values, index=torch.int64):
 def solve(parts, solver="direct", b=None):
     b = torch.ones(1, 2, dtype=torch.float64) if b is None else b
     return torch.ops.prdp.linear_solve(
-        b, parts, "csr", [], [], False, solver, 3, 1e-5, 3, "implicit", None, None, "return", 0
+        b, parts, "csr", [], [], False, solver, 3, 1e-5, 3, *NO_PRECONDITIONER, "implicit", None, None, "return", 0
     )
 
 

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from helpers import dense_laplacian, field, statuses
+from helpers import NO_PRECONDITIONER, dense_laplacian, field, statuses
 
 import prdp_torch as prdp
 from prdp_torch import fields, operators
@@ -99,7 +99,7 @@ def test_the_loops_and_plain_tensors_agree_on_a_stretched_domain():
                 b, a.tensors, a.kind, a.shape, a.parameters, transposed, "gmres", 3, 0.0, 5
             )
             found, *_ = torch.ops.prdp.linear_solve(
-                b, a.tensors, a.kind, a.shape, a.parameters, transposed, "gmres", 3, 0.0, 5, "none", None, None,
+                b, a.tensors, a.kind, a.shape, a.parameters, transposed, "gmres", 3, 0.0, 5, *NO_PRECONDITIONER, "none", None, None,
                 "return", 0,
             )  # fmt: skip
             torch.testing.assert_close(found, oracle, rtol=1e-9, atol=1e-11)

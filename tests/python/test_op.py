@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from helpers import SOLVERS, field
+from helpers import NO_PRECONDITIONER, SOLVERS, field
 from torch.library import opcheck
 from torch.utils.checkpoint import checkpoint
 
@@ -16,7 +16,7 @@ from prdp_torch import operators
 def arguments(backward="implicit", solver="jacobi", requires_grad=True):
     b = field((5,)).requires_grad_(requires_grad)
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=requires_grad)
-    return b, nu, (solver, 4, 1e-5, 3, backward, None, None, "raise", 0)
+    return b, nu, (solver, 4, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0)
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unrolled", "none"])
@@ -62,7 +62,7 @@ def test_matrices_and_the_other_ops_pass_opcheck():
             torch.ops.prdp.unrolled_vjp,
             (b.detach(), b.detach(), torch.tensor([4, 4]), torch.tensor([-1, -1]),
              torch.full((2,), 0.1, dtype=torch.float64), [1, 1], [nu.detach()], "heat", [5], [1.0], False, "cg",
-             4, 1e-5, 3, "unrolled", None, None, "raise", 0),
+             4, 1e-5, 3, *NO_PRECONDITIONER, "unrolled", None, None, "raise", 0),
         ),
     ]  # fmt: skip
     for op, args in calls:

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import field, modes, random
+from helpers import NO_PRECONDITIONER, field, modes, random
 from torch.library import opcheck
 
 import prdp_torch as prdp
@@ -94,7 +94,7 @@ def test_starting_from_the_state_saves_products_on_trajectories(name, solver):
 def test_the_ops_pass_opcheck(backward):
     b, x0 = field((5,)).requires_grad_(), field((5,), seed=1)
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
-    options = ("cg", 3, 1e-5, 3, backward, None, None, "raise", 0, 0)
+    options = ("cg", 3, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0, 0)
     equation = ([nu], "heat", [5], [0.1], 2)
     for op, arguments in (
         (torch.ops.prdp.linear_solve, (b, [nu], "heat", [5], [1.0], False, *options, x0)),

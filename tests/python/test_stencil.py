@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers import field, statuses
+from helpers import NO_PRECONDITIONER, field, statuses
 from stencils import FAR_2D, NEAREST, NINE, cases, dense, few, random_coefficients
 
 import prdp_torch as prdp
@@ -43,7 +43,7 @@ def loops_and_tensors(c, offsets, boundary, b, solver, transposed):
     """The solution by the CPU loops, of A or by way of the adjoint solve of Aᵀ, and that by plain tensors."""
     a = operators.Stencil(c, offsets, boundary)
     spec = (a.tensors, a.kind, a.shape, a.parameters, transposed, solver.method, solver.max_iter, solver.rtol)
-    rest = (solver.restart, "none", None, None, "return", 0)
+    rest = (solver.restart, *NO_PRECONDITIONER, "none", None, None, "return", 0)
     loops = torch.ops.prdp.linear_solve(b, *spec, *rest)
     u, info = _C.solve_with_tensors(b, *spec, solver.restart)
     return loops, (u, *info)

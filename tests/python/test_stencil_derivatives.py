@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers import field
+from helpers import NO_PRECONDITIONER, field
 from stencils import CASES, FAR_2D, FEW, NEAREST, dense, few, random_coefficients
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
@@ -111,7 +111,7 @@ def test_opcheck(shape, offsets, boundary):
     a = operators.Stencil(c, offsets, boundary)
     for backward in ("implicit", "unrolled"):
         for solver in ("jacobi", "direct"):
-            options = (solver, 3, 1e-5, 3, backward, None, None, "raise", 0)
+            options = (solver, 3, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0)
             call = (b, a.tensors, a.kind, a.shape, a.parameters, False, *options)
             assert set(opcheck(torch.ops.prdp.linear_solve.default, call).values()) == {"SUCCESS"}
     call = (b, a.tensors, a.kind, a.shape, a.parameters, True)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import field, random, spd_matrices
+from helpers import NO_PRECONDITIONER, field, random, spd_matrices
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 from torch.utils._pytree import tree_leaves
 from transforms import SECOND, SECOND_NAMES, close
@@ -26,7 +26,18 @@ def csr_solve(solver, backward="implicit"):
 
     def solve(a, b):
         tensors = [crow, col, a[row, column]]
-        options = (solver.method, solver.max_iter, solver.rtol, solver.restart, backward, None, None, "raise", 0)
+        options = (
+            solver.method,
+            solver.max_iter,
+            solver.rtol,
+            solver.restart,
+            *NO_PRECONDITIONER,
+            backward,
+            None,
+            None,
+            "raise",
+            0,
+        )
         return torch.ops.prdp.linear_solve(b[None], tensors, "csr", [], [], False, *options)[0][0]
 
     return solve

@@ -3,7 +3,7 @@ iterates kept or some."""
 
 import pytest
 import torch
-from helpers import field, spd_matrices, statuses
+from helpers import NO_PRECONDITIONER, field, spd_matrices, statuses
 from torch.autograd import gradcheck
 from torch.library import opcheck
 
@@ -243,7 +243,7 @@ def test_the_op_behind_it_passes_opcheck():
     # One to be taken back, one that is solved: its derivative is a solve.
     said = torch.tensor([4, 3]), torch.tensor([-1, 1]), torch.tensor([0.1, 0.0], dtype=torch.float64)
     for method in METHODS:
-        options = (method, 4, 1e-5, 3, "unrolled", None, None, "raise", 0, 2)
+        options = (method, 4, 1e-5, 3, *NO_PRECONDITIONER, "unrolled", None, None, "raise", 0, 2)
         args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
         assert set(opcheck(torch.ops.prdp.unrolled_vjp.default, args).values()) == {"SUCCESS"}
 

@@ -12,9 +12,11 @@ namespace prdp {
 #define PRDP_X0_SCHEMA ", Tensor? x0=None"
 #define PRDP_FROM_STATE_SCHEMA ", bool from_state=False"
 
-#define PRDP_OPTIONS_SCHEMA                                                                        \
-  "str solver, SymInt max_iter, float rtol, int restart, str backward, SymInt? adjoint_max_iter, " \
-  "float? adjoint_rtol, str on_failure, int adjoint_log, int checkpoint_every=0"
+#define PRDP_OPTIONS_SCHEMA                                                                                \
+  "str solver, SymInt max_iter, float rtol, int restart, str preconditioner, int[] preconditioner_shape, " \
+  "float[] preconditioner_parameters, Tensor[] preconditioner_tensors, bool preconditioner_transposed, "   \
+  "str backward, SymInt? adjoint_max_iter, float? adjoint_rtol, str on_failure, int adjoint_log, "         \
+  "int checkpoint_every=0"
 
 namespace detail {
 
@@ -22,8 +24,9 @@ template <class Signature, class Last>
 struct AddOptions;
 template <class Result, class... Front, class Last>
 struct AddOptions<Result(Front...), Last> {
-  using Type = Result(Front..., c10::string_view, c10::SymInt, double, int64_t, c10::string_view,
-                      std::optional<c10::SymInt>, std::optional<double>, c10::string_view, int64_t, int64_t, Last);
+  using Type = Result(Front..., c10::string_view, c10::SymInt, double, int64_t, c10::string_view, at::IntArrayRef,
+                      at::ArrayRef<double>, at::TensorList, bool, c10::string_view, std::optional<c10::SymInt>,
+                      std::optional<double>, c10::string_view, int64_t, int64_t, Last);
 };
 
 }  // namespace detail
@@ -37,10 +40,13 @@ using WithOptionsAndX0 = typename detail::AddOptions<Signature, const std::optio
 
 /// Raises ValueError for names that do not exist.
 inline SolveOptions unflatten(c10::string_view solver, c10::SymInt max_iter, double rtol, int64_t restart,
-                              c10::string_view backward, std::optional<c10::SymInt> adjoint_max_iter,
-                              std::optional<double> adjoint_rtol, c10::string_view on_failure, int64_t adjoint_log,
-                              int64_t checkpoint_every, bool from_state) {
-  return {{method_from_name(solver), std::move(max_iter), rtol, restart},
+                              c10::string_view preconditioner, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                              at::TensorList tensors, bool transposed, c10::string_view backward,
+                              std::optional<c10::SymInt> adjoint_max_iter, std::optional<double> adjoint_rtol,
+                              c10::string_view on_failure, int64_t adjoint_log, int64_t checkpoint_every,
+                              bool from_state) {
+  OperatorSpec inverse{std::string(preconditioner), shape.vec(), parameters.vec(), tensors.vec(), transposed};
+  return {{method_from_name(solver), std::move(max_iter), rtol, restart, std::move(inverse)},
           backward_from_name(backward),
           std::move(adjoint_max_iter),
           adjoint_rtol,
@@ -68,8 +74,11 @@ namespace detail {
 
 template <class Op, class Last, class... Front>
 auto call_with(const Op& op, const SolveOptions& o, const Last& last, const Front&... front) {
-  return op.call(front..., name(o.solver.method), o.solver.max_iter, o.solver.rtol, o.solver.restart, name(o.backward),
-                 o.adjoint_max_iter, o.adjoint_rtol, name(o.on_failure), o.adjoint_log, o.checkpoint_every, last);
+  const auto& m = o.solver.preconditioner.spec();
+  return op.call(front..., name(o.solver.method), o.solver.max_iter, o.solver.rtol, o.solver.restart,
+                 c10::string_view(m.kind), at::IntArrayRef(m.shape), at::ArrayRef<double>(m.parameters),
+                 at::TensorList(m.tensors), m.transposed, name(o.backward), o.adjoint_max_iter, o.adjoint_rtol,
+                 name(o.on_failure), o.adjoint_log, o.checkpoint_every, last);
 }
 
 }  // namespace detail

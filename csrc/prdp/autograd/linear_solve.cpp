@@ -9,19 +9,21 @@
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
 #include "prdp/operators/disguises.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
 
 namespace {
 
-using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
 constexpr const char* kSchema =
     "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
     "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
     ") -> "
-    "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
+    "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications, "
+    "Tensor floor)";
 
 /// The arguments of the op but b.
 struct Call {
@@ -55,6 +57,10 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);
+  TORCH_CHECK_VALUE(!options.solver.preconditioner.is_multigrid() || a->has_coarse_grids(), role_of(spec),
+                    ": multigrid is for Heat, Poisson, Burgers, and for Stencil with neighbours at most one cell away; "
+                    "it makes no coarse grids of this ",
+                    operator_kind(spec.kind).title);
   TORCH_CHECK_VALUE(
       !x0.defined() ||
           (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() && x0.device() == b.device()),
@@ -67,7 +73,7 @@ template <class... Args>
 Outputs solve_kernel(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack(std::move(args)...);
   const auto [u, info] = linear_solve_kernel(a, b, options, x0);
-  return {u, info.iterations, info.residual, info.status, info.operator_applications};
+  return {u, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
 /// Shapes and dtypes only, for fake tensors.
@@ -77,15 +83,21 @@ Outputs fake_kernel(const at::Tensor& b, Args... args) {
   checked_operator(a, b, options, x0);
   const auto counts = [&] { return at::empty_symint({b.sym_size(0)}, b.options().dtype(at::kLong)); };
   return {at::empty_symint(b.sym_sizes(), b.options()), counts(), at::empty_symint({b.sym_size(0)}, b.options()),
-          counts(), counts()};
+          counts(), counts(), at::empty_symint({b.sym_size(0)}, b.options())};
+}
+
+/// Whether all tensors of a call are plain.
+bool is_plain_call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
+  return is_plain(b) && all_plain(a.tensors) && all_plain(o.solver.preconditioner.spec().tensors) &&
+         (!x0.defined() || is_plain(x0));
 }
 
 /// The op below autograd.
 Outputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
-  if (!is_plain(b) || !all_plain(a.tensors) || (x0.defined() && !is_plain(x0))) return call_op(b, a, o, x0);
+  if (!is_plain_call(b, a, o, x0)) return call_op(b, a, o, x0);
   const auto [u, info] = linear_solve_kernel(a, b, o, x0);
-  return {u, info.iterations, info.residual, info.status, info.operator_applications};
+  return {u, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
 /// A start is a constant of the derivatives.
@@ -105,7 +117,7 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? c10::make_intrusive<SolveNode>(b, a, options) : nullptr;
   const auto out = call_below(b, a, options, x0);
-  const auto& [u, iterations, residual, status, applications] = out;
+  const auto& [u, iterations, residual, status, applications, floor] = out;
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
   if (reverse) torch::autograd::set_history(u, node);
   if (forward) u._set_fw_grad(solve_jvp(b, solved, a, options), /*level=*/0, /*is_inplace_op=*/false);
@@ -115,7 +127,7 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
 Outputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
-  const bool plain = nobody_watches() && is_plain(b) && all_plain(a.tensors) && (!x0.defined() || is_plain(x0));
+  const bool plain = nobody_watches() && is_plain_call(b, a, options, x0);
   return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
 }
 
@@ -137,9 +149,9 @@ struct Kernels<Outputs(const at::Tensor&, Args...)> {
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
-  auto [u, iterations, residual, status, applications] =
+  auto [u, iterations, residual, status, applications, floor] =
       call(lone_vector ? b.unsqueeze(0) : b, a, options, lone_vector && x0.defined() ? x0.unsqueeze(0) : x0);
-  return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications}};
+  return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications, floor}};
 }
 
 SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
@@ -147,13 +159,12 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   const auto a = checked_operator(spec, b, options, x0);
   a->check_parameters();
   const auto& s = options.solver;
-  auto result = solve(*a, b, {s.method, s.max_iter.expect_int(), s.rtol, s.restart, {}, true, x0});
+  auto result = solve(*a, b, {s, {}, true, x0});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
   if (!b.is_cpu())
-    for (auto* part : {&info.iterations, &info.residual, &info.status, &info.operator_applications})
-      *part = part->to(b.device());
+    for (auto* part : info.parts()) *part = part->to(b.device());
   return result;
 }
 

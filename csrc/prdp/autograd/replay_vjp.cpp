@@ -20,10 +20,12 @@ class Replay {
 
   Replay(MakeOperator make, StepwiseSolve& solve, std::vector<at::Tensor> inputs, at::IntArrayRef needed,
          const at::Tensor& cotangent)
-      : gradients(inputs.size()), make_(std::move(make)), solve_(solve), inputs_(std::move(inputs)), needed_(needed) {
-    // u = P x / scale is linear in x, and its own transpose.
-    bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent));
-  }
+      : gradients(inputs.size()),
+        make_(std::move(make)),
+        solve_(solve),
+        inputs_(std::move(inputs)),
+        needed_(needed),
+        cotangent_(cotangent) {}
 
   void start() { now_ = {}, done_ = 0; }
   void save(int64_t slot) {
@@ -43,6 +45,7 @@ class Replay {
     const auto found = with_autograd([&] {
       const auto a = make_({inputs.begin() + 1, inputs.end()});
       const auto after = solve_.step(*a, inputs[0], before, k);
+      if (bars_.empty()) bars_.push_back(solve_.scaled_back(*make_(tensors()), cotangent_));
       for (size_t i = 0; i < bars_.size(); ++i) {
         if (!bars_[i].defined() || !after[i].requires_grad()) continue;
         outputs.push_back(after[i]);
@@ -81,6 +84,7 @@ class Replay {
   StepwiseSolve& solve_;
   std::vector<at::Tensor> inputs_;  // the right-hand side and the tensors of A
   at::IntArrayRef needed_;
+  at::Tensor cotangent_;
   State now_;
   int64_t done_ = 0;
   std::vector<State> kept_;

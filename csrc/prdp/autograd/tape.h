@@ -5,8 +5,8 @@
 #include <vector>
 
 #include "prdp/autograd/tape_number.h"
-#include "prdp/kernels/loops.h"
 #include "prdp/kernels/vector.h"
+#include "prdp/kernels/whole_vectors.h"
 
 namespace prdp {
 
@@ -50,17 +50,15 @@ template <class T>
 class Tape {
  public:
   enum class Kind : int8_t {
-    kAxpy,             // out = a + sign factor b
-    kCombination,      // out = factor a + sign Σ of the terms
-    kWeigh,            // out = a∘b
-    kApply,            // out = A a
-    kResidual,         // out = the right-hand side - A a
-    kDivide,           // out = D⁻¹ a
-    kInverseDiagonal,  // out = |D|⁻¹, scaled
-    kSweep,            // out = b + a - D⁻¹A b
-    kDot,              // made = a·b
-    kSquare,           // made = ‖a‖²
-    kWeightedSquare    // made = Σ a_i b_i²
+    kAxpy,         // out = a + sign factor b
+    kCombination,  // out = factor a + sign Σ of the terms
+    kApply,        // out = A a
+    kResidual,     // out = the right-hand side - A a
+    kDivide,       // out = D⁻¹ a
+    kPrecondition, // out = M⁻¹ a, M being a constant
+    kSweep,        // out = b + a - D⁻¹A b
+    kDot,          // made = a·b
+    kSquare        // made = ‖a‖²
   };
   /// An operation: versions of vectors, and nodes of numbers.
   struct Op {
@@ -132,8 +130,8 @@ class Tape {
   }
   void add_bar(int32_t version, T factor, const T* x) {
     if (version == kZero || factor == T(0)) return;
-    if (has_bar(version)) loops_.axpy(factor, x, versions_[version].bar, length_);
-    else loops_.scale(factor, x, new_bar(version), length_);
+    if (has_bar(version)) vectors_.axpy(factor, x, versions_[version].bar, length_);
+    else vectors_.scale(factor, x, new_bar(version), length_);
   }
   /// Adds x, whose memory may be exchanged for other memory.
   void give_bar(int32_t version, T*& x) {
@@ -174,7 +172,7 @@ class Tape {
     terms.cut_to(mark.terms);
   }
 
-  const kernels::Loops<T>& loops_ = kernels::loops<T>();
+  kernels::WholeVectors<T> vectors_;
   int64_t length_;
   VectorPool<T> pool_;
   Log<Version> versions_;

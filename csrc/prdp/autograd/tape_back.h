@@ -7,17 +7,17 @@ namespace prdp {
 
 /// Takes the operations of a tape back, from the cotangents of what they made to those of what they were made of.
 /// Here stands the derivative of every operation of a space, and so that of every method.
-template <class Kernel>
+template <class T>
 class TapeBack {
  public:
-  using T = typename Kernel::Scalar;
+  using Kernel = kernels::Kernel<T>;
   /// Pairs (λ, v) come out divided by these, as they belong to the scaled sample; no rows: not wanted.
   struct Gradient {
     ProductRows* rows;
     T lambda_scale, v_scale;
   };
 
-  TapeBack(Tape<T>& tape, SampleSpace<Kernel>& values, const Kernel& a, const Kernel& transpose, SampleState& state,
+  TapeBack(Tape<T>& tape, SampleSpace<T>& values, const Kernel& a, const Kernel& transpose, SampleState& state,
            int32_t b, Gradient gradient)
       : tape_(tape), values_(values), a_(a), transpose_(transpose), state_(state), b_(b), gradient_(gradient) {
     for (T** own : {&minus_diagonal_bar_, &scratch_, &second_}) *own = tape_.new_memory();
@@ -40,8 +40,8 @@ class TapeBack {
   /// Adds sign ∂⟨λ, A v⟩/∂g to A's gradient.
   void differentiate(T sign, const T* lambda, const T* v) {
     if (!gradient_.rows) return;
-    a_.store(lambda, sign / gradient_.lambda_scale, gradient_.rows->template lambda<T>());
-    a_.store(v, T(1) / gradient_.v_scale, gradient_.rows->template v<T>());
+    a_.layout().store(lambda, sign / gradient_.lambda_scale, gradient_.rows->template lambda<T>());
+    a_.layout().store(v, T(1) / gradient_.v_scale, gradient_.rows->template v<T>());
     gradient_.rows->push();
   }
   T* minus_diagonal_bar() { return minus_diagonal_bar_; }
@@ -60,13 +60,9 @@ class TapeBack {
     const T *const a = tape_.value(op.a), *const b = op.b < 0 ? nullptr : tape_.value(op.b);
     switch (op.kind) {
       case Kind::kSquare: return tape_.add_bar(op.a, 2 * bar, a);
-      case Kind::kDot: tape_.add_bar(op.a, bar, b); return tape_.add_bar(op.b, bar, a);
-      default:  // kWeightedSquare
-        values_.weigh(a, b, scratch_);
-        tape_.add_bar(op.b, 2 * bar, scratch_);
-        if (!gradient_.rows) return;
-        values_.weigh(b, b, scratch_);
-        tape_.add_bar(op.a, bar, scratch_);
+      default:  // kDot
+        tape_.add_bar(op.a, bar, b);
+        return tape_.add_bar(op.b, bar, a);
     }
   }
   void take_back(const Op& op, T* bar) {
@@ -83,12 +79,6 @@ class TapeBack {
         }
         if (op.factor != T(1)) return tape_.add_bar(op.a, op.factor, bar);
         return tape_.move_bar(op.out, op.a);
-      case Kind::kWeigh:
-        values_.weigh(tape_.value(op.a), bar, scratch_);
-        tape_.add_bar(op.b, 1, scratch_);
-        if (!gradient_.rows) return;
-        values_.weigh(bar, tape_.value(op.b), scratch_);
-        return tape_.add_bar(op.a, 1, scratch_);
       case Kind::kApply: return product_back(op.a, 1, bar);
       case Kind::kResidual:
         values_.project(bar);
@@ -96,12 +86,14 @@ class TapeBack {
         return product_back(op.a, -1, bar);
       case Kind::kDivide:
         a_.divide_by_diagonal(bar, scratch_);
-        if (gradient_.rows) loops_.weighted_xpby(scratch_, tape_.value(op.out), T(1), minus_diagonal_bar_, length());
+        if (gradient_.rows) {
+          vectors_.weigh(scratch_, tape_.value(op.out), second_, length());
+          vectors_.axpy(T(1), second_, minus_diagonal_bar_, length());
+        }
         return tape_.add_bar(op.a, 1, scratch_);
-      case Kind::kInverseDiagonal:
-        values_.weigh(bar, tape_.value(op.out), scratch_);
-        a_.divide_by_diagonal(scratch_, scratch_);
-        return loops_.axpy(1, scratch_, minus_diagonal_bar_, length());
+      case Kind::kPrecondition:
+        values_.precondition_transpose(bar, scratch_);
+        return tape_.add_bar(op.a, 1, scratch_);
       case Kind::kSweep: return sweep_back(op, bar);
       default: TORCH_INTERNAL_ASSERT(false, "an operation that makes a number");
     }
@@ -117,7 +109,7 @@ class TapeBack {
     product_back(op.b, -1, second_);
   }
   void add_to_number(int32_t node, T sign, const T* bar, int32_t of) {
-    if (node >= 0) tape_.numbers[node].bar += sign * loops_.dot(bar, tape_.value(of), length());
+    if (node >= 0) tape_.numbers[node].bar += sign * vectors_.dot(bar, tape_.value(of), length());
   }
   /// The cotangent of v for that of A v, or minus it; and the share of A's gradient.
   void product_back(int32_t of, T sign, const T* lambda) {
@@ -133,9 +125,9 @@ class TapeBack {
   }
   int64_t length() const { return tape_.length(); }
 
-  const kernels::Loops<T>& loops_ = kernels::loops<T>();
+  kernels::WholeVectors<T> vectors_;
   Tape<T>& tape_;
-  SampleSpace<Kernel>& values_;
+  SampleSpace<T>& values_;
   const Kernel &a_, &transpose_;
   SampleState& state_;
   int32_t b_;

@@ -34,10 +34,9 @@ class KeptStates {
 
 /// The iterations of a method as they ran, for run_back(). An iteration is taken back by its operations, which the
 /// space records while it runs again. What it starts from and ends with is x and what the method carries.
-template <class Method, class Kernel>
+template <class Method, class T>
 class TapeRun {
-  using T = typename Kernel::Scalar;
-  using Space = TapeSpace<Kernel>;
+  using Space = TapeSpace<T>;
   using Vector = typename Space::Vector;
   using Number = typename Space::Scalar;
 
@@ -54,7 +53,7 @@ class TapeRun {
       static_cast<int64_t>(std::tuple_size_v<decltype(std::declval<Method&>().carried())>) - kNumbers + 1;
 
   /// The cotangent of the last iterate is in x_bar, memory of the tape.
-  TapeRun(Tape<T>& tape, Space& space, TapeBack<Kernel>& back, Method method, KeptStates<T>& kept, T* x_bar, Stop stop)
+  TapeRun(Tape<T>& tape, Space& space, TapeBack<T>& back, Method method, KeptStates<T>& kept, T* x_bar, Stop stop)
       : tape_(tape), space_(space), back_(back), method_(std::move(method)), kept_(kept), stop_(stop) {
     each([&](auto& part, size_t i) {
       const bool is_x = static_cast<void*>(&part) == &method_.x;
@@ -171,7 +170,7 @@ class TapeRun {
 
   Tape<T>& tape_;
   Space& space_;
-  TapeBack<Kernel>& back_;
+  TapeBack<T>& back_;
   Method method_;
   KeptStates<T>& kept_;
   Stop stop_;

@@ -10,10 +10,9 @@ namespace prdp {
 
 /// A sample as a space whose operations can be taken back. A method runs in it as in any other. While it records, every
 /// operation writes to new memory and notes on the tape what it did; so no method needs a derivative of its own.
-template <class Kernel>
+template <class T>
 class TapeSpace {
  public:
-  using T = typename Kernel::Scalar;
   using Scalar = TapeNumber<T>;
   using States = std::array<SampleState, 1>;
   /// The version that it holds now, and the one whose memory it uses while nothing is recorded.
@@ -21,9 +20,8 @@ class TapeSpace {
     int32_t version = -1, home = -1;
   };
 
-  TapeSpace(Tape<T>& tape, SampleSpace<Kernel>& values) : tape_(tape), values_(values) {
+  TapeSpace(Tape<T>& tape, SampleSpace<T>& values) : tape_(tape), values_(values) {
     b_.version = tape_.add_version(values.b());
-    for (auto& t : temporaries_) t = vector();
     b2_ = number(Kind::kSquare, values.b2(), b_.version);
   }
   TapeSpace(const TapeSpace&) = delete;
@@ -76,6 +74,10 @@ class TapeSpace {
           .factor_node = beta.node,
           .factor = beta.value});
   }
+  Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
+    xpby(x, beta, y);
+    return number(Kind::kSquare, values_.dot(value(y), value(y)), y.version);
+  }
   Scalar dot(const Vector& a, const Vector& b) {
     return number(Kind::kDot, values_.dot(value(a), value(b)), a.version, b.version);
   }
@@ -114,40 +116,21 @@ class TapeSpace {
     const auto first = number(Kind::kDot, dots[0], of, out.version);
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
-  void apply(const Vector& v, Vector& out, Preconditioner preconditioner) {
-    if (preconditioner == Preconditioner::kNone) return apply(v, out);
-    Vector divided = temporary();
-    divide_by_diagonal(v, divided);
-    apply(divided, out);
+  bool is_preconditioned() const { return values_.is_preconditioned(); }
+  Scalar precondition(const Vector& v, Vector& out) {
+    const T* from = value(v);
+    const auto of = v.version;
+    const T product = values_.precondition(from, fresh(out));
+    note({.kind = values_.is_preconditioned_by_diagonal() ? Kind::kDivide : Kind::kPrecondition,
+          .out = out.version,
+          .a = of});
+    return number(Kind::kDot, product, of, out.version);
   }
   void divide_by_diagonal(const Vector& b, Vector& c) {
     const T* from = value(b);
     const auto of = b.version;
     values_.divide_by_diagonal(from, fresh(c));
     note({.kind = Kind::kDivide, .out = c.version, .a = of});
-  }
-  void inverse_diagonal(Vector& w) {
-    values_.inverse_diagonal(fresh(w));
-    note({.kind = Kind::kInverseDiagonal, .out = w.version});
-  }
-  void weigh(const Vector& w, const Vector& v, Vector& z) {
-    const T *weights = value(w), *from = value(v);
-    const auto of_w = w.version, of_v = v.version;
-    values_.weigh(weights, from, fresh(z));
-    note({.kind = Kind::kWeigh, .out = z.version, .a = of_w, .b = of_v});
-  }
-  Scalar weighted_square(const Vector& w, const Vector& v) {
-    return number(Kind::kWeightedSquare, values_.weighted_square(value(w), value(v)), w.version, v.version);
-  }
-  std::array<Scalar, 2> descend(const Scalar& alpha, const Vector& p, const Vector& q, const Vector& w, Vector& x,
-                                Vector& r) {
-    const auto plain = descend(alpha, p, q, x, r);
-    return {plain, weighted_square(w, r)};
-  }
-  void xpby(const Vector& w, const Vector& r, const Scalar& beta, Vector& p) {
-    Vector weighted = temporary();
-    weigh(w, r, weighted);
-    xpby(weighted, beta, p);
   }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar*) {
     if (recording_) {
@@ -167,7 +150,7 @@ class TapeSpace {
     return values_.measured_sweep(value(c), value(x), fresh(next), nullptr);  // a residual alone; no derivative
   }
   Scalar radius2() const { return values_.radius2(); }
-  static constexpr bool sweeps_contract() { return false; }
+  bool sweeps_contract() const { return values_.sweeps_contract(); }
   Scalar residual(const Vector& x, Vector& r) {
     const T* from = value(x);
     const auto of = x.version;
@@ -182,15 +165,11 @@ class TapeSpace {
     const T length = values_.step_length(num.value, den.value, a2.value, b2.value);
     return length == T(0) ? Scalar(length) : num / den;
   }
-  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Vector& w, const Vector& q,
-                     const Scalar& plain2) {
-    const T length = values_.step_length(num.value, den.value, a2.value, value(w), value(q), plain2.value);
-    return length == T(0) ? Scalar(length) : num / den;
-  }
   Scalar ratio(const Scalar& num, const Scalar& den) const {
     const T value = values_.ratio(num.value, den.value);
     return value == T(0) ? Scalar(value) : num / den;
   }
+  void break_down(const Scalar& where) { values_.break_down(where.value); }
 
   Scalar constant(const Scalar& a) const { return a.value; }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
@@ -202,22 +181,25 @@ class TapeSpace {
                               Vector& w) {
     return combine(-1, h, v, count, factor.value, w);
   }
-  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
-                       Preconditioner preconditioner) {
-    if (preconditioner == Preconditioner::kNone) {
-      combine(1, y.data(), v, count, 1, x);
-      return;
-    }
-    Vector sum = temporary(), divided = temporary();
-    fill_zero(sum);
-    combine(1, y.data(), v, count, 1, sum);
-    divide_by_diagonal(sum, divided);
-    add(divided, x);
+  void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
+    combine(1, y, v, count, 1, x);
   }
   bool lost_orthogonality(const Scalar& left2, const Scalar& taken2, Scalar& loss) const {
     return values_.lost_orthogonality(left2.value, taken2.value, loss.value);
   }
   Scalar inverse(const Scalar& a, const Scalar& scale) const { return values_.inverse(a.value, scale.value); }
+  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
+            Scalar* y) const {
+    const auto plain = [](const Scalar* from, int64_t count) {
+      std::vector<T> values(count);
+      for (int64_t i = 0; i < count; ++i) values[i] = from[i].value;
+      return values;
+    };
+    if (keep.value != 0) return;
+    auto found = plain(y, n);
+    values_.damp(plain(r, n * stride).data(), stride, plain(g, n).data(), n, scale.value, keep.value, found.data());
+    std::copy(found.begin(), found.end(), y);
+  }
   Scalar larger(const Scalar& a, const Scalar& b) const { return values_.larger(a.value, b.value); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return values_.is_larger(a.value, b.value); }
   void restore(const Scalar& where, const Vector& from, Vector& to) {
@@ -258,11 +240,6 @@ class TapeSpace {
     if (after != before) copy_values(before, after);
     return after;
   }
-  /// One of two that are used up before the next but one.
-  Vector temporary() {
-    std::swap(temporaries_[0], temporaries_[1]);
-    return temporaries_[0];
-  }
   C10_ALWAYS_INLINE void note(Op op) {
     if (!recording_) return;
     op.numbers = tape_.numbers.size();
@@ -286,7 +263,7 @@ class TapeSpace {
       if (recording_) tape_.terms.push({v[i].version, h[i].node, sign * h[i].value});
     }
     const auto& from = pointers(v, count);
-    const T left2 = loops_.multi_axpy(T(sign), plain_.data(), from.data(), count, factor, changed(w), tape_.length());
+    const T left2 = vectors_.multi_axpy(T(sign), plain_.data(), from.data(), count, factor, changed(w), tape_.length());
     note({.kind = Kind::kCombination,
           .out = w.version,
           .a = before,
@@ -297,13 +274,12 @@ class TapeSpace {
     return left2;
   }
 
-  const kernels::Loops<T>& loops_ = kernels::loops<T>();
+  kernels::WholeVectors<T> vectors_;
   Tape<T>& tape_;
-  SampleSpace<Kernel>& values_;
+  SampleSpace<T>& values_;
   bool recording_ = true;
   Vector b_;
   Scalar b2_;
-  Vector temporaries_[2];
   std::vector<T*> pointers_;
   std::vector<T> plain_;
 };

@@ -3,8 +3,9 @@
 #include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/share_samples.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -38,31 +39,20 @@ void add_diagonals(std::vector<at::Tensor>& gradients, const at::Tensor& diagona
     if (needed[i + 1]) add_to(gradients[i + 1], found[next++]);
 }
 
-template <class T, class Parameters>
-void reverse(const Parameters& a, const Parameters& transpose, const ReverseBatch<T>& batch, int64_t size,
-             int64_t grain) {
-  interruption::parallel_for(0, size, grain, [&](int64_t begin, int64_t end) {
-    const at::NoGradGuard no_grad;
-    reverse_range(a, transpose, batch, begin, end);
-  });
-}
-
 }  // namespace
 
 bool can_use_tape(const Operator& a, const UnrolledSolve& solve, const at::Tensor& b) {
-  return b.is_cpu() && has_tape(traits(solve.solver.method)) && !std::holds_alternative<std::monostate>(a.kernel(b));
+  return b.is_cpu() && traits(solve.solver.method).has_tape && !solve.solver.preconditioner.is_operator() &&
+         a.kernels(b, false);
 }
 
 UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                      at::IntArrayRef needed) {
   const auto a = make_operator(solve.a);
-  auto transposed = solve.a;
-  transposed.transposed = !transposed.transposed;
-  const auto parameters = a->kernel(b), transpose = make_operator(transposed)->kernel(b);
   const auto x0 = solve.x0.defined() ? solve.x0.contiguous() : at::Tensor();
   const auto rhs = b.contiguous(), bar = cotangent.contiguous(), iterations = solve.iterations.contiguous();
   const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
-  const bool for_diagonal = for_a && traits(solve.solver.method).divides_by_diagonal;
+  const bool for_diagonal = for_a && divides_by_diagonal(solve.solver);
   const auto b_bar = at::empty_like(rhs), diagonal_bar = for_diagonal ? at::empty_like(rhs) : at::Tensor();
   UnrolledVjp found{std::vector<at::Tensor>(needed.size()), at::empty_like(iterations)};
   std::vector<std::vector<at::Tensor>> of_samples(rhs.size(0));
@@ -70,10 +60,8 @@ UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Unr
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const int64_t most = size == 0 ? 0 : iterations.max().item<int64_t>();
   const int64_t grain = grain_size(solve.solver.method, size, unknowns, 4 * most, solve.solver.restart);
-  const auto run = [&]<class T>(T) {
-    ReverseBatch<T> batch{solve.solver.method,
-                          solve.solver.rtol,
-                          solve.solver.restart,
+  const auto run = [&]<class T>(const kernels::KernelBatch<T>& of_a) {
+    ReverseBatch<T> batch{solve.solver,
                           solve.checkpoint_every,
                           iterations.const_data_ptr<int64_t>(),
                           rhs.const_data_ptr<T>(),
@@ -88,15 +76,14 @@ UnrolledVjp tape_vjp(const at::Tensor& cotangent, const at::Tensor& b, const Unr
       batch.rows = [&](int64_t s) { return ProductRows(a->select(at::full({1}, s, at::kLong)), rhs); };
       batch.take_gradients = [&](int64_t s, std::vector<at::Tensor> g) { of_samples[s] = std::move(g); };
     }
-    std::visit(
-        [&](const auto& p) {
-          using Parameters = std::decay_t<decltype(p)>;
-          if constexpr (!std::is_same_v<Parameters, std::monostate>)
-            reverse(p, std::get<Parameters>(transpose), batch, size, grain);
-        },
-        parameters);
+    const auto transpose = a->kernels(b, true);
+    share_samples(size, unknowns, grain, [&](int64_t begin, int64_t end) {
+      const at::NoGradGuard no_grad;
+      reverse_samples(of_a, std::get<kernels::KernelBatch<T>>(transpose->of_dtype), batch, unknowns, begin, end);
+    });
   };
-  rhs.scalar_type() == at::kFloat ? run(float()) : run(double());
+  const auto kernels = a->kernels(b, false);
+  std::visit(run, kernels->of_dtype);
 
   if (needed[0]) found.gradients[0] = b_bar;
   for (int64_t s = 0; s < size; ++s)

@@ -22,8 +22,8 @@ constexpr const char* kSchema =
     "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
     "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
     ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
-    "Tensor operator_applications)";
-using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+    "Tensor operator_applications, Tensor floor)";
+using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                                            const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
                                            at::IntArrayRef, at::ArrayRef<double>, bool)>;
@@ -91,8 +91,10 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
   const int64_t unknowns = solved.b.numel() / batch;
   if (traits(solver.method).ends_at_unknowns &&
       std::find(iterations.begin(), iterations.end(), unknowns) != iterations.end()) {
-    const auto one_less =
-        solve(a, solved.b.detach(), {solver.method, unknowns - 1, 0.0, solver.restart, {}, true, solved.x0});
+    auto shorter = solver;
+    shorter.max_iter = unknowns - 1;
+    shorter.rtol = 0.0;
+    const auto one_less = solve(a, solved.b.detach(), {shorter, {}, true, solved.x0});
     const Solved before{solved.b, one_less.u, {}, one_less.info.status, one_less.info.residual};
     const auto sufficed = within_rounding(a, before, rows, [&] { return one_less.u; });
     for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != unknowns || sufficed[i]);
@@ -134,7 +136,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   implicit.adjoint_rtol = std::min(asked, kRoundings / 2 * epsilon_of(solved.b));
 
   SolveInfo info{at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble), at::empty({batch}, at::kLong),
-                 at::empty({batch}, at::kLong)};
+                 at::empty({batch}, at::kLong), at::zeros({batch}, at::kDouble)};
   const auto says = [&](int64_t i, int64_t iterations, double residual, SolveStatus why, int64_t applications) {
     info.iterations.mutable_data_ptr<int64_t>()[i] = iterations;
     info.residual.mutable_data_ptr<double>()[i] = residual;
@@ -183,8 +185,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
       if (exact[i] && is_failure(static_cast<SolveStatus>(info.status.const_data_ptr<int64_t>()[i]))) good[i] = false;
     if (good != rows) {  // their adjoint solve failed
       auto said = info;
-      for (auto* part : {&said.iterations, &said.residual, &said.status, &said.operator_applications})
-        *part = part->clone();
+      for (auto* part : said.parts()) *part = part->clone();
       found.gradients = share(good);
       info = said;
     }
@@ -204,12 +205,11 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     else says(i, 0, std::numeric_limits<double>::infinity(), SolveStatus::kNonfiniteInput, 0);
     failures.status.mutable_data_ptr<int64_t>()[i] = info.status.const_data_ptr<int64_t>()[i];
   }
-  info.residual = info.residual.to(solved.b.scalar_type());
+  for (auto* part : {&info.residual, &info.floor}) *part = part->to(solved.b.scalar_type());
   if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, options.solver, /*adjoint=*/true}, *a, cotangent, failures, options.on_failure);
-  const auto device = solved.b.device();
-  found.info = {info.iterations.to(device), info.residual.to(device), info.status.to(device),
-                info.operator_applications.to(device)};
+  found.info = info;
+  for (auto* part : found.info.parts()) *part = part->to(solved.b.device());
   return found;
 }
 
@@ -222,7 +222,8 @@ UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b
     // K iterations from zero are u = p(I - D⁻¹A) D⁻¹ b; transposed, that is K iterations with Aᵀ.
     auto transpose = solve.a;
     transpose.transposed = !transpose.transposed;
-    const SolveRequest request{method, 0, 0.0, solve.solver.restart, solve.iterations, /*guarded=*/false};
+    const Solver transposed{method, 0, 0.0, solve.solver.restart, solve.solver.preconditioner.transposed()};
+    const SolveRequest request{transposed, solve.iterations, /*guarded=*/false};
     const auto [b_bar, info] = prdp::solve(*make_operator(transpose), cotangent, request);
     UnrolledVjp found{std::vector<at::Tensor>(needed.size()), info.operator_applications};
     found.gradients[0] = b_bar;
@@ -269,7 +270,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   const auto& info = found.info;
   // -1 crosses the op for no residual: torch's checks of ops compare outputs, and NaN equals nothing.
   const auto residual_or_not = info.residual.masked_fill(info.residual.isnan(), -1.0);
-  return {gradients, info.iterations, residual_or_not, info.status, info.operator_applications};
+  return {gradients, info.iterations, residual_or_not, info.status, info.operator_applications, info.floor};
 }
 
 template <class... Options>
@@ -283,7 +284,8 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
   const auto of_dtype = [&](at::ScalarType dtype) {
     return at::empty_symint({b.sym_size(0)}, b.options().dtype(dtype));
   };
-  return {gradients, of_dtype(at::kLong), of_dtype(b.scalar_type()), of_dtype(at::kLong), of_dtype(at::kLong)};
+  return {gradients, of_dtype(at::kLong), of_dtype(b.scalar_type()), of_dtype(at::kLong), of_dtype(at::kLong),
+          of_dtype(b.scalar_type())};
 }
 
 }  // namespace
@@ -291,12 +293,12 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
-  const auto [gradients, iterations, residual, status, applications] =
+  const auto [gradients, iterations, residual, status, applications, floor] =
       call_with_x0(op, options, solved.x0, cotangent, solved.b, solved.iterations, solved.status, solved.residual,
                    needed, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
                    at::ArrayRef<double>(a.parameters), a.transposed);
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
-  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications}};
+  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications, floor}};
   for (size_t i = 0, next = 0; i < needed.size(); ++i)
     if (needed[i]) found.gradients[i] = gradients[next++];
   return found;

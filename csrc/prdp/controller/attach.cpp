@@ -18,7 +18,9 @@ Solves last_solves(const std::vector<const StepperBase*>& steppers) {
   for (const auto* stepper : steppers) {
     solves.converged = solves.converged && stepper->converged();
     if (!stepper->info()) continue;
-    const auto residual = stepper->info()->residual.to(at::kDouble).mean().item<double>();
+    const auto& info = *stepper->info();
+    const auto beyond_rounding = info.residual.masked_fill(info.floor.gt(0), 0.0);
+    const auto residual = beyond_rounding.to(at::kDouble).mean().item<double>();
     if (std::isfinite(residual)) solves.residual = std::max(residual, solves.residual.value_or(0.0));
   }
   return solves;

@@ -4,26 +4,42 @@
 
 namespace prdp::kernels {
 
-/// I + dt Γ(w) - ν dt L on each of the `dim` channels, with the winds averaged to the faces.
+/// The coefficients of a stencil of nearest neighbours on a periodic grid as contiguous fields.
 template <class T>
-Stencil<T> burgers(const UpwindParameters<T>& parameters, int64_t dim) {
-  const auto pattern = parameters.pattern(dim);
-  const auto assemble = [parameters, pattern, dim](int64_t s) -> std::optional<StencilRows<T>> {
-    const auto p = parameters.sample(s);
-    if (!p.is_finite(dim)) return std::nullopt;
-    const auto wind = [&p](int64_t channel, int64_t j) { return p.winds + (channel * p.ny + j) * p.nx; };
-    const auto winds = [&](int axis, int64_t j, T* scratch) -> WindRow<T> {
-      if (axis == 1) return {wind(1, j > 0 ? j - 1 : p.ny - 1), wind(1, j), wind(1, j + 1 < p.ny ? j + 1 : 0)};
-      const T* w = wind(0, j);
-      scratch[0] = w[p.nx - 1];
-      std::copy(w, w + p.nx, scratch + 1);
-      scratch[p.nx + 1] = w[0];
-      return {scratch, scratch + 1, scratch + 2};
-    };
-    const UpwindTerms terms{1.0, p.dt, p.nu * p.dt, p.transposed, p.length_y, p.length_x};
-    return upwind_rows<T>(pattern, terms, winds);
+RawStencil<T> raw_stencil(const StencilRows<T>& rows) {
+  RawStencil<T> a(rows.grid());
+  std::vector<T*> fields;
+  for (const auto& o : rows.pattern().offsets) fields.push_back(a.add(RawStencil<T>::place(o)));
+  const auto& [nz, ny, nx] = rows.grid().shape;
+  rows.for_each_coefficient([&](int64_t row, int64_t k, int64_t i, T value) { fields[k][row * nx + i] = value; });
+  return a;
+}
+
+/// I + dt Γ(w) - ν dt L on each of the `dim` channels, with the winds averaged to the faces; null where a wind is not
+/// finite.
+template <class T>
+std::unique_ptr<Kernel<T>> burgers(const UpwindParameters<T>& p, int64_t dim) {
+  if (!std::isfinite(p.largest_wind(dim))) return nullptr;
+  const double factor = scale_of_operator(p.magnitude(dim, 1.0, p.dt, p.nu * p.dt));
+  const auto wind = [&p](int64_t channel, int64_t j) { return p.winds + (channel * p.ny + j) * p.nx; };
+  const auto winds = [&](int axis, int64_t j, T* scratch) -> WindRow<T> {
+    if (axis == 1) return {wind(1, j > 0 ? j - 1 : p.ny - 1), wind(1, j), wind(1, j + 1 < p.ny ? j + 1 : 0)};
+    const T* w = wind(0, j);
+    scratch[0] = w[p.nx - 1];
+    std::copy(w, w + p.nx, scratch + 1);
+    scratch[p.nx + 1] = w[0];
+    return {scratch, scratch + 1, scratch + 2};
   };
-  return {pattern->grid, dim, parameters.is_shared(), assemble};
+  UpwindTerms terms{factor, p.dt * factor, p.nu * p.dt * factor, p.transposed, p.length_y, p.length_x};
+  auto rows = std::make_shared<StencilRows<T>>(upwind_rows<T>(p.pattern(dim), terms, winds));
+  const auto raw = [p, dim]() -> std::optional<RawStencil<T>> {
+    auto untransposed = p;
+    untransposed.transposed = false;
+    const auto kernel = burgers(untransposed, dim);
+    return raw_stencil(dynamic_cast<const Stencil<T>&>(*kernel).coefficients());
+  };
+  return std::make_unique<Stencil<T>>(std::move(rows), dim, static_cast<T>(factor),
+                                      typename Stencil<T>::Source{[p, dim] { return p.key(dim); }, raw, p.transposed});
 }
 
 }  // namespace prdp::kernels

@@ -1,38 +1,64 @@
 #pragma once
 #include <cstdint>
+#include <cstring>
 #include <memory>
-#include <string>
 #include <typeinfo>
 
-/// The last factorisations of sparse matrices. The steps of a rollout share one operator, and so do their
-/// adjoint solves where it is symmetric; a factorisation costs as much as dozens of solves.
+/// Factorisations of sparse matrices, and hierarchies of grids, that later solves with the same matrix use again: its
+/// adjoint solve, the other steps of a rollout, the next update of a training. They are found by a hash of the numbers
+/// that the matrix is made of, so that nobody has to say whether these have changed.
+namespace prdp::kernels {
+
+/// 128 bits of hash.
+struct FactorKey {
+  uint64_t low, high;
+  bool operator==(const FactorKey&) const = default;
+};
+
+/// Hashes numbers as fast as memory delivers them.
+class FactorKeyMaker {
+ public:
+  template <class T>
+  FactorKeyMaker& add(const T* values, int64_t count) {
+    return add_bytes(reinterpret_cast<const unsigned char*>(values), count * static_cast<int64_t>(sizeof(T)));
+  }
+  template <class T>
+  FactorKeyMaker& add(T value) {
+    return add(&value, 1);
+  }
+  FactorKey key() const;
+
+ private:
+  FactorKeyMaker& add_bytes(const unsigned char* bytes, int64_t count);
+
+  uint64_t lanes_[4] = {0x9e3779b97f4a7c15, 0xbf58476d1ce4e5b9, 0x94d049bb133111eb, 0xd6e8feb86659fd93};
+  uint64_t count_ = 0;
+};
+
+}  // namespace prdp::kernels
+
 namespace prdp::factor_cache {
 
-using Factors = std::shared_ptr<const void>;
+using Kept = std::shared_ptr<const void>;
 
-/// The factors kept under exactly this key, or null.
-Factors find(const std::string& key);
-/// Keeps them in place of older ones, unless they are too large.
-void keep(std::string key, Factors factors, int64_t bytes);
-/// Frees all factors.
+/// What is kept under this key and type, or null.
+Kept find(const kernels::FactorKey& key, const std::type_info& type);
+/// Keeps it. What was used least recently goes once all take more than limit() bytes; what is larger than that is not
+/// kept.
+void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes);
+/// Frees all of it.
 void clear();
-/// How many factors were made so far.
+/// How much was made so far.
 int64_t count_made();
+int64_t limit();
 
-/// The factors F of the matrix whose numbers are the key, from the cache or from make(). Any thread may call this.
+/// The F of the matrix with this key, from the cache or from make(). Any thread may call this.
 template <class F, class Make>
-std::shared_ptr<const F> find_or_make(std::string key, const Make& make) {
-  key += typeid(F).name();
-  if (const auto found = find(key)) return std::static_pointer_cast<const F>(found);
+std::shared_ptr<const F> find_or_make(const kernels::FactorKey& key, const Make& make) {
+  if (const auto found = find(key, typeid(F))) return std::static_pointer_cast<const F>(found);
   const std::shared_ptr<const F> made = make();
-  keep(std::move(key), made, made->bytes());
+  keep(key, typeid(F), made, made->bytes());
   return made;
-}
-
-/// Appends the bytes of `count` numbers to a key.
-template <class T>
-void append(std::string& key, const T* values, int64_t count) {
-  key.append(reinterpret_cast<const char*>(values), static_cast<size_t>(count) * sizeof(T));
 }
 
 }  // namespace prdp::factor_cache

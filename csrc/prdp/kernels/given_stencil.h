@@ -19,8 +19,43 @@ inline std::array<Run, 2> runs(int64_t offset, int64_t n, bool periodic, bool tr
   return {{inner, offset > 0 ? Run{n - offset, 0, offset} : Run{0, n + offset, -offset}}};
 }
 
-/// The stencil with `coefficients` (batch, k, nz, ny, nx) for the offsets that `pattern` was given, or its
-/// transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
+/// The rows of factor times the stencil with these coefficients, each (nz, ny, nx) and one for each offset that `pattern`
+/// was given; or of its transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
+template <class T>
+StencilRows<T> assemble_rows(std::shared_ptr<const StencilPattern> pattern, const std::vector<const T*>& coefficients,
+                             T factor, bool transposed) {
+  StencilRows<T> a(pattern);
+  const auto& [nz, ny, nx] = pattern->grid.shape;
+  const auto& loops = kernels::loops<T>();
+  std::vector<bool> holds(pattern->offsets.size());
+  for (size_t given = 0; given < coefficients.size(); ++given) {
+    const int64_t k = pattern->places[given];
+    if (k < 0) continue;
+    const auto along = [&](int axis) {
+      return runs(pattern->offsets[k].along[axis], pattern->grid.shape[axis], pattern->grid.periodic[axis], transposed);
+    };
+    for (const Run& z : along(0))
+      for (int64_t plane = 0; plane < z.count; ++plane)
+        for (const Run& y : along(1))
+          for (const Run& x : along(2)) {
+            if (y.count == 0 || x.count == 0) continue;
+            T* to = a.coefficient((z.to + plane) * ny + y.to, k) + x.to;
+            const T* source = coefficients[given] + ((z.from + plane) * ny + y.from) * nx + x.from;
+            if (!holds[k]) {
+              loops.copy_rows(factor, source, nx, to, a.stride(), y.count, x.count);
+            } else {
+              for (int64_t r = 0; r < y.count; ++r)
+                for (int64_t i = 0; i < x.count; ++i) to[r * a.stride() + i] += factor * source[r * nx + i];
+            }
+          }
+    holds[k] = true;
+  }
+  a.close();
+  return a;
+}
+
+/// The stencils with `coefficients` (batch, k, nz, ny, nx) for the offsets that `pattern` was given, or their
+/// transposes: the stencils of the opposite offsets, of which `pattern` is then to be.
 template <class T>
 struct GivenStencil {
   const T* coefficients;
@@ -28,53 +63,63 @@ struct GivenStencil {
   std::shared_ptr<const StencilPattern> pattern;
   bool transposed;
 
-  std::optional<StencilRows<T>> assemble(int64_t s) const {
+  /// Null where a coefficient is not finite.
+  std::unique_ptr<Kernel<T>> make(int64_t s, int64_t channels) const {
     const auto& [nz, ny, nx] = pattern->grid.shape;
     const int64_t points = nz * ny * nx, given = static_cast<int64_t>(pattern->places.size());
     const T* from = coefficients + s * sample_stride;
-    if (!std::isfinite(largest_magnitude(from, given * points))) return std::nullopt;
-    StencilRows<T> a(pattern);
-    std::vector<bool> holds(pattern->offsets.size());
-    for (const int64_t k : pattern->places) {
-      if (k >= 0) {
-        add(a, k, from, holds[k]);
-        holds[k] = true;
-      }
-      from += points;
-    }
-    a.close();
-    return a;
+    const T magnitude = largest_magnitude(from, given * points);
+    if (!std::isfinite(magnitude)) return nullptr;
+    std::vector<const T*> fields;
+    for (int64_t k = 0; k < given; ++k) fields.push_back(from + k * points);
+    const T factor = scale_of_operator(magnitude);
+    auto rows = std::make_shared<StencilRows<T>>(assemble_rows(pattern, fields, factor, transposed));
+    const auto key = [given_stencil = *this, from, count = given * points] {
+      return given_stencil.of_matrix().add(from, count).key();
+    };
+    const auto raw = [given_stencil = *this, fields, factor, points] { return given_stencil.raw(fields, factor, points); };
+    return std::make_unique<Stencil<T>>(std::move(rows), channels, factor, typename Stencil<T>::Source{key, raw, transposed});
   }
 
  private:
-  /// Adds `from` (nz, ny, nx) to coefficient k, which is zero unless `holds`.
-  void add(StencilRows<T>& a, int64_t k, const T* from, bool holds) const {
-    const auto& [nz, ny, nx] = pattern->grid.shape;
-    const auto along = [&](int axis) {
-      return runs(pattern->offsets[k].along[axis], pattern->grid.shape[axis], pattern->grid.periodic[axis], transposed);
-    };
-    const auto& loops = kernels::loops<T>();
-    for (const Run& z : along(0))
-      for (int64_t plane = 0; plane < z.count; ++plane)
-        for (const Run& y : along(1))
-          for (const Run& x : along(2)) {
-            if (y.count == 0 || x.count == 0) continue;
-            T* to = a.coefficient((z.to + plane) * ny + y.to, k) + x.to;
-            const T* source = from + ((z.from + plane) * ny + y.from) * nx + x.from;
-            if (!holds) {
-              loops.copy_rows(T(1), source, nx, to, a.stride(), y.count, x.count);
-            } else {
-              for (int64_t r = 0; r < y.count; ++r)
-                for (int64_t i = 0; i < x.count; ++i) to[r * a.stride() + i] += source[r * nx + i];
-            }
-          }
+  /// The part of the key that tells the grid and the offsets, as they are in the matrix that is not transposed.
+  FactorKeyMaker of_matrix() const {
+    FactorKeyMaker key;
+    const auto& grid = pattern->grid;
+    for (int d = 0; d < 3; ++d) key.add(grid.shape[d]).add(int64_t{grid.periodic[d]});
+    for (const int64_t k : pattern->places) {
+      if (k < 0) key.add(int64_t{3});
+      else key.add(untransposed(k).along, 3);
+    }
+    return key;
+  }
+  Offset untransposed(int64_t k) const {
+    Offset o = pattern->offsets[k];
+    if (transposed)
+      for (auto& cells : o.along) cells = -cells;
+    return o;
+  }
+  /// The coefficients, times the factor, as multigrid takes them; nothing if neighbours lie further away.
+  std::optional<RawStencil<T>> raw(const std::vector<const T*>& fields, T factor, int64_t points) const {
+    RawStencil<T> a(pattern->grid);
+    for (size_t given = 0; given < fields.size(); ++given) {
+      const int64_t k = pattern->places[given];
+      if (k < 0) continue;
+      const Offset o = untransposed(k);
+      for (const int64_t cells : o.along)
+        if (std::abs(cells) > 1) return std::nullopt;
+      const int place = RawStencil<T>::place(o);
+      if (factor == T(1) && !a.coefficients[place]) {
+        a.coefficients[place] = fields[given];
+        continue;
+      }
+      const T* before = a.coefficients[place];
+      T* sum = a.add(place);
+      for (int64_t i = 0; i < points; ++i) sum[i] = (before ? before[i] : T(0)) + factor * fields[given][i];
+    }
+    if (!a.coefficients[RawStencil<T>::kCentre]) a.add(RawStencil<T>::kCentre);
+    return a;
   }
 };
-
-template <class T>
-Stencil<T> given_stencil(const GivenStencil<T>& source, int64_t channels) {
-  return {source.pattern->grid, channels, source.sample_stride == 0,
-          [source](int64_t s) { return source.assemble(s); }};
-}
 
 }  // namespace prdp::kernels

@@ -3,94 +3,154 @@
 #include <array>
 #include <cmath>
 #include <utility>
+#include <vector>
 
+#include "prdp/kernels/kernel.h"
 #include "prdp/kernels/laplacian_parameters.h"
-#include "prdp/kernels/loops.h"
-#include "prdp/kernels/vector.h"
 
 namespace prdp::kernels {
 
-/// The Laplacian-type stencil on one sample, rows padded with zero lanes. A sample is stored in its
-/// native order with at least one zero between rows, planes one zero row apart, and a zero halo in
-/// front and behind, so that neighbours outside the grid read zero without a branch.
+/// The Laplacian-type stencil on one sample. A sample is stored in its native order with at least one zero between
+/// rows, planes one zero row apart, and a zero halo in front and behind, so that neighbours outside the grid read zero
+/// without a branch.
 template <class T, int Dim>
-class Laplacian {
- public:
-  using Scalar = T;
+class Laplacian final : public Kernel<T> {
+  using Base = Kernel<T>;
 
-  explicit Laplacian(const LaplacianParameters& p)
-      : parameters_(p),
-        nx_(p.shape[Dim - 1]),
-        ny_(Dim > 1 ? p.shape[Dim - 2] : 1),
-        nz_(Dim > 2 ? p.shape[Dim - 3] : 1),
-        row_(round_up_to_lanes<T>(nx_ + 1)),
-        plane_((Dim > 2 ? ny_ + 1 : ny_) * row_),
-        centre_(static_cast<T>(p.centre)),
-        apply_weights_(Dim * row_, T(0)),
-        sweep_weights_(Dim * row_, T(0)) {
-    norm_ = std::abs(p.centre);
+ public:
+  using Base::layout, Base::length;
+
+  explicit Laplacian(const LaplacianParameters& given) : Laplacian(given, scale_of(given)) {}
+
+  /// Of factor()·A.
+  const LaplacianParameters& parameters() const { return parameters_; }
+  double norm() const override { return norm_; }
+  bool has_zero_diagonal() const override { return centre_ == T(0); }
+  void divide_by_diagonal(const T* b, T* c) const override { Base::vectors_.scale(T(1) / centre_, b, c, length()); }
+
+  void apply(const T* v, T* out) const override { apply_with_dots(v, out); }
+  std::array<T, 2> apply_with_dots(const T* v, T* out) const override {
+    return sums_over<T, 2>(parts(), [&](int64_t p, T* dots) {
+      const auto [a, at] = part(p, apply_weights_);
+      loops_.apply[Dim - 1](a, v + at, out + at, dots);
+    });
+  }
+
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega) const override {
+    if (parts() == 1) {
+      if (loops_.sweeps[Dim - 1](stencil(sweep_weights_), c, x, y, n, omega) != x) std::swap(x, y);
+      return;
+    }
+    for (int64_t s = 0; s < n; ++s, std::swap(x, y)) jacobi_sweep(c, x, y, omega ? omega + s : nullptr);
+  }
+  T jacobi_sweep(const T* c, const T* x, T* y, const T* omega) const override {
+    const auto change2 = sums_over<T, 1>(parts(), [&](int64_t p, T* sum) {
+      const auto [a, at] = part(p, sweep_weights_);
+      *sum = loops_.sweep_and_measure[Dim - 1](a, c + at, x + at, y + at, omega);
+    });
+    return centre_ * centre_ * change2[0];
+  }
+  std::optional<double> radius() const override { return jacobi_radius(parameters_); }
+  void smooth(const T* b, const T* x, T* y, T p, T q) const override {
+    shared_rows::for_each(parts(), [&](int64_t i) {
+      const auto [a, at] = part(i, apply_weights_);
+      loops_.smooth[Dim - 1](a, b + at, x + at, y + at, p, q, T(1) / centre_);
+    });
+  }
+  void residual(const T* b, const T* x, T* r) const override {
+    shared_rows::for_each(parts(), [&](int64_t i) {
+      const auto [a, at] = part(i, apply_weights_);
+      loops_.residual[Dim - 1](a, b + at, x + at, r + at);
+    });
+  }
+  std::optional<GridOperator<T>> grid_operator() const override;
+  std::shared_ptr<const Factors<T>> factorise() const override;
+
+ private:
+  Laplacian(LaplacianParameters p, double factor) : Base(layout_of(p), static_cast<T>(factor)), parameters_(p) {
+    parameters_.centre *= factor;
+    for (auto& off : parameters_.off) off *= factor;
+    centre_ = static_cast<T>(parameters_.centre);
+    norm_ = std::abs(parameters_.centre);
+    const int64_t row = layout().row, nx = layout().nx;
+    apply_weights_.assign(Dim * row, T(0));
+    sweep_weights_.assign(Dim * row, T(0));
     for (int d = 0; d < Dim; ++d) {
-      const double off = p.off[Dim - 1 - d];
+      const double off = parameters_.off[Dim - 1 - d];
       norm_ += 2.0 * std::abs(off);
-      std::fill_n(apply_weights_.begin() + d * row_, nx_, static_cast<T>(off));
-      std::fill_n(sweep_weights_.begin() + d * row_, nx_, static_cast<T>(-off / p.centre));
+      std::fill_n(apply_weights_.begin() + d * row, nx, static_cast<T>(off));
+      std::fill_n(sweep_weights_.begin() + d * row, nx, static_cast<T>(-off / parameters_.centre));
     }
   }
 
-  const LaplacianParameters& parameters() const { return parameters_; }
-  bool is_shared() const { return true; }
-  const Laplacian& sample(int64_t) const { return *this; }
-  int64_t unknowns() const { return nz_ * ny_ * nx_; }
-  int64_t length() const { return nz_ * plane_; }
-  int64_t halo() const { return Dim == 1 ? kLanes<T> : Dim == 2 ? row_ : plane_; }
-  double norm() const { return norm_; }
-  bool operator_is_finite() const { return true; }
-  bool has_zero_diagonal() const { return centre_ == T(0); }
-
-  /// dst = scale·src, from a contiguous sample into the padded layout; and back.
-  void load(const T* src, T scale, T* dst) const {
-    for (int64_t z = 0; z < nz_; ++z)
-      loops_.copy_rows(scale, src + z * ny_ * nx_, nx_, dst + z * plane_, row_, ny_, nx_);
-  }
-  void store(const T* src, T scale, T* dst) const {
-    for (int64_t z = 0; z < nz_; ++z)
-      loops_.copy_rows(scale, src + z * plane_, row_, dst + z * ny_ * nx_, nx_, ny_, nx_);
+  /// In double, as the centre may lie outside the range of T.
+  static double scale_of(const LaplacianParameters& p) { return scale_of_operator(std::abs(p.centre)); }
+  static Layout<T> layout_of(const LaplacianParameters& p) {
+    const int64_t nx = p.shape[Dim - 1], ny = Dim > 1 ? p.shape[Dim - 2] : 1, nz = Dim > 2 ? p.shape[Dim - 3] : 1;
+    const int64_t row = round_up_to_lanes<T>(nx + 1), plane = (Dim > 2 ? ny + 1 : ny) * row;
+    return {nz, ny, nx, row, plane, Dim == 1 ? kLanes<T> : Dim == 2 ? row : plane};
   }
 
-  /// out = A v; returns v·out and ‖out‖².
-  std::array<T, 2> apply(const T* v, T* out) const {
-    std::array<T, 2> dots;
-    loops_.apply[Dim - 1](stencil(apply_weights_), v, out, dots.data());
-    return dots;
-  }
-
-  /// c = D⁻¹ b
-  void divide_by_diagonal(const T* b, T* c) const { loops_.scale(T(1) / centre_, b, c, length()); }
-
-  /// n sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use. With omega, one for each,
-  /// Chebyshev's x ← y + omega (that - y), where y holds the iterate before x, before and after.
-  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega = nullptr) const {
-    if (loops_.sweeps[Dim - 1](stencil(sweep_weights_), c, x, y, n, omega) != x) std::swap(x, y);
-  }
-  /// One of them, from x to y; returns ‖b - A x‖².
-  T jacobi_sweep(const T* c, const T* x, T* y, const T* omega = nullptr) const {
-    const T change2 = loops_.sweep_and_measure[Dim - 1](stencil(sweep_weights_), c, x, y, omega);
-    return centre_ * centre_ * change2;
-  }
-  /// The spectral radius of I - D⁻¹A.
-  double radius() const { return jacobi_radius(parameters_); }
-
- private:
   PaddedStencil<T> stencil(const std::vector<T>& weights) const {
-    return {ny_, nz_, row_, plane_, centre_, weights.data()};
+    return {layout().rows, layout().planes, layout().row, layout().plane, centre_, weights.data()};
+  }
+  /// A large sample in parts for several threads: values of the only row, rows of the only plane, or planes.
+  int64_t each() const {
+    if constexpr (Dim == 1) return kBlock;
+    return std::max<int64_t>(kBlock / (Dim == 2 ? layout().row : layout().plane), 1);
+  }
+  int64_t in_all() const { return Dim == 1 ? layout().row : Dim == 2 ? layout().rows : layout().planes; }
+  int64_t parts() const { return length() <= kBlock ? 1 : std::max<int64_t>(in_all() / each(), 1); }
+  /// Part p, and where it begins.
+  std::pair<PaddedStencil<T>, int64_t> part(int64_t p, const std::vector<T>& weights) const {
+    auto a = stencil(weights);
+    if (parts() == 1) return {a, 0};
+    const int64_t first = p * each(), count = p + 1 < parts() ? each() : in_all() - first;
+    if constexpr (Dim == 1) {
+      a.row = count;
+      a.weights += first;
+      return {a, first};
+    }
+    (Dim == 2 ? a.ny : a.nz) = count;
+    return {a, first * (Dim == 2 ? layout().row : layout().plane)};
   }
 
-  const Loops<T>& loops_ = kernels::loops<T>();
+  const Loops<T>& loops_ = loops<T>();
   LaplacianParameters parameters_;
-  int64_t nx_, ny_, nz_, row_, plane_;
   T centre_;
   double norm_;
   std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: x, y, z
 };
+
+template <class T, int Dim>
+std::optional<GridOperator<T>> Laplacian<T, Dim>::grid_operator() const {
+  RawStencil<T> a({Dim, {1, 1, 1}, {false, false, false}});
+  for (int d = 0; d < Dim; ++d) a.grid.shape[3 - Dim + d] = parameters_.shape[d];
+  const auto add = [&](const Offset& o, double value) {
+    std::fill_n(a.add(RawStencil<T>::place(o)), a.points(), static_cast<T>(value));
+  };
+  add({{0, 0, 0}}, parameters_.centre);
+  for (int d = 0; d < Dim; ++d)
+    for (const int64_t side : {-1, 1}) {
+      Offset o{{0, 0, 0}};
+      o.along[3 - Dim + d] = side;
+      add(o, parameters_.off[d]);
+    }
+  FactorKeyMaker key;
+  key.add(parameters_.dim).add(parameters_.shape.data(), 3).add(parameters_.centre).add(parameters_.off.data(), 3);
+  return GridOperator<T>{std::move(a), key.key(), false};
+}
+
+/// The same for all samples of a batch.
+template <class T>
+KernelBatch<T> laplacian(const LaplacianParameters& p) {
+  return {true, [p](int64_t) -> std::unique_ptr<Kernel<T>> {
+            switch (p.dim) {
+              case 1: return std::make_unique<Laplacian<T, 1>>(p);
+              case 2: return std::make_unique<Laplacian<T, 2>>(p);
+              default: return std::make_unique<Laplacian<T, 3>>(p);
+            }
+          }};
+}
 
 }  // namespace prdp::kernels

@@ -196,6 +196,43 @@ T* many_sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, con
   return x;
 }
 
+/// y = x + p (x - y) + q D⁻¹(b - A x)
+template <class T>
+struct Smoothing {
+  const T* b;
+  T* y;
+  T p, q, centre;
+
+  Register<T> start(int64_t, const Register<T>& x) const { return centre * x; }
+  void finish(int64_t i, int, const Register<T>& x, const Register<T>& ax) {
+    store<T>(y + i, x + p * (x - load(y + i)) + q * (load(b + i) - ax));
+  }
+};
+
+template <int Dim, class T>
+void smooth(const PaddedStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal) {
+  Smoothing<T> body{b, y, p, q * inverse_diagonal, a.centre};
+  for (int64_t z = 0; z < a.nz; ++z, x += a.plane, body.b += a.plane, body.y += a.plane)
+    go_through<Dim>(a, {x - a.plane, x, x + a.plane}, body);
+}
+
+/// r = b - A x
+template <class T>
+struct Residual {
+  const T* b;
+  T *y, centre;
+
+  Register<T> start(int64_t, const Register<T>& x) const { return centre * x; }
+  void finish(int64_t i, int, const Register<T>&, const Register<T>& ax) { store<T>(y + i, load(b + i) - ax); }
+};
+
+template <int Dim, class T>
+void residual(const PaddedStencil<T>& a, const T* b, const T* x, T* r) {
+  Residual<T> body{b, r, a.centre};
+  for (int64_t z = 0; z < a.nz; ++z, x += a.plane, body.b += a.plane, body.y += a.plane)
+    go_through<Dim>(a, {x - a.plane, x, x + a.plane}, body);
+}
+
 template <int Dim, class T>
 T* sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
   return omega ? many_sweeps<Dim, true>(a, c, x, y, n, omega) : many_sweeps<Dim, false>(a, c, x, y, n, omega);

@@ -2,6 +2,7 @@
 // internal linkage, and nothing of the standard library is instantiated: no code for one processor can
 // be linked in the place of another's.
 #include "prdp/kernels/laplacian_loops.h"
+#include "prdp/kernels/multigrid_loops.h"
 #include "prdp/kernels/stencil_loops.h"
 #include "prdp/kernels/vector_loops.h"
 
@@ -18,10 +19,9 @@ constexpr Loops<T> table(const char* level) {
           scale<T>,
           axpy<T>,
           xpby<T>,
+          xpby_with_square<T>,
           descend<T>,
-          weighted_descend<T>,
-          weighted_xpby<T>,
-          weighted_square<T>,
+          weigh<T>,
           multi_dot<T>,
           multi_axpy<T>,
           {apply<1, T>, apply<2, T>, apply<3, T>},
@@ -32,7 +32,18 @@ constexpr Loops<T> table(const char* level) {
           apply_offsets<T>,
           {sweep_neighbours<1, T>, sweep_neighbours<2, T>, sweep_neighbours<3, T>},
           sweep_offsets<T>,
-          apply_staggered<T>};
+          apply_staggered<T>,
+          {smooth_neighbours<1, T>, smooth_neighbours<2, T>, smooth_neighbours<3, T>},
+          smooth_offsets<T>,
+          {smooth<1, T>, smooth<2, T>, smooth<3, T>},
+          {residual_neighbours<1, T>, residual_neighbours<2, T>, residual_neighbours<3, T>},
+          residual_offsets<T>,
+          {residual<1, T>, residual<2, T>, residual<3, T>},
+          restrict_row<T>,
+          add_interpolated<T>,
+          split<T>,
+          add_merged<T>,
+          collapse<T>};
 }
 
 }  // namespace

@@ -62,6 +62,26 @@ struct StaggeredStencil {
   const T* weights;
 };
 
+/// The coefficients of a coarse operator at a row of coarse points, Galerkin's product with the fine one along one axis.
+/// "Before" and "after" are the fine points on either side of a coarse one, "here". Fine coefficients with one offset in
+/// the other axes: lower, centre and upper along this one, null where there is none but the centre. The weights by which
+/// a fine point is interpolated from the coarse points to its left and right belong to the column, those of the
+/// restriction to the row.
+template <class T>
+struct Collapse {
+  const T *lower_before, *lower_here, *lower_after;
+  const T *centre_before, *centre_here, *centre_after;
+  const T *upper_before, *upper_here, *upper_after;
+  const T *before_left, *before_right, *after_left, *after_right;
+  const T *restrict_before, *restrict_after;
+  T *left, *centre, *right;  // out
+};
+
+/// Rows of a field from `begin` to `end`, counted over all planes.
+struct Lines {
+  int64_t begin, end;
+};
+
 template <class T>
 struct Loops {
   const char* level;  // "baseline", "x86-64-v3", "x86-64-v4"
@@ -76,14 +96,13 @@ struct Loops {
   void (*scale)(T factor, const T* x, T* out, int64_t n);
   /// y += alpha x; any n.
   void (*axpy)(T alpha, const T* x, T* y, int64_t n);
-  /// y = x + beta y
+  /// y = x + beta y; and the same, returning ‖y‖².
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
+  T (*xpby_with_square)(const T* x, T beta, T* y, int64_t n);
   /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself.
   T (*descend)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
-  /// The same with Σ w_i r_i² besides; y = w∘x + beta y; and Σ w_i x_i². w∘x is entry by entry.
-  T (*weighted_descend)(T alpha, const T* p, const T* q, const T* w, T* x, T* r, int64_t n, T* weighted);
-  void (*weighted_xpby)(const T* w, const T* x, T beta, T* y, int64_t n);
-  T (*weighted_square)(const T* w, const T* x, int64_t n);
+  /// out = w∘x, entry by entry; returns x·out.
+  T (*weigh)(const T* w, const T* x, T* out, int64_t n);
   /// For `count` vectors, at least one: h_j = v_j·(factor·w); and w = factor·w + sign·Σ alpha_j v_j, which returns
   /// ‖w‖².
   void (*multi_dot)(const T* const* v, int64_t count, T factor, const T* w, T* h, int64_t n);
@@ -103,13 +122,34 @@ struct Loops {
   /// either side. Sets lower and upper, adds to centre; any n.
   void (*upwind_row)(T advection, T diffusion, const T* before, const T* here, const T* after, T* lower, T* upper,
                      T* centre, int64_t n);
-  /// By the number of dimensions less one. out = A v; dots += {v·out, ‖out‖²} unless it is null.
-  void (*apply_neighbours[3])(const NeighbourStencil<T>& a, const T* v, T* out, T* dots);
-  void (*apply_offsets)(const OffsetStencil<T>& a, const T* v, T* out, T* dots);
+  /// On the rows that `lines` names. By the number of dimensions less one: out = A v; dots += {v·out, ‖out‖²} unless
+  /// it is null.
+  void (*apply_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* v, T* out, T* dots);
+  void (*apply_offsets)(const OffsetStencil<T>& a, Lines lines, const T* v, T* out, T* dots);
   /// A Jacobi sweep y = x + c - D⁻¹A x; *squares += ‖D(y - x)‖² unless it is null.
-  void (*sweep_neighbours[3])(const NeighbourStencil<T>& a, const T* c, const T* x, T* y, T* squares);
-  void (*sweep_offsets)(const OffsetStencil<T>& a, const T* c, const T* x, T* y, T* squares);
-  void (*apply_staggered)(const StaggeredStencil<T>& a, const T* v, T* out);
+  void (*sweep_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* c, const T* x, T* y, T* squares);
+  void (*sweep_offsets)(const OffsetStencil<T>& a, Lines lines, const T* c, const T* x, T* y, T* squares);
+  void (*apply_staggered)(const StaggeredStencil<T>& a, Lines lines, const T* v, T* out);
+
+  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); y holds the iterate before x, before, and the one after it,
+  /// after. On Laplacians the same with 1/D for the last argument.
+  void (*smooth_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
+  void (*smooth_offsets)(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
+  void (*smooth[3])(const PaddedStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal);
+  /// r = b - A x
+  void (*residual_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* r);
+  void (*residual_offsets)(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* r);
+  void (*residual[3])(const PaddedStencil<T>& a, const T* b, const T* x, T* r);
+  /// out = middle + weight_before∘before + weight_after∘after; and out += the last two; any n.
+  void (*restrict_row)(const T* middle, const T* before, const T* weight_before, const T* after, const T* weight_after,
+                       T* out, int64_t n);
+  void (*add_interpolated)(const T* before, const T* weight_before, const T* after, const T* weight_after, T* out,
+                           int64_t n);
+  /// Every second value of a row of n, from its first and from its second one on; and row += the two.
+  void (*split)(const T* row, T* first, T* second, int64_t n);
+  void (*add_merged)(const T* first, const T* second, T* row, int64_t n);
+  /// For n coarse points, whose fine ones lie one or two values apart.
+  void (*collapse)(const Collapse<T>& c, int64_t step, int64_t n);
 };
 
 /// The loops for this processor; the environment variable PRDP_CPU_LEVEL asks for a lower level by its

@@ -1,183 +1,186 @@
 #pragma once
 #include <algorithm>
-#include <array>
+#include <cmath>
 #include <utility>
 #include <vector>
 
 #include "prdp/kernels/factor_cache.h"
-#include "prdp/kernels/vector.h"
+#include "prdp/kernels/kernel.h"
 
 namespace prdp::kernels {
 
-/// What the two kinds of matrices share: a vector is n values, padded at its end, and the Jacobi
-/// sweep follows from the product and the diagonal.
-template <class T, class Matrix>
-class MatrixBase {
+/// What the two kinds of matrices share: a vector is n values, padded at its end, and the Jacobi sweep follows from the
+/// product and the diagonal.
+template <class T>
+class MatrixKernel : public Kernel<T> {
  public:
-  using Scalar = T;
-
-  explicit MatrixBase(int64_t n) : n_(n) {}
-  int64_t unknowns() const { return n_; }
-  int64_t length() const { return round_up_to_lanes<T>(n_); }
-  int64_t halo() const { return 0; }
-  void load(const T* src, T scale, T* dst) const {
-    for (int64_t i = 0; i < n_; ++i) dst[i] = scale * src[i];
+  bool has_zero_diagonal() const final { return std::find(diagonal_.begin(), diagonal_.end(), T(0)) != diagonal_.end(); }
+  void divide_by_diagonal(const T* b, T* c) const final {
+    for (int64_t i = 0; i < n(); ++i) c[i] = b[i] / diagonal_[i];
   }
-  void store(const T* src, T scale, T* dst) const { load(src, scale, dst); }
-
-  bool has_zero_diagonal() const {
-    for (int64_t i = 0; i < n_; ++i)
-      if (self().diagonal(i) == T(0)) return true;
-    return false;
-  }
-  void divide_by_diagonal(const T* b, T* c) const {
-    for (int64_t i = 0; i < n_; ++i) c[i] = b[i] / self().diagonal(i);
-  }
-  /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use.
-  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n) const {
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T*) const final {
     for (; n > 0; --n, std::swap(x, y)) sweep<false>(c, x, y);
   }
-  /// One of them, from x to y; returns ‖b - A x‖².
-  T jacobi_sweep(const T* c, const T* x, T* y) const { return sweep<true>(c, x, y); }
+  T jacobi_sweep(const T* c, const T* x, T* y, const T*) const final { return sweep<true>(c, x, y); }
 
  protected:
-  int64_t n_;
+  MatrixKernel(int64_t n, T factor) : Kernel<T>(Layout<T>::of_fields(1, 1, n), factor), diagonal_(n, T(0)) {}
+  int64_t n() const { return static_cast<int64_t>(diagonal_.size()); }
+  /// Values of the matrix as the products need them: those given, or scaled in memory of this kernel.
+  const T* scaled(const T* values, int64_t count) {
+    if (Kernel<T>::factor() == T(1)) return values;
+    memory_.resize(static_cast<size_t>(count));
+    std::transform(values, values + count, memory_.begin(), [f = Kernel<T>::factor()](T a) { return f * a; });
+    return memory_.data();
+  }
+
+  /// Calls body(begin, end) for parts of the rows, which several threads may share; `work` is that of all.
+  template <class Body>
+  void for_each_part(int64_t work, const Body& body) const {
+    const int64_t each = std::max<int64_t>(kBlock * n() / std::max<int64_t>(work, 1), 1);
+    shared_rows::for_each((n() + each - 1) / each,
+                          [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
+  }
+
+  std::vector<T> diagonal_;
 
  private:
   template <bool Measure>
   T sweep(const T* c, const T* x, T* y) const {
-    self().apply(x, y);
+    this->apply(x, y);
     T residual = 0;
-    for (int64_t i = 0; i < n_; ++i) {
-      const T d = self().diagonal(i), change = c[i] - y[i] / d;
+    for (int64_t i = 0; i < n(); ++i) {
+      const T d = diagonal_[i], change = c[i] - y[i] / d;
       y[i] = x[i] + change;
       if constexpr (Measure) residual += d * change * d * change;
     }
     return residual;
   }
 
-  const Matrix& self() const { return static_cast<const Matrix&>(*this); }
+  std::vector<T> memory_;
 };
 
 /// A dense row-major matrix, or its transpose.
 template <class T>
-class Dense : public MatrixBase<T, Dense<T>> {
+class Dense final : public MatrixKernel<T> {
  public:
-  /// `sample_stride` is 0 for a matrix that all samples share.
-  Dense(const T* matrix, int64_t n, int64_t sample_stride, bool transposed)
-      : MatrixBase<T, Dense<T>>(n), a_(matrix), sample_stride_(sample_stride), transposed_(transposed) {}
-
-  Dense sample(int64_t s) const { return {a_ + s * sample_stride_, n_, 0, transposed_}; }
-  bool is_shared() const { return sample_stride_ == 0; }
-  T diagonal(int64_t i) const { return a_[i * n_ + i]; }
-  int64_t stored() const { return n_ * n_; }
-  T at(int64_t i, int64_t j) const { return transposed_ ? a_[j * n_ + i] : a_[i * n_ + j]; }
-  /// Of the largest entry; NaN or Inf if one is not finite.
-  T magnitude() const { return largest_magnitude(a_, n_ * n_); }
-  bool operator_is_finite() const { return std::isfinite(magnitude()); }
-  /// factor · this one, its entries in `memory`.
-  Dense scaled(T factor, std::vector<T>& memory) const {
-    memory.resize(static_cast<size_t>(n_ * n_));
-    std::transform(a_, a_ + n_ * n_, memory.begin(), [factor](T a) { return factor * a; });
-    return {memory.data(), n_, 0, transposed_};
+  /// `magnitude` is that of the largest entry.
+  Dense(const T* matrix, int64_t n, bool transposed, T magnitude)
+      : MatrixKernel<T>(n, scale_of_operator(magnitude)), a_(this->scaled(matrix, n * n)), transposed_(transposed) {
+    for (int64_t i = 0; i < n; ++i) this->diagonal_[i] = a_[i * n + i];
   }
 
-  void apply(const T* v, T* out) const {
-    if (!transposed_) {
-      for (int64_t i = 0; i < n_; ++i) out[i] = loops_.dot(a_ + i * n_, v, n_);
-      return;
-    }
-    std::fill(out, out + n_, T(0));
-    for (int64_t i = 0; i < n_; ++i) loops_.axpy(v[i], a_ + i * n_, out, n_);
+  int64_t work() const override { return n() * n() + n(); }
+  /// The matrix that is not transposed.
+  const T* values() const { return a_; }
+  bool transposed() const { return transposed_; }
+  void apply(const T* v, T* out) const override {
+    this->for_each_part(work(), [&](int64_t begin, int64_t end) {
+      if (!transposed_) {
+        for (int64_t i = begin; i < end; ++i) out[i] = loops_.dot(a_ + i * n(), v, n());
+        return;
+      }
+      std::fill(out + begin, out + end, T(0));
+      for (int64_t i = 0; i < n(); ++i) loops_.axpy(v[i], a_ + i * n() + begin, out + begin, end - begin);
+    });
   }
-  double norm() const {
+  double norm() const override {
     double largest = 0;
-    for (int64_t i = 0; i < n_; ++i) {
+    for (int64_t i = 0; i < n(); ++i) {
       double sum = 0;
-      for (int64_t j = 0; j < n_; ++j) sum += std::abs(a_[i * n_ + j]);
+      for (int64_t j = 0; j < n(); ++j) sum += std::abs(a_[i * n() + j]);
       largest = std::max(largest, sum);
     }
     return largest;
   }
+  std::shared_ptr<const Factors<T>> factorise() const override;
 
  private:
-  using MatrixBase<T, Dense<T>>::n_;
-  const Loops<T>& loops_ = kernels::loops<T>();
+  using MatrixKernel<T>::n;
+  const Loops<T>& loops_ = loops<T>();
   const T* a_;
-  int64_t sample_stride_;
   bool transposed_;
 };
 
-/// A matrix in compressed sparse rows, or its transpose.
+/// A matrix in compressed sparse rows, or its transpose, whose rows it makes.
 template <class T>
-class Csr : public MatrixBase<T, Csr<T>> {
+class Csr final : public MatrixKernel<T> {
  public:
-  Csr(const int64_t* crow, const int64_t* col, const T* values, int64_t n, int64_t stored, bool is_shared,
-      bool transposed)
-      : MatrixBase<T, Csr<T>>(n),
+  /// `magnitude` is that of the largest value.
+  Csr(const int64_t* crow, const int64_t* col, const T* values, int64_t n, bool transposed, T magnitude)
+      : MatrixKernel<T>(n, scale_of_operator(magnitude)),
+        given_crow_(crow),
+        given_col_(col),
+        given_values_(values),
+        transposed_(transposed),
         crow_(crow),
         col_(col),
-        values_(values),
-        stored_(stored),
-        is_shared_(is_shared),
-        transposed_(transposed) {
-    if (!is_shared) return;
-    diagonal_.assign(n, T(0));
-    for_each_entry([&](int64_t i, int64_t j, T a) { diagonal_[i] += i == j ? a : T(0); });
+        values_(this->scaled(values, crow[n])) {
+    if (transposed) transpose();
+    for_each_entry([&](int64_t i, int64_t j, T a) { this->diagonal_[i] += i == j ? a : T(0); });
   }
 
-  Csr sample(int64_t s) const {
-    if (is_shared_) return *this;
-    return {crow_ + s * (n_ + 1), col_ + s * stored_, values_ + s * stored_, n_, stored_, true, transposed_};
-  }
-  bool is_shared() const { return is_shared_; }
-  /// As Dense has them.
-  T magnitude() const { return largest_magnitude(values_, stored_); }
-  bool operator_is_finite() const { return std::isfinite(magnitude()); }
-  Csr scaled(T factor, std::vector<T>& memory) const {
-    memory.resize(static_cast<size_t>(stored_));
-    std::transform(values_, values_ + stored_, memory.begin(), [factor](T a) { return factor * a; });
-    return {crow_, col_, memory.data(), n_, stored_, true, transposed_};
-  }
-  T diagonal(int64_t i) const { return diagonal_[i]; }
-  void apply(const T* v, T* out) const {
-    std::fill(out, out + n_, T(0));
-    for_each_entry([&](int64_t i, int64_t j, T a) { out[i] += a * v[j]; });
+  int64_t stored() const { return crow_[n()]; }
+  int64_t work() const override { return stored() + n(); }
+  void apply(const T* v, T* out) const override {
+    this->for_each_part(work(), [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        T sum = 0;
+        for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) sum += values_[k] * v[col_[k]];
+        out[i] = sum;
+      }
+    });
   }
   /// Calls body(row, column, value) for every stored entry of the matrix as applied.
   template <class Body>
   void for_each_entry(const Body& body) const {
-    for (int64_t i = 0; i < n_; ++i)
-      for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k)
-        transposed_ ? body(col_[k], i, values_[k]) : body(i, col_[k], values_[k]);
+    for (int64_t i = 0; i < n(); ++i)
+      for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) body(i, col_[k], values_[k]);
   }
-  int64_t stored() const { return stored_; }
-  /// All that the matrix is, for the factor cache.
-  std::string key() const {
-    std::string key;
-    factor_cache::append(key, std::array{n_, stored_, int64_t{transposed_}}.data(), 3);
-    factor_cache::append(key, crow_, n_ + 1);
-    factor_cache::append(key, col_, stored_);
-    factor_cache::append(key, values_, stored_);
-    return key;
-  }
-  double norm() const {
+  double norm() const override {
     double largest = 0;
-    for (int64_t i = 0; i < n_; ++i) {
+    for (int64_t i = 0; i < n(); ++i) {
       double sum = 0;
       for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) sum += std::abs(values_[k]);
       largest = std::max(largest, sum);
     }
     return largest;
   }
+  std::shared_ptr<const Factors<T>> factorise() const override;
+
+  /// Tells the matrix from others, the same for its transpose.
+  FactorKey key() const {
+    FactorKeyMaker key;
+    return key.add(n()).add(given_crow_, n() + 1).add(given_col_, stored()).add(given_values_, stored()).key();
+  }
+  bool transposed() const { return transposed_; }
 
  private:
-  using MatrixBase<T, Csr<T>>::n_;
+  using MatrixKernel<T>::n;
+
+  void transpose() {
+    own_crow_.assign(n() + 1, 0);
+    own_col_.resize(stored());
+    own_values_.resize(stored());
+    for (int64_t k = 0; k < stored(); ++k) ++own_crow_[col_[k] + 1];
+    for (int64_t i = 0; i < n(); ++i) own_crow_[i + 1] += own_crow_[i];
+    auto next = own_crow_;
+    for_each_entry([&](int64_t i, int64_t j, T a) {
+      own_col_[next[j]] = i;
+      own_values_[next[j]++] = a;
+    });
+    crow_ = own_crow_.data();
+    col_ = own_col_.data();
+    values_ = own_values_.data();
+  }
+
+  const int64_t *given_crow_, *given_col_;
+  const T* given_values_;
+  bool transposed_;
   const int64_t *crow_, *col_;
   const T* values_;
-  int64_t stored_;
-  bool is_shared_, transposed_;
-  std::vector<T> diagonal_;  // empty until sample() has picked one matrix
+  std::vector<int64_t> own_crow_, own_col_;
+  std::vector<T> own_values_;
 };
 
 }  // namespace prdp::kernels

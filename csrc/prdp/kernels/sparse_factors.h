@@ -1,63 +1,70 @@
 #pragma once
 #include <Eigen/Sparse>
-#include <Eigen/SparseCholesky>
-#include <Eigen/SparseLU>
-#include <algorithm>
+#include <memory>
 #include <optional>
 #include <vector>
 
+#include "prdp/kernels/factor_cache.h"
+#include "prdp/kernels/null_space.h"
+
 namespace prdp::kernels {
 
-/// Factors of a sparse matrix by Eigen: Cholesky's if the matrix is symmetric and definite of either sign, which takes
-/// a quarter of the time, otherwise LU with pivoting. Once they are made, any thread may solve with them.
+/// Unknowns that are held at zero, and equations that are left out, so that what is left of a matrix with known null
+/// spaces is regular: as many of each as there are null vectors.
+struct Pins {
+  std::vector<int64_t> unknowns, equations;
+};
+/// Indices at which the vectors are far from linearly dependent.
+std::vector<int64_t> pivots(std::vector<std::vector<double>> vectors);
+
+/// Of a matrix in which the field with the null space begins at `first_entry`; none without a null space.
 template <class T>
+Pins pins_of(const std::optional<NullSpace<T>>& right, const std::optional<NullSpace<T>>& left, int64_t first_entry) {
+  if (!right) return {};
+  Pins pins{pivots(right->contiguous()), pivots(left->contiguous())};
+  for (auto& i : pins.unknowns) i += first_entry;
+  for (auto& i : pins.equations) i += first_entry;
+  return pins;
+}
+
+/// Factors of a sparse matrix in double by Eigen: Cholesky's if the matrix is symmetric and definite of either sign,
+/// which takes a quarter of the time, otherwise LU with pivoting. Any thread may solve with them.
 class SparseFactors {
  public:
-  using Vector = Eigen::Matrix<T, Eigen::Dynamic, 1>;
+  using Matrix = Eigen::SparseMatrix<double>;
+  using Triplets = std::vector<Eigen::Triplet<double>>;
 
-  /// Of the first n rows and columns of the kernel's matrix.
-  template <class Kernel>
-  SparseFactors(const Kernel& kernel, int64_t n) {
-    std::vector<Eigen::Triplet<T>> entries;
-    kernel.for_each_entry([&](int64_t i, int64_t j, auto value) {
-      if (i < n && j < n) entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<T>(value));
-    });
-    Matrix m(n, n);
-    m.setFromTriplets(entries.begin(), entries.end());
-    if (is_symmetric(m)) {
-      if (m.coeff(0, 0) < T(0)) sign_ = T(-1);
-      cholesky_.emplace(Matrix(sign_ * m));
-      if (cholesky_->info() == Eigen::Success) return;
-      cholesky_.reset();
-    }
-    lu_.emplace(m);
-  }
-  bool is_regular() const { return cholesky_ || lu_->info() == Eigen::Success; }
-  template <class Rhs>
-  Vector solve(const Rhs& rhs) const {
-    if (cholesky_) return sign_ * cholesky_->solve(rhs);
-    return lu_->solve(rhs);
-  }
-  int64_t bytes() const {
-    const int64_t stored = cholesky_      ? cholesky_->matrixL().nestedExpression().nonZeros()
-                           : is_regular() ? int64_t{lu_->nnzL()} + lu_->nnzU()
-                                          : 0;
-    return stored * static_cast<int64_t>(sizeof(T) + sizeof(int));
-  }
+  SparseFactors(const Triplets& entries, int64_t n, const Pins& pins);
+  ~SparseFactors();
+  /// Whether all pivots are larger than the rounding errors of computing them.
+  bool is_regular() const;
+  /// x ← A⁻¹ x, or A⁻ᵀ x.
+  void solve(Eigen::VectorXd& x, bool transposed) const;
+  int64_t bytes() const;
 
  private:
-  using Matrix = Eigen::SparseMatrix<T>;
-
-  static bool is_symmetric(const Matrix& m) {
-    const Matrix t = m.transpose();
-    return std::equal(m.outerIndexPtr(), m.outerIndexPtr() + m.outerSize() + 1, t.outerIndexPtr()) &&
-           std::equal(m.innerIndexPtr(), m.innerIndexPtr() + m.nonZeros(), t.innerIndexPtr()) &&
-           std::equal(m.valuePtr(), m.valuePtr() + m.nonZeros(), t.valuePtr());
-  }
-
-  T sign_ = 1;
-  std::optional<Eigen::SimplicialLLT<Matrix>> cholesky_;
-  std::optional<Eigen::SparseLU<Matrix>> lu_;
+  struct Factorised;
+  Eigen::VectorXi kept_unknowns_, kept_equations_;
+  std::shared_ptr<const Factorised> factorised_;
 };
+
+/// Those of a kernel, from the cache or made: kernel.for_each_entry(body), key() and transposed() tell the matrix. The
+/// factors are those of the matrix that is not transposed.
+template <class Kernel>
+std::shared_ptr<const SparseFactors> sparse_factors(const Kernel& kernel, const FactorKey& matrix, bool transposed,
+                                                    int64_t n, Pins pins) {
+  if (transposed) std::swap(pins.unknowns, pins.equations);
+  FactorKeyMaker key;
+  key.add(matrix).add(pins.unknowns.data(), std::ssize(pins.unknowns));
+  key.add(pins.equations.data(), std::ssize(pins.equations));
+  return factor_cache::find_or_make<SparseFactors>(key.key(), [&] {
+    SparseFactors::Triplets entries;
+    kernel.for_each_entry([&](int64_t i, int64_t j, auto value) {
+      if (transposed) std::swap(i, j);
+      entries.emplace_back(static_cast<int>(i), static_cast<int>(j), static_cast<double>(value));
+    });
+    return std::make_shared<SparseFactors>(entries, n, pins);
+  });
+}
 
 }  // namespace prdp::kernels

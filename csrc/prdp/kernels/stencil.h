@@ -1,86 +1,114 @@
 #pragma once
 #include <functional>
-#include <limits>
-#include <optional>
+#include <utility>
 
-#include "prdp/kernels/field_rows.h"
+#include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_rows.h"
 
 namespace prdp::kernels {
 
-/// One stencil with its own coefficients at every point, on each channel of a sample. It has coefficients itself if all
-/// samples share them; otherwise only sample(s) has them.
+/// One stencil with its own coefficients at every point, on each channel of a sample.
 template <class T>
-class Stencil : public FieldRows<T> {
+class Stencil final : public Kernel<T> {
+  using Base = Kernel<T>;
+
  public:
-  /// The coefficients of a sample; none where they, or what they are made of, are not finite.
-  using Assemble = std::function<std::optional<StencilRows<T>>(int64_t sample)>;
+  using Base::layout;
 
-  Stencil(const StencilGrid& grid, int64_t channels, bool is_shared, Assemble assemble)
-      : FieldRows<T>(channels, grid.shape[0] * grid.shape[1], grid.shape[2]),
-        grid_(grid),
-        is_shared_(is_shared),
-        assemble_(std::move(assemble)) {
-    if (is_shared) coefficients_ = assemble_(0);
-  }
-  Stencil sample(int64_t s) const {
-    return {grid_, this->fields_, true, [this, s](int64_t) { return assemble_(s); }};
-  }
-  bool is_shared() const { return is_shared_; }
-  bool operator_is_finite() const { return !is_shared_ || coefficients_.has_value(); }
-  double norm() const { return coefficients_ ? coefficients_->norm() : std::numeric_limits<double>::quiet_NaN(); }
-  int64_t channels() const { return this->fields_; }
+  /// What the rows were made of; `transposed` says which way round.
+  struct Source {
+    std::function<FactorKey()> key;                    // of the matrix that is not transposed
+    std::function<std::optional<RawStencil<T>>()> raw;  // its coefficients; nothing if neighbours lie far away
+    bool transposed = false;
+  };
+
+  Stencil(std::shared_ptr<const StencilRows<T>> rows, int64_t channels, T factor, Source source = {})
+      : Base(Layout<T>::of_fields(channels, rows->rows(), rows->grid().shape[2]), factor),
+        rows_(std::move(rows)),
+        coefficients_(*rows_),
+        source_(std::move(source)) {}
+
+  int64_t channels() const { return layout().planes; }
   /// Of one channel.
-  const StencilRows<T>& coefficients() const { return *coefficients_; }
+  const StencilRows<T>& coefficients() const { return coefficients_; }
+  double norm() const override { return coefficients_.norm(); }
 
-  /// out = A v
-  void apply(const T* v, T* out) const { apply_to_channels(v, out, nullptr); }
-  /// The same; returns v·out and ‖out‖².
-  std::array<T, 2> apply_with_dots(const T* v, T* out) const {
-    std::array<T, 2> dots{};
-    apply_to_channels(v, out, dots.data());
-    return dots;
+  void apply(const T* v, T* out) const override {
+    shared_rows::for_each(parts(), [&](int64_t p) {
+      const auto [lines, at] = part(p);
+      coefficients_.apply(lines, v + at, out + at, nullptr);
+    });
+  }
+  std::array<T, 2> apply_with_dots(const T* v, T* out) const override {
+    return sums_over<T, 2>(parts(), [&](int64_t p, T* dots) {
+      const auto [lines, at] = part(p);
+      coefficients_.apply(lines, v + at, out + at, dots);
+    });
   }
 
-  bool has_zero_diagonal() const {
-    for (int64_t r = 0; r < this->rows_; ++r) {
-      const T* d = diagonal(r);
-      if (std::find(d, d + this->nx_, T(0)) != d + this->nx_) return true;
+  bool has_zero_diagonal() const override {
+    for (int64_t r = 0; r < layout().rows; ++r) {
+      const T* d = coefficients_.coefficient(r, 0);
+      if (std::find(d, d + layout().nx, T(0)) != d + layout().nx) return true;
     }
     return false;
   }
-  /// c = D⁻¹ b
-  void divide_by_diagonal(const T* b, T* c) const {
-    for (int64_t r = 0; r < this->fields_ * this->rows_; ++r) {
-      const T* d = diagonal(r % this->rows_);
-      for (int64_t i = 0; i < this->row_; ++i) c[r * this->row_ + i] = b[r * this->row_ + i] / d[i];
-    }
+  void divide_by_diagonal(const T* b, T* c) const override {
+    const int64_t row = layout().row;
+    shared_rows::for_each(parts(), [&](int64_t p) {
+      const auto [lines, at] = part(p);
+      for (int64_t r = lines.begin; r < lines.end; ++r) {
+        const T* d = coefficients_.coefficient(r, 0);
+        for (int64_t i = 0; i < row; ++i) c[at + r * row + i] = b[at + r * row + i] / d[i];
+      }
+    });
   }
-  /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use.
-  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n) const {
-    for (; n > 0; --n, std::swap(x, y)) sweep_channels(c, x, y, nullptr);
+  void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T*) const override {
+    for (; n > 0; --n, std::swap(x, y))
+      shared_rows::for_each(parts(), [&](int64_t p) {
+        const auto [lines, at] = part(p);
+        coefficients_.sweep(lines, c + at, x + at, y + at, nullptr);
+      });
   }
-  /// One of them, from x to y; returns ‖b - A x‖².
-  T jacobi_sweep(const T* c, const T* x, T* y) const {
-    T squares = 0;
-    sweep_channels(c, x, y, &squares);
-    return squares;
+  T jacobi_sweep(const T* c, const T* x, T* y, const T*) const override {
+    return sums_over<T, 1>(parts(), [&](int64_t p, T* squares) {
+      const auto [lines, at] = part(p);
+      coefficients_.sweep(lines, c + at, x + at, y + at, squares);
+    })[0];
+  }
+  void smooth(const T* b, const T* x, T* y, T p, T q) const override {
+    shared_rows::for_each(parts(), [&](int64_t i) {
+      const auto [lines, at] = part(i);
+      coefficients_.smooth(lines, b + at, x + at, y + at, p, q);
+    });
+  }
+  void residual(const T* b, const T* x, T* r) const override {
+    shared_rows::for_each(parts(), [&](int64_t i) {
+      const auto [lines, at] = part(i);
+      coefficients_.residual(lines, b + at, x + at, r + at);
+    });
+  }
+  std::shared_ptr<const Factors<T>> factorise() const override;
+  std::optional<GridOperator<T>> grid_operator() const override {
+    auto raw = source_.raw ? source_.raw() : std::nullopt;
+    if (!raw) return std::nullopt;
+    return GridOperator<T>{std::move(*raw), source_.key(), source_.transposed};
   }
 
  private:
-  const T* diagonal(int64_t r) const { return coefficients_->coefficient(r, 0); }
-  void apply_to_channels(const T* v, T* out, T* dots) const {
-    for (int64_t at = 0; at < this->length(); at += this->field()) coefficients_->apply(v + at, out + at, dots);
-  }
-  void sweep_channels(const T* c, const T* x, T* y, T* squares) const {
-    for (int64_t at = 0; at < this->length(); at += this->field())
-      coefficients_->sweep(c + at, x + at, y + at, squares);
+  /// A sample in parts: blocks of rows, of one channel each.
+  int64_t rows_each() const { return std::max<int64_t>(kBlock / layout().row, 1); }
+  int64_t of_channel() const { return (layout().rows + rows_each() - 1) / rows_each(); }
+  int64_t parts() const { return channels() * of_channel(); }
+  /// The rows of part p, and where its channel begins.
+  std::pair<Lines, int64_t> part(int64_t p) const {
+    const int64_t first = p % of_channel() * rows_each();
+    return {{first, std::min(first + rows_each(), layout().rows)}, p / of_channel() * layout().plane};
   }
 
-  StencilGrid grid_;
-  bool is_shared_;
-  Assemble assemble_;
-  std::optional<StencilRows<T>> coefficients_;
+  std::shared_ptr<const StencilRows<T>> rows_;
+  const StencilRows<T>& coefficients_;
+  Source source_;
 };
 
 }  // namespace prdp::kernels

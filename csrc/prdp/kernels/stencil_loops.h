@@ -85,54 +85,56 @@ struct NeighbourRow {
   }
 };
 
-/// Calls body.finish(i, v, A v, diagonal) for every register i of a field v. What it takes of `out` is
-/// whatever body keeps there.
+/// Calls body.finish(i, v, A v, diagonal) for every register i of a field v.
 template <int Dim, class T, class Body>
-void for_each_register(const NeighbourStencil<T>& a, const T* v, T*, Body& shared) {
+void for_each_register(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& shared) {
   Body body = shared;  // a copy, which no store can change for all the compiler knows
-  int64_t at = 0;
-  for (int64_t z = 0; z < a.nz; ++z)
-    for (int64_t j = 0; j < a.ny; ++j, at += a.row) {
-      NeighbourRow<Dim, T> u(a, z, j, v);
-      for (int64_t i = 0; i < a.row; i += kWidth<T>) {
-        const Register<T> sum = u.product(i);
-        body.finish(at + i, u.line.here, u.with_ends(i, sum), u.w + i);
-      }
+  for (int64_t line = lines.begin; line < lines.end; ++line) {
+    NeighbourRow<Dim, T> u(a, line / a.ny, line % a.ny, v);
+    for (int64_t i = 0, at = line * a.row; i < a.row; i += kWidth<T>) {
+      const Register<T> sum = u.product(i);
+      body.finish(at + i, u.line.here, u.with_ends(i, sum), u.w + i);
     }
+  }
   shared = body;
 }
 
-/// The same, with A v in `out` on the way.
 template <class T, class Body>
-void for_each_register(const OffsetStencil<T>& a, const T* v, T* out, Body& shared) {
+void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body& shared) {
+  constexpr int most = 4;  // sums at once, as each waits for its last addition
   Body body = shared;
   const T* from[kMostOffsets];
-  const T *w = a.coefficients, *wrap_values = a.wrap_values;
-  int64_t at = 0;
-  for (int64_t z = 0; z < a.nz; ++z)
-    for (int64_t j = 0; j < a.ny; ++j, at += a.row, w += a.count * a.row, wrap_values += a.wrap_count) {
-      for (int64_t k = 0; k < a.count; ++k) {
-        const auto& o = a.offsets[k].along;
-        const int64_t plane = round(z + o[0], a.nz), line = round(j + o[1], a.ny);
-        from[k] = v + (plane * a.ny + line) * a.row + o[2];
-      }
-      T* const row = out + at;
-      // Several sums at once, as each waits for its last addition.
-      for_each_block<4>(0, a.row / kWidth<T>, [&](int64_t first, auto size) {
-        Register<T> sums[size.value] = {};
-        for (int64_t k = 0; k < a.count; ++k)
-          for (int c = 0; c < size.value; ++c) {
-            const int64_t i = (first + c) * kWidth<T>;
-            sums[c] += load(w + k * a.row + i) * load(from[k] + i);
-          }
-        for (int c = 0; c < size.value; ++c) store(row + (first + c) * kWidth<T>, sums[c]);
-      });
-      for (int64_t e = 0; e < a.wrap_count; ++e) {
-        const auto& wrap = a.wraps[e];
-        row[wrap.to] += wrap_values[e] * from[wrap.coefficient][wrap.from];
-      }
-      for (int64_t i = 0; i < a.row; i += kWidth<T>) body.finish(at + i, load(v + at + i), load(row + i), w + i);
+  for (int64_t line = lines.begin; line < lines.end; ++line) {
+    const int64_t at = line * a.row;
+    const T *const w = a.coefficients + line * a.count * a.row, *const wrap_values = a.wrap_values + line * a.wrap_count;
+    for (int64_t k = 0; k < a.count; ++k) {
+      const auto& o = a.offsets[k].along;
+      from[k] = v + (round(line / a.ny + o[0], a.nz) * a.ny + round(line % a.ny + o[1], a.ny)) * a.row + o[2];
     }
+    for_each_block<most>(0, a.row / kWidth<T>, [&](int64_t first, auto size) {
+      const int64_t begin = first * kWidth<T>, end = begin + size.value * kWidth<T>;
+      Register<T> sums[size.value] = {};
+      for (int64_t k = 0; k < a.count; ++k)
+        for (int c = 0; c < size.value; ++c) {
+          const int64_t i = begin + c * kWidth<T>;
+          sums[c] += load(w + k * a.row + i) * load(from[k] + i);
+        }
+      if (a.wrap_count > 0 && (begin < 2 || end > a.nx - 2)) {  // what leaves the row comes to its first or last two
+        T values[size.value * kWidth<T>];
+        for (int c = 0; c < size.value; ++c) store(values + c * kWidth<T>, sums[c]);
+        for (int64_t e = 0; e < a.wrap_count; ++e) {
+          const auto& wrap = a.wraps[e];
+          if (wrap.to < begin || wrap.to >= end) continue;
+          values[wrap.to - begin] += wrap_values[e] * from[wrap.coefficient][wrap.from];
+        }
+        for (int c = 0; c < size.value; ++c) sums[c] = load(values + c * kWidth<T>);
+      }
+      for (int c = 0; c < size.value; ++c) {
+        const int64_t i = begin + c * kWidth<T>;
+        body.finish(at + i, load(v + at + i), sums[c], w + i);
+      }
+    });
+  }
   shared = body;
 }
 
@@ -166,6 +168,28 @@ struct StencilSweep {
   }
 };
 
+/// y = x + p (x - y) + q D⁻¹(b - A x)
+template <class T>
+struct StencilSmoothing {
+  const T* b;
+  T* y;
+  T p, q;
+
+  void finish(int64_t i, const Register<T>& x, const Register<T>& ax, const T* diagonal) {
+    const Register<T> before = load(y + i);
+    store<T>(y + i, x + p * (x - before) + q * (load(b + i) - ax) / load(diagonal));
+  }
+};
+
+/// r = b - A x
+template <class T>
+struct StencilResidual {
+  const T* b;
+  T* r;
+
+  void finish(int64_t i, const Register<T>&, const Register<T>& ax, const T*) { store<T>(r + i, load(b + i) - ax); }
+};
+
 template <class Traversal, class T>
 void stencil_product(const Traversal& for_each, T* out, T* dots) {
   if (!dots) {
@@ -189,29 +213,52 @@ void stencil_sweep(const Traversal& for_each, const T* c, T* y, T* squares) {
 }
 
 template <int Dim, class T>
-void apply_neighbours(const NeighbourStencil<T>& a, const T* v, T* out, T* dots) {
-  stencil_product([&](auto& body) { for_each_register<Dim>(a, v, out, body); }, out, dots);
+void apply_neighbours(const NeighbourStencil<T>& a, Lines lines, const T* v, T* out, T* dots) {
+  stencil_product([&](auto& body) { for_each_register<Dim>(a, lines, v, body); }, out, dots);
 }
 template <class T>
-void apply_offsets(const OffsetStencil<T>& a, const T* v, T* out, T* dots) {
-  stencil_product([&](auto& body) { for_each_register(a, v, out, body); }, out, dots);
+void apply_offsets(const OffsetStencil<T>& a, Lines lines, const T* v, T* out, T* dots) {
+  stencil_product([&](auto& body) { for_each_register(a, lines, v, body); }, out, dots);
 }
 template <int Dim, class T>
-void sweep_neighbours(const NeighbourStencil<T>& a, const T* c, const T* x, T* y, T* squares) {
-  stencil_sweep([&](auto& body) { for_each_register<Dim>(a, x, y, body); }, c, y, squares);
+void sweep_neighbours(const NeighbourStencil<T>& a, Lines lines, const T* c, const T* x, T* y, T* squares) {
+  stencil_sweep([&](auto& body) { for_each_register<Dim>(a, lines, x, body); }, c, y, squares);
 }
 template <class T>
-void sweep_offsets(const OffsetStencil<T>& a, const T* c, const T* x, T* y, T* squares) {
-  stencil_sweep([&](auto& body) { for_each_register(a, x, y, body); }, c, y, squares);
+void sweep_offsets(const OffsetStencil<T>& a, Lines lines, const T* c, const T* x, T* y, T* squares) {
+  stencil_sweep([&](auto& body) { for_each_register(a, lines, x, body); }, c, y, squares);
+}
+
+template <int Dim, class T>
+void smooth_neighbours(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q) {
+  StencilSmoothing<T> body{b, y, p, q};
+  for_each_register<Dim>(a, lines, x, body);
+}
+template <class T>
+void smooth_offsets(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q) {
+  StencilSmoothing<T> body{b, y, p, q};
+  for_each_register(a, lines, x, body);
+}
+
+template <int Dim, class T>
+void residual_neighbours(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* r) {
+  StencilResidual<T> body{b, r};
+  for_each_register<Dim>(a, lines, x, body);
+}
+template <class T>
+void residual_offsets(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* r) {
+  StencilResidual<T> body{b, r};
+  for_each_register(a, lines, x, body);
 }
 
 template <class T>
-void apply_staggered(const StaggeredStencil<T>& a, const T* v, T* out) {
+void apply_staggered(const StaggeredStencil<T>& a, Lines lines, const T* v, T* out) {
   const auto& grid = a.velocity[0];
   const int64_t row = grid.row, field = grid.ny * row, last = grid.nx - 1;
   const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
+  out += lines.begin * row;
   T *out1 = out, *out2 = out + field, *divergence = out + 2 * field;
-  for (int64_t j = 0; j < grid.ny; ++j, out1 += row, out2 += row, divergence += row) {
+  for (int64_t j = lines.begin; j < lines.end; ++j, out1 += row, out2 += row, divergence += row) {
     NeighbourRow<2, T> u1(a.velocity[0], 0, j, v), u2(a.velocity[1], 0, j, v + field);
     Line<T> p(v + 2 * field + j * row);
     const T* p_below = v + 2 * field + round(j - 1, grid.ny) * row;

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <memory>
 
-#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/stencil_pattern.h"
 #include "prdp/kernels/vector.h"
 
@@ -60,17 +59,28 @@ class StencilRows {
     }
   }
 
-  /// out = A v; dots += {v·out, ‖out‖²} unless it is null.
-  void apply(const T* v, T* out, T* dots) const {
+  /// On these rows: out = A v; dots += {v·out, ‖out‖²} unless it is null.
+  void apply(Lines lines, const T* v, T* out, T* dots) const {
     const auto& loops = kernels::loops<T>();
-    if (pattern_->nearest) loops.apply_neighbours[grid().dim - 1](neighbours(), v, out, dots);
-    else loops.apply_offsets(offsets(), v, out, dots);
+    if (pattern_->nearest) loops.apply_neighbours[grid().dim - 1](neighbours(), lines, v, out, dots);
+    else loops.apply_offsets(offsets(), lines, v, out, dots);
   }
   /// A Jacobi sweep y = x + c - D⁻¹A x; *squares += ‖D(y - x)‖² unless it is null.
-  void sweep(const T* c, const T* x, T* y, T* squares) const {
+  void sweep(Lines lines, const T* c, const T* x, T* y, T* squares) const {
     const auto& loops = kernels::loops<T>();
-    if (pattern_->nearest) loops.sweep_neighbours[grid().dim - 1](neighbours(), c, x, y, squares);
-    else loops.sweep_offsets(offsets(), c, x, y, squares);
+    if (pattern_->nearest) loops.sweep_neighbours[grid().dim - 1](neighbours(), lines, c, x, y, squares);
+    else loops.sweep_offsets(offsets(), lines, c, x, y, squares);
+  }
+  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); and r = b - A x.
+  void smooth(Lines lines, const T* b, const T* x, T* y, T p, T q) const {
+    const auto& loops = kernels::loops<T>();
+    if (pattern_->nearest) loops.smooth_neighbours[grid().dim - 1](neighbours(), lines, b, x, y, p, q);
+    else loops.smooth_offsets(offsets(), lines, b, x, y, p, q);
+  }
+  void residual(Lines lines, const T* b, const T* x, T* r) const {
+    const auto& loops = kernels::loops<T>();
+    if (pattern_->nearest) loops.residual_neighbours[grid().dim - 1](neighbours(), lines, b, x, r);
+    else loops.residual_offsets(offsets(), lines, b, x, r);
   }
   /// The same for the loops of operators that hold several stencils of nearest neighbours.
   NeighbourStencil<T> neighbours() const {
@@ -78,20 +88,7 @@ class StencilRows {
     return {n[0], n[1], nx_, row_, coefficients_, coupled_ ? coupled(0) : nullptr};
   }
 
-  /// All that the matrix is, for the factor cache.
-  std::string key() const {
-    const auto& g = grid();
-    std::string key;
-    factor_cache::append(key,
-                         std::array{g.shape[0], g.shape[1], g.shape[2], int64_t{g.periodic[0]}, int64_t{g.periodic[1]},
-                                    int64_t{g.periodic[2]}, count_}
-                             .data(),
-                         7);
-    factor_cache::append(key, pattern_->offsets.data(), count_);
-    factor_cache::append(key, coefficients_, rows() * (stride() + coupled_));
-    return key;
-  }
-
+  int64_t bytes() const { return static_cast<int64_t>(memory_.size() * sizeof(T)); }
   /// max_i Σ_j |A_ij|
   double norm() const {
     std::vector<T> sums(nx_);
@@ -110,6 +107,19 @@ class StencilRows {
       largest = std::max(largest, largest_magnitude(sums.data(), nx_));
     }
     return static_cast<double>(largest);
+  }
+  /// Calls body(row of the grid, coefficient, point of the row, value) for all coefficients, those that leave a periodic
+  /// row along x included.
+  template <class Body>
+  void for_each_coefficient(const Body& body) const {
+    for (int64_t r = 0; r < rows(); ++r)
+      for (int64_t k = 0; k < count_; ++k) {
+        const int64_t x = pattern_->offsets[k].along[2];
+        for (int64_t i = 0; i < nx_; ++i) {
+          const bool leaves = i + x < 0 || i + x >= nx_;
+          body(r, k, i, leaves && grid().periodic[2] ? wrapped(r, k, i) : coefficient(r, k)[i]);
+        }
+      }
   }
   /// Calls body(row, column, value) for the entries of the matrix; where nearest neighbours coincide they
   /// come one by one.

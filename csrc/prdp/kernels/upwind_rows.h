@@ -1,30 +1,34 @@
 #pragma once
 #include <algorithm>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/stencil_rows.h"
 
 namespace prdp::kernels {
 
-/// An operator that depends on a velocity field, as plain arrays: the winds (batch, channel, ny, nx) on
-/// a periodic grid; ny = 1 in one dimension.
+/// An operator that depends on a velocity field, as plain arrays: the winds (channel, ny, nx) of one sample on a
+/// periodic grid; ny = 1 in one dimension.
 template <class T>
 struct UpwindParameters {
   const T* winds;
-  int64_t sample_stride;  // 0: all samples share them
   int64_t ny, nx;
   double nu, dt;
   bool transposed;
   double length_y = 1.0, length_x = 1.0;  // of the domain
 
-  bool is_shared() const { return sample_stride == 0; }
-  UpwindParameters sample(int64_t s) const {
-    UpwindParameters p = *this;
-    p.winds += s * sample_stride;
-    p.sample_stride = 0;
-    return p;
+  /// NaN or Inf where a wind is: max(w, 0) would lose it.
+  T largest_wind(int64_t channels) const { return largest_magnitude(winds, channels * ny * nx); }
+  /// A bound of the entries of shift·I + advection·Γ - diffusion·L, up to a factor of some ten.
+  double magnitude(int64_t dim, double shift, double advection, double diffusion) const {
+    const double x = static_cast<double>(nx) / length_x, y = dim > 1 ? static_cast<double>(ny) / length_y : 0.0;
+    const auto wind = static_cast<double>(largest_wind(dim));
+    return std::max({shift, advection * wind * std::max(x, y), diffusion * std::max(x * x, y * y)});
   }
-  /// max(w, 0) loses a NaN: it must be seen here.
-  bool is_finite(int64_t channels) const { return std::isfinite(largest_magnitude(winds, channels * ny * nx)); }
+  /// Tells the operator from others of its kind, the same for its transpose.
+  FactorKey key(int64_t channels) const {
+    FactorKeyMaker key;
+    return key.add(ny).add(nx).add(nu).add(dt).add(length_y).add(length_x).add(winds, channels * ny * nx).key();
+  }
   std::shared_ptr<const StencilPattern> pattern(int64_t dim) const {
     return std::make_shared<StencilPattern>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
                                             StencilPattern::nearest_neighbours(dim));

@@ -54,6 +54,18 @@ T dot(const T* a, const T* b, int64_t n) {
   return sum;
 }
 
+/// Calls body(i, k) for each register i of n values, k being 0 and 1 in turn: for two sums at once, as an addition waits
+/// for the one before it.
+template <class T, class Body>
+void for_each_in_turn(int64_t n, const Body& body) {
+  int64_t i = 0;
+  for (; i + 2 * kWidth<T> <= n; i += 2 * kWidth<T>) {
+    body(i, 0);
+    body(i + kWidth<T>, 1);
+  }
+  if (i < n) body(i, 0);
+}
+
 /// w = factor·w + sign·Σ alpha_j v_j over the first Count vectors of v; returns ‖w‖².
 template <int Count, class T>
 T axpy_block(T sign, const T* alpha, const T* const* v, T factor, T* w, int64_t n) {
@@ -67,12 +79,7 @@ T axpy_block(T sign, const T* alpha, const T* const* v, T factor, T* w, int64_t 
     store(w + i, wi);
     squares[k] += wi * wi;
   };
-  int64_t i = 0;
-  for (; i + 2 * kWidth<T> <= n; i += 2 * kWidth<T>) {
-    add(i, 0);
-    add(i + kWidth<T>, 1);
-  }
-  if (i < n) add(i, 0);
+  for_each_in_turn<T>(n, add);
   return sum_lanes<T>(squares[0] + squares[1]);
 }
 
@@ -101,46 +108,36 @@ void scale(T factor, const T* x, T* out, int64_t n) {
 }
 
 template <class T>
+T xpby_with_square(const T* x, T beta, T* y, int64_t n) {
+  Register<T> squares[2] = {};
+  for_each_in_turn<T>(n, [&](int64_t i, int k) {
+    const Register<T> yi = load(x + i) + beta * load(y + i);
+    store(y + i, yi);
+    squares[k] += yi * yi;
+  });
+  return sum_lanes<T>(squares[0] + squares[1]);
+}
+
+template <class T>
 T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
-  Register<T> squares = {};
-  for (int64_t i = 0; i < n; i += kWidth<T>) {
+  Register<T> squares[2] = {};
+  for_each_in_turn<T>(n, [&](int64_t i, int k) {
     store(x + i, load(x + i) + alpha * load(p + i));
     const Register<T> ri = load(r + i) - alpha * load(q + i);
     store(r + i, ri);
-    squares += ri * ri;
-  }
-  return sum_lanes<T>(squares);
+    squares[k] += ri * ri;
+  });
+  return sum_lanes<T>(squares[0] + squares[1]);
 }
 
 template <class T>
-T weighted_descend(T alpha, const T* p, const T* q, const T* w, T* x, T* r, int64_t n, T* weighted) {
-  Register<T> squares = {}, parts = {};
-  for (int64_t i = 0; i < n; i += kWidth<T>) {
-    store(x + i, load(x + i) + alpha * load(p + i));
-    const Register<T> ri = load(r + i) - alpha * load(q + i), square = ri * ri;
-    store(r + i, ri);
-    squares += square;
-    parts += load(w + i) * square;
-  }
-  *weighted = sum_lanes<T>(parts);
-  return sum_lanes<T>(squares);
-}
-
-template <class T>
-void weighted_xpby(const T* w, const T* x, T beta, T* y, int64_t n) {
-  for (int64_t i = 0; i < n; i += kWidth<T>) store<T>(y + i, load(w + i) * load(x + i) + beta * load(y + i));
-}
-
-template <class T>
-T weighted_square(const T* w, const T* x, int64_t n) {
+T weigh(const T* w, const T* x, T* out, int64_t n) {
   Register<T> sums[2] = {};
-  int64_t i = 0;
-  for (; i + 2 * kWidth<T> <= n; i += 2 * kWidth<T>)
-    for (int k = 0; k < 2; ++k) {
-      const auto xk = load(x + i + k * kWidth<T>);
-      sums[k] += load(w + i + k * kWidth<T>) * (xk * xk);
-    }
-  if (i < n) sums[0] += load(w + i) * (load(x + i) * load(x + i));
+  for_each_in_turn<T>(n, [&](int64_t i, int k) {
+    const Register<T> xi = load(x + i), product = load(w + i) * xi;
+    store(out + i, product);
+    sums[k] += xi * product;
+  });
   return sum_lanes<T>(sums[0] + sums[1]);
 }
 

@@ -1,6 +1,8 @@
 #include "prdp/operators/burgers_operator.h"
 
+#include "prdp/kernels/burgers.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/upwind_kernels.h"
 
 namespace prdp {
 
@@ -35,10 +37,8 @@ at::Tensor BurgersOperator::solve_transpose_directly(const at::Tensor& b) const 
   return solve_channels(channel_matrix(*this, winds_.options()).mT(), b);
 }
 
-KernelParameters BurgersOperator::kernel(const at::Tensor&) const {
-  BurgersParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
-  for (int64_t d = 0; d < grid_.dim(); ++d) k.length[2 - grid_.dim() + d] = grid_.length(d);
-  return k;
+std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tensor& b, bool transposed) const {
+  return upwind_kernels(b, transposed, [dim = grid_.dim()](const auto& p) { return kernels::burgers(p, dim); });
 }
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {

@@ -23,7 +23,8 @@ class BurgersOperator final : public FlowOperator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
-  KernelParameters kernel(const at::Tensor& b) const override;
+  bool has_coarse_grids() const override { return true; }
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
   /// The block of one channel, made when first wanted: the CPU loops never ask for it.

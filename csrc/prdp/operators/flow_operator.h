@@ -20,6 +20,9 @@ class FlowOperator : public Operator {
   /// Vectors have `channels` channels.
   FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels);
 
+  /// The kernels that make(parameters) makes of the winds of each sample, kernels::UpwindParameters; Make is a template.
+  template <class Make>
+  std::shared_ptr<const kernels::Kernels> upwind_kernels(const at::Tensor& b, bool transposed, const Make& make) const;
   /// Of the channel that blows along a grid axis: (batch or 1, 1, *shape).
   at::Tensor wind_along(int64_t axis) const { return winds_.narrow(1, grid_.dim() - 1 - axis, 1); }
   /// The gradient of the winds from those of its channels, summed over the samples that share them.

@@ -2,6 +2,8 @@
 
 #include <cmath>
 
+#include "prdp/kernels/laplacian.h"
+
 namespace prdp {
 
 at::Tensor LaplacianOperator::diagonal() const {
@@ -30,7 +32,7 @@ std::vector<int64_t> LaplacianOperator::vector_shape() const {
   return shape;
 }
 
-KernelParameters LaplacianOperator::kernel(const at::Tensor&) const {
+std::shared_ptr<const kernels::Kernels> LaplacianOperator::kernels(const at::Tensor& b, bool) const {
   const auto [alpha, beta] = coefficients();
   kernels::LaplacianParameters k;
   k.dim = grid_.dim();
@@ -39,7 +41,7 @@ KernelParameters LaplacianOperator::kernel(const at::Tensor&) const {
     k.shape[d] = grid_.shape()[d];
     k.off[d] = beta / (grid_.dx(d) * grid_.dx(d));
   }
-  return k;
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, [&]<class T>(T) { return kernels::laplacian<T>(k); });
 }
 
 PoissonOperator::PoissonOperator(const OperatorSpec& spec)

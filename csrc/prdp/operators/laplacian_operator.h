@@ -15,8 +15,10 @@ class LaplacianOperator : public Operator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
   at::Tensor norm() const override;
   at::Tensor jacobi_radius() const override;
+  bool knows_jacobi_radius() const override { return true; }
+  bool has_coarse_grids() const override { return true; }
   std::vector<int64_t> vector_shape() const override;
-  KernelParameters kernel(const at::Tensor& b) const override;
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  protected:
   explicit LaplacianOperator(Grid grid) : grid_(std::move(grid)) {}

@@ -2,6 +2,7 @@
 
 #include <ATen/TensorSubclassLikeUtils.h>
 
+#include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
 
 namespace prdp {
@@ -89,7 +90,18 @@ std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
   return chosen;
 }
 
-KernelParameters DenseOperator::kernel(const at::Tensor&) const { return DenseParameters{matrix_.contiguous()}; }
+std::shared_ptr<const kernels::Kernels> DenseOperator::kernels(const at::Tensor& b, bool transposed) const {
+  const auto of_samples = [transposed, a = matrix_.detach().contiguous()]<class T>(T) -> kernels::KernelBatch<T> {
+    const int64_t n = a.size(-1), stride = a.dim() == 3 && a.size(0) > 1 ? n * n : 0;
+    return {stride == 0, [=](int64_t s) -> std::unique_ptr<kernels::Kernel<T>> {
+              const T* values = a.template const_data_ptr<T>() + s * stride;
+              const T magnitude = kernels::largest_magnitude(values, n * n);
+              if (!std::isfinite(magnitude)) return nullptr;
+              return std::make_unique<kernels::Dense<T>>(values, n, transposed, magnitude);
+            }};
+  };
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
+}
 
 CsrOperator::CsrOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE(spec.tensors.size() == 3, "csr: takes three tensors, crow, col and values");
@@ -199,8 +211,20 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
   return chosen;
 }
 
-KernelParameters CsrOperator::kernel(const at::Tensor&) const {
-  return CsrParameters{crow_.contiguous(), col_.contiguous(), values_.contiguous()};
+std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b, bool transposed) const {
+  const auto of_samples = [transposed, n = n(), crow = crow_.contiguous(), col = col_.contiguous(),
+                           a = values_.detach().contiguous()]<class T>(T) -> kernels::KernelBatch<T> {
+    const int64_t stored = a.size(-1), own = a.dim() == 2 && a.size(0) > 1;
+    return {!own, [=](int64_t s) -> std::unique_ptr<kernels::Kernel<T>> {
+              const T* values = a.template const_data_ptr<T>() + own * s * stored;
+              const T magnitude = kernels::largest_magnitude(values, stored);
+              if (!std::isfinite(magnitude)) return nullptr;
+              return std::make_unique<kernels::Csr<T>>(crow.template const_data_ptr<int64_t>() + own * s * (n + 1),
+                                                       col.template const_data_ptr<int64_t>() + own * s * stored,
+                                                       values, n, transposed, magnitude);
+            }};
+  };
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
 }
 
 }  // namespace prdp

@@ -18,7 +18,7 @@ class DenseOperator final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
-  KernelParameters kernel(const at::Tensor& b) const override;
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
   at::Tensor matrix_;
@@ -44,7 +44,7 @@ class CsrOperator final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {n()}; }
-  KernelParameters kernel(const at::Tensor& b) const override;
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
   int64_t n() const { return crow_.size(-1) - 1; }

@@ -1,6 +1,8 @@
 #include "prdp/operators/navier_stokes_operator.h"
 
+#include "prdp/kernels/navier_stokes.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/upwind_kernels.h"
 
 namespace prdp {
 
@@ -100,15 +102,8 @@ at::Tensor NavierStokesOperator::solve(const at::Tensor& matrix, const at::Tenso
   return project(solve_dense(matrix, rhs).reshape_as(b));
 }
 
-at::Tensor NavierStokesOperator::precondition(const at::Tensor& v, bool transposed) const {
-  if (!stokes_) stokes_.emplace(grid_, step_.nu, step_.dt, v.scalar_type());
-  return (*stokes_)(v, transposed);
-}
-
-KernelParameters NavierStokesOperator::kernel(const at::Tensor&) const {
-  NavierStokesParameters k{winds_.detach().contiguous(), step_.nu.item<double>(), step_.dt};
-  k.length = {grid_.length(kY), grid_.length(kX)};
-  return k;
+std::shared_ptr<const kernels::Kernels> NavierStokesOperator::kernels(const at::Tensor& b, bool transposed) const {
+  return upwind_kernels(b, transposed, [](const auto& p) { return kernels::navier_stokes(p); });
 }
 
 std::unique_ptr<Operator> NavierStokesOperator::select(const at::Tensor& index) const {

@@ -3,7 +3,6 @@
 
 #include "prdp/operators/advection_diffusion.h"
 #include "prdp/operators/flow_operator.h"
-#include "prdp/operators/stokes_solve.h"
 
 namespace prdp {
 
@@ -35,9 +34,7 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve(regular_matrix().mT(), b); }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
-  KernelParameters kernel(const at::Tensor& b) const override;
-  /// The same step without winds.
-  at::Tensor precondition(const at::Tensor& v, bool transposed) const override;
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
   /// C₁ and C₂, made when first wanted: the CPU loops never ask for them.
@@ -52,7 +49,6 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) const;
 
   mutable std::optional<Momentum> made_;
-  mutable std::optional<StokesSolve> stokes_;
 };
 
 }  // namespace prdp

@@ -34,9 +34,7 @@ at::Tensor Operator::dense(const at::TensorOptions& options) const {
   return batch == 1 && norm().dim() == 0 ? matrix.squeeze(0) : matrix;
 }
 
-at::Tensor Operator::precondition(const at::Tensor&, bool) const {
-  TORCH_CHECK_VALUE(false, "GMRES: preconditioner \"stokes\" is for NavierStokes operators alone");
-}
+std::shared_ptr<const kernels::Kernels> Operator::kernels(const at::Tensor&, bool) const { return nullptr; }
 
 at::Tensor Operator::jacobi_radius() const {
   TORCH_CHECK_VALUE(false,
@@ -58,11 +56,10 @@ class Transposed final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override {
     return a_->product_rule(u, lambda);  // ⟨λ, Aᵀ u⟩ = ⟨u, A λ⟩
   }
-  at::Tensor project(const at::Tensor& v) const override { return a_->project(v); }
-  at::Tensor precondition(const at::Tensor& v, bool transposed) const override {
-    return a_->precondition(v, !transposed);
-  }
+  at::Tensor project(const at::Tensor& v) const override { return a_->project_solution(v); }
+  at::Tensor project_solution(const at::Tensor& v) const override { return a_->project(v); }
   at::Tensor jacobi_radius() const override { return a_->jacobi_radius(); }
+  bool knows_jacobi_radius() const override { return a_->knows_jacobi_radius(); }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   at::Tensor solve_directly(const at::Tensor& b) const override { return a_->solve_transpose_directly(b); }
@@ -72,14 +69,9 @@ class Transposed final : public Operator {
     return chosen ? std::make_unique<Transposed>(std::move(chosen)) : nullptr;
   }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
-  KernelParameters kernel(const at::Tensor& b) const override {
-    auto k = a_->kernel(b);
-    if (auto* dense = std::get_if<DenseParameters>(&k)) dense->transposed = true;
-    if (auto* csr = std::get_if<CsrParameters>(&k)) csr->transposed = true;
-    if (auto* burgers = std::get_if<BurgersParameters>(&k)) burgers->transposed = true;
-    if (auto* flow = std::get_if<NavierStokesParameters>(&k)) flow->transposed = true;
-    if (auto* stencil = std::get_if<StencilParameters>(&k)) stencil->transposed = true;
-    return k;
+  bool has_coarse_grids() const override { return a_->has_coarse_grids(); }
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override {
+    return a_->kernels(b, !transposed);
   }
 
  private:

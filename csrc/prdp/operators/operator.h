@@ -1,14 +1,9 @@
 #pragma once
 #include <ATen/ATen.h>
 
-#include <array>
 #include <memory>
 #include <string>
-#include <variant>
 #include <vector>
-
-#include "prdp/kernels/laplacian_parameters.h"
-#include "prdp/kernels/stencil_pattern.h"
 
 namespace prdp {
 
@@ -21,49 +16,9 @@ struct OperatorSpec {
   bool transposed = false;
 };
 
-/// A contiguous matrix (n, n) shared by all samples, or (batch, n, n).
-struct DenseParameters {
-  at::Tensor matrix;
-  bool transposed = false;
-};
-
-/// Compressed sparse rows with int64 indices: crow (n + 1), col (nnz) and values (nnz), contiguous. Each may have a
-/// leading batch axis.
-struct CsrParameters {
-  at::Tensor crow, col, values;
-  bool transposed = false;
-};
-
-/// The winds (batch or 1, Dim, *shape), contiguous, of I + dt Γ - ν dt L on a periodic grid in one or
-/// two dimensions; channel 0 is the velocity along x, the last axis.
-struct BurgersParameters {
-  at::Tensor winds;
-  double nu, dt;
-  bool transposed = false;
-  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
-};
-
-/// The velocity (batch or 1, 2 or more, Ny, Nx), contiguous, about which the Navier–Stokes equations
-/// are linearised on a periodic staggered grid; the first two channels are u1 (along x) and u2.
-struct NavierStokesParameters {
-  at::Tensor velocity;
-  double nu, dt;
-  bool transposed = false;
-  std::array<double, 2> length{1.0, 1.0};  // of the domain, along y and x
-};
-
-/// The coefficients (batch or 1, k, *shape), contiguous, of a stencil with k offsets, the same for every channel.
-struct StencilParameters {
-  at::Tensor coefficients;
-  kernels::StencilGrid grid;
-  std::vector<kernels::Offset> offsets;
-  int64_t channels;
-  bool transposed = false;
-};
-
-/// What the CPU loops need to know about an operator. With monostate there are no such loops for it.
-using KernelParameters = std::variant<std::monostate, kernels::LaplacianParameters, DenseParameters, CsrParameters,
-                                      BurgersParameters, NavierStokesParameters, StencilParameters>;
+namespace kernels {
+struct Kernels;
+}
 
 /// A linear operator A(g) on batches of vectors: (batch, channel, *shape) on grids, (batch, n) for matrices. It is
 /// immutable.
@@ -88,13 +43,14 @@ class Operator {
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
   /// ‖A‖∞: one value, or one per sample.
   virtual at::Tensor norm() const = 0;
-  /// v without its component in the null space of A and Aᵀ; v itself if A is regular. Differentiable.
+  /// v without its part in the null space of Aᵀ, which no product with A has, and without that in the null space of A,
+  /// which no product changes; v itself if A is regular. Differentiable.
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
-  /// M⁻¹ v, or M⁻ᵀ v, for a cheap M ≈ A. Raises ValueError if this operator has none.
-  virtual at::Tensor precondition(const at::Tensor& v, bool transposed) const;
+  virtual at::Tensor project_solution(const at::Tensor& v) const { return project(v); }
   /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
   /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;
+  virtual bool knows_jacobi_radius() const { return false; }
   /// The index of the first NaN or Inf in the tensors of A: (i, j) in a matrix, (channel, *grid) in winds.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator for the samples `index` (int64) alone, differentiable in the same tensors; null if that is not
@@ -103,8 +59,10 @@ class Operator {
   /// The shape of one vector without its batch axis; with one channel if A takes any number of them.
   virtual std::vector<int64_t> vector_shape() const = 0;
 
-  /// The parameters of the CPU loops, for vectors with the shape of b.
-  virtual KernelParameters kernel(const at::Tensor& /*b*/) const { return std::monostate{}; }
+  /// Whether multigrid can make coarse grids of it: a stencil whose neighbours lie at most one cell away.
+  virtual bool has_coarse_grids() const { return false; }
+  /// A, or Aᵀ, for the CPU loops on vectors with the shape and dtype of b; null if there are no such loops.
+  virtual std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const;
 
   /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.
   at::Tensor dense(const at::TensorOptions& options) const;

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/tensors.h"
@@ -222,8 +223,26 @@ std::vector<int64_t> StencilOperator::vector_shape() const {
   return shape;
 }
 
-KernelParameters StencilOperator::kernel(const at::Tensor& b) const {
-  return StencilParameters{coefficients_.detach().contiguous(), grid_, offsets_, b.size(1)};
+bool StencilOperator::has_coarse_grids() const {
+  const kernels::StencilPattern pattern(grid_, offsets_);
+  return std::all_of(pattern.offsets.begin(), pattern.offsets.end(), [](const kernels::Offset& o) {
+    return std::all_of(std::begin(o.along), std::end(o.along), [](int64_t cells) { return std::abs(cells) <= 1; });
+  });
+}
+
+std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tensor& b, bool transposed) const {
+  auto offsets = offsets_;
+  if (transposed)
+    for (auto& offset : offsets)
+      for (auto& cells : offset.along) cells = -cells;
+  const auto of_samples = [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
+                           pattern = std::make_shared<kernels::StencilPattern>(
+                               grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
+    const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
+                                         transposed};
+    return {c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};
+  };
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
 }
 
 }  // namespace prdp

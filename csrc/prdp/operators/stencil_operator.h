@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/grid/grid.h"
+#include "prdp/kernels/stencil_pattern.h"
 #include "prdp/operators/operator.h"
 
 namespace prdp {
@@ -30,7 +31,8 @@ class StencilOperator final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override;
-  KernelParameters kernel(const at::Tensor& b) const override;
+  bool has_coarse_grids() const override;
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
   int64_t dim() const { return grid_.dim; }

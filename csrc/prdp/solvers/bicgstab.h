@@ -1,4 +1,5 @@
 #pragma once
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <tuple>
@@ -9,7 +10,8 @@ namespace prdp {
 
 /// BiCGStab (van der Vorst 1992), for any operator: two products per iteration and no basis to keep. With r̂, the
 /// first residual: ρ = r̂·r, p ← r + β (p - ω v) with β = (ρ/ρ₋)(α/ω), v = A p, α = ρ / r̂·v, s = r - α v, t = A s,
-/// ω = s·t / t·t, x += α p + ω s, r = s - ω t.
+/// ω = s·t / t·t, x += α p + ω s, r = s - ω t. Preconditioned from the right: A M⁻¹ takes the place of A, and x moves
+/// along M⁻¹ p and M⁻¹ s.
 ///
 /// Where r has become all but orthogonal to r̂, so that two digits of ρ are left at most, it starts anew from
 /// r̂ = p = r. It breaks down where r̂·v is rounding, or s·t of the iteration before was.
@@ -26,7 +28,8 @@ class BiCGStabMethod {
         hat_(space.vector()),
         p_(space.vector()),
         v_(space.vector()),
-        t_(space.vector()) {}
+        t_(space.vector()),
+        z_(space.is_preconditioned() ? space.vector() : t_) {}
 
   void start() {
     for (auto* vector : {&x, &p_, &v_}) space_.fill_zero(*vector);
@@ -48,14 +51,14 @@ class BiCGStabMethod {
     const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
     space_.xpby(v_, -over_omega, p_);
     space_.xpby(r_, -rho * inverse_, p_);
-    const Scalar vv = space_.apply_with_dots(p_, v_)[1], hv = space_.dot(hat_, v_);
+    const Scalar vv = apply_to(p_, v_)[1], hv = space_.dot(hat_, v_);
     inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
     const Scalar moves = space_.is_not_zero(over_omega) * space_.is_not_zero(inverse_);
-    ss_ = space_.descend(rho * inverse_ * moves, p_, v_, x, r_);
-    const auto [st, tt] = space_.apply_with_dots(r_, t_);
+    ss_ = space_.descend(rho * inverse_ * moves, space_.is_preconditioned() ? z_ : p_, v_, x, r_);
+    const auto [st, tt] = apply_to(r_, t_);
     st_ = st;
     tt_ = tt;
-    rr_ = space_.descend(space_.ratio(st, tt) * moves, r_, t_, x, r_);
+    rr_ = space_.descend(space_.ratio(st, tt) * moves, space_.is_preconditioned() ? z_ : r_, t_, x, r_);
   }
   auto residual2() const { return rr_; }
   /// From the true residual it starts anew.
@@ -74,8 +77,16 @@ class BiCGStabMethod {
   typename Space::Vector x;
 
  private:
+  /// out = A v, or A M⁻¹ v with M⁻¹ v in z_; returns v·out and ‖out‖².
+  std::array<Scalar, 2> apply_to(typename Space::Vector& v, typename Space::Vector& out) {
+    if (!space_.is_preconditioned()) return space_.apply_with_dots(v, out);
+    space_.precondition(v, z_);
+    const Scalar out2 = space_.apply_with_dots(z_, out)[1];
+    return {space_.dot(v, out), out2};
+  }
+
   Space& space_;
-  typename Space::Vector r_, hat_, p_, v_, t_;       // r, and s between; r̂; A p; A s
+  typename Space::Vector r_, hat_, p_, v_, t_, z_;   // r, and s between; r̂; A p; A s; M⁻¹ p, or of s
   Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
 };
 

@@ -6,53 +6,88 @@
 
 namespace prdp {
 
-/// Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators of either sign.
+/// Conjugate gradients (Hestenes and Stiefel 1952), for symmetric definite operators of either sign. Preconditioned,
+/// z = M⁻¹ r takes the place of r in the directions: α = r·z / p·Ap; u += α p; r -= α A p; p ← z + β p. M must be
+/// definite too, of either sign; the residual that the method is judged by is r itself.
 template <VectorSpace Space>
 class ConjugateGradientMethod {
  public:
-  static constexpr bool kHasRecursiveResidual = true;
+  using Scalar = typename Space::Scalar;
+  static constexpr bool kHasRecursiveResidual = true, kDescendsEnergy = true;
 
   explicit ConjugateGradientMethod(Space& space)
-      : x(space.vector()), space_(space), r_(space.vector()), p_(space.vector()), q_(space.vector()) {}
+      : x(space.vector()),
+        space_(space),
+        r_(space.vector()),
+        p_(space.vector()),
+        q_(space.vector()),
+        z_(space.is_preconditioned() ? space.vector() : r_) {}
 
   void start() {
     space_.fill_zero(x);
     space_.copy(space_.b(), r_);
-    space_.copy(space_.b(), p_);
-    rr_ = pp_ = space_.b2();
+    begin_along(space_.b2());
   }
   void step() {
+    if (space_.is_preconditioned()) refuse_indefinite();
     const auto [pq, qq] = space_.apply_with_dots(p_, q_);
-    alpha_ = space_.step_length(rr_, pq, pp_, qq);
-    const auto rr = space_.descend(alpha_, p_, q_, x, r_);
-    beta_ = space_.ratio(rr, rr_);
-    space_.xpby(r_, beta_, p_);
-    pp_ = rr + beta_ * beta_ * pp_;  // r and p are orthogonal
-    rr_ = rr;
+    alpha_ = space_.step_length(rz_, pq, pp_, qq);  // 0 where r·z has changed its sign
+    if (!space_.is_preconditioned()) {
+      const auto rr = space_.descend(alpha_, p_, q_, x, r_);
+      beta_ = space_.ratio(rr, rz_);
+      space_.xpby(r_, beta_, p_);
+      pp_ = rr + beta_ * beta_ * pp_;  // r and p are orthogonal
+      rr_ = rz_ = rr;
+      return;
+    }
+    rr_ = space_.descend(alpha_ * sign_, p_, q_, x, r_);
+    const Scalar rz = sign_ * space_.precondition(r_, z_);
+    beta_ = space_.ratio(rz, rz_);
+    pp_ = space_.xpby_with_square(z_, beta_, p_);
+    rz_ = rz;
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
-    go_on_from(space_.residual(x, r_));
+    begin_along(space_.residual(x, r_));
     return rr_;
   }
 
+  /// The true one, after recompute_residual().
+  const typename Space::Vector& residual() const { return r_; }
+
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, p_, rr_, pp_); }
+  auto carried() { return std::tie(r_, p_, rr_, rz_, pp_, sign_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;
 
- protected:
-  /// Starts anew along the true residual, which is in r.
-  void go_on_from(const typename Space::Scalar& rr) {
-    rr_ = rr;
-    space_.copy(r_, p_);
-    space_.assign(rr_, pp_);
+ private:
+  /// A breakdown where r·M⁻¹r is zero or has another sign than at first, and r is not zero.
+  void refuse_indefinite() {
+    space_.break_down((1 - space_.is_larger(rz_, rz_ * 0)) * space_.is_not_zero(space_.ratio(rr_, rr_)));
+  }
+  /// Starts anew along the residual, which is in r and whose square is given.
+  void begin_along(const Scalar& rr) {
+    space_.assign(rr, rr_);
+    space_.assign(rr * 0 + 1, sign_);
+    if (!space_.is_preconditioned()) {
+      space_.copy(r_, p_);
+      space_.assign(rr_, rz_);
+      space_.assign(rr_, pp_);
+      return;
+    }
+    const Scalar rz = space_.precondition(r_, z_), negative = space_.is_larger(-rz, rz * 0);
+    space_.assign(1 - 2 * negative, sign_);
+    space_.assign(sign_ * rz, rz_);
+    space_.copy(z_, p_);
+    space_.assign(space_.dot(z_, z_), pp_);
   }
 
   Space& space_;
-  typename Space::Vector r_, p_, q_;  // residual; search direction; A p
-  typename Space::Scalar rr_{}, pp_{}, alpha_{}, beta_{};
+  typename Space::Vector r_, p_, q_, z_;  // residual; search direction; A p; M⁻¹ r, or r itself
+  Scalar rr_{}, rz_{}, pp_{};             // r·r, |r·z|, p·p
+  Scalar sign_{};                         // of r·z
+  Scalar alpha_{}, beta_{};
 };
 
 }  // namespace prdp

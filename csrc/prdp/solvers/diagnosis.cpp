@@ -19,8 +19,8 @@ std::string name_of(const Solver& solver) {
   std::ostringstream text;
   text << method.label;
   if (method.counts == Counts::kCycles) text << "(" << solver.restart << ")";
-  if (method.preconditioner != Preconditioner::kNone)
-    text << " with preconditioner=\"" << name(method.preconditioner) << "\"";
+  if (solver.preconditioner.is_operator()) text << " with preconditioner " << solver.preconditioner.title();
+  else if (solver.preconditioner) text << " with preconditioner=\"" << solver.preconditioner.title() << "\"";
   return text.str();
 }
 
@@ -87,7 +87,9 @@ std::string zero_diagonal(const SolveRole& role) {
   const std::string why = operator_kind(role.a.kind).has_pressure
                               ? "the pressure rows have a zero diagonal"
                               : "it divides by the diagonal of A, which has a zero there";
-  return why + (traits(role.solver.method).label == "GMRES" ? "; take GMRES without it" : "; take GMRES");
+  return why + (role.solver.preconditioner.is_diagonal() && traits(role.solver.method).made_for == MadeFor::kAny
+                    ? "; take " + std::string(traits(role.solver.method).label) + " without it"
+                    : "; take GMRES");
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {

@@ -10,6 +10,8 @@ namespace prdp {
 template <FactorisedSpace Space>
 class DirectMethod {
  public:
+  static constexpr bool kIsExact = true;
+
   explicit DirectMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
 
   void start() {

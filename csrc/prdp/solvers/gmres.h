@@ -25,14 +25,15 @@ class GmresMethod {
   using Vector = typename Space::Vector;
 
   /// Preconditioned from the right, A M⁻¹ y = b with x = M⁻¹ y: the residual is that of A u = b.
-  GmresMethod(Space& space, int64_t restart, Preconditioner preconditioner)
+  GmresMethod(Space& space, int64_t restart)
       : x(space.vector()),
         space_(space),
-        preconditioner_(preconditioner),
         m_(std::min(restart, space.unknowns())),
         r_(space.vector()),
         kept_x_(space.vector()),
         kept_r_(space.vector()),
+        z_(space.is_preconditioned() ? space.vector() : r_),
+        sum_(space.is_preconditioned() ? space.vector() : r_),
         u_(m_ + 1),
         h_(m_ * (m_ + 1)),
         columns_(m_ + 1),
@@ -59,7 +60,7 @@ class GmresMethod {
     u_[0] = kept_r_;
     const int64_t columns = extend_basis();
     minimise(columns);
-    space_.add_combination(weights_, u_, columns, x, preconditioner_);
+    move_along_basis(columns);
     ready_ = false;
     confirmed_ = true;
   }
@@ -114,7 +115,8 @@ class GmresMethod {
     exhausted_ = space_.is_zero(length);
     loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
-      space_.apply(u_[j], u_[j + 1], preconditioner_);
+      if (space_.is_preconditioned()) space_.precondition(u_[j], z_);
+      space_.apply(space_.is_preconditioned() ? z_ : u_[j], u_[j + 1]);
       if (space_.derivatives() > 0) products_[j] = u_[j + 1];
       scale_ = space_.larger(scale_, orthogonalise(j));
       const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
@@ -153,6 +155,14 @@ class GmresMethod {
     }
     return {space_.subtract_combination(weights_.data(), u_, j + 1, factor, u_[j + 1]), taken2};
   }
+  /// x += M⁻¹ Σ weights_j u_j
+  void move_along_basis(int64_t columns) {
+    if (!space_.is_preconditioned()) return space_.add_combination(weights_.data(), u_, columns, x);
+    space_.fill_zero(sum_);
+    space_.add_combination(weights_.data(), u_, columns, sum_);
+    space_.precondition(sum_, z_);
+    space_.add(z_, x);
+  }
   /// The weights of the u_j that belong to y.
   void weigh(int64_t columns) {
     for (int64_t j = 0; j < columns; ++j) weights_[j] = columns_[j].y * columns_[j].inverse_length;
@@ -177,23 +187,20 @@ class GmresMethod {
     c.g = c.cos * c.g;
   }
 
-  /// y = argmin ‖r - A V y‖. A column that would take so long a step that its rounding exceeds r is
-  /// left out with all after it: A is singular there, to the dtype.
+  /// y = argmin ‖r - A V y‖. Where that takes a step so long that its rounding exceeds r, A is singular to the dtype, and
+  /// y is damped; its derivative is that of a constant there.
   void minimise(int64_t columns) {
     using std::sqrt;
     const Scalar size = space_.constant(sqrt(residual2_));
+    Scalar short_enough = one_;
     for (int64_t j = columns - 1; j >= 0; --j) {
       Column& c = columns_[j];
       c.y = c.g;
       for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
       c.y = c.y * c.inverse;
-      const Scalar kept = space_.is_not_zero(space_.inverse(size, scale_ * c.y));
-      if (space_.surely_all(kept)) continue;
-      for (int64_t k = j; k < columns; ++k) {
-        columns_[k].y = columns_[k].y * kept;
-        columns_[k].inverse = columns_[k].inverse * kept;
-      }
+      short_enough = short_enough * space_.is_not_zero(space_.inverse(size, scale_ * c.y));
     }
+    if (!space_.surely_all(short_enough)) damp(columns, short_enough);
     for (int derivative = 1; derivative <= space_.derivatives(); ++derivative) {
       Vector e = kept_r_;
       weigh(columns);
@@ -206,6 +213,16 @@ class GmresMethod {
     weigh(columns);
   }
 
+  /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being the rounding errors of A.
+  void damp(int64_t columns, const Scalar& short_enough) {
+    std::vector<Scalar> g(columns), y(columns);
+    for (int64_t j = 0; j < columns; ++j) g[j] = columns_[j].g, y[j] = columns_[j].y;
+    space_.damp(h_.data(), m_ + 1, g.data(), columns, scale_, short_enough, y.data());
+    for (int64_t j = 0; j < columns; ++j) {
+      columns_[j].y = y[j];
+      columns_[j].inverse = columns_[j].inverse * short_enough;
+    }
+  }
   /// z ← (RᵀR)⁻¹ z
   void solve_normal(std::vector<Scalar>& z) {
     const auto columns = static_cast<int64_t>(z.size());
@@ -220,9 +237,8 @@ class GmresMethod {
   }
 
   Space& space_;
-  Preconditioner preconditioner_;
   int64_t m_;
-  Vector r_, kept_x_, kept_r_;
+  Vector r_, kept_x_, kept_r_, z_, sum_;
   std::vector<Vector> u_, products_;  // orthogonal basis; A u_j, kept while recording
   std::vector<Scalar> h_;             // by columns, R once rotated
   std::vector<Column> columns_;

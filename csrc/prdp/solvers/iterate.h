@@ -30,6 +30,7 @@ struct SampleState {
   int64_t still = 0;   // cycles since the residual last fell, for methods whose residual never grows
   double fallen2 = std::numeric_limits<double>::infinity();  // the residual then
   double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
+  double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
 
   void stop(SolveStatus why) {
     status = why;
@@ -42,6 +43,7 @@ struct SampleState {
     settled = claims = false;
     status = SolveStatus::kMaxIter;
     iterations = still = look = 0;
+    floor2 = 0.0;
     fallen2 = std::numeric_limits<double>::infinity();
     refuted2 = std::numeric_limits<double>::infinity();
   }
@@ -68,6 +70,15 @@ inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n)
 /// Methods that update their residual by a recursion, and go on from the true one once it is recomputed.
 template <class Method>
 inline constexpr bool kHasRecursiveResidual = requires { Method::kHasRecursiveResidual; };
+
+/// Methods for definite operators: a truncated iterate may have a residual above ‖b‖ and still be nearer to the solution
+/// than zero, in the norm of A.
+template <class Method>
+inline constexpr bool kDescendsEnergy = requires { Method::kDescendsEnergy; };
+
+/// Methods whose one iteration solves.
+template <class Method>
+inline constexpr bool kIsExact = requires { Method::kIsExact; };
 
 /// Whether a residual asks to be confirmed by the true one.
 inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
@@ -107,19 +118,22 @@ inline void judge_progress(SampleState& s, bool exhausted) {
   if (++s.still >= patience) s.stop(SolveStatus::kStagnated);
 }
 
-/// Stops those of the `doubtful` samples whose residual is rounding, ε ‖A‖ ‖u‖. An exhausted space is
-/// judged with some slack.
+/// Stops those of the `doubtful` samples whose residual is rounding, floor = ε ‖A‖ ‖u‖: one that is no larger, or up to
+/// eight times as large where rtol lies below the floor. An exhausted space is judged with more slack. A floor near ‖b‖
+/// says nothing: there u is garbage.
 template <class Space, class Method, class Predicate>
-void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
-                            const Predicate& doubtful, double slack = 1.0) {
+void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
+                            const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
   const auto u2 = space.lanes(space.solution2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double bound = s.status == SolveStatus::kBreakdown ? 100.0 : slack;
-    if (doubtful(s) && std::sqrt(s.residual2) <= bound * space.epsilon() * norm_a[i] * std::sqrt(u2[i]))
-      s.stop(SolveStatus::kStagnated);
+    const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
+    const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : rtol * b <= floor ? 8.0 : 1.0;
+    if (!doubtful(s) || !(floor <= 0.25 * b) || !(std::sqrt(s.residual2) <= slack * floor)) continue;
+    s.stop(SolveStatus::kStagnated);
+    s.floor2 = floor * floor;
   }
 }
 
@@ -175,11 +189,13 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
   }
   if constexpr (kTakesStrides<Method>) {  // sweeps go on at their rounding for ever, and never claim what is below it
     constexpr int64_t patience = 128;
-    const auto is_still = [rtol](const SampleState& s) {
+    stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
       return rtol > 0.0 && s.active && !s.claims && s.iterations - s.best > patience;
-    };
-    stop_at_rounding_floor(space, method, states, is_still, /*slack=*/4.0);
+    });
   }
+  if constexpr (kLeastResidual<Method>)
+    stop_at_rounding_floor(space, method, states, rtol,
+                           [](const SampleState& s) { return s.active && !s.claims && s.still > 0; });
   if (!any_claims) return;
 
   space.freeze_unless(states, [](const SampleState& s) { return s.claims; });
@@ -195,7 +211,7 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     }
     s.refuted2 = s.residual2;
   }
-  stop_at_rounding_floor(space, method, states, [](const SampleState& s) { return s.claims && s.active; });
+  stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) { return s.claims && s.active; });
   for (auto& s : states)
     if (s.claims) s.settled = !s.active;
 }
@@ -249,7 +265,7 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!lost(s)) judge(s, rtol);
   }
-  stop_at_rounding_floor(space, method, states, [rtol](const SampleState& s) {
+  stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
     const bool unsolved =
         s.status == SolveStatus::kMaxIter || (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
     return rtol > 0.0 && !s.settled && unsolved;
@@ -260,23 +276,70 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
   }
 }
 
+/// Which samples end with a residual above ‖b‖, though nothing failed: zero would be a better answer.
+template <class Space>
+auto worse_than_zero(Space& space, const typename Space::States& states) {
+  return space.map(states, [&](const SampleState& s) {
+    const bool ended = s.status == SolveStatus::kMaxIter || s.status == SolveStatus::kStagnated;
+    return ended && s.residual2 > (1.0 + 256.0 * space.epsilon()) * s.b2;
+  });
+}
+
+/// Whether the iterates of a method for definite operators do what they are made for, for each sample: A is symmetric,
+/// judged by x·A r and r·A x, and x is nearer to the solution than zero in the norm of A, which is (x·b)² > (x·r)² for
+/// a definite A of either sign. One product.
+template <class Space, class Method>
+auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
+  const auto& x = method.x;
+  const auto &r = method.residual(), &b = space.b();
+  auto ar = space.scratch();
+  space.apply(r, ar);
+  const auto number = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
+  const auto xb = number(x, b), xr = number(x, r), rb = number(r, b), rr = number(r, r), bb = number(b, b);
+  const auto x_ar = number(x, ar), xx = number(x, x), ar2 = number(ar, ar);
+  space.fill_zero(ar);
+  size_t i = 0;
+  return space.map(states, [&](const SampleState&) {
+    const double ax2 = bb[i] - 2 * rb[i] + rr[i];
+    const double scale = std::sqrt(rr[i]) * std::sqrt(std::max(ax2, 0.0)) + std::sqrt(xx[i]) * std::sqrt(ar2[i]);
+    const bool symmetric = std::abs(rb[i] - rr[i] - x_ar[i]) <= 2e3 * space.epsilon() * scale;
+    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i];
+    ++i;
+    return symmetric && nearer;
+  });
+}
+
 }  // namespace detail
 
 /// Solves every sample that `states` holds active, from zero or the space's start; the result is method.x, but for
-/// that start. A sample that
-/// overflows or diverges is run again for as many iterations as gave its smallest residual, unless the
-/// iterations are wanted as they come.
+/// that start. A sample that overflows or diverges, or ends worse than zero without an excuse, is run again for as many
+/// iterations as gave its smallest residual, unless the iterations are wanted as they come.
 template <class Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   using namespace detail;
   const bool track = rtol > 0.0;
   const auto caps = space.map(states, [](const SampleState& s) { return s.cap; });
+  const auto any = [](const auto& rows) { return std::find(rows.begin(), rows.end(), true) != rows.end(); };
   run(space, method, states, rtol, track);
   conclude(space, method, states, rtol);
   if (!guarded) return;
-  const auto again = space.map(
+  auto worse = worse_than_zero(space, states);
+  if (any(worse)) {
+    if constexpr (kDescendsEnergy<Method>) {
+      const auto falls = energy_falls(space, method, states);
+      for (size_t i = 0; i < states.size(); ++i) {
+        if (worse[i] && !falls[i]) states[i].status = SolveStatus::kDiverged;
+        worse[i] = false;
+      }
+    } else if constexpr (kIsExact<Method>) {
+      for (size_t i = 0; i < states.size(); ++i)
+        if (worse[i]) states[i].status = SolveStatus::kBreakdown;
+    }
+  }
+  auto again = space.map(
       states, [&](const SampleState& s) { return lost(s) || (!track && s.status == SolveStatus::kBreakdown); });
-  if (std::find(again.begin(), again.end(), true) == again.end()) return;
+  for (size_t i = 0; i < states.size(); ++i) again[i] = again[i] || worse[i];
+  if (!any(again)) return;
 
   // The cold path. Where no residual was looked at, a watched pass finds the best iterate, or the
   // iteration that broke down; then that iterate is remade, by the same steps: a method that went on from
@@ -289,13 +352,19 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
     run(space, method, states, rtol, /*track=*/true);
   }
   const auto watched = states;
-  for (size_t i = 0; i < states.size(); ++i) {
-    const int64_t wanted = lost(first[i]) ? watched[i].best : watched[i].iterations;
-    states[i].run_again(again[i] ? wanted : 0);
+  const auto remake = [&](const auto& wanted) {
+    for (size_t i = 0; i < states.size(); ++i) states[i].run_again(again[i] ? wanted(i) : 0);
+    space.run_again();
+    run(space, method, states, rtol, track);
+    conclude(space, method, states, rtol);
+  };
+  remake([&](size_t i) { return lost(first[i]) || worse[i] ? watched[i].best : watched[i].iterations; });
+  const auto still_worse = worse_than_zero(space, states);
+  for (size_t i = 0; i < states.size(); ++i) worse[i] = worse[i] && still_worse[i];
+  if (any(worse)) {  // a recursive residual had said otherwise
+    const auto remade = states;
+    remake([&](size_t i) { return worse[i] ? 0 : remade[i].iterations; });
   }
-  space.run_again();
-  run(space, method, states, rtol, track);
-  conclude(space, method, states, rtol);
   for (size_t i = 0; i < states.size(); ++i) {
     if (again[i]) states[i].status = first[i].status;
     else states[i] = first[i];

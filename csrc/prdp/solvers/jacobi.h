@@ -16,13 +16,7 @@ namespace prdp {
 template <SweepingSpace Space>
 class JacobiMethod {
  public:
-  explicit JacobiMethod(Space& space, bool accelerated = false)
-      : x(space.vector()),
-        space_(space),
-        accelerated_(accelerated),
-        c_(space.vector()),
-        next_(space.vector()),
-        r_(space.vector()) {}
+  explicit JacobiMethod(Space& space) : JacobiMethod(space, /*accelerated=*/false) {}
 
   void start() {
     space_.divide_by_diagonal(space_.b(), c_);
@@ -62,6 +56,14 @@ class JacobiMethod {
 
  protected:
   using Scalar = typename Space::Scalar;
+
+  JacobiMethod(Space& space, bool accelerated)
+      : x(space.vector()),
+        space_(space),
+        accelerated_(accelerated),
+        c_(space.vector()),
+        next_(space.vector()),
+        r_(space.vector()) {}
 
   /// ω of n iterations after the first `first`, which is at least one; null without acceleration.
   const Scalar* weights(int64_t first, int64_t n) {

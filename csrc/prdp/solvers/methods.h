@@ -9,7 +9,7 @@
 #include "prdp/solvers/direct.h"
 #include "prdp/solvers/gmres.h"
 #include "prdp/solvers/jacobi.h"
-#include "prdp/solvers/preconditioned_conjugate_gradient.h"
+#include "prdp/solvers/multigrid.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
@@ -27,27 +27,27 @@ enum class MadeFor {
   kKnownSpectrum   // the operator knows that radius: Heat and Poisson
 };
 
-/// The CPU loops that run a method. Where there are none, plain tensor operations do.
-enum class RunsOn { kAllLoops, kLaplacianLoops, kTensors };
-
 /// One row of the table.
 struct MethodTraits {
   Method method;
   std::string_view name;   // in scenes and in the ops
   std::string_view label;  // its class in C++ and Python, which errors name
-  Preconditioner preconditioner = Preconditioner::kNone;
   MadeFor made_for = MadeFor::kAny;
   Counts counts = Counts::kIterations;
   int64_t products = 1;       // with A per iteration, or per vector of a cycle
   int64_t vectors;            // that it keeps at most beside b and scratch; a cycle keeps `restart` more
+  bool takes_preconditioner = false;  // and then keeps two vectors more
   double nanoseconds;         // of a core per unknown and iteration, or vector of a cycle
   bool divides_by_diagonal = false;  // refuses an operator with a zero on it
+  bool is_multigrid = false;  // needs multigrid for its preconditioner
   bool is_direct = false;  // takes the operator's exact method, and no start
   /// From zero, u is a polynomial of A, fixed by the number of iterations, times b. Then u is smooth in A and
   /// linear in b, and the transposed map is as many iterations with Aᵀ.
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
-  RunsOn runs_on = RunsOn::kAllLoops;
+  /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);
+  /// else autograd does it, in plain tensor operations.
+  bool has_tape = true;
 };
 
 /// A row with the class that iterates.
@@ -55,8 +55,7 @@ template <template <IterationSpace> class Iteration>
 struct MethodRow : MethodTraits {
   template <IterationSpace Space>
   auto make(Space& space, int64_t restart) const {
-    if constexpr (std::is_constructible_v<Iteration<Space>, Space&, int64_t, Preconditioner>)
-      return Iteration<Space>(space, restart, preconditioner);
+    if constexpr (std::is_constructible_v<Iteration<Space>, Space&, int64_t>) return Iteration<Space>(space, restart);
     else return Iteration<Space>(space);
   }
 };
@@ -78,7 +77,7 @@ inline constexpr std::tuple kMethods{
                                 .vectors = 4,
                                 .nanoseconds = 0.1,
                                 .is_polynomial = true,
-                                .runs_on = RunsOn::kLaplacianLoops}},
+                                .has_tape = false}},
     MethodRow<SteepestDescentMethod>{{.method = Method::kSteepestDescent,
                                       .name = "steepest_descent",
                                       .label = "SteepestDescent",
@@ -90,51 +89,37 @@ inline constexpr std::tuple kMethods{
                                         .label = "CG",
                                         .made_for = MadeFor::kDefinite,
                                         .vectors = 4,
+                                        .takes_preconditioner = true,
                                         .nanoseconds = 0.3,
                                         .ends_at_unknowns = true}},
-    MethodRow<PreconditionedConjugateGradientMethod>{{.method = Method::kConjugateGradientDiagonal,
-                                                      .name = "cg_diagonal",
-                                                      .label = "CG",
-                                                      .preconditioner = Preconditioner::kDiagonal,
-                                                      .made_for = MadeFor::kDefinite,
-                                                      .vectors = 5,
-                                                      .nanoseconds = 0.6,
-                                                      .divides_by_diagonal = true,
-                                                      .ends_at_unknowns = true}},
     MethodRow<BiCGStabMethod>{{.method = Method::kBiCGStab,
                                .name = "bicgstab",
                                .label = "BiCGStab",
                                .products = 2,
                                .vectors = 6,
+                               .takes_preconditioner = true,
                                .nanoseconds = 0.8}},
     MethodRow<GmresMethod>{{.method = Method::kGmres,
                             .name = "gmres",
                             .label = "GMRES",
                             .counts = Counts::kCycles,
                             .vectors = 4,
+                            .takes_preconditioner = true,
                             .nanoseconds = 0.8}},
-    MethodRow<GmresMethod>{{.method = Method::kGmresDiagonal,
-                            .name = "gmres_diagonal",
-                            .label = "GMRES",
-                            .preconditioner = Preconditioner::kDiagonal,
-                            .counts = Counts::kCycles,
-                            .vectors = 4,
-                            .nanoseconds = 0.8,
-                            .divides_by_diagonal = true}},
-    MethodRow<GmresMethod>{{.method = Method::kGmresStokes,
-                            .name = "gmres_stokes",
-                            .label = "GMRES",
-                            .preconditioner = Preconditioner::kStokes,
-                            .counts = Counts::kCycles,
-                            .vectors = 4,
-                            .nanoseconds = 0.8,
-                            .runs_on = RunsOn::kTensors}},
+    MethodRow<MultigridMethod>{{.method = Method::kMultigrid,
+                                .name = "multigrid",
+                                .label = "Multigrid",
+                                .vectors = 3,
+                                .nanoseconds = 4.0,
+                                .is_multigrid = true,
+                                .is_polynomial = true}},
     MethodRow<DirectMethod>{{.method = Method::kDirect,
                              .name = "direct",
                              .label = "Direct",
                              .vectors = 4,
                              .nanoseconds = 0.3,
-                             .is_direct = true}}};
+                             .is_direct = true,
+                             .has_tape = false}}};
 
 inline constexpr auto kTraits =
     std::apply([](const auto&... row) { return std::array<MethodTraits, sizeof...(row)>{row...}; }, kMethods);
@@ -145,10 +130,6 @@ static_assert(
       return true;
     }(),
     "the rows of the table are not in the order of the enumerators");
-
-/// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h).
-/// Else autograd does it, in plain tensor operations.
-constexpr bool has_tape(const MethodTraits& method) { return method.runs_on == RunsOn::kAllLoops && !method.is_direct; }
 
 constexpr const MethodTraits& traits(Method method) { return kTraits[static_cast<size_t>(method)]; }
 
@@ -174,7 +155,14 @@ auto with_method(Method method, int64_t restart, Space& space, const Body& body)
 
 /// Vectors that a method keeps at most, beside b and one of scratch.
 constexpr int64_t vectors_of(Method method, int64_t restart) {
-  return traits(method).vectors + (traits(method).counts == Counts::kCycles ? restart : 0);
+  const auto& row = traits(method);
+  return row.vectors + (row.takes_preconditioner ? 2 : 0) + (row.counts == Counts::kCycles ? restart : 0);
+}
+
+/// Whether the solver refuses an operator with a zero on its diagonal.
+inline bool divides_by_diagonal(const Solver& solver) {
+  const auto& m = solver.preconditioner;
+  return traits(solver.method).divides_by_diagonal || m.is_diagonal() || m.is_multigrid();
 }
 
 /// Iterations, or those vectors that so many cycles build up.

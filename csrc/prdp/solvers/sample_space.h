@@ -7,20 +7,17 @@
 #include <utility>
 #include <vector>
 
-#include "prdp/kernels/direct_factors.h"
 #include "prdp/solvers/iterate.h"
-#include "prdp/solvers/solver.h"
+#include "prdp/solvers/sample_system.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
 
 /// One sample after the other as a space for iterate(): vectors are padded memory of the thread's
-/// workspace, and every operation is a plain loop in place. `Kernel` is one of kernels/.
-template <class Kernel>
+/// workspace, and every operation is a plain loop in place.
+template <class T>
 class SampleSpace {
  public:
-  using T = typename Kernel::Scalar;
-  using Factors = typename kernels::FactorsOf<Kernel>::Type;
   using Vector = T*;
   using Scalar = T;
   using States = std::array<SampleState, 1>;
@@ -28,22 +25,22 @@ class SampleSpace {
   /// Vectors that the space itself keeps; two more where samples may have a start.
   static constexpr int64_t vectors(bool starts) { return starts ? 4 : 2; }
 
-  SampleSpace(const Kernel& kernel, kernels::Workspace<T>& workspace, bool starts = false)
-      : kernel_(&kernel), workspace_(workspace), own_(vectors(starts)), used_(own_) {}
+  /// The system may be set anew between samples; its layout stays.
+  SampleSpace(const SampleSystem<T>& system, kernels::Workspace<T>& workspace, bool starts = false)
+      : system_(system), workspace_(workspace), own_(vectors(starts)), used_(own_) {}
 
-  /// The operator of the samples that follow, with its direct method where that is wanted.
-  void set_operator(const Kernel& kernel, const Factors* factors) {
-    kernel_ = &kernel;
-    factors_ = factors;
-  }
   /// Takes over a sample, whose b the caller has put into b().
   void begin(SampleState& state) {
     state_ = &state;
     broken_ = started_ = false;
     b2_ = dot(b(), b());
   }
-  void project([[maybe_unused]] Vector v) {
-    if constexpr (kernels::kHasNullSpace<Kernel>) kernel_->project(v);
+  /// Onto what products with A may contain; and onto the solutions of least norm.
+  void project(Vector v) {
+    if (const auto& space = system_.a().left_null_space()) space->project(v);
+  }
+  void project_solution(Vector v) {
+    if (const auto& space = system_.a().null_space()) space->project(v);
   }
   /// Starts the sample from α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better
   /// than zero. From here on b() is the residual of the start, and what the method looks for is added to it.
@@ -51,21 +48,21 @@ class SampleSpace {
     const T magnitude = kernels::largest_magnitude(x0, unknowns());
     if (magnitude == T(0)) return;
     Vector x = start(), product = scratch(), r = whole_b();
-    kernel_->load(x0, kernels::power_of_two_scale(magnitude), x);
-    project(x);
+    layout().load(x0, kernels::power_of_two_scale(magnitude), x);
+    project_solution(x);
     apply(x, product);
     project(product);
-    const T largest = loops_.largest_magnitude(product, length());
+    const T largest = vectors_.largest_magnitude(product, length());
     if (std::isfinite(largest) && largest > T(0)) {
       const T scale = kernels::power_of_two_scale(largest);
-      loops_.scale(scale, product, product, length());
+      vectors_.scale(scale, product, product, length());
       const T alpha = dot(b(), product) / dot(product, product);
-      std::copy(b(), b() + length(), r);
-      loops_.axpy(-alpha, product, r, length());
-      loops_.scale(scale, x, x, length());
-      loops_.scale(alpha, x, x, length());
+      copy(b(), r);
+      vectors_.axpy(-alpha, product, r, length());
+      vectors_.scale(scale, x, x, length());
+      vectors_.scale(alpha, x, x, length());
       const T left2 = dot(r, r);
-      started_ = left2 < b2_ && std::isfinite(loops_.largest_magnitude(x, length()));
+      started_ = left2 < b2_ && std::isfinite(vectors_.largest_magnitude(x, length()));
       if (started_) {
         std::swap_ranges(b(), b() + length(), r);
         b2_ = left2;
@@ -87,91 +84,62 @@ class SampleSpace {
   Vector scratch() { return workspace_.vector(1); }
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
-  int64_t unknowns() const { return kernel_->unknowns(); }
+  int64_t unknowns() const { return system_.a().unknowns(); }
   double epsilon() const { return std::numeric_limits<T>::epsilon() / 2; }
 
-  void fill_zero(Vector v) { std::fill(v, v + length(), T(0)); }
-  void copy(const T* from, Vector to) { std::copy(from, from + length(), to); }
+  void fill_zero(Vector v) { vectors_.fill_zero(v, length()); }
+  void copy(const T* from, Vector to) { vectors_.copy(from, to, length()); }
   void assign(Scalar from, Scalar& to) { to = from; }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
-  void add(const T* d, Vector x) { loops_.axpy(T(1), d, x, length()); }
-  void xpby(const T* x, Scalar beta, Vector y) { loops_.xpby(x, beta, y, length()); }
-  Scalar dot(const T* a, const T* b) const { return loops_.dot(a, b, length()); }
+  void add(const T* d, Vector x) { vectors_.axpy(T(1), d, x, length()); }
+  void xpby(const T* x, Scalar beta, Vector y) { vectors_.xpby(x, beta, y, length()); }
+  Scalar xpby_with_square(const T* x, Scalar beta, Vector y) { return vectors_.xpby_with_square(x, beta, y, length()); }
+  Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
   Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
-    return loops_.descend(alpha, p, q, x, r, length());
+    return vectors_.descend(alpha, p, q, x, r, length());
   }
 
-  /// out = A v; returns v·out and ‖out‖².
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
     count(1);
-    if constexpr (requires { kernel_->apply(v, out)[0]; }) return kernel_->apply(v, out);
-    if constexpr (requires { kernel_->apply_with_dots(v, out); }) return kernel_->apply_with_dots(v, out);
-    kernel_->apply(v, out);
-    return {dot(v, out), dot(out, out)};
+    return system_.a().apply_with_dots(v, out);
   }
   void apply(const T* v, Vector out) {
     count(1);
-    kernel_->apply(v, out);
+    system_.a().apply(v, out);
   }
-  /// out = A M⁻¹ v. M is the diagonal, if anything: for others solve() takes plain tensors.
-  void apply(const T* v, Vector out, Preconditioner preconditioner) {
-    if (preconditioner == Preconditioner::kNone) return apply(v, out);
-    kernel_->divide_by_diagonal(v, scratch());
-    apply(scratch(), out);
-  }
-  void divide_by_diagonal(const T* b, Vector c) { kernel_->divide_by_diagonal(b, c); }
-  /// w = |D|⁻¹, times the power of two that brings its largest entry into [1, 2).
-  void inverse_diagonal(Vector w) {
-    std::fill_n(scratch(), kernel_->unknowns(), T(1));
-    kernel_->load(scratch(), T(1), w);
-    fill_zero(scratch());
-    kernel_->divide_by_diagonal(w, w);
-    std::transform(w, w + length(), w, [](T d) { return std::abs(d); });
-    loops_.scale(kernels::power_of_two_scale(loops_.largest_magnitude(w, length())), w, w, length());
-  }
-  /// The same with weights w: z = w∘v, entry by entry; Σ w_i v_i²; x += α p and r -= α q, with ‖r‖² and its
-  /// weighted one; p = w∘r + β p.
-  void weigh(const T* w, const T* v, Vector z) {
-    fill_zero(z);
-    loops_.weighted_xpby(w, v, T(0), z, length());
-  }
-  Scalar weighted_square(const T* w, const T* v) const { return loops_.weighted_square(w, v, length()); }
-  std::array<Scalar, 2> descend(Scalar alpha, const T* p, const T* q, const T* w, Vector x, Vector r) {
-    Scalar weighted;
-    const Scalar plain = loops_.weighted_descend(alpha, p, q, w, x, r, length(), &weighted);
-    return {plain, weighted};
-  }
-  void xpby(const T* w, const T* r, Scalar beta, Vector p) { loops_.weighted_xpby(w, r, beta, p, length()); }
+  bool is_preconditioned() const { return system_.preconditioner(); }
+  bool is_preconditioned_by_diagonal() const { return system_.by_diagonal(); }
+  Scalar precondition(const T* v, Vector out) { return system_.preconditioner()->apply(v, out); }
+  void precondition_transpose(const T* v, Vector out) { system_.preconditioner()->apply_transpose(v, out); }
+  void divide_by_diagonal(const T* b, Vector c) { system_.a().divide_by_diagonal(b, c); }
   /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
   /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.
   void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
     for (int64_t part; n > 0; n -= part) {
-      part = std::min(n, interruption::Watch::at_once(work()));
+      part = std::min(n, interruption::Watch::at_once(system_.a().work()));
       count(part);
-      if constexpr (kernels::kHasSpectrum<Kernel>) kernel_->jacobi_sweeps(c, x, next, part, omega);
-      else kernel_->jacobi_sweeps(c, x, next, part);
+      system_.a().jacobi_sweeps(c, x, next, part, omega);
       if (omega) omega += part;
     }
   }
   Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
     count(1);
-    if constexpr (kernels::kHasSpectrum<Kernel>) return kernel_->jacobi_sweep(c, x, next, omega);
-    else return kernel_->jacobi_sweep(c, x, next);
+    return system_.a().jacobi_sweep(c, x, next, omega);
   }
   /// The square of the spectral radius of I - D⁻¹A; solve() sees to it that there is one.
   Scalar radius2() const {
-    if constexpr (kernels::kHasSpectrum<Kernel>) return static_cast<T>(kernel_->radius() * kernel_->radius());
-    else return 0;
+    const double radius = system_.a().radius().value_or(0.0);
+    return static_cast<T>(radius * radius);
   }
   /// Whether the norms of Jacobi's residuals are a convex sequence on a logarithmic scale.
-  static constexpr bool sweeps_contract() { return kernels::kHasSpectrum<Kernel>; }
+  bool sweeps_contract() const { return system_.a().radius().has_value(); }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(solution(x), r);
     const T* const of = started_ ? whole_b() : b();
     const T one = 1;
-    const Scalar rr = loops_.multi_axpy(T(1), &one, &of, 1, T(-1), r, length());
-    if constexpr (!kernels::kHasNullSpace<Kernel>) return rr;
+    const Scalar rr = vectors_.multi_axpy(T(1), &one, &of, 1, T(-1), r, length());
+    if (!system_.a().left_null_space()) return rr;
     project(r);
     return dot(r, r);
   }
@@ -181,7 +149,7 @@ class SampleSpace {
     return dot(u, u);
   }
   void solve_directly(const T* r, Vector d) {
-    if (factors_->solve(r, d)) return;
+    if (system_.factors().solve(r, d)) return;
     broken_ = true;
     fill_zero(d);
   }
@@ -197,31 +165,21 @@ class SampleSpace {
     }
     return num / den;
   }
-  /// The same where b2 = Σ w_i q_i². Of that, 2‖q‖² is a bound, which mostly says enough.
-  Scalar step_length(Scalar num, Scalar den, Scalar a2, const T* w, const T* q, Scalar plain2) {
-    const T bound2 = 2 * plain2;
-    const bool clear = std::abs(den) > std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(bound2);
-    return step_length(num, den, a2, clear && std::isfinite(bound2) ? bound2 : weighted_square(w, q));
-  }
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
+  void break_down(Scalar where) { broken_ = broken_ || where != 0; }
 
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
   static constexpr int derivatives() { return 0; }
   Scalar constant(Scalar value) const { return value; }
   void dots(const std::vector<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
-    loops_.multi_dot(v.data(), count, factor, w, h, length());
+    vectors_.multi_dot(v.data(), count, factor, w, h, length());
   }
+  /// w = factor w - Σ h_i v_i; returns ‖w‖². And x += Σ y_i v_i.
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Scalar factor, Vector w) {
-    return loops_.multi_axpy(T(-1), h, v.data(), count, factor, w, length());
+    return vectors_.multi_axpy(T(-1), h, v.data(), count, factor, w, length());
   }
-  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector x,
-                       Preconditioner preconditioner) {
-    const bool plain = preconditioner == Preconditioner::kNone;
-    if (!plain) fill_zero(scratch());
-    loops_.multi_axpy(T(1), y.data(), v.data(), count, T(1), plain ? x : scratch(), length());
-    if (plain) return;
-    kernel_->divide_by_diagonal(scratch(), scratch());
-    add(scratch(), x);
+  void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector x) {
+    vectors_.multi_axpy(T(1), y, v.data(), count, T(1), x, length());
   }
   /// Whether w, of which `left2` is left beside the `taken2` that went along the basis, needs another
   /// pass: each takes a share of the digits away, and three may be missing.
@@ -235,6 +193,35 @@ class SampleSpace {
   Scalar inverse(Scalar value, Scalar scale) const {
     return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
   }
+  /// Rotates the rows of ε scale I into R, one by one, and then solves with R.
+  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
+    if (keep != 0) return;
+    std::vector<T> a(n * n), rhs(g, g + n), row(n);
+    for (int64_t j = 0; j < n; ++j)
+      for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+    for (int64_t k = 0; k < n; ++k) {
+      std::fill(row.begin(), row.end(), T(0));
+      row[k] = std::numeric_limits<T>::epsilon() * scale;
+      T of_row = 0;
+      for (int64_t i = k; i < n; ++i) {
+        const T length = std::hypot(a[i * n + i], row[i]);
+        if (length == T(0)) continue;
+        const T cos = a[i * n + i] / length, sin = row[i] / length;
+        const auto rotate = [&](T& upper, T& lower) {
+          const T rotated = cos * upper + sin * lower;
+          lower = cos * lower - sin * upper;
+          upper = rotated;
+        };
+        for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
+        rotate(rhs[i], of_row);
+      }
+    }
+    for (int64_t i = n - 1; i >= 0; --i) {
+      T sum = rhs[i];
+      for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
+      y[i] = a[i * n + i] == T(0) ? T(0) : sum / a[i * n + i];
+    }
+  }
   Scalar larger(Scalar a, Scalar b) const { return a > b ? a : b; }
   Scalar is_larger(Scalar a, Scalar b) const { return a > b; }
   void restore(Scalar where, const T* from, Vector to) {
@@ -247,7 +234,7 @@ class SampleSpace {
 
   std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
-  std::array<double, 1> operator_norm() const { return {kernel_->norm()}; }
+  std::array<double, 1> operator_norm() const { return {system_.a().norm()}; }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}  // a lone sample stops by leaving the loop
   template <class Function>
@@ -266,33 +253,29 @@ class SampleSpace {
   }
 
  private:
-  /// Squared norms below this are zero to the dtype, b being scaled to the order of one.
+  /// Squared norms below this are zero to the dtype, b and A being scaled to the order of one.
   static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
 
   static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
 
-  int64_t length() const { return kernel_->length(); }
+  const kernels::Layout<T>& layout() const { return system_.a().layout(); }
+  int64_t length() const { return system_.a().length(); }
   Vector start() { return workspace_.vector(2); }
   Vector whole_b() { return workspace_.vector(3); }
   const T* solution(const T* x) {
     if (!started_) return x;
-    std::transform(x, x + length(), start(), scratch(), std::plus<T>());
+    copy(x, scratch());
+    add(start(), scratch());
     return scratch();
   }
-  /// Of a product with A.
-  int64_t work() const {
-    if constexpr (requires { kernel_->stored(); }) return kernel_->stored() + kernel_->unknowns();
-    else return kernel_->unknowns();
-  }
   void count(int64_t products) {
-    watch_.spend(products * work());
+    watch_.spend(products * system_.a().work());
     state_->applications += products;
   }
 
   interruption::Watch& watch_ = interruption::Watch::local();
-  const kernels::Loops<T>& loops_ = kernels::loops<T>();
-  const Kernel* kernel_;
-  const Factors* factors_ = nullptr;
+  kernels::WholeVectors<T> vectors_;
+  const SampleSystem<T>& system_;
   kernels::Workspace<T>& workspace_;
   SampleState* state_ = nullptr;
   int64_t own_, used_;

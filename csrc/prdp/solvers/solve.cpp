@@ -3,8 +3,8 @@
 #include <ATen/EmptyTensor.h>
 
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/solve_cpu.h"
-#include "prdp/threads/interruption.h"
+#include "prdp/solvers/share_samples.h"
+#include "prdp/solvers/solve_samples.h"
 
 namespace prdp {
 
@@ -15,30 +15,24 @@ at::Tensor empty(at::IntArrayRef sizes, at::ScalarType dtype) { return at::detai
 
 SolveInfo empty_info(const at::Tensor& b) {
   const int64_t batch = b.size(0);
-  return {empty(batch, at::kLong), empty(batch, b.scalar_type()), empty(batch, at::kLong), empty(batch, at::kLong)};
+  return {empty(batch, at::kLong), empty(batch, b.scalar_type()), empty(batch, at::kLong), empty(batch, at::kLong),
+          empty(batch, b.scalar_type())};
 }
 
-/// Whether the CPU loops run this method for the operator with these parameters.
-bool has_loops(Method method, const KernelParameters& parameters) {
-  switch (traits(method).runs_on) {
-    case RunsOn::kAllLoops: return !std::holds_alternative<std::monostate>(parameters);
-    case RunsOn::kLaplacianLoops: return std::holds_alternative<kernels::LaplacianParameters>(parameters);
-    case RunsOn::kTensors: break;
-  }
-  return false;
-}
+/// Whether this solver runs in the CPU loops, if the operator has any.
+bool runs_on_loops(const Solver& solver) { return !solver.preconditioner.is_operator(); }
 
-template <class T, class Parameters>
-SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRequest& request) {
+template <class T>
+SolveResult solve_on_cpu(const kernels::KernelBatch<T>& kernels, const at::Tensor& b, const SolveRequest& request) {
   const auto rhs = b.contiguous();
   SolveResult result{empty(rhs.sizes(), rhs.scalar_type()), empty_info(rhs)};
-  const int64_t size = rhs.size(0);
+  const auto& solver = request.solver;
+  const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
-  const SampleBatch<T> batch{request.method,
-                             request.max_iter,
-                             request.rtol,
-                             request.restart,
+  const SampleBatch<T> batch{solver,
+                             solver.max_iter.expect_int(),
+                             unknowns,
                              caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
                              request.guarded,
                              rhs.const_data_ptr<T>(),
@@ -47,10 +41,12 @@ SolveResult solve_on_cpu(const Parameters& a, const at::Tensor& b, const SolveRe
                              result.info.iterations.mutable_data_ptr<int64_t>(),
                              result.info.residual.mutable_data_ptr<T>(),
                              result.info.status.mutable_data_ptr<int64_t>(),
-                             result.info.operator_applications.mutable_data_ptr<int64_t>()};
-  const int64_t unknowns = rhs.numel() / std::max<int64_t>(size, 1);
-  interruption::parallel_for(0, size, grain_size(request.method, size, unknowns, request.max_iter, request.restart),
-                             [&](int64_t begin, int64_t end) { solve_range(a, batch, begin, end); });
+                             result.info.operator_applications.mutable_data_ptr<int64_t>(),
+                             result.info.floor.mutable_data_ptr<T>()};
+  if (size == 0) return result;
+  const auto shared = shared_system(kernels, solver);
+  const auto solve_range = [&](int64_t begin, int64_t end) { solve_samples(kernels, shared.get(), batch, begin, end); };
+  share_samples(size, unknowns, grain_size(solver.method, size, unknowns, batch.max_iter, solver.restart), solve_range);
   return result;
 }
 
@@ -66,19 +62,11 @@ int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t ite
 }
 
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
-  const auto parameters = a.kernel(b);
-  if (!b.is_cpu() || !has_loops(request.method, parameters)) return solve_with_tensors(a, b, request);
-  return std::visit(
-      [&](const auto& p) -> SolveResult {
-        if constexpr (std::is_same_v<std::decay_t<decltype(p)>, std::monostate>) {
-          TORCH_INTERNAL_ASSERT(false);
-        } else if (b.scalar_type() == at::kFloat) {
-          return solve_on_cpu<float>(p, b, request);
-        } else {
-          return solve_on_cpu<double>(p, b, request);
-        }
-      },
-      parameters);
+  if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
+    a.jacobi_radius();  // raises
+  const auto kernels = b.is_cpu() && runs_on_loops(request.solver) ? a.kernels(b, false) : nullptr;
+  if (!kernels) return solve_with_tensors(a, b, request);
+  return std::visit([&](const auto& batch) { return solve_on_cpu(batch, b, request); }, kernels->of_dtype);
 }
 
 }  // namespace prdp

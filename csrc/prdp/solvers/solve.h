@@ -14,10 +14,7 @@ struct SolveResult {
 /// last iterate of every sample, even if it diverged. `x0`, with the shape of b, is a guess that is scaled as
 /// linear_solve() describes; if undefined, the iterations start from zero.
 struct SolveRequest {
-  Method method;
-  int64_t max_iter;
-  double rtol;
-  int64_t restart = kDefaultRestart;
+  Solver solver;
   std::optional<at::Tensor> caps{};
   bool guarded = true;
   at::Tensor x0{};
@@ -55,8 +52,12 @@ class StepwiseSolve {
   const at::Tensor& rhs() const { return rhs_; }
   /// The state after iteration `done` + 1, from the state before it. A sample past its cap does not change.
   State step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done);
-  /// P x / scale, where u = start + P x / scale. The same function takes ū to x̄.
-  at::Tensor scaled_back(const Operator& a, const at::Tensor& x) const { return a.project(x) / scale_; }
+  /// P c x / scale, where u = start + P c x / scale, c being the scale of A. The same function takes ū to x̄. Known
+  /// after the first step.
+  at::Tensor scaled_back(const Operator& a, const at::Tensor& x) const {
+    const auto u = a.project_solution(x) / scale_;
+    return scale_of_a_.defined() ? u * scale_of_a_ : u;
+  }
   /// The cotangent of b from that of rhs(): b̄ = P r̄ scale.
   at::Tensor bar_of_b(const Operator& a, const at::Tensor& rhs_bar) const { return a.project(rhs_bar) * scale_; }
   /// Where the iterations start; undefined if at zero.
@@ -66,7 +67,9 @@ class StepwiseSolve {
 
  private:
   Solver solver_;
+  std::unique_ptr<Operator> inverse_;
   at::Tensor scale_, rhs_, start_;
+  at::Tensor scale_of_a_, scale_of_inverse_;  // TensorSpace::System
   std::vector<double> b2_;  // of b, scaled
   std::vector<int64_t> caps_, applications_;
 };

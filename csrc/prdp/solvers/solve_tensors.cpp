@@ -10,7 +10,7 @@ namespace prdp {
 namespace {
 
 /// Says of each sample whether it is settled before iterating, and how; MAX_ITER: it is not.
-std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method, const at::Tensor& magnitude,
+std::vector<SolveStatus> settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& magnitude,
                                            const at::Tensor& start_magnitude) {
   const int64_t batch = magnitude.size(0);
   std::vector<SolveStatus> status(batch, SolveStatus::kMaxIter);
@@ -19,11 +19,9 @@ std::vector<SolveStatus> settle_beforehand(const Operator& a, Method method, con
     for (int64_t i = 0; i < batch; ++i)
       if (host.const_data_ptr<bool>()[i]) status[i] = why;
   };
-  // A method that does not suit the operator raises here, also where nothing needs to be iterated.
-  if (traits(method).made_for == MadeFor::kKnownSpectrum) a.jacobi_radius();
   // The last mark holds: the order is that of the CPU loops, from the end.
   mark(magnitude.eq(0), SolveStatus::kConverged);
-  if (traits(method).divides_by_diagonal) {
+  if (divides_by_diagonal(solver)) {
     const auto zero = a.diagonal().eq(0);
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
@@ -37,7 +35,7 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
   const auto batch = static_cast<int64_t>(states.size());
   const auto counts = at::TensorOptions().dtype(at::kLong);
   SolveInfo info{at::empty({batch}, counts), at::empty({batch}, at::kDouble), at::empty({batch}, counts),
-                 at::empty({batch}, counts)};
+                 at::empty({batch}, counts), at::empty({batch}, at::kDouble)};
   for (int64_t i = 0; i < batch; ++i) {
     const auto& s = states[i];
     double residual = s.b2 > 0.0 ? std::sqrt(s.residual2 / s.b2) : 0.0;
@@ -47,8 +45,9 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
     info.residual.mutable_data_ptr<double>()[i] = residual;
     info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(s.status);
     info.operator_applications.mutable_data_ptr<int64_t>()[i] = s.applications;
+    info.floor.mutable_data_ptr<double>()[i] = s.floor2 > 0.0 ? std::sqrt(s.floor2 / s.b2) : 0.0;
   }
-  info.residual = info.residual.to(real.device(at::kCPU));
+  for (auto* part : {&info.residual, &info.floor}) *part = part->to(real.device(at::kCPU));
   return info;
 }
 
@@ -81,10 +80,10 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   };
   const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
   const auto y = of_order_one(x0.detach()).b;
-  const auto [product, scale] = of_order_one(a.project(a.apply(a.project(y))));
+  const auto [product, scale] = of_order_one(a.project(a.apply(a.project_solution(y))));
   const auto product2 = dot(product, product);
   const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
-  const auto x = a.project(y) * scale * alpha, r = b - alpha * product;
+  const auto x = a.project_solution(y) * scale * alpha, r = b - alpha * product;
   const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
   return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
           per_sample(y.flatten(1).ne(0).any(1), b)};
@@ -93,6 +92,14 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
 /// The same recorded, of b and the tensors of A, for a start that is a constant.
 at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& start) {
   return start.defined() ? b - a.project(a.apply(start)) : b;
+}
+
+/// The operator that a preconditioner is; null for others. Raises ValueError or TypeError unless it takes vectors as b.
+std::unique_ptr<Operator> make_inverse(const Preconditioner& preconditioner, const at::Tensor& b) {
+  if (!preconditioner.is_operator()) return nullptr;
+  auto inverse = make_operator(preconditioner.spec());
+  inverse->check_vector(b);
+  return inverse;
 }
 
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
@@ -134,13 +141,9 @@ void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& stat
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
   const auto magnitude = largest_magnitude(b);
-  const bool starts = takes_start(request.method, request.x0);
-  const auto status =
-      settle_beforehand(a, request.method, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
-  const auto is_open = [](SolveStatus s) { return s == SolveStatus::kMaxIter; };
-  const bool iterates = request.max_iter > 0 && std::any_of(status.begin(), status.end(), is_open);
-  if (traits(request.method).preconditioner == Preconditioner::kStokes && !iterates && b.size(0) > 0)
-    a.precondition(at::zeros_like(b), false);
+  const auto& solver = request.solver;
+  const bool starts = takes_start(solver.method, request.x0);
+  const auto status = settle_beforehand(a, solver, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
   auto takes_part = at::empty({b.size(0)}, at::kBool);
   std::vector<SampleState> states(status.size());
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
@@ -149,13 +152,15 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     s.status = status[i];
     s.active = s.status == SolveStatus::kMaxIter;
     s.settled = !s.active;
-    s.cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : request.max_iter;
+    s.cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : solver.max_iter.expect_int();
     takes_part.mutable_data_ptr<bool>()[i] = s.active;
   }
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
   const auto rhs = a.project(whole);
-  const auto inconsistent = find_inconsistent(whole, rhs, request.rtol);
-  TensorSpace space(a, rhs, states);
+  const auto inconsistent = find_inconsistent(whole, rhs, solver.rtol);
+  const auto inverse = make_inverse(solver.preconditioner, b);
+  TensorSpace::System system{a, solver.preconditioner, inverse.get()};
+  TensorSpace space(system, rhs, states);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
   if (starts) {
@@ -166,9 +171,9 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     space.start_from(made.x, made.r);
   }
 
-  auto u = with_method(request.method, request.restart, space, [&](auto method) {
-    iterate(space, method, states, request.rtol, request.guarded);
-    return a.project(space.solution(method.x));
+  auto u = with_method(solver.method, solver.restart, space, [&](auto method) {
+    iterate(space, method, states, solver.rtol, request.guarded);
+    return a.project_solution(space.solution(method.x));
   });
   for (size_t i = 0; i < states.size(); ++i)
     if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
@@ -182,6 +187,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     states[i].status = SolveStatus::kOverflow;
     states[i].iterations = 0;
     states[i].residual2 = states[i].b2;
+    states[i].floor2 = 0.0;
   }
   return {u.contiguous(), info_of(states, b.options())};
 }
@@ -207,7 +213,9 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   std::vector<SampleState> states(b.size(0));
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   const auto whole = a.project(rhs);
-  TensorSpace space(a, whole, states, /*recording=*/true);
+  const auto inverse = make_inverse(solver.preconditioner, b);
+  TensorSpace::System system{a, solver.preconditioner, inverse.get()};
+  TensorSpace space(system, whole, states, /*recording=*/true);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = host_caps.const_data_ptr<int64_t>()[i];
@@ -220,14 +228,14 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const auto u = with_method(solver.method, solver.restart, space, [&](auto m) {
     m.start();
     for (int64_t done = 0; done < most; ++done) iterate_again(space, m, states, solver.rtol, done);
-    return a.project(space.solution(m.x)) / scale;
+    return a.project_solution(space.solution(m.x)) / scale;
   });
   return {u, info_of(states, b.options()).operator_applications.to(caps.device())};
 }
 
 StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
                              const at::Tensor& caps)
-    : solver_(solver) {
+    : solver_(solver), inverse_(make_inverse(solver.preconditioner, b)) {
   const auto [scaled, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   scale_ = scale;
   rhs_ = a.project(scaled);
@@ -247,7 +255,8 @@ int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin
 
 StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done) {
   std::vector<SampleState> states(caps_.size());
-  TensorSpace space(a, rhs, states, /*recording=*/true);
+  TensorSpace::System system{a, solver_.preconditioner, inverse_.get(), scale_of_a_, scale_of_inverse_};
+  TensorSpace space(system, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = caps_[i];
     states[i].b2 = b2_[i];
@@ -266,6 +275,8 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rh
     return 0;
   });
   for (size_t i = 0; i < states.size(); ++i) applications_[i] += states[i].applications;
+  scale_of_a_ = system.scale_of_a;
+  scale_of_inverse_ = system.scale_of_inverse;
   return after;
 }
 

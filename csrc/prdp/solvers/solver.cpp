@@ -2,6 +2,7 @@
 #include <sstream>
 #include <utility>
 
+#include "prdp/operators/kinds.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
@@ -16,8 +17,6 @@ constexpr auto kMethodNames = [] {
   for (size_t i = 0; i < names.size(); ++i) names[i] = {kTraits[i].method, kTraits[i].name};
   return names;
 }();
-constexpr Names<Preconditioner, 3> kPreconditioners{
-    {{Preconditioner::kNone, "none"}, {Preconditioner::kDiagonal, "diagonal"}, {Preconditioner::kStokes, "stokes"}}};
 constexpr Names<Backward, 3> kBackwards{
     {{Backward::kImplicit, "implicit"}, {Backward::kUnrolled, "unrolled"}, {Backward::kNone, "none"}}};
 constexpr Names<OnFailure, 4> kOnFailures{{{OnFailure::kRaise, "raise"},
@@ -47,7 +46,6 @@ Enum from_name(const Names<Enum, N>& names, std::string_view wanted, const char*
 }  // namespace
 
 std::string_view name(Method method) { return traits(method).name; }
-std::string_view name(Preconditioner preconditioner) { return to_name(kPreconditioners, preconditioner); }
 std::string_view name(Backward backward) { return to_name(kBackwards, backward); }
 std::string_view name(OnFailure on_failure) { return to_name(kOnFailures, on_failure); }
 std::string_view name(Start start) { return to_name(kStarts, start); }
@@ -65,22 +63,26 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
 }
 
-/// The method of this label with this preconditioner.
-Method with_preconditioner(std::string_view label, Preconditioner preconditioner) {
-  for (const auto& row : kTraits)
-    if (row.label == label && row.preconditioner == preconditioner) return row.method;
-  TORCH_CHECK_VALUE(false, label, ": takes no preconditioner of the kind ", name(preconditioner));
-}
-
 }  // namespace
 
-CG::operator Solver() const { return {with_preconditioner("CG", preconditioner), max_iter, rtol}; }
+Preconditioner Preconditioner::transposed() const {
+  auto other = *this;
+  other.spec_.transposed = !spec_.transposed;
+  return other;
+}
 
-GMRES::operator Solver() const { return {with_preconditioner("GMRES", preconditioner), max_iter, rtol, restart}; }
+std::string Preconditioner::title() const { return is_operator() ? operator_kind(spec_.kind).title : spec_.kind; }
 
 void Solver::check(const char* who) const {
   check_budget(who, "", max_iter, rtol);
   TORCH_CHECK_VALUE(restart >= 1, who, ": restart must be >= 1, got ", restart);
+  if (traits(method).is_multigrid) {
+    TORCH_CHECK_VALUE(preconditioner.is_multigrid(), who, ": the method multigrid needs Preconditioner::multigrid()");
+  } else {
+    TORCH_CHECK_VALUE(!preconditioner || traits(method).takes_preconditioner, who, ": ", traits(method).label,
+                      " takes no preconditioner; CG, BiCGStab and GMRES take one");
+  }
+  TORCH_CHECK_VALUE(preconditioner.smoothing() >= 1, who, ": smoothing must be >= 1, got ", preconditioner.smoothing());
 }
 
 void SolveOptions::check(const char* who) const {

@@ -1,9 +1,12 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <optional>
 #include <string>
 #include <string_view>
+
+#include "prdp/operators/operator.h"
 
 namespace prdp {
 
@@ -13,16 +16,45 @@ enum class Method {
   kChebyshev,
   kSteepestDescent,
   kConjugateGradient,
-  kConjugateGradientDiagonal,
   kBiCGStab,
   kGmres,
-  kGmresDiagonal,
-  kGmresStokes,
+  kMultigrid,
   kDirect
 };
 
-/// What CG and GMRES may be preconditioned by: the diagonal of A, or a Navier-Stokes step without winds.
-enum class Preconditioner { kNone, kDiagonal, kStokes };
+/// Smoothing steps of multigrid before and after each coarse grid.
+inline constexpr int64_t kDefaultSmoothing = 2;
+
+/// M ≈ A, whose inverse CG, BiCGStab and GMRES may apply in every iteration; the adjoint solve applies the transpose.
+/// In unrolled derivatives M is a constant, unless it is the diagonal.
+class Preconditioner {
+ public:
+  Preconditioner() = default;  // none
+  /// Any operator whose product is M⁻¹ r. CG needs a symmetric definite one.
+  Preconditioner(OperatorSpec inverse) : spec_(std::move(inverse)) {}
+  /// The diagonal of A.
+  static Preconditioner diagonal() { return OperatorSpec{"diagonal", {}, {}, {}}; }
+
+  explicit operator bool() const { return !spec_.kind.empty(); }
+  bool is_diagonal() const { return spec_.kind == "diagonal"; }
+  bool is_multigrid() const { return spec_.kind == "multigrid"; }
+  /// Whether it is an operator of the user's own.
+  bool is_operator() const { return *this && !is_diagonal() && !is_multigrid(); }
+  int64_t smoothing() const { return spec_.shape.empty() ? kDefaultSmoothing : spec_.shape[0]; }
+  /// A V-cycle of multigrid, with so many smoothing steps before and after each coarse grid; for Heat, Poisson, Burgers
+  /// and stencils whose neighbours lie at most one cell away.
+  static Preconditioner multigrid(int64_t smoothing = kDefaultSmoothing) {
+    return OperatorSpec{"multigrid", {smoothing}, {}, {}};
+  }
+  /// As it crosses torch's dispatcher: the operator, or the name in its `kind`; empty for none.
+  const OperatorSpec& spec() const { return spec_; }
+  Preconditioner transposed() const;
+  /// "diagonal", "Function"; empty for none.
+  std::string title() const;
+
+ private:
+  OperatorSpec spec_;
+};
 
 /// Relative residual at which an iteration may stop, ε in the paper.
 inline constexpr double kDefaultRtol = 1e-5;
@@ -36,8 +68,10 @@ struct Solver {
   c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
   double rtol = kDefaultRtol;
   int64_t restart = kDefaultRestart;  // m of GMRES(m)
+  Preconditioner preconditioner{};
 
-  /// Raises ValueError unless max_iter >= 0, rtol >= 0 and restart >= 1.
+  /// Raises ValueError unless max_iter >= 0, rtol >= 0 and restart >= 1, and for a preconditioner that the method does
+  /// not take.
   void check(const char* who) const;
 };
 
@@ -57,27 +91,38 @@ struct SteepestDescent {
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kSteepestDescent, max_iter, rtol}; }
 };
-/// For symmetric definite operators. Preconditioner: kNone or kDiagonal; another one raises ValueError.
+/// For symmetric definite operators.
 struct CG {
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  Preconditioner preconditioner = Preconditioner::kNone;
-  operator Solver() const;
+  Preconditioner preconditioner{};
+  operator Solver() const {
+    return {Method::kConjugateGradient, max_iter, rtol, kDefaultRestart, preconditioner};
+  }
 };
-/// For any operator; two products with A per iteration.
+/// For any operator; two products with A per iteration. Preconditioned from the right.
 struct BiCGStab {
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  operator Solver() const { return {Method::kBiCGStab, max_iter, rtol}; }
+  Preconditioner preconditioner{};
+  operator Solver() const { return {Method::kBiCGStab, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
-/// Restarted; max_iter counts cycles. Preconditioned from the right; kStokes is for NavierStokes alone
-/// and runs in plain tensor operations.
+/// Restarted; max_iter counts cycles. Preconditioned from the right.
 struct GMRES {
   int64_t restart = kDefaultRestart;
   int64_t max_iter;
   double rtol = kDefaultRtol;
-  Preconditioner preconditioner = Preconditioner::kNone;
-  operator Solver() const;
+  Preconditioner preconditioner{};
+  operator Solver() const { return {Method::kGmres, max_iter, rtol, restart, preconditioner}; }
+};
+/// V-cycles, u ← u + M⁻¹(b - A u); max_iter counts them. For the operators that Preconditioner::multigrid() is for.
+struct Multigrid {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  int64_t smoothing = kDefaultSmoothing;
+  operator Solver() const {
+    return {Method::kMultigrid, max_iter, rtol, kDefaultRestart, Preconditioner::multigrid(smoothing)};
+  }
 };
 /// The cheapest exact method of the operator. An iteration is one direct solve; those after the first refine its
 /// result.
@@ -104,7 +149,6 @@ enum class OnFailure { kRaise, kWarn, kReturn, kZeroGrad };
 
 /// Names as users write them; from_name raises ValueError naming the allowed ones.
 std::string_view name(Method method);
-std::string_view name(Preconditioner preconditioner);
 std::string_view name(Backward backward);
 std::string_view name(OnFailure on_failure);
 std::string_view name(Start start);
@@ -119,6 +163,14 @@ struct SolveInfo {
   at::Tensor residual;               // ‖b - A u‖ / ‖b‖, recomputed from u
   at::Tensor status;                 // SolveStatus
   at::Tensor operator_applications;  // number of products with A
+  /// Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖: the sample is
+  /// STAGNATED, and u as accurate as the dtype allows. 0 elsewhere.
+  at::Tensor floor;
+
+  /// All of them, in this order.
+  std::array<at::Tensor*, 5> parts() { return {&iterations, &residual, &status, &operator_applications, &floor}; }
+  /// Which samples are solved, as far as their dtype goes (bool).
+  at::Tensor solved() const { return status.gt(0).logical_or(floor.gt(0)); }
 };
 
 /// A value of checkpoint_every that stands for ⌈√K⌉, where K is the number of iterations that ran.

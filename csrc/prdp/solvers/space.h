@@ -34,8 +34,9 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   s.advance(x, y);
   /// y += x
   s.add(x, y);
-  /// y = x + a y
+  /// y = x + a y; and the same, returning ‖y‖².
   s.xpby(x, a, y);
+  { s.xpby_with_square(x, a, y) } -> std::same_as<typename S::Scalar>;
   /// x·y
   { s.dot(x, y) } -> std::same_as<typename S::Scalar>;
   /// x += a p and y -= a q; returns ‖y‖². p may be y.
@@ -44,6 +45,9 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   s.apply(x, y);
   /// y = A x; returns x·y and ‖y‖².
   { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+  /// Whether there is a preconditioner M; y = M⁻¹ x, which returns x·y.
+  { s.is_preconditioned() } -> std::same_as<bool>;
+  { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
   /// y = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖y‖².
   { s.residual(x, y) } -> std::same_as<typename S::Scalar>;
   /// a/b for a step, where the third and fourth are the squares of the norms whose product bounds b: 0 where a is
@@ -51,6 +55,8 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   { s.step_length(a, b, a, b) } -> std::same_as<typename S::Scalar>;
   /// a/b for b >= 0; 0 where b is negligible.
   { s.ratio(a, b) } -> std::same_as<typename S::Scalar>;
+  /// A breakdown of the samples where a is not zero.
+  s.break_down(a);
   /// 1 where a is not zero, else 0; and the other way round.
   { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
   { s.is_zero(a) } -> std::same_as<typename S::Scalar>;
@@ -62,25 +68,6 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   /// Unit roundoff.
   { s.epsilon() } -> std::same_as<double>;
 };
-
-/// What a preconditioner by the diagonal needs beside: products with weights w, entry by entry.
-template <class S>
-concept WeightedSpace =
-    VectorSpace<S> && requires(S s, typename S::Vector w, typename S::Vector x, typename S::Vector y,
-                               typename S::Vector p, typename S::Vector q, typename S::Scalar a, typename S::Scalar b) {
-      /// w = 1/|D|, times the power of two that brings its largest entry into [1, 2).
-      s.inverse_diagonal(w);
-      /// y = w∘x
-      s.weigh(w, x, y);
-      /// Σ w_i x_i²
-      { s.weighted_square(w, x) } -> std::same_as<typename S::Scalar>;
-      /// x += a p and y -= a q; returns ‖y‖² and Σ w_i y_i².
-      { s.descend(a, p, q, w, x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-      /// y = w∘x + a y
-      s.xpby(w, x, a, y);
-      /// step_length() with Σ w_i q_i² for the fourth; the last is ‖q‖².
-      { s.step_length(a, b, a, w, q, b) } -> std::same_as<typename S::Scalar>;
-    };
 
 /// What Jacobi's and Chebyshev's sweeps need beside.
 template <class S>
@@ -102,16 +89,14 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
 template <class S>
 concept KrylovSpace =
     VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y, std::vector<typename S::Vector> v,
-                               int64_t n, typename S::Scalar a, typename S::Scalar b, typename S::Scalar* h,
-                               std::vector<typename S::Scalar> w, Preconditioner preconditioner) {
-      /// y = A M⁻¹ x
-      s.apply(x, y, preconditioner);
+                               int64_t n, int64_t m, typename S::Scalar a, typename S::Scalar b,
+                               const typename S::Scalar* w, const typename S::Scalar* g, typename S::Scalar* h) {
       /// h_i = v_i·(a x) for the first n of v, as constants.
       s.dots(v, n, a, x, h);
       /// x = a x - Σ h_i v_i with a constant a; returns ‖x‖² as a constant.
       { s.subtract_combination(h, v, n, a, x) } -> std::same_as<typename S::Scalar>;
-      /// x += M⁻¹ Σ w_i v_i
-      s.add_combination(w, v, n, x, preconditioner);
+      /// x += Σ h_i v_i
+      s.add_combination(h, v, n, x);
       /// Whether a vector, of which a is left beside the b that went along the basis (both squared), is to be made
       /// orthogonal once more; the last keeps count of the digits lost.
       { s.lost_orthogonality(a, b, a) } -> std::same_as<bool>;
@@ -119,6 +104,9 @@ concept KrylovSpace =
       { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
       /// max(a, b)
       { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
+      /// Where the last but one is zero: h = argmin ‖g - R h‖² + (ε b)² ‖h‖², for the upper triangle R in the first n
+      /// columns of w, of which each has m entries. A constant.
+      s.damp(w, m, g, n, b, a, h);
       /// Whether a differs from zero in every sample; a space that would have to look closely may say no.
       { s.surely_all(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.
@@ -138,7 +126,7 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
 
 /// All of it, and what the loop around the methods needs (iterate.h).
 template <class S>
-concept IterationSpace = WeightedSpace<S> && SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S> &&
+concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S> &&
                          requires(S s, typename S::Vector x, typename S::Scalar a, typename S::States states,
                                   bool (*wanted)(const typename S::States::value_type&)) {
                            /// One number per sample, on the host.

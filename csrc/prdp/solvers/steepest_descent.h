@@ -10,7 +10,7 @@ namespace prdp {
 template <VectorSpace Space>
 class SteepestDescentMethod {
  public:
-  static constexpr bool kHasRecursiveResidual = true;
+  static constexpr bool kHasRecursiveResidual = true, kDescendsEnergy = true;
 
   explicit SteepestDescentMethod(Space& space)
       : x(space.vector()), space_(space), r_(space.vector()), q_(space.vector()) {}
@@ -30,6 +30,9 @@ class SteepestDescentMethod {
     go_on_from(space_.residual(x, r_));
     return rr_;
   }
+
+  /// The true one, after recompute_residual().
+  const typename Space::Vector& residual() const { return r_; }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, rr_); }

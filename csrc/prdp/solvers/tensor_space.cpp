@@ -26,8 +26,8 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 
 }  // namespace
 
-TensorSpace::TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording)
-    : a_(a), b_(std::move(b)), states_(states), recording_(recording) {
+TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
+    : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
@@ -43,33 +43,36 @@ double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
 
 const at::Tensor& TensorSpace::diagonal() {
   if (!diagonal_.defined()) {
-    const auto d = a_.diagonal().to(b_.options());
+    const auto d = system_.a.diagonal().to(b_.options());
     diagonal_ = at::where(d.eq(0), at::ones_like(d), d);
   }
   return diagonal_;
 }
 
-void TensorSpace::inverse_diagonal(Vector& w) {
-  const auto inverse = diagonal().abs().reciprocal().expand_as(b_);
-  w = inverse * power_of_two_scale(inverse.detach().amax(all_but_batch_, /*keepdim=*/true));
+TensorSpace::Vector TensorSpace::scaled(const Vector& product, const Vector& v, at::Tensor& scale) const {
+  if (!scale.defined()) {
+    const auto magnitude = [&](const Vector& t) { return t.detach().abs().amax(all_but_batch_, /*keepdim=*/true); };
+    const auto of_product = magnitude(product), of_v = magnitude(v);
+    const auto usable = of_product.gt(0).logical_and(of_product.isfinite()).logical_and(of_v.gt(0));
+    const auto one = at::ones_like(of_v);
+    scale = power_of_two_scale(at::where(usable, of_product, one)) / power_of_two_scale(at::where(usable, of_v, one));
+  }
+  return product * scale;
 }
 
-TensorSpace::Vector TensorSpace::precondition(const Vector& v, Preconditioner preconditioner) {
-  switch (preconditioner) {
-    case Preconditioner::kNone: break;
-    case Preconditioner::kDiagonal: return v / diagonal();
-    case Preconditioner::kStokes: return a_.precondition(v, false);
-  }
-  return v;
+TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
+  const auto z = system_.inverse ? scaled(system_.inverse->apply(v), v, system_.scale_of_inverse) : v / diagonal();
+  out = keep_frozen(z, out);
+  return dot(v, z);
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {
-  const auto solution = a_.solve_directly(r);
+  const auto solution = system_.a.solve_directly(r);
   const auto finite = solution.isfinite().all(/*dim=*/1, /*keepdim=*/true);
   auto every = finite;
   for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
   const auto singular = every.logical_not();
-  broken_ = broken_.defined() ? broken_.logical_or(singular) : singular;
+  note_broken(singular);
   d = at::where(every, solution, at::zeros_like(solution));
 }
 
@@ -79,7 +82,7 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
   const auto vanishes =
       den.detach().abs().le(bound).logical_and(bound.isfinite()).logical_and(nothing_left.logical_not());
-  broken_ = broken_.defined() ? broken_.logical_or(vanishes) : vanishes;
+  note_broken(vanishes);
   const auto none = nothing_left.logical_or(vanishes);
   const auto safe = at::where(none, at::ones_like(den), den);
   return at::where(none, at::zeros_like(num), num / safe);
@@ -95,6 +98,25 @@ TensorSpace::Scalar TensorSpace::inverse(const Scalar& value, const Scalar& scal
   return at::where(vanishing, at::zeros_like(value), 1 / value);
 }
 
+void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale,
+                       const Scalar& keep, Scalar* y) const {
+  const auto wanted = keep.detach().eq(0);
+  if (!wanted.any().item<bool>()) return;
+  const int64_t batch = b_.size(0);
+  auto a = at::zeros({batch, 2 * n, n}, b_.options());
+  auto rhs = at::zeros({batch, 2 * n, 1}, b_.options());
+  const auto number = [batch](const Scalar& s) { return s.detach().reshape(-1).expand(batch); };
+  const auto safe = [&](const Scalar& s) { return at::where(number(wanted), number(s), at::zeros({}, s.options())); };
+  for (int64_t j = 0; j < n; ++j) {
+    for (int64_t i = 0; i <= j; ++i) a.select(1, i).select(1, j).copy_(safe(r[j * stride + i]));
+    a.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
+    rhs.select(1, j).select(1, 0).copy_(safe(g[j]));
+  }
+  const auto [q, upper] = at::linalg_qr(a);
+  const auto found = at::linalg_solve_triangular(upper, at::matmul(q.mT(), rhs), /*upper=*/true);
+  for (int64_t j = 0; j < n; ++j) y[j] = at::where(wanted, found.select(1, j).view_as(wanted), y[j]);
+}
+
 std::vector<double> TensorSpace::lanes(const Scalar& value) const {
   return to_host(value, static_cast<int64_t>(states_.size()));
 }
@@ -108,7 +130,7 @@ std::vector<bool> TensorSpace::broken() const {
 }
 
 std::vector<double> TensorSpace::operator_norm() const {
-  return to_host(a_.norm(), static_cast<int64_t>(states_.size()));
+  return to_host(system_.a.norm(), static_cast<int64_t>(states_.size()));
 }
 
 TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, const Vector& kept,

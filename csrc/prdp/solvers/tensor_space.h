@@ -20,8 +20,16 @@ class TensorSpace {
   using Scalar = at::Tensor;  // (batch, 1, ...)
   using States = std::vector<SampleState>;
 
+  /// What a solve computes with: A, and the inverse of the preconditioner if it is an operator. Both are scaled by a
+  /// power of two for each sample, which their first product gives: so no product of theirs over- or underflows.
+  struct System {
+    const Operator& a;
+    const Preconditioner& preconditioner;
+    const Operator* inverse = nullptr;
+    at::Tensor scale_of_a{}, scale_of_inverse{};  // (batch, 1, …); undefined before the first product
+  };
   /// b must be finite and scaled to the order of one, or zero.
-  TensorSpace(const Operator& a, at::Tensor b, States& states, bool recording = false);
+  TensorSpace(System& system, at::Tensor b, States& states, bool recording = false);
   /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
   void start_from(at::Tensor x, at::Tensor r);
 
@@ -43,6 +51,10 @@ class TensorSpace {
   }
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
   void xpby(const Vector& x, const Scalar& beta, Vector& y) { y = keep_frozen(x + beta * y, y); }
+  Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
+    xpby(x, beta, y);
+    return dot(y, y);
+  }
   Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     x = keep_frozen(x + alpha * p, x);
@@ -50,24 +62,14 @@ class TensorSpace {
     return dot(r, r);
   }
 
-  void apply(const Vector& v, Vector& out, Preconditioner preconditioner = Preconditioner::kNone) {
-    count();
-    out = a_.apply(precondition(v, preconditioner));
-  }
+  void apply(const Vector& v, Vector& out) { out = scaled(product(v), v, system_.scale_of_a); }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
     apply(v, out);
     return {dot(v, out), dot(out, out)};
   }
+  bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
+  Scalar precondition(const Vector& v, Vector& out);
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
-  void inverse_diagonal(Vector& w);
-  void weigh(const Vector& w, const Vector& v, Vector& z) const { z = keep_frozen(w * v, z); }
-  Scalar weighted_square(const Vector& w, const Vector& v) const { return dot(v, w * v); }
-  std::array<Scalar, 2> descend(const Scalar& alpha, const Vector& p, const Vector& q, const Vector& w, Vector& x,
-                                Vector& r) {
-    const auto plain = descend(alpha, p, q, x, r);
-    return {plain, weighted_square(w, r)};
-  }
-  void xpby(const Vector& w, const Vector& r, const Scalar& beta, Vector& p) { xpby(w * r, beta, p); }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
     for (int64_t s = 0; s < n; ++s) {
       next = swept(x, jacobi_change(c, x), next, omega ? omega + s : nullptr);
@@ -80,16 +82,19 @@ class TensorSpace {
     const auto r = diagonal() * change;
     return dot(r, r);
   }
-  Scalar radius2() const { return a_.jacobi_radius().square(); }
+  Scalar radius2() const { return system_.a.jacobi_radius().square(); }
   static constexpr bool sweeps_contract() { return false; }  // not known of the operator
   Scalar residual(const Vector& x, Vector& r) {
-    Vector product;
-    apply(solution(x), product);
-    r = keep_frozen(a_.project((start_.defined() ? whole_b_ : b_) - product), r);
+    const auto ax = product(solution(x));
+    r = keep_frozen(system_.a.project((start_.defined() ? whole_b_ : b_) - ax), r);
     return dot(r, r);
   }
   bool started() const { return start_.defined(); }
-  Vector solution(const Vector& x) const { return start_.defined() ? start_ + x : x; }
+  /// u, which is x and the start where A is not scaled.
+  Vector solution(const Vector& x) const {
+    const auto from_zero = system_.scale_of_a.defined() ? x * system_.scale_of_a : x;
+    return start_.defined() ? start_ + from_zero : from_zero;
+  }
   Scalar solution2(const Vector& x) const {
     const auto u = solution(x);
     return dot(u, u);
@@ -97,11 +102,8 @@ class TensorSpace {
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
-  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Vector& w, const Vector& q,
-                     const Scalar&) {
-    return step_length(num, den, a2, weighted_square(w, q));
-  }
   Scalar ratio(const Scalar& num, const Scalar& den) const;
+  void break_down(const Scalar& where) { note_broken(where.detach().ne(0)); }
 
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
   int derivatives() const { return recording_ ? 2 : 0; }
@@ -116,14 +118,15 @@ class TensorSpace {
     for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
     return dot(w.detach(), w.detach());
   }
-  void add_combination(const std::vector<Scalar>& y, const std::vector<Vector>& v, int64_t count, Vector& x,
-                       Preconditioner preconditioner) {
-    auto sum = y[0] * v[0];
-    for (int64_t i = 1; i < count; ++i) sum = sum + y[i] * v[i];
-    x = keep_frozen(x + precondition(sum, preconditioner), x);
+  void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
+    auto sum = x;
+    for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
+    x = keep_frozen(sum, x);
   }
   bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& value, const Scalar& scale) const;
+  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
+            Scalar* y) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
   void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const {
@@ -160,19 +163,23 @@ class TensorSpace {
     return omega ? before + *omega * (x + change - before) : x + change;
   }
   Vector jacobi_change(const Vector& c, const Vector& x) {
-    Vector product;
-    apply(x, product);
-    return c - product / diagonal();
+    return c - product(x) / diagonal();
   }
   /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
   const at::Tensor& diagonal();
-  /// M⁻¹ v
-  Vector precondition(const Vector& v, Preconditioner preconditioner);
+  /// A v, not scaled.
+  Vector product(const Vector& v) {
+    count();
+    return system_.a.apply(v);
+  }
+  /// product·scale; where the scale is not known yet, it brings the product to the order of v.
+  Vector scaled(const Vector& product, const Vector& v, at::Tensor& scale) const;
+  void note_broken(const at::Tensor& rows) { broken_ = broken_.defined() ? broken_.logical_or(rows) : rows; }
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;
 
-  const Operator& a_;
+  System& system_;
   at::Tensor b_, b2_, diagonal_;
   at::Tensor start_, whole_b_;  // undefined: from zero
   States& states_;

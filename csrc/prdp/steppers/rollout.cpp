@@ -23,7 +23,7 @@ namespace {
 
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
-using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
 // A rollout is a row of solves, picard_steps to a step: solve s takes its winds from solution s and its
 // right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
@@ -31,7 +31,7 @@ constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
     "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
     ") -> "
-    "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications)";
+    "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications, Tensor floor)";
 constexpr const char* kVjpSchema =
     "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
     "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
@@ -85,7 +85,7 @@ Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_v
     reports.push(info);
   }
   auto info = reports.joined(u);
-  return {at::stack(solutions, 1), info.iterations, info.residual, info.status, info.operator_applications};
+  return {at::stack(solutions, 1), info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
 template <class... Options>
@@ -98,7 +98,7 @@ Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_vie
     return at::empty_symint({u.sym_size(0), solves}, u.options().dtype(dtype));
   };
   return {at::empty_symint(sizes, u.options()), of_dtype(at::kLong), of_dtype(u.scalar_type()), of_dtype(at::kLong),
-          of_dtype(at::kLong)};
+          of_dtype(at::kLong), of_dtype(u.scalar_type())};
 }
 
 template <class... Options>
@@ -150,9 +150,9 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
                                const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
     const auto& options = call->options;
-    const auto [solutions, iterations, residual, status, applications] =
+    const auto [solutions, iterations, residual, status, applications, floor] =
         call_solves(call->equation, u, call->solves, options);
-    ctx->mark_non_differentiable({iterations, residual, status, applications});
+    ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
     ctx->set_materialize_grads(false);
     const bool unrolled = options.backward == Backward::kUnrolled;
     const bool a_varies = equation_kind(call->equation.kind).linearised || any_requires_grad(tensors);
@@ -163,7 +163,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     ctx->save_for_backward(saved);
     call->equation.tensors.clear();  // they are among the saved ones
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
-    return {solutions, iterations, residual, status, applications};
+    return {solutions, iterations, residual, status, applications, floor};
   }
 
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
@@ -222,7 +222,7 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
     return call_solves(call->equation, u, call->solves, call->options);
   }
   const auto out = RolloutSolves::apply(u, tensors, call);
-  return {out[0], out[1], out[2], out[3], out[4]};
+  return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }
 
 /// The same step by step.
@@ -245,7 +245,7 @@ Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_
                        at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt steps, Options... flat) {
   const auto [states, info] =
       rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps, unflatten(std::move(flat)...));
-  return {states, info.iterations, info.residual, info.status, info.operator_applications};
+  return {states, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
 }  // namespace
@@ -259,12 +259,13 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   TORCH_CHECK_VALUE(
       steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  auto [solutions, iterations, residual, status, applications] = call_solves(equation, u, steps * picard, options);
-  if (picard == 1) return {solutions, {iterations, residual, status, applications}};
+  auto [solutions, iterations, residual, status, applications, floor] =
+      call_solves(equation, u, steps * picard, options);
+  if (picard == 1) return {solutions, {iterations, residual, status, applications, floor}};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
   return {solutions.slice_symint(1, 0, std::nullopt, picard),
           {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1), of_steps(status).amin(-1),
-           of_steps(applications).sum(-1)}};
+           of_steps(applications).sum(-1), of_steps(floor).select(-1, picard - 1)}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
@@ -274,7 +275,7 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
       "rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
       "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
       ") -> (Tensor states, Tensor iterations, Tensor residual, "
-      "Tensor status, Tensor operator_applications)",
+      "Tensor status, Tensor operator_applications, Tensor floor)",
       static_cast<SolvesSignature*>(rollout_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {

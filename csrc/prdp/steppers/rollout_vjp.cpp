@@ -31,15 +31,17 @@ void Reports::push(const SolveInfo& info) {
   residual_.push_back(info.residual);
   status_.push_back(info.status);
   applications_.push_back(info.operator_applications);
+  floor_.push_back(info.floor);
 }
 
 void Reports::reverse() {
-  for (auto* list : {&iterations_, &residual_, &status_, &applications_}) std::reverse(list->begin(), list->end());
+  for (auto* list : {&iterations_, &residual_, &status_, &applications_, &floor_}) std::reverse(list->begin(), list->end());
 }
 
 SolveInfo Reports::joined(const at::Tensor& u) const {
   return {side_by_side(iterations_, u, at::kLong), side_by_side(residual_, u, u.scalar_type()),
-          side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong)};
+          side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong),
+          side_by_side(floor_, u, u.scalar_type())};
 }
 
 std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,

@@ -15,7 +15,7 @@ class Reports {
   SolveInfo joined(const at::Tensor& u) const;
 
  private:
-  std::vector<at::Tensor> iterations_, residual_, status_, applications_;
+  std::vector<at::Tensor> iterations_, residual_, status_, applications_, floor_;
 };
 
 /// What the solves of a rollout store for their derivative; undefined if it is not needed.

@@ -22,7 +22,7 @@ std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs) {
   if (!any) return std::nullopt;
   const SolveInfo none{at::zeros_like(any->iterations), at::zeros_like(any->residual),
                        at::full_like(any->status, static_cast<int64_t>(SolveStatus::kConverged)),
-                       at::zeros_like(any->operator_applications)};
+                       at::zeros_like(any->operator_applications), at::zeros_like(any->floor)};
   Reports reports;
   for (const auto& info : found) reports.push(info.value_or(none));
   return reports.joined(any->residual);
@@ -47,7 +47,7 @@ std::optional<SolveInfo> StepperBase::adjoint_info() const {
 
 bool StepperBase::converged() const {
   const auto adjoint = adjoint_info();
-  return info_ && info_->status.gt(0).all().item<bool>() && (!adjoint || adjoint->status.gt(0).all().item<bool>());
+  return info_ && info_->solved().all().item<bool>() && (!adjoint || adjoint->solved().all().item<bool>());
 }
 
 }  // namespace prdp

@@ -56,8 +56,7 @@ void read_solver(Section& s, Scene& scene) {
   const When spectrum{!scene.physics.periodic(), "only for `heat` and `poisson`"};
   Choices methods;
   for (const auto& method : kTraits)
-    if (method.preconditioner == Preconditioner::kNone)
-      methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum : When{});
+    methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum : When{});
   s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
   s.count(scene.solver.max_iter, 1,
           {"max_iter", "K of the converged solver, K_ε in the paper", "iterations (`gmres`: cycles)"});

@@ -1,10 +1,11 @@
 #pragma once
-#include "prdp/kernels/direct_factors.h"
-#include "prdp/kernels/factor_cache.h"
-#include "prdp/kernels/sparse_factors.h"
-#include "prdp/kernels/stencil.h"
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
 
-/// The exact methods of stencils. All factorise and solve in double, whatever T is.
+#include "prdp/kernels/stencil_rows.h"
+
 namespace prdp::kernels {
 
 /// Thomas' algorithm for all unknowns of a line but the last one, which may be coupled to both ends:
@@ -37,9 +38,13 @@ class CyclicThomas {
     border_first_ = last > 0 ? border[0] : 0.0;
     border_last_ = last > 1 ? border[last - 1] : 0.0;
     solve_tridiagonal(column_.data());
-    inverse_corner_ = 1.0 / (corner - border_product(column_.data()));
+    const double last_pivot = corner - border_product(column_.data());
+    inverse_corner_ = 1.0 / last_pivot;
+    is_regular_ = std::abs(last_pivot) > std::numeric_limits<double>::epsilon() * static_cast<double>(n_) * a.norm();
   }
   bool is_dominant() const { return is_dominant_; }
+  /// Whether the last pivot, the only one that a dominant matrix may lose, is larger than its rounding errors.
+  bool is_regular() const { return is_regular_; }
   /// v ← A⁻¹ v
   void solve(double* v) const {
     solve_tridiagonal(v);
@@ -77,46 +82,9 @@ class CyclicThomas {
   }
 
   int64_t n_;
-  bool is_dominant_;
+  bool is_dominant_, is_regular_ = false;
   std::vector<double> lower_, inverse_pivot_, upper_, column_;  // column_: M⁻¹e
   double border_first_, border_last_, inverse_corner_;
-};
-
-/// One factorisation for all channels.
-template <class T>
-class StencilFactors {
- public:
-  explicit StencilFactors(const Stencil<T>& kernel) : kernel_(kernel), values_(kernel.unknowns()) {
-    const auto& a = kernel.coefficients();
-    if (a.pattern().nearest && a.rows() == 1) thomas_.emplace(a);
-    if (thomas_ && thomas_->is_dominant()) return;
-    sparse_ = factor_cache::find_or_make<SparseFactors<double>>(
-        a.key(), [&] { return std::make_shared<SparseFactors<double>>(a, kernel.unknowns() / kernel.channels()); });
-  }
-  bool solve(const T* r, T* d) const {
-    if (sparse_ && !sparse_->is_regular()) return false;
-    kernel_.store(r, T(1), values_.data());
-    const int64_t n = static_cast<int64_t>(values_.size()), points = n / kernel_.channels();
-    for (int64_t at = 0; at < n; at += points) {
-      Eigen::VectorXd x = values_.segment(at, points).template cast<double>();
-      if (sparse_) x = sparse_->solve(x);
-      else thomas_->solve(x.data());
-      values_.segment(at, points) = x.template cast<T>();
-    }
-    kernel_.load(values_.data(), T(1), d);
-    return all_finite(values_.data(), n);
-  }
-
- private:
-  const Stencil<T>& kernel_;
-  mutable Eigen::Matrix<T, Eigen::Dynamic, 1> values_;  // one object a thread
-  std::optional<CyclicThomas> thomas_;
-  std::shared_ptr<const SparseFactors<double>> sparse_;
-};
-
-template <class T>
-struct FactorsOf<Stencil<T>> {
-  using Type = StencilFactors<T>;
 };
 
 }  // namespace prdp::kernels

@@ -1,0 +1,254 @@
+#include "prdp/kernels/galerkin.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+
+#include "prdp/kernels/loops.h"
+#include "prdp/threads/shared_rows.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+/// Points of a grid with a ring of one point around it.
+struct Ringed {
+  int64_t ny, nx;  // with the ring
+
+  explicit Ringed(const StencilGrid& grid) : ny(grid.shape[1] + 2), nx(grid.shape[2] + 2) {}
+  static int64_t size(const StencilGrid& grid) {
+    return (grid.shape[0] + 2) * (grid.shape[1] + 2) * (grid.shape[2] + 2);
+  }
+  int64_t at(int64_t z, int64_t y, int64_t x) const { return ((z + 1) * ny + y + 1) * nx + x + 1; }
+};
+
+/// Calls body(z, y, first point of the row) for all rows, on several threads if there are many.
+template <class Body>
+void for_each_row(const StencilGrid& grid, const Body& body) {
+  const int64_t rows = grid.shape[0] * grid.shape[1], nx = grid.shape[2];
+  const int64_t each = std::max<int64_t>(8192 / nx, 1);
+  shared_rows::for_each((rows + each - 1) / each, [&](int64_t part) {
+    for (int64_t r = part * each; r < std::min(rows, (part + 1) * each); ++r)
+      body(r / grid.shape[1], r % grid.shape[1], r * nx);
+  });
+}
+
+/// The row at an offset from row (z, y), where it lies in the grid, or comes round its end; else -1.
+int64_t row_at(const StencilGrid& grid, int64_t z, int64_t y, const Offset& o) {
+  const int64_t nz = grid.shape[0], ny = grid.shape[1];
+  z = neighbour(z, o.along[0], nz, grid.periodic[0]);
+  y = neighbour(y, o.along[1], ny, grid.periodic[1]);
+  return z < 0 || y < 0 ? -1 : z * ny + y;
+}
+
+/// Sums of the coefficients with offset -1, 0 and 1 along the axis: of A, or of Aᵀ.
+template <class T>
+using Sums = std::array<std::vector<T>, 3>;
+
+template <class T>
+Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
+  Sums<T> sums;
+  for (auto& s : sums) s.assign(a.points(), T(0));
+  const int64_t nx = a.grid.shape[2];
+  for_each_row(a.grid, [&](int64_t z, int64_t y, int64_t at) {
+    for (int k = 0; k < 27; ++k) {
+      const Offset o = RawStencil<T>::offset(k);
+      const T *own = a.coefficients[k], *of_transpose = a.coefficients[26 - k];
+      if (!(transposed ? of_transpose : own)) continue;
+      T* to = sums[o.along[axis] + 1].data() + at;
+      if (!transposed) {
+        for (int64_t i = 0; i < nx; ++i) to[i] += own[at + i];
+        continue;
+      }
+      // Aᵀ couples i to i + o as A couples i + o to i. Beyond the grid, A's own coefficient stands for it.
+      const int64_t row = row_at(a.grid, z, y, o);
+      const T* beyond = own ? own : of_transpose;
+      for (int64_t i = 0; i < nx; ++i) {
+        const int64_t j = row < 0 ? -1 : neighbour(i, o.along[2], nx, a.grid.periodic[2]);
+        to[i] += j < 0 ? beyond[at + i] : of_transpose[row * nx + j];
+      }
+    }
+  });
+  return sums;
+}
+
+/// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros.
+template <class T>
+Weights<T> weights_of(const StencilGrid& grid, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
+  const Ringed ringed(grid);
+  Weights<T> w{std::vector<T>(Ringed::size(grid), T(0)), std::vector<T>(Ringed::size(grid), T(0))};
+  const auto& [nz, ny, nx] = grid.shape;
+  for_each_row(grid, [&](int64_t z, int64_t y, int64_t at) {
+    T *left = w.left.data() + ringed.at(z, y, 0), *right = w.right.data() + ringed.at(z, y, 0);
+    for (int64_t i = 0; i < nx; ++i) {
+      T s[3] = {sums[0][at + i], sums[1][at + i], sums[2][at + i]};
+      if (averaged_with)
+        for (int d = 0; d < 3; ++d) s[d] += (*averaged_with)[d][at + i];
+      const T centre = s[1] == T(0) ? T(1) : s[1];
+      left[i] = std::clamp(-s[0] / centre, T(0), T(1));
+      right[i] = std::clamp(-s[2] / centre, T(0), T(1));
+    }
+  });
+  for (auto* field : {&w.left, &w.right}) {
+    T* const f = field->data();
+    const auto row = [&](int64_t z, int64_t y) { return f + ringed.at(z, y, -1); };
+    if (grid.periodic[2])
+      for (int64_t z = 0; z < nz; ++z)
+        for (int64_t y = 0; y < ny; ++y) row(z, y)[0] = row(z, y)[nx], row(z, y)[nx + 1] = row(z, y)[1];
+    if (grid.periodic[1])
+      for (int64_t z = 0; z < nz; ++z) {
+        std::copy_n(row(z, ny - 1), nx + 2, row(z, -1));
+        std::copy_n(row(z, 0), nx + 2, row(z, ny));
+      }
+    if (grid.periodic[0]) {
+      const int64_t plane = ringed.ny * ringed.nx;
+      std::copy_n(f + nz * plane, plane, f);
+      std::copy_n(f + plane, plane, f + (nz + 1) * plane);
+    }
+  }
+  return w;
+}
+
+/// Constants in place of the weights of a neighbour that is not there.
+template <class T>
+struct Constants {
+  std::vector<T> zeros, ones;
+  explicit Constants(int64_t n) : zeros(n, T(0)), ones(n, T(1)) {}
+};
+
+/// Everything that the coarse coefficients with one offset in the other axes are made of.
+template <class T>
+class CollapseOf {
+ public:
+  CollapseOf(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer, const Constants<T>& constants,
+             int centre, T* const out[3])
+      : a_(a), axis_(axis), transfer_(transfer), constants_(constants), ringed_(a.grid), out_(out) {
+    const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
+    for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[centre + (d - 1) * step];
+    offset_ = RawStencil<T>::offset(centre);
+  }
+  bool is_empty() const { return !fine_[0] && !fine_[1] && !fine_[2]; }
+
+  /// The coarse points from `first` on, n of them: of a row along x, or of x itself if that is the axis.
+  void points(int64_t z, int64_t y, int64_t x, int64_t n, int64_t coarse, int64_t to) const {
+    const int64_t extent = a_.grid.shape[axis_];
+    const bool periodic = a_.grid.periodic[axis_];
+    const int64_t here = 2 * coarse + !periodic;
+    // An odd ring has no point between its last and its first; a line of an even number has none behind its last.
+    const bool has_before = here > 0 || (periodic && extent % 2 == 0);
+    const bool has_after = here + 1 < extent;
+    const auto along = [&](int64_t i) {
+      const int64_t at = (i + extent) % extent;
+      return std::array<int64_t, 3>{axis_ == 0 ? at : z, axis_ == 1 ? at : y, axis_ == 2 ? at : x};
+    };
+    const auto before = along(here - 1), middle = along(here), after = along(here + 1);
+    const auto coefficient = [&](int d, const std::array<int64_t, 3>& p) -> const T* {
+      if (!fine_[d]) return has_sides() ? constants_.zeros.data() : nullptr;
+      return fine_[d] + (p[0] * a_.grid.shape[1] + p[1]) * a_.grid.shape[2] + p[2];
+    };
+    const auto weight = [&](const std::vector<T>& field, const std::array<int64_t, 3>& p, bool of_column) {
+      const auto& o = offset_.along;
+      return field.data() + (of_column ? ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]) : ringed_.at(p[0], p[1], p[2]));
+    };
+    const T *zeros = constants_.zeros.data(), *ones = constants_.ones.data();
+    const auto& [p, r] = transfer_;
+    const Collapse<T> c{coefficient(0, before),
+                        coefficient(0, middle),
+                        coefficient(0, after),
+                        fine_[1] ? coefficient(1, before) : zeros,
+                        fine_[1] ? coefficient(1, middle) : zeros,
+                        fine_[1] ? coefficient(1, after) : zeros,
+                        coefficient(2, before),
+                        coefficient(2, middle),
+                        coefficient(2, after),
+                        has_before ? weight(p.left, before, true) : ones,
+                        has_before ? weight(p.right, before, true) : zeros,
+                        has_after ? weight(p.left, after, true) : zeros,
+                        has_after ? weight(p.right, after, true) : ones,
+                        has_before ? weight(r.right, before, false) : zeros,
+                        has_after ? weight(r.left, after, false) : zeros,
+                        out_[0] + to,
+                        out_[1] + to,
+                        out_[2] + to};
+    loops<T>().collapse(c, axis_ == 2 ? 2 : 1, n);
+  }
+
+ private:
+  bool has_sides() const { return fine_[0] || fine_[2]; }
+
+  const RawStencil<T>& a_;
+  int axis_;
+  const AxisTransfer<T>& transfer_;
+  const Constants<T>& constants_;
+  Ringed ringed_;
+  T* const* out_;
+  const T* fine_[3];  // with offset -1, 0, 1 along the axis
+  Offset offset_;     // in the other axes
+};
+
+}  // namespace
+
+template <class T>
+AxisTransfer<T> make_transfer(const RawStencil<T>& a, int axis, bool symmetric) {
+  const auto own = sums_along(a, axis, false);
+  if (symmetric) {
+    auto w = weights_of(a.grid, own);
+    return {w, w};
+  }
+  const auto of_transpose = sums_along(a, axis, true);
+  return {weights_of(a.grid, own, &of_transpose), weights_of(a.grid, of_transpose)};
+}
+
+template <class T>
+RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer) {
+  const bool periodic = a.grid.periodic[axis];
+  RawStencil<T> coarse(a.grid);
+  const int64_t count = coarse_points(a.grid.shape[axis], periodic);
+  coarse.grid.shape[axis] = count;
+  const Constants<T> constants(a.grid.shape[2] + 2);
+  const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
+  for (int centre = 0; centre < 27; ++centre) {
+    if (RawStencil<T>::offset(centre).along[axis] != 0) continue;
+    T* out[3] = {};
+    if (CollapseOf<T>(a, axis, transfer, constants, centre, out).is_empty()) continue;
+    for (int d = 0; d < 3; ++d) out[d] = coarse.add(centre + (d - 1) * step);
+    const CollapseOf<T> part(a, axis, transfer, constants, centre, out);
+    for_each_row(coarse.grid, [&](int64_t z, int64_t y, int64_t to) {
+      if (axis != 2) return part.points(z, y, 0, a.grid.shape[2], axis == 0 ? z : y, to);
+      // The ends of a row may lack a neighbour.
+      part.points(z, y, 0, 1, 0, to);
+      if (count > 2) part.points(z, y, 0, count - 2, 1, to + 1);
+      if (count > 1) part.points(z, y, 0, 1, count - 1, to + count - 1);
+    });
+  }
+  return coarse;
+}
+
+template <class T>
+bool is_symmetric(const RawStencil<T>& a) {
+  const int64_t nx = a.grid.shape[2];
+  for (int k = 0; k < RawStencil<T>::kCentre; ++k) {
+    const T *one = a.coefficients[k], *other = a.coefficients[26 - k];
+    if (!one && !other) continue;
+    if (!one || !other) return false;
+    const Offset o = RawStencil<T>::offset(k);
+    for (int64_t r = 0; r < a.grid.shape[0] * a.grid.shape[1]; ++r) {
+      const int64_t row = row_at(a.grid, r / a.grid.shape[1], r % a.grid.shape[1], o);
+      if (row < 0) continue;
+      for (int64_t i = 0; i < nx; ++i) {
+        const int64_t j = neighbour(i, o.along[2], nx, a.grid.periodic[2]);
+        if (j >= 0 && one[r * nx + i] != other[row * nx + j]) return false;
+      }
+    }
+  }
+  return true;
+}
+
+template AxisTransfer<float> make_transfer(const RawStencil<float>&, int, bool);
+template AxisTransfer<double> make_transfer(const RawStencil<double>&, int, bool);
+template RawStencil<float> collapse(const RawStencil<float>&, int, const AxisTransfer<float>&);
+template RawStencil<double> collapse(const RawStencil<double>&, int, const AxisTransfer<double>&);
+template bool is_symmetric(const RawStencil<float>&);
+template bool is_symmetric(const RawStencil<double>&);
+
+}  // namespace prdp::kernels

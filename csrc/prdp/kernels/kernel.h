@@ -1,0 +1,138 @@
+#pragma once
+#include <c10/util/Exception.h>
+
+#include <array>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <variant>
+
+#include "prdp/kernels/factor_cache.h"
+#include "prdp/kernels/layout.h"
+#include "prdp/kernels/null_space.h"
+#include "prdp/kernels/raw_stencil.h"
+
+namespace prdp::kernels {
+
+/// The exact method of an operator, made once and used for any number of right-hand sides, by any thread.
+template <class T>
+class Factors {
+ public:
+  virtual ~Factors() = default;
+  /// d = A⁻¹ r in padded memory; false if A is singular.
+  virtual bool solve(const T* r, T* d) const = 0;
+};
+
+/// factor()·A on one channel of one sample, as a stencil on a grid.
+template <class T>
+struct GridOperator {
+  RawStencil<T> stencil;  // of the operator that is not transposed
+  FactorKey key;          // tells it from others
+  bool transposed;
+};
+
+/// A on one sample in padded memory: everything that the CPU loops know of an operator. It may be used by several
+/// threads at once. What it computes with is factor()·A, where the factor is a power of two: entries far from the
+/// order of one are scaled, so that products of several of them neither overflow nor underflow.
+template <class T>
+class Kernel {
+ public:
+  Kernel(const Layout<T>& layout, T factor) : layout_(layout), factor_(factor) {}
+  Kernel(const Kernel&) = delete;
+  Kernel& operator=(const Kernel&) = delete;
+  virtual ~Kernel() = default;
+
+  const Layout<T>& layout() const { return layout_; }
+  int64_t unknowns() const { return layout_.unknowns(); }
+  int64_t length() const { return layout_.length(); }
+  T factor() const { return factor_; }
+
+  /// ‖A‖∞
+  virtual double norm() const = 0;
+  /// Multiplications of a product.
+  virtual int64_t work() const { return unknowns(); }
+  /// out = A v
+  virtual void apply(const T* v, T* out) const = 0;
+  /// The same; returns v·out and ‖out‖².
+  virtual std::array<T, 2> apply_with_dots(const T* v, T* out) const {
+    apply(v, out);
+    return {vectors_.dot(v, out, length()), vectors_.dot(out, out, length())};
+  }
+
+  virtual bool has_zero_diagonal() const = 0;
+  /// c = D⁻¹ b
+  virtual void divide_by_diagonal(const T* b, T* c) const = 0;
+  /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use. With omega, one for each sweep,
+  /// Chebyshev's x ← y + omega (that - y), where y holds the iterate before x, before and after; only where the
+  /// spectral radius is known.
+  virtual void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega) const = 0;
+  /// One of them, from x to y; returns ‖b - A x‖².
+  virtual T jacobi_sweep(const T* c, const T* x, T* y, const T* omega) const = 0;
+  /// The spectral radius of I - D⁻¹A, which is symmetric there; nothing if it is not known.
+  virtual std::optional<double> radius() const { return std::nullopt; }
+
+  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); y holds the iterate before x, before, and the one after it,
+  /// after. And r = b - A x. Only for a grid_operator().
+  virtual void smooth(const T* b, const T* x, T* y, T p, T q) const;
+  virtual void residual(const T* b, const T* x, T* r) const;
+  /// What multigrid makes its coarse grids of; nothing if the operator is not of that kind.
+  virtual std::optional<GridOperator<T>> grid_operator() const { return std::nullopt; }
+
+  virtual std::shared_ptr<const Factors<T>> factorise() const = 0;
+
+  /// The null space of A, if it was named: what A maps to zero, and what no product with A contains.
+  const std::optional<NullSpace<T>>& null_space() const { return null_space_; }
+  const std::optional<NullSpace<T>>& left_null_space() const { return left_null_space_; }
+  void set_null_spaces(NullSpace<T> right, NullSpace<T> left) {
+    null_space_.emplace(std::move(right));
+    left_null_space_.emplace(std::move(left));
+  }
+
+ protected:
+  const WholeVectors<T> vectors_{};
+
+ private:
+  Layout<T> layout_;
+  T factor_;
+  std::optional<NullSpace<T>> null_space_, left_null_space_;
+};
+
+template <class T>
+void Kernel<T>::smooth(const T*, const T*, T*, T, T) const {
+  TORCH_INTERNAL_ASSERT(false, "no multigrid for this operator");
+}
+template <class T>
+void Kernel<T>::residual(const T*, const T*, T*) const {
+  TORCH_INTERNAL_ASSERT(false, "no multigrid for this operator");
+}
+
+/// A of a batch: one kernel for all samples, or one for each.
+template <class T>
+struct KernelBatch {
+  bool is_shared;
+  /// Null where A is not finite. The kernel may refer to the memory that the batch was made of.
+  std::function<std::unique_ptr<Kernel<T>>(int64_t sample)> make;
+};
+
+/// The same in the dtype of the vectors.
+struct Kernels {
+  std::variant<KernelBatch<float>, KernelBatch<double>> of_dtype;
+};
+
+/// Of make(T()), a KernelBatch<T>.
+template <class Make>
+std::shared_ptr<const Kernels> make_kernels(bool single, const Make& make) {
+  if (single) return std::make_shared<Kernels>(Kernels{make(float())});
+  return std::make_shared<Kernels>(Kernels{make(double())});
+}
+
+/// The power of two that brings an operator whose largest entry has this magnitude to the order of one; 1 if it is
+/// not far from there.
+template <class T>
+T scale_of_operator(T magnitude) {
+  constexpr int far = 8;
+  if (!std::isfinite(magnitude) || magnitude == T(0) || std::abs(std::ilogb(magnitude)) <= far) return 1;
+  return power_of_two_scale(magnitude);
+}
+
+}  // namespace prdp::kernels

@@ -1,0 +1,141 @@
+#include <Eigen/Dense>
+#include <cmath>
+#include <numbers>
+
+#include "prdp/kernels/laplacian.h"
+#include "prdp/threads/interruption.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+template <class T>
+bool all_finite(const T* x, int64_t n) {
+  return std::isfinite(largest_magnitude(x, n));
+}
+
+/// Thomas' algorithm for the constant tridiagonal matrix. The one division per row is done beforehand.
+template <class T>
+class Thomas final : public Factors<T> {
+ public:
+  Thomas(const LaplacianParameters& p, int64_t n) : off_(static_cast<T>(p.off[0])), inverse_pivot_(n) {
+    double pivot = p.centre;
+    for (auto& inverse : inverse_pivot_) {
+      inverse = static_cast<T>(1.0 / pivot);
+      pivot = p.centre - p.off[0] * p.off[0] / pivot;
+    }
+  }
+  bool solve(const T* r, T* d) const override {
+    const auto n = static_cast<int64_t>(inverse_pivot_.size());
+    T previous = 0;
+    for (int64_t i = 0; i < n; ++i) d[i] = previous = (r[i] - off_ * previous) * inverse_pivot_[i];
+    for (int64_t i = n - 2; i >= 0; --i) d[i] -= off_ * inverse_pivot_[i] * d[i + 1];
+    return all_finite(d, n);
+  }
+
+ private:
+  T off_;
+  std::vector<T> inverse_pivot_;
+};
+
+/// Diagonalisation by the sine transform in 2D and 3D: small matrix products along each axis.
+template <class T, int Dim>
+class SineTransform final : public Factors<T> {
+ public:
+  SineTransform(const LaplacianParameters& p, const Layout<T>& layout) : layout_(layout), inverse_(layout.unknowns()) {
+    basis_[0] = basis(layout.nx);
+    basis_[1] = basis(layout.rows);
+    if (Dim > 2) basis_[2] = basis(layout.planes);
+    int64_t at = 0;
+    for (int64_t k = 1; k <= layout.planes; ++k)
+      for (int64_t j = 1; j <= layout.rows; ++j)
+        for (int64_t i = 1; i <= layout.nx; ++i) {
+          // Along one axis, off (v_{i-1} + v_{i+1}) has the eigenvalues 2 off cos(π k / (N + 1)).
+          double value =
+              p.centre + 2.0 * p.off[Dim - 1] * cosine(i, layout.nx) + 2.0 * p.off[Dim - 2] * cosine(j, layout.rows);
+          if constexpr (Dim > 2) value += 2.0 * p.off[0] * cosine(k, layout.planes);
+          inverse_[at++] = static_cast<T>(1.0 / value);
+        }
+  }
+  bool solve(const T* r, T* d) const override {
+    static thread_local std::vector<T> field, other;
+    field.resize(inverse_.size());
+    other.resize(inverse_.size());
+    layout_.store(r, T(1), field.data());
+    transform(field, other);
+    for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse_[i];
+    transform(field, other);
+    layout_.load(field.data(), T(1), d);
+    return all_finite(field.data(), static_cast<int64_t>(field.size()));
+  }
+
+ private:
+  using Matrix = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  using View = Eigen::Map<Matrix>;
+
+  static double cosine(int64_t k, int64_t n) {
+    return std::cos(std::numbers::pi * static_cast<double>(k) / static_cast<double>(n + 1));
+  }
+  /// S_jk = √(2/(N+1)) sin(π j k/(N+1)), symmetric and its own inverse.
+  static Matrix basis(int64_t n) {
+    std::vector<double> sine(2 * (n + 1));
+    for (int64_t m = 0; m < 2 * (n + 1); ++m)
+      sine[m] = std::sqrt(2.0 / static_cast<double>(n + 1)) *
+                std::sin(std::numbers::pi * static_cast<double>(m) / static_cast<double>(n + 1));
+    Matrix s(n, n);
+    for (int64_t j = 0; j < n; ++j)
+      for (int64_t k = 0; k < n; ++k) s(j, k) = static_cast<T>(sine[(j + 1) * (k + 1) % (2 * (n + 1))]);
+    return s;
+  }
+  /// Calls body(first, count) for the n rows of a product whose rows take `work` multiplications each, with looks for an
+  /// interruption in between.
+  template <class Body>
+  static void in_pieces(int64_t n, int64_t work, const Body& body) {
+    const int64_t each = std::max<int64_t>(int64_t{1 << 26} / std::max<int64_t>(work, 1), 16);
+    for (int64_t first = 0; first < n; first += each) {
+      const int64_t count = std::min(each, n - first);
+      interruption::Watch::local().spend(count * work);
+      body(first, count);
+    }
+  }
+  /// field ← S field along every axis; the axes commute.
+  void transform(std::vector<T>& field, std::vector<T>& other) const {
+    const int64_t nz = layout_.planes, ny = layout_.rows, nx = layout_.nx;
+    in_pieces(nz * ny, nx * nx, [&](int64_t first, int64_t count) {
+      View(other.data() + first * nx, count, nx).noalias() = View(field.data() + first * nx, count, nx) * basis_[0];
+    });
+    for (int64_t z = 0; z < nz; ++z)
+      in_pieces(ny, ny * nx, [&](int64_t first, int64_t count) {
+        View(field.data() + (z * ny + first) * nx, count, nx).noalias() =
+            basis_[1].middleRows(first, count) * View(other.data() + z * ny * nx, ny, nx);
+      });
+    if constexpr (Dim > 2) {
+      in_pieces(nz, nz * ny * nx, [&](int64_t first, int64_t count) {
+        View(other.data() + first * ny * nx, count, ny * nx).noalias() =
+            basis_[2].middleRows(first, count) * View(field.data(), nz, ny * nx);
+      });
+      field.swap(other);
+    }
+  }
+
+  Layout<T> layout_;
+  std::vector<T> inverse_;
+  Matrix basis_[3];
+};
+
+}  // namespace
+
+template <class T, int Dim>
+std::shared_ptr<const Factors<T>> Laplacian<T, Dim>::factorise() const {
+  if constexpr (Dim == 1) return std::make_shared<Thomas<T>>(parameters_, this->unknowns());
+  else return std::make_shared<SineTransform<T, Dim>>(parameters_, layout());
+}
+
+template std::shared_ptr<const Factors<float>> Laplacian<float, 1>::factorise() const;
+template std::shared_ptr<const Factors<float>> Laplacian<float, 2>::factorise() const;
+template std::shared_ptr<const Factors<float>> Laplacian<float, 3>::factorise() const;
+template std::shared_ptr<const Factors<double>> Laplacian<double, 1>::factorise() const;
+template std::shared_ptr<const Factors<double>> Laplacian<double, 2>::factorise() const;
+template std::shared_ptr<const Factors<double>> Laplacian<double, 3>::factorise() const;
+
+}  // namespace prdp::kernels

@@ -1,0 +1,102 @@
+#include <Eigen/Dense>
+#include <limits>
+
+#include "prdp/kernels/matrix.h"
+#include "prdp/kernels/sparse_factors.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+template <class T>
+using Values = Eigen::Matrix<T, Eigen::Dynamic, 1>;
+
+/// LU with partial pivoting, in double whatever the dtype of the matrix.
+struct DenseLU {
+  Eigen::PartialPivLU<Eigen::MatrixXd> lu;
+  bool is_regular;
+
+  explicit DenseLU(const Eigen::MatrixXd& m)
+      : lu(m),
+        is_regular(lu.matrixLU().diagonal().cwiseAbs().minCoeff() >
+                   std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows()) *
+                       m.cwiseAbs().rowwise().sum().maxCoeff()) {}
+  int64_t bytes() const { return lu.rows() * lu.rows() * static_cast<int64_t>(sizeof(double)); }
+};
+
+/// A null space that is named is filled: A + s Σ l_k r_kᵀ is regular.
+template <class T>
+class DenseFactors final : public Factors<T> {
+ public:
+  explicit DenseFactors(const Dense<T>& a) : n_(a.unknowns()), transposed_(a.transposed()) {
+    const auto make = [&] {
+      Eigen::MatrixXd m = Eigen::Map<const RowMajor>(a.values(), n_, n_).template cast<double>();
+      if (!a.null_space()) return std::make_shared<DenseLU>(m);
+      const double size = m.cwiseAbs().maxCoeff() * static_cast<double>(n_);
+      auto right = a.null_space()->contiguous(), left = a.left_null_space()->contiguous();
+      if (transposed_) right.swap(left);
+      for (size_t k = 0; k < right.size(); ++k) m += size * vector(left[k]) * vector(right[k]).transpose();
+      return std::make_shared<DenseLU>(m);
+    };
+    if (a.null_space()) lu_ = make();
+    else lu_ = factor_cache::find_or_make<DenseLU>(FactorKeyMaker().add(n_).add(a.values(), n_ * n_).key(), make);
+  }
+  bool solve(const T* r, T* d) const override {
+    if (!lu_->is_regular) return false;
+    const Eigen::VectorXd rhs = Eigen::Map<const Values<T>>(r, n_).template cast<double>();
+    Eigen::VectorXd x;
+    if (transposed_) x = lu_->lu.transpose().solve(rhs);
+    else x = lu_->lu.solve(rhs);
+    Eigen::Map<Values<T>>(d, n_) = x.template cast<T>();
+    return x.template cast<T>().allFinite();
+  }
+
+ private:
+  using RowMajor = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  static Eigen::Map<const Eigen::VectorXd> vector(const std::vector<double>& v) {
+    return {v.data(), static_cast<Eigen::Index>(v.size())};
+  }
+
+  int64_t n_;
+  bool transposed_;
+  std::shared_ptr<const DenseLU> lu_;
+};
+
+template <class T>
+class CsrFactors final : public Factors<T> {
+ public:
+  explicit CsrFactors(const Csr<T>& a)
+      : n_(a.unknowns()),
+        transposed_(a.transposed()),
+        sparse_(sparse_factors(a, a.key(), a.transposed(), n_, pins_of(a.null_space(), a.left_null_space(), 0))) {}
+  bool solve(const T* r, T* d) const override {
+    if (!sparse_->is_regular()) return false;
+    Eigen::VectorXd x = Eigen::Map<const Values<T>>(r, n_).template cast<double>();
+    sparse_->solve(x, transposed_);
+    Eigen::Map<Values<T>>(d, n_) = x.template cast<T>();
+    return Eigen::Map<Values<T>>(d, n_).allFinite();
+  }
+
+ private:
+  int64_t n_;
+  bool transposed_;
+  std::shared_ptr<const SparseFactors> sparse_;
+};
+
+}  // namespace
+
+template <class T>
+std::shared_ptr<const Factors<T>> Dense<T>::factorise() const {
+  return std::make_shared<DenseFactors<T>>(*this);
+}
+template <class T>
+std::shared_ptr<const Factors<T>> Csr<T>::factorise() const {
+  return std::make_shared<CsrFactors<T>>(*this);
+}
+
+template std::shared_ptr<const Factors<float>> Dense<float>::factorise() const;
+template std::shared_ptr<const Factors<double>> Dense<double>::factorise() const;
+template std::shared_ptr<const Factors<float>> Csr<float>::factorise() const;
+template std::shared_ptr<const Factors<double>> Csr<double>::factorise() const;
+
+}  // namespace prdp::kernels

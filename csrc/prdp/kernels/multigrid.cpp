@@ -1,0 +1,160 @@
+#include "prdp/kernels/multigrid.h"
+
+#include "prdp/kernels/stencil.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+/// The steps x ← x + p (x - x₋) + q D⁻¹(b - A x) of Chebyshev's iteration over [ρ/4, ρ].
+template <class T>
+void set_smoothing(double radius, int64_t steps, std::vector<T>& p, std::vector<T>& q) {
+  constexpr double ratio = 4.0;
+  const double middle = (radius + radius / ratio) / 2, half = (radius - radius / ratio) / 2, sigma = middle / half;
+  p.push_back(T(0));
+  q.push_back(static_cast<T>(1.0 / middle));
+  double rho = 1.0 / sigma;
+  for (int64_t s = 1; s < steps; ++s) {
+    const double next = 1.0 / (2.0 * sigma - rho);
+    p.push_back(static_cast<T>(next * rho));
+    q.push_back(static_cast<T>(2.0 * next / half));
+    rho = next;
+  }
+}
+
+}  // namespace
+
+template <class T>
+std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing) {
+  auto given = a.grid_operator();
+  if (!given) return nullptr;
+  // A hierarchy without levels stands for one that could not be made.
+  struct Kept {
+    std::shared_ptr<const Hierarchy<T>> hierarchy;
+    int64_t bytes() const { return hierarchy ? hierarchy->bytes() : 0; }
+  };
+  const auto kept = factor_cache::find_or_make<Kept>(given->key, [&] {
+    return std::make_shared<Kept>(Kept{Hierarchy<T>::make(std::move(given->stencil))});
+  });
+  if (!kept->hierarchy) return nullptr;
+  return std::unique_ptr<Multigrid>(new Multigrid(kept->hierarchy, a, transpose, given->transposed, smoothing));
+}
+
+template <class T>
+Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Kernel<T>& a, const Kernel<T>* transpose,
+                        bool transposed, int64_t smoothing)
+    : hierarchy_(std::move(hierarchy)), transposed_(transposed) {
+  levels_.reserve(hierarchy_->levels().size());
+  add_level(0, a, transpose, smoothing);
+  // Laplacians keep the planes of their one channel apart.
+  const bool channels = dynamic_cast<const Stencil<T>*>(&a) != nullptr;
+  const int64_t fields = channels ? a.layout().planes : 1;
+  levels_[0].grid = PaddedGrid::of(a.layout(), hierarchy_->levels()[0].grid, channels);
+  for (size_t l = 1; l < hierarchy_->levels().size(); ++l) {
+    auto own = std::make_unique<Stencil<T>>(hierarchy_->rows(l, transposed), fields, T(1));
+    std::unique_ptr<Kernel<T>> own_transpose;
+    if (transpose) own_transpose = std::make_unique<Stencil<T>>(hierarchy_->rows(l, !transposed), fields, T(1));
+    add_level(l, *own, own_transpose.get(), smoothing);
+    levels_[l].own = std::move(own);
+    levels_[l].own_transpose = std::move(own_transpose);
+    levels_[l].grid = PaddedGrid::of(levels_[l].a->layout(), hierarchy_->levels()[l].grid, true);
+  }
+  for (size_t l = 0; l < levels_.size(); ++l) {
+    auto& level = levels_[l];
+    const auto& transfers = hierarchy_->levels()[l].transfers;
+    int64_t length = level.a->length();
+    for (size_t t = 0; t + 1 < transfers.size(); ++t) {
+      const auto& grid = transfers[t].coarse();
+      const auto layout = Layout<T>::of_fields(fields, grid.shape[0] * grid.shape[1], grid.shape[2]);
+      level.between.push_back(PaddedGrid::of(layout, grid, true));
+      length = std::max(length, layout.length());
+    }
+    level.memory.prepare(kBetween + static_cast<int64_t>(level.between.size()), length, level.a->layout().halo);
+  }
+  contiguous_.resize(hierarchy_->coarsest_inverse().size());
+  solved_.resize(contiguous_.size());
+}
+
+template <class T>
+void Multigrid<T>::add_level(size_t l, const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing) {
+  levels_.emplace_back();
+  levels_.back().a = &a;
+  levels_.back().transpose = transpose;
+  set_smoothing(hierarchy_->levels()[l].radius, smoothing, levels_.back().p, levels_.back().q);
+}
+
+template <class T>
+T Multigrid<T>::apply(const T* r, T* z) {
+  const int64_t length = levels_[0].a->length();
+  vectors_.copy(cycle(0, r, false), z, length);
+  return vectors_.dot(r, z, length);
+}
+
+template <class T>
+void Multigrid<T>::apply_transpose(const T* r, T* z) {
+  vectors_.copy(cycle(0, r, true), z, levels_[0].a->length());
+}
+
+template <class T>
+const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
+  auto& level = levels_[l];
+  const auto& transfers = hierarchy_->levels()[l].transfers;
+  if (transfers.empty()) return solve_coarsest(b, transposed);
+  const auto& a = kernel(level, transposed);
+  const int64_t length = a.length();
+  T *x = level.memory.vector(kX), *y = level.memory.vector(kY), *r = level.memory.vector(kR);
+  const bool of_transpose = transposed != transposed_;
+
+  a.divide_by_diagonal(b, x);
+  vectors_.scale(level.q[0], x, x, length);
+  vectors_.fill_zero(y, length);
+  for (size_t s = 1; s < level.p.size(); ++s, std::swap(x, y)) a.smooth(b, x, y, level.p[s], level.q[s]);
+
+  a.residual(b, x, r);
+  const auto vector = [&](size_t t) { return t == 0 ? r : level.memory.vector(kBetween + static_cast<int64_t>(t) - 1); };
+  const auto grid = [&](size_t t) -> const PaddedGrid& { return t == 0 ? level.grid : level.between[t - 1]; };
+  auto& next = levels_[l + 1];
+  const size_t last = transfers.size() - 1;
+  for (size_t t = 0; t < last; ++t) transfers[t].restrict(grid(t), vector(t), grid(t + 1), vector(t + 1), of_transpose);
+  T* const next_b = next.memory.vector(kB);
+  transfers[last].restrict(grid(last), vector(last), next.grid, next_b, of_transpose);
+  const T* correction = cycle(l + 1, next_b, transposed);
+  const PaddedGrid* from = &next.grid;
+  for (size_t t = last; t > 0; --t) {
+    vectors_.fill_zero(vector(t), grid(t).fields * grid(t).field);
+    transfers[t].add_interpolated(*from, correction, grid(t), vector(t), of_transpose);
+    correction = vector(t);
+    from = &grid(t);
+  }
+  transfers[0].add_interpolated(*from, correction, level.grid, x, of_transpose);
+
+  for (size_t s = 0; s < level.p.size(); ++s, std::swap(x, y)) a.smooth(b, x, y, level.p[s], level.q[s]);
+  return x;
+}
+
+template <class T>
+const T* Multigrid<T>::solve_coarsest(const T* b, bool transposed) {
+  auto& level = levels_.back();
+  const auto& layout = level.a->layout();
+  const auto& inverse = hierarchy_->coarsest_inverse();
+  const auto& points = hierarchy_->levels().back().grid.shape;
+  const int64_t n = points[0] * points[1] * points[2], fields = layout.unknowns() / n;
+  contiguous_.resize(layout.unknowns());
+  solved_.resize(layout.unknowns());
+  layout.store(b, T(1), contiguous_.data());
+  const bool by_columns = transposed != transposed_;
+  for (int64_t f = 0; f < fields; ++f)
+    for (int64_t i = 0; i < n; ++i) {
+      T sum = 0;
+      for (int64_t j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * contiguous_[f * n + j];
+      solved_[f * n + i] = sum;
+    }
+  T* const x = level.memory.vector(kX);
+  layout.load(solved_.data(), T(1), x);
+  return x;
+}
+
+template class Multigrid<float>;
+template class Multigrid<double>;
+
+}  // namespace prdp::kernels

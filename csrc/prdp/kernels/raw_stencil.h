@@ -1,0 +1,37 @@
+#pragma once
+#include <memory>
+#include <vector>
+
+#include "prdp/kernels/stencil_pattern.h"
+
+namespace prdp::kernels {
+
+/// A stencil with neighbours at most one cell away, as contiguous fields (nz, ny, nx) of coefficients. What points beyond
+/// the grid is kept: no product uses it, but the weights of interpolation need it.
+template <class T>
+struct RawStencil {
+  explicit RawStencil(const StencilGrid& on) : grid(on) {}
+  RawStencil(RawStencil&&) = default;  // a copy would point to the memory of the other
+  RawStencil& operator=(RawStencil&&) = default;
+
+  StencilGrid grid;
+  /// By offset, 9 (z + 1) + 3 (y + 1) + x + 1; null where there is no such neighbour.
+  const T* coefficients[27] = {};
+  std::vector<std::vector<T>> memory{};  // of those that are not somebody else's
+
+  static int place(const Offset& o) {
+    return static_cast<int>(9 * (o.along[0] + 1) + 3 * (o.along[1] + 1) + o.along[2] + 1);
+  }
+  static Offset offset(int place) { return {{place / 9 - 1, place / 3 % 3 - 1, place % 3 - 1}}; }
+  static constexpr int kCentre = 13;
+
+  int64_t points() const { return grid.shape[0] * grid.shape[1] * grid.shape[2]; }
+  /// A new field of zeros for this offset.
+  T* add(int place) {
+    memory.emplace_back(points(), T(0));
+    coefficients[place] = memory.back().data();
+    return memory.back().data();
+  }
+};
+
+}  // namespace prdp::kernels

@@ -1,0 +1,154 @@
+#include "prdp/kernels/sparse_factors.h"
+
+#include <Eigen/SparseCholesky>
+#include <Eigen/SparseLU>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+
+#include "prdp/threads/leavable.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+using Matrix = SparseFactors::Matrix;
+
+/// LU that tells its least pivot.
+class PivotedLU : public Eigen::SparseLU<Matrix> {
+ public:
+  double least_pivot() const {
+    double least = std::numeric_limits<double>::infinity();
+    for (Eigen::Index j = 0; j < this->cols(); ++j)
+      for (SCMatrix::InnerIterator it(this->m_Lstore, j); it; ++it)
+        if (it.index() == j) {
+          least = std::min(least, std::abs(it.value()));
+          break;
+        }
+    return least;
+  }
+};
+
+double least_pivot(const Eigen::SimplicialLLT<Matrix>& cholesky) {
+  const auto& l = cholesky.matrixL().nestedExpression();
+  double least = std::numeric_limits<double>::infinity();
+  for (Eigen::Index j = 0; j < l.cols(); ++j) {  // the diagonal comes first in each column
+    const double d = l.valuePtr()[l.outerIndexPtr()[j]];
+    least = std::min(least, d * d);
+  }
+  return least;
+}
+
+bool is_symmetric(const Matrix& m) {
+  const Matrix t = m.transpose();
+  return std::equal(m.outerIndexPtr(), m.outerIndexPtr() + m.outerSize() + 1, t.outerIndexPtr()) &&
+         std::equal(m.innerIndexPtr(), m.innerIndexPtr() + m.nonZeros(), t.innerIndexPtr()) &&
+         std::equal(m.valuePtr(), m.valuePtr() + m.nonZeros(), t.valuePtr());
+}
+
+/// Eigen's ordering and factorisation may not return if a row or a column is empty.
+bool has_empty_line(const Matrix& m) {
+  std::vector<char> row(m.rows()), column(m.cols());
+  for (Eigen::Index j = 0; j < m.outerSize(); ++j)
+    for (Matrix::InnerIterator it(m, j); it; ++it)
+      if (it.value() != 0.0) row[it.row()] = column[it.col()] = true;
+  const auto empty = [](char entries) { return !entries; };
+  return std::any_of(row.begin(), row.end(), empty) || std::any_of(column.begin(), column.end(), empty);
+}
+
+/// For each of n indices its place among those that are not left out, or -1.
+Eigen::VectorXi places(int64_t n, const std::vector<int64_t>& left_out) {
+  Eigen::VectorXi place = Eigen::VectorXi::Zero(n);
+  for (const int64_t i : left_out) place[i] = -1;
+  for (int64_t i = 0, next = 0; i < n; ++i)
+    if (place[i] == 0) place[i] = static_cast<int>(next++);
+  return place;
+}
+
+}  // namespace
+
+std::vector<int64_t> pivots(std::vector<std::vector<double>> vectors) {
+  std::vector<int64_t> found;
+  for (size_t k = 0; k < vectors.size(); ++k) {
+    const auto& v = vectors[k];
+    const auto largest = std::max_element(v.begin(), v.end(), [](double a, double b) { return std::abs(a) < std::abs(b); });
+    const auto at = largest - v.begin();
+    found.push_back(at);
+    for (size_t j = k + 1; j < vectors.size(); ++j) {
+      const double share = vectors[j][at] / v[at];
+      for (size_t i = 0; i < v.size(); ++i) vectors[j][i] -= share * v[i];
+      vectors[j][at] = 0.0;
+    }
+  }
+  return found;
+}
+
+struct SparseFactors::Factorised {
+  double sign = 1.0;
+  std::optional<Eigen::SimplicialLLT<Matrix>> cholesky;
+  mutable PivotedLU lu;
+  bool is_regular = false;
+
+  explicit Factorised(const Matrix& m) {
+    double largest = 0.0;  // Σ|a| of a column
+    for (Eigen::Index j = 0; j < m.outerSize(); ++j) {
+      double sum = 0.0;
+      for (Matrix::InnerIterator it(m, j); it; ++it) sum += std::abs(it.value());
+      largest = std::max(largest, sum);
+    }
+    const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows()) * largest;
+    if (m.rows() > 0 && has_empty_line(m)) return;
+    if (is_symmetric(m)) {
+      if (m.rows() > 0 && m.coeff(0, 0) < 0.0) sign = -1.0;
+      cholesky.emplace(Matrix(sign * m));
+      if (cholesky->info() == Eigen::Success) {
+        is_regular = least_pivot(*cholesky) > rounding;
+        return;
+      }
+      cholesky.reset();
+    }
+    lu.compute(m);
+    is_regular = lu.info() == Eigen::Success && lu.least_pivot() > rounding;
+  }
+};
+
+SparseFactors::SparseFactors(const Triplets& entries, int64_t n, const Pins& pins)
+    : kept_unknowns_(places(n, pins.unknowns)), kept_equations_(places(n, pins.equations)) {
+  const auto size = n - static_cast<int64_t>(pins.unknowns.size());
+  Triplets kept;
+  for (const auto& e : entries)
+    if (kept_equations_[e.row()] >= 0 && kept_unknowns_[e.col()] >= 0)
+      kept.emplace_back(kept_equations_[e.row()], kept_unknowns_[e.col()], e.value());
+  auto m = std::make_shared<Matrix>(size, size);
+  m->setFromTriplets(kept.begin(), kept.end());
+  factorised_ = interruption::in_a_thread_to_leave(entries.size() > 100'000,
+                                                   [m] { return std::make_shared<const Factorised>(*m); });
+}
+
+SparseFactors::~SparseFactors() = default;
+
+bool SparseFactors::is_regular() const { return factorised_->is_regular; }
+
+void SparseFactors::solve(Eigen::VectorXd& x, bool transposed) const {
+  const auto& to_take = transposed ? kept_unknowns_ : kept_equations_;
+  const auto& to_give = transposed ? kept_equations_ : kept_unknowns_;
+  const auto n = static_cast<int64_t>(x.size());
+  Eigen::VectorXd rhs(to_take.size() == 0 ? 0 : to_take.maxCoeff() + 1);
+  for (int64_t i = 0; i < n; ++i)
+    if (to_take[i] >= 0) rhs[to_take[i]] = x[i];
+  Eigen::VectorXd found;
+  if (factorised_->cholesky) found = factorised_->sign * factorised_->cholesky->solve(rhs);
+  else if (transposed) found = factorised_->lu.transpose().solve(rhs);
+  else found = factorised_->lu.solve(rhs);
+  for (int64_t i = 0; i < n; ++i) x[i] = to_give[i] >= 0 ? found[to_give[i]] : 0.0;
+}
+
+int64_t SparseFactors::bytes() const {
+  const int64_t stored = factorised_->cholesky ? factorised_->cholesky->matrixL().nestedExpression().nonZeros()
+                         : is_regular()        ? int64_t{factorised_->lu.nnzL()} + factorised_->lu.nnzU()
+                                               : 0;
+  return stored * static_cast<int64_t>(sizeof(double) + sizeof(int)) + kept_unknowns_.size() * 8;
+}
+
+}  // namespace prdp::kernels

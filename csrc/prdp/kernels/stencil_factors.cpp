@@ -1,0 +1,104 @@
+#include <optional>
+
+#include "prdp/kernels/cyclic_thomas.h"
+#include "prdp/kernels/navier_stokes.h"
+#include "prdp/kernels/sparse_factors.h"
+#include "prdp/kernels/stencil.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+/// Contiguous values in double.
+template <class T>
+Eigen::VectorXd values_of(const T* v, const Layout<T>& layout) {
+  Eigen::Matrix<T, Eigen::Dynamic, 1> values(layout.unknowns());
+  layout.store(v, T(1), values.data());
+  return values.template cast<double>();
+}
+/// Back into padded memory; false if they are not finite.
+template <class T>
+bool give_back(const Eigen::VectorXd& x, const Layout<T>& layout, T* d) {
+  const Eigen::Matrix<T, Eigen::Dynamic, 1> values = x.template cast<T>();
+  layout.load(values.data(), T(1), d);
+  return values.allFinite();
+}
+
+/// One factorisation for all channels, in double whatever T is.
+template <class T>
+class StencilFactors final : public Factors<T> {
+ public:
+  StencilFactors(const Stencil<T>& kernel, const FactorKey& key, bool transposed)
+      : layout_(kernel.layout()), transposed_(transposed) {
+    const auto& a = kernel.coefficients();
+    if (a.pattern().nearest && a.rows() == 1 && !kernel.null_space()) thomas_.emplace(a);
+    if (thomas_ && thomas_->is_dominant()) return;
+    thomas_.reset();
+    sparse_ = sparse_factors(a, key, transposed, layout_.rows * layout_.nx,
+                             pins_of(kernel.null_space(), kernel.left_null_space(), 0));
+  }
+  bool solve(const T* r, T* d) const override {
+    if (sparse_ ? !sparse_->is_regular() : !thomas_->is_regular()) return false;
+    Eigen::VectorXd x = values_of(r, layout_);
+    const int64_t points = layout_.rows * layout_.nx;
+    for (int64_t channel = 0; channel < layout_.planes; ++channel) {
+      if (thomas_) {
+        thomas_->solve(x.data() + channel * points);
+        continue;
+      }
+      Eigen::VectorXd field = x.segment(channel * points, points);
+      sparse_->solve(field, transposed_);
+      x.segment(channel * points, points) = field;
+    }
+    return give_back(x, layout_, d);
+  }
+
+ private:
+  Layout<T> layout_;
+  bool transposed_;
+  std::optional<CyclicThomas> thomas_;
+  std::shared_ptr<const SparseFactors> sparse_;
+};
+
+/// One pressure is held at zero, and its equation, which the others imply, is left out.
+template <class T>
+class NavierStokesFactors final : public Factors<T> {
+ public:
+  explicit NavierStokesFactors(const NavierStokes<T>& kernel)
+      : layout_(kernel.layout()),
+        transposed_(kernel.transposed()),
+        lu_(sparse_factors(kernel, kernel.key(), kernel.transposed(), kernel.unknowns(),
+                           pins_of(kernel.null_space(), kernel.left_null_space(), 2 * layout_.rows * layout_.nx))) {}
+  bool solve(const T* r, T* d) const override {
+    if (!lu_->is_regular()) return false;
+    Eigen::VectorXd x = values_of(r, layout_);
+    auto pressure = x.tail(layout_.rows * layout_.nx);
+    pressure.array() -= pressure.mean();
+    lu_->solve(x, transposed_);
+    pressure.array() -= pressure.mean();
+    return give_back(x, layout_, d);
+  }
+
+ private:
+  Layout<T> layout_;
+  bool transposed_;
+  std::shared_ptr<const SparseFactors> lu_;
+};
+
+}  // namespace
+
+template <class T>
+std::shared_ptr<const Factors<T>> Stencil<T>::factorise() const {
+  return std::make_shared<StencilFactors<T>>(*this, source_.key(), source_.transposed);
+}
+template <class T>
+std::shared_ptr<const Factors<T>> NavierStokes<T>::factorise() const {
+  return std::make_shared<NavierStokesFactors<T>>(*this);
+}
+
+template std::shared_ptr<const Factors<float>> Stencil<float>::factorise() const;
+template std::shared_ptr<const Factors<double>> Stencil<double>::factorise() const;
+template std::shared_ptr<const Factors<float>> NavierStokes<float>::factorise() const;
+template std::shared_ptr<const Factors<double>> NavierStokes<double>::factorise() const;
+
+}  // namespace prdp::kernels

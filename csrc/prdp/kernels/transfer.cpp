@@ -1,0 +1,168 @@
+#include "prdp/kernels/transfer.h"
+
+#include <algorithm>
+
+#include "prdp/kernels/loops.h"
+#include "prdp/kernels/whole_vectors.h"
+
+namespace prdp::kernels {
+
+namespace {
+
+/// Rows that a thread keeps while it splits and merges them; at least n values each, with room for two more.
+template <class T>
+struct SplitRows {
+  std::vector<T> first, second, coarse;
+
+  static SplitRows& local(int64_t n) {
+    static thread_local SplitRows rows;
+    const auto size = static_cast<size_t>(n + 4);
+    for (auto* row : {&rows.first, &rows.second, &rows.coarse})
+      if (row->size() < size) row->resize(size);
+    return rows;
+  }
+};
+
+}  // namespace
+
+template <class T>
+Transfer<T>::Transfer(const StencilGrid& grid, int axis, const AxisTransfer<T>& weights, bool symmetric)
+    : fine_(grid), coarse_(grid), axis_(axis), periodic_(grid.periodic[axis]), zeros_(grid.shape[2], T(0)) {
+  coarse_.shape[axis] = coarse_points(grid.shape[axis], periodic_);
+  interpolation_ = compress(weights.interpolation);
+  if (!symmetric) restriction_ = compress(weights.restriction);
+}
+
+template <class T>
+int64_t Transfer<T>::bytes() const {
+  return static_cast<int64_t>((interpolation_.left.size() + restriction_.left.size()) * 2 * sizeof(T));
+}
+
+template <class T>
+int64_t Transfer<T>::weights_at(int64_t z, int64_t y) const {
+  const int64_t row = axis_ == 2 ? between() + 2 : fine_.shape[2], rows = axis_ == 1 ? between() : fine_.shape[1];
+  return (z * rows + y) * row;
+}
+
+template <class T>
+typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights) const {
+  const auto& [nz, ny, nx] = fine_.shape;
+  const auto from = [&, ny = ny, nx = nx](int64_t z, int64_t y, int64_t x) {
+    return ((z + 1) * (ny + 2) + y + 1) * (nx + 2) + x + 1;
+  };
+  const int64_t first = periodic_ ? 1 : 0, count = between();
+  int64_t extent[3] = {nz, ny, nx};
+  extent[axis_] = axis_ == 2 ? count + 2 : count;
+  Compressed c;
+  for (const auto [all, some] : {std::pair(&weights.left, &c.left), std::pair(&weights.right, &c.right)}) {
+    some->assign(extent[0] * extent[1] * extent[2], T(0));
+    for (int64_t z = 0; z < extent[0]; ++z)
+      for (int64_t y = 0; y < extent[1]; ++y) {
+        T* const to = some->data() + weights_at(z, y);
+        const int64_t fine_z = axis_ == 0 ? 2 * z + first : z, fine_y = axis_ == 1 ? 2 * y + first : y;
+        const T* const row = all->data() + from(fine_z, fine_y, 0);
+        if (axis_ != 2) {
+          std::copy_n(row, nx, to);
+          continue;
+        }
+        for (int64_t k = 0; k < count; ++k) to[k + 1] = row[2 * k + first];
+        if (periodic_ && nx % 2 == 0) to[0] = to[count];  // the last point lies before the first, too
+      }
+  }
+  return c;
+}
+
+template <class T>
+template <class Body>
+void Transfer<T>::for_each_row(const PaddedGrid& grid, const Body& body) const {
+  const int64_t rows = grid.fields * grid.shape[0] * grid.shape[1];
+  const int64_t each = std::max<int64_t>(kBlock / grid.row, 1);
+  shared_rows::for_each((rows + each - 1) / each, [&](int64_t part) {
+    for (int64_t r = part * each; r < std::min(rows, (part + 1) * each); ++r) {
+      const int64_t of_field = grid.shape[0] * grid.shape[1];
+      body(r / of_field, r % of_field / grid.shape[1], r % grid.shape[1]);
+    }
+  });
+}
+
+template <class T>
+void Transfer<T>::restrict(const PaddedGrid& from, const T* fine, const PaddedGrid& to, T* coarse,
+                           bool transposed) const {
+  const auto& w = of_restriction(transposed);
+  const auto& loops = kernels::loops<T>();
+  const int64_t nx = fine_.shape[2], n = fine_.shape[axis_], count = between();
+  for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
+    T* const out = coarse + to.at(f, z, y);
+    if (axis_ == 2) {
+      auto& rows = SplitRows<T>::local(nx);
+      // What lies between coarse points, from place 1 on.
+      T* const others = (periodic_ ? rows.second : rows.first).data();
+      T* const here = (periodic_ ? rows.first : rows.second).data();
+      if (periodic_) loops.split(fine + from.at(f, z, y), here, others + 1, nx);
+      else loops.split(fine + from.at(f, z, y), others + 1, here, nx);
+      others[0] = others[count];
+      others[count + 1] = T(0);
+      const int64_t before = periodic_ ? 0 : 1, at = weights_at(z, y);
+      loops.restrict_row(here, others + before, w.right.data() + at + before, others + before + 1,
+                         w.left.data() + at + before + 1, out, coarse_.shape[2]);
+      return;
+    }
+    const int64_t j = axis_ == 0 ? z : y, here = periodic_ ? 2 * j : 2 * j + 1;
+    const auto fine_row = [&](int64_t i) { return fine + (axis_ == 0 ? from.at(f, i, y) : from.at(f, z, i)); };
+    const auto weight = [&](const std::vector<T>& field, int64_t k) {
+      return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
+    };
+    const int64_t before = here - 1, after = here + 1;
+    const bool wraps = before < 0 && periodic_ && n % 2 == 0;
+    const T* row_before = zeros_.data();
+    const T *weight_before = zeros_.data(), *row_after = zeros_.data(), *weight_after = zeros_.data();
+    if (before >= 0 || wraps) {
+      row_before = fine_row(wraps ? n - 1 : before);
+      weight_before = weight(w.right, wraps ? count - 1 : before / 2);
+    }
+    if (after < n) {
+      row_after = fine_row(after);
+      weight_after = weight(w.left, after / 2);
+    }
+    loops.restrict_row(fine_row(here), row_before, weight_before, row_after, weight_after, out, nx);
+  });
+}
+
+template <class T>
+void Transfer<T>::add_interpolated(const PaddedGrid& from, const T* coarse, const PaddedGrid& to, T* fine,
+                                   bool transposed) const {
+  const auto& w = of_interpolation(transposed);
+  const auto& loops = kernels::loops<T>();
+  const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[axis_], count = between();
+  for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
+    T* const out = fine + to.at(f, z, y);
+    if (axis_ == 2) {
+      auto& rows = SplitRows<T>::local(nx);
+      T* const others = (periodic_ ? rows.second : rows.first).data();
+      T* const here = rows.coarse.data();  // from place 1 on, with what lies beyond the ends
+      std::copy_n(coarse + from.at(f, z, y), coarse_count, here + 1);
+      here[0] = T(0);
+      here[coarse_count + 1] = periodic_ ? here[1] : T(0);
+      std::fill_n(others, count, T(0));
+      const int64_t left = periodic_ ? 1 : 0, at = weights_at(z, y) + 1;
+      loops.add_interpolated(here + left, w.left.data() + at, here + left + 1, w.right.data() + at, others, count);
+      if (periodic_) loops.add_merged(here + 1, others, out, nx);
+      else loops.add_merged(others, here + 1, out, nx);
+      return;
+    }
+    const int64_t i = axis_ == 0 ? z : y;
+    const auto coarse_row = [&](int64_t j) { return coarse + (axis_ == 0 ? from.at(f, j, y) : from.at(f, z, j)); };
+    const bool is_coarse = i % 2 == (periodic_ ? 0 : 1);
+    if (is_coarse) return loops.axpy(T(1), coarse_row(i / 2), out, nx);
+    const int64_t k = i / 2, at = axis_ == 0 ? weights_at(k, y) : weights_at(z, k);
+    const int64_t left = periodic_ ? k : k - 1, right = periodic_ ? (k + 1) % coarse_count : k;
+    const T* const row_left = left >= 0 ? coarse_row(left) : zeros_.data();
+    const T* const row_right = right < coarse_count ? coarse_row(right) : zeros_.data();
+    loops.add_interpolated(row_left, w.left.data() + at, row_right, w.right.data() + at, out, nx);
+  });
+}
+
+template class Transfer<float>;
+template class Transfer<double>;
+
+}  // namespace prdp::kernels

@@ -1,0 +1,30 @@
+#pragma once
+#include "prdp/kernels/kernel.h"
+#include "prdp/kernels/upwind_rows.h"
+#include "prdp/operators/flow_operator.h"
+
+namespace prdp {
+
+template <class Make>
+std::shared_ptr<const kernels::Kernels> FlowOperator::upwind_kernels(const at::Tensor& b, bool transposed,
+                                                                     const Make& make) const {
+  const auto dim = static_cast<size_t>(grid_.dim());
+  double length[2] = {1.0, 1.0};
+  int64_t extent[2] = {1, 1};  // along y and x
+  for (size_t d = 0; d < dim; ++d) {
+    length[2 - dim + d] = grid_.length(static_cast<int64_t>(d));
+    extent[2 - dim + d] = grid_.shape()[d];
+  }
+  const auto of_samples = [=, winds = winds_.detach().contiguous(), nu = step_.nu.item<double>(),
+                           dt = step_.dt]<class T>(T) -> kernels::KernelBatch<T> {
+    const bool shared = winds.size(0) == 1;
+    const int64_t stride = shared ? 0 : winds.stride(0);
+    return {shared, [=](int64_t s) {
+              return make(kernels::UpwindParameters<T>{winds.const_data_ptr<T>() + s * stride, extent[0], extent[1], nu,
+                                                       dt, transposed, length[0], length[1]});
+            }};
+  };
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
+}
+
+}  // namespace prdp

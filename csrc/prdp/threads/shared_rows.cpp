@@ -1,0 +1,14 @@
+#include "prdp/threads/shared_rows.h"
+
+namespace prdp::shared_rows {
+
+namespace {
+thread_local bool wanted_here = false;
+}
+
+bool wanted() { return wanted_here; }
+
+Scope::Scope(bool wanted) : before_(std::exchange(wanted_here, wanted)) {}
+Scope::~Scope() { wanted_here = before_; }
+
+}  // namespace prdp::shared_rows
