@@ -54,7 +54,7 @@ typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights
   int64_t extent[3] = {nz, ny, nx};
   extent[axis_] = axis_ == 2 ? count + 2 : count;
   Compressed c;
-  for (const auto [all, some] : {std::pair(&weights.left, &c.left), std::pair(&weights.right, &c.right)}) {
+  for (const auto& [all, some] : {std::pair(&weights.left, &c.left), std::pair(&weights.right, &c.right)}) {
     some->assign(extent[0] * extent[1] * extent[2], T(0));
     for (int64_t z = 0; z < extent[0]; ++z)
       for (int64_t y = 0; y < extent[1]; ++y) {
