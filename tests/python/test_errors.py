@@ -171,12 +171,14 @@ def unsuited():
     burgers = operators.Burgers(field((8,)), 1e-3, 1e-2)
     function = operators.Function(lambda v: v, lambda v: v)
     chebyshev = "Chebyshev: the spectrum is known of Heat and Poisson operators alone"
-    stokes = 'preconditioner "stokes" is for NavierStokes operators alone'
+    multigrid = 'preconditioner "multigrid" is for Heat, Poisson, Burgers, NavierStokes, and Stencil .* not for this'
+    flow = operators.NavierStokes(field((8, 8), channels=2), 1e-3, 1e-2)
+    cycles = "the method Multigrid is for Heat, Poisson, Burgers, and Stencil"
     return [
         (burgers, prdp.Chebyshev(1), chebyshev),
         (function, prdp.Chebyshev(5), chebyshev),
-        (burgers, prdp.GMRES(3, preconditioner="stokes"), stokes),
-        (function, prdp.GMRES(3, preconditioner="stokes"), stokes),
+        (flow, prdp.Multigrid(3), cycles),
+        (function, prdp.GMRES(3, preconditioner="multigrid"), multigrid),
         (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi and preconditioner"),
     ]
 
