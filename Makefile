@@ -11,7 +11,8 @@ BIN := .venv/bin
 STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
-CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_WERROR=ON
+CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
+  -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
 .PHONY: demo test docs tidy sanitize fuzz bench-peers clean
 
