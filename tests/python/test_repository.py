@@ -58,7 +58,9 @@ def test_pictures_have_no_alpha_channel():
     """It is a quarter of their pixels and says nothing."""
     pictures = tracked("*.png")
     assert len(pictures) > 30
-    assert [path.name for path in pictures if "A" in Image.open(path).mode] == []
+    for path in pictures:
+        with Image.open(path) as picture:
+            assert "A" not in picture.mode, path
 
 
 def test_a_chart_is_written_small_and_looks_the_same(tmp_path):
@@ -68,9 +70,9 @@ def test_a_chart_is_written_small_and_looks_the_same(tmp_path):
     axes.plot([1, 3, 2])
     write_png(figure, tmp_path / "small.png", dpi=110)
     figure.savefig(tmp_path / "plain.png", dpi=110)
-    small, plain = (Image.open(tmp_path / f"{name}.png") for name in ("small", "plain"))
-    assert small.convert("RGBA").tobytes() == plain.convert("RGBA").tobytes()
-    assert small.info["dpi"] == pytest.approx(plain.info["dpi"], abs=0.01)
+    with Image.open(tmp_path / "small.png") as small, Image.open(tmp_path / "plain.png") as plain:
+        assert small.convert("RGBA").tobytes() == plain.convert("RGBA").tobytes()
+        assert small.info["dpi"] == pytest.approx(plain.info["dpi"], abs=0.01)
     assert (tmp_path / "small.png").stat().st_size < (tmp_path / "plain.png").stat().st_size
 
 
