@@ -79,7 +79,7 @@ def test_the_source_archive_can_be_built(tmp_path):
     (source,) = (path for path in tmp_path.glob("prdp_torch-*") if path.is_dir())
 
     def files(root):
-        names = ("cmake", "csrc", "examples", "prdp_torch")
+        names = ("cmake", "csrc", "examples", "packaging", "prdp_torch")
         found = {path.relative_to(root) for name in names for path in (root / name).rglob("*") if path.is_file()}
         made = {".so", ".pyc"}
         return {path for path in found if path.suffix not in made and path.name != "built_for_torch.txt"}
