@@ -1,6 +1,7 @@
 """Bad input: clear errors before any work, tested by their words."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -164,6 +165,30 @@ def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
         match=r"was built for torch 2.0.1\+cpu, but torch .* is installed; install torch 2.0.1\+cpu, or rebuild",
     ):
         _load.check_torch()
+
+
+def test_a_build_for_cuda_is_that_for_the_cpu(monkeypatch, tmp_path):
+    from prdp_torch import _load
+
+    monkeypatch.setattr(_load, "_BUILT_FOR", tmp_path / "built_for_torch.txt")
+    release = torch.__version__.partition("+")[0]
+    for built_for in (release, f"{release}+cpu", f"{release}+cu130"):
+        (tmp_path / "built_for_torch.txt").write_text(f"{built_for}\n")
+        _load.check_torch()
+    (tmp_path / "built_for_torch.txt").write_text(f"{release}.1\n")
+    with pytest.raises(ImportError, match="rebuild prdp_torch for this one with 'pip install --force-reinstall --no-d"):
+        _load.check_torch()
+
+
+def test_a_library_that_cannot_be_loaded_says_what_to_do(monkeypatch):
+    from prdp_torch import _load
+
+    def refuse(name):
+        raise ImportError(f"{name}: undefined symbol: _ZN3c10")
+
+    monkeypatch.setattr(_load, "importlib", SimpleNamespace(import_module=refuse))
+    with pytest.raises(ImportError, match=r"for another build of torch .*: undefined symbol: .*; rebuild it with 'pip"):
+        _load.load_library()
 
 
 def unsuited():
