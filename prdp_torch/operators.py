@@ -218,7 +218,7 @@ class Diffusion(Operator):
         if faces not in ("harmonic", "arithmetic"):
             raise ValueError(f"Diffusion: faces must be 'harmonic' or 'arithmetic', got {faces!r}")
         self.boundary = _sides(boundary, dim)
-        self.length = _check.lengths("Diffusion", length, dim)
+        self.length = _check.lengths("Diffusion", length, dim) or [1.0] * dim
         self.kappa = kappa
         if isinstance(shift, torch.Tensor) and shift.dim() > 0:
             if shift.dim() != kappa.dim():

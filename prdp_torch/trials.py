@@ -77,6 +77,7 @@ def candidates(step):
     kind = getattr(step, "kind", None)
     if kind not in ("heat", "poisson", "navier_stokes"):  # whose diagonals are constant
         every += [CG(1, preconditioner="diagonal"), GMRES(1, restart=8, preconditioner="diagonal")]
+    every += [CG(1, preconditioner="multigrid"), GMRES(1, restart=8, preconditioner="multigrid")]
     return [*every, Direct(1)]
 
 

@@ -152,7 +152,9 @@ void bind_solvers(py::module_& m) {
       [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
          std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol, std::string on_failure,
          int64_t checkpoint_every, std::string start) {
-        SolveOptions{{method_from_name(method), max_iter, rtol, restart},
+        const auto of_method = method_from_name(method);
+        SolveOptions{{of_method, max_iter, rtol, restart,
+                      of_method == Method::kMultigrid ? Preconditioner::multigrid() : Preconditioner()},
                      backward_from_name(backward),
                      adjoint_max_iter,
                      adjoint_rtol,

@@ -114,9 +114,10 @@ TEST(Solve, AnOperatorOfOnesOwnPreconditions) {
       {[&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); },
        [&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); }});
   const Preconditioner inverse = products->spec({});
-  for (const Solver& solver : {Solver(prdp::CG{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
-                               Solver(prdp::BiCGStab{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
-                               Solver(prdp::GMRES{.restart = 1, .max_iter = 1, .rtol = 1e-10, .preconditioner = inverse})})
+  for (const Solver& solver :
+       {Solver(prdp::CG{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
+        Solver(prdp::BiCGStab{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),
+        Solver(prdp::GMRES{.restart = 1, .max_iter = 1, .rtol = 1e-10, .preconditioner = inverse})})
     EXPECT_TRUE((prdp::linear_solve(a, b, {solver}).info.status > 0).all().item<bool>());
 }
 

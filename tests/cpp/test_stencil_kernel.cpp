@@ -47,8 +47,8 @@ std::vector<T> random_coefficients(int64_t points, size_t count) {
 }
 
 template <class T>
-std::unique_ptr<Kernel<T>> make_kernel(const StencilGrid& grid, std::vector<Offset> offsets, const std::vector<T>& coefficients,
-                       int64_t channels, bool transposed) {
+std::unique_ptr<Kernel<T>> make_kernel(const StencilGrid& grid, std::vector<Offset> offsets,
+                                       const std::vector<T>& coefficients, int64_t channels, bool transposed) {
   if (transposed)
     for (auto& offset : offsets)
       for (auto& cells : offset.along) cells = -cells;

@@ -47,6 +47,21 @@ def test_matrix_and_right_hand_side_must_fit():
         prdp.linear_solve(torch.eye(3, device="meta"), torch.zeros(3), prdp.Jacobi(1))
 
 
+def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
+    nu = torch.nn.Parameter(torch.tensor(1e-3, device="meta"))
+    without = torch.ones(5, device="meta")
+    function = operators.Function(lambda v, k: k * v, tensors=(without,))
+    for call in (
+        lambda: prdp.Heat((5,), nu, 1.0)(torch.zeros(1, 1, 5)),
+        lambda: prdp.Heat((5,), nu, 1.0).rollout(torch.zeros(1, 1, 5), 2),
+        lambda: prdp.linear_solve(operators.Heat((5,), nu, 1.0), torch.zeros(1, 1, 5), prdp.Jacobi(1)),
+        lambda: prdp.linear_solve(function, torch.zeros(1, 5), prdp.CG(1)),
+    ):
+        for graph in (torch.no_grad, torch.enable_grad):
+            with graph(), pytest.raises(ValueError, match="a tensor of it is on meta but the vector is on cpu; it has"):
+                call()
+
+
 @pytest.mark.parametrize(
     "make, message",
     [

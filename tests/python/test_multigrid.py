@@ -57,7 +57,7 @@ def noise(shape, seed=0, dtype=F64):
 EASY = {
     **{f"poisson {n}": (lambda s: operators.Poisson(s), (n, n), 6, 10) for n in (31, 64, 127, 500)},
     "poisson 200x37": (lambda s: operators.Poisson(s), (200, 37), 6, 10),
-    "poisson 1d": (lambda s: operators.Poisson(s), (1000,), 4, 6),
+    "poisson 1d": (lambda s: operators.Poisson(s), (1000,), 5, 8),
     "poisson 3d": (lambda s: operators.Poisson(s), (37, 20, 48), 7, 11),
     "heat": (lambda s: operators.Heat(s, 1.0, 1.0), (255, 255), 6, 10),
     "periodic": (lambda s: diffusion(torch.ones(s).double(), 1.0, "periodic"), (63, 64), 6, 10),

@@ -19,7 +19,7 @@ def right_hand_side(shape, seed=1):
     return b
 
 
-@pytest.mark.parametrize("shape", [(3, 4), (8, 5), (1, 6), (6, 1)], ids=str)
+@pytest.mark.parametrize("shape", [(3, 4), (8, 5), (2, 6)], ids=str)
 def test_it_meets_the_minimum_norm_solution_and_its_adjoint(shape):
     w = field(shape, batch=2, channels=2)
     b = right_hand_side(shape).requires_grad_()

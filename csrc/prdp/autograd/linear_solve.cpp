@@ -10,6 +10,7 @@
 #include "prdp/autograd/solve_node.h"
 #include "prdp/operators/disguises.h"
 #include "prdp/operators/kinds.h"
+#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -67,6 +68,7 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);
+  check_devices(spec, b);
   check_multigrid(*a, spec, options.solver);
   TORCH_CHECK_VALUE(
       !x0.defined() ||
@@ -89,8 +91,12 @@ Outputs fake_kernel(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack(std::move(args)...);
   checked_operator(a, b, options, x0);
   const auto counts = [&] { return at::empty_symint({b.sym_size(0)}, b.options().dtype(at::kLong)); };
-  return {at::empty_symint(b.sym_sizes(), b.options()), counts(), at::empty_symint({b.sym_size(0)}, b.options()),
-          counts(), counts(), at::empty_symint({b.sym_size(0)}, b.options())};
+  return {at::empty_symint(b.sym_sizes(), b.options()),
+          counts(),
+          at::empty_symint({b.sym_size(0)}, b.options()),
+          counts(),
+          counts(),
+          at::empty_symint({b.sym_size(0)}, b.options())};
 }
 
 /// Whether all tensors of a call are plain.
@@ -167,7 +173,9 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   a->check_parameters();
   a->check_null_spaces(b);
   const auto& s = options.solver;
-  auto result = solve(*a, b, {s, {}, true, x0});
+  // No u has a part in a null space that was named, so the cotangent's there has no influence.
+  const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
+  auto result = solve(*a, rhs, {s, {}, true, x0});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);

@@ -91,9 +91,7 @@ class TapeBack {
           vectors_.axpy(T(1), second_, minus_diagonal_bar_, length());
         }
         return tape_.add_bar(op.a, 1, scratch_);
-      case Kind::kPrecondition:
-        values_.precondition_transpose(bar, scratch_);
-        return tape_.add_bar(op.a, 1, scratch_);
+      case Kind::kPrecondition: values_.precondition_transpose(bar, scratch_); return tape_.add_bar(op.a, 1, scratch_);
       case Kind::kSweep: return sweep_back(op, bar);
       default: TORCH_INTERNAL_ASSERT(false, "an operation that makes a number");
     }

@@ -2,9 +2,9 @@
 
 #include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/kernels/share_samples.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {

@@ -284,8 +284,8 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
   const auto of_dtype = [&](at::ScalarType dtype) {
     return at::empty_symint({b.sym_size(0)}, b.options().dtype(dtype));
   };
-  return {gradients, of_dtype(at::kLong), of_dtype(b.scalar_type()), of_dtype(at::kLong), of_dtype(at::kLong),
-          of_dtype(b.scalar_type())};
+  return {gradients,           of_dtype(at::kLong), of_dtype(b.scalar_type()),
+          of_dtype(at::kLong), of_dtype(at::kLong), of_dtype(b.scalar_type())};
 }
 
 }  // namespace

@@ -70,8 +70,8 @@ int64_t limit() { return int64_t{1} << 29; }
 
 Kept find(const kernels::FactorKey& key, const std::type_info& type) {
   const std::lock_guard lock(mutex);
-  const auto it = std::find_if(entries.begin(), entries.end(),
-                               [&](const Entry& e) { return e.key == key && *e.type == type; });
+  const auto it =
+      std::find_if(entries.begin(), entries.end(), [&](const Entry& e) { return e.key == key && *e.type == type; });
   if (it == entries.end()) return nullptr;
   entries.splice(entries.begin(), entries, it);
   return it->kept;

@@ -148,7 +148,8 @@ class CollapseOf {
     };
     const auto weight = [&](const std::vector<T>& field, const std::array<int64_t, 3>& p, bool of_column) {
       const auto& o = offset_.along;
-      return field.data() + (of_column ? ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]) : ringed_.at(p[0], p[1], p[2]));
+      return field.data() +
+             (of_column ? ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]) : ringed_.at(p[0], p[1], p[2]));
     };
     const T *zeros = constants_.zeros.data(), *ones = constants_.ones.data();
     const auto& [p, r] = transfer_;

@@ -3,9 +3,9 @@
 
 #include "prdp/kernels/raw_stencil.h"
 
-/// Coarser grids by dropping every second point of one axis, and operators on them (black-box multigrid, Dendy 1982, one
-/// axis at a time). The coarse points are the odd ones of an axis that ends with zeros, and the even ones of a periodic
-/// axis, whose first and last point are both coarse if their number is odd.
+/// Coarser grids by dropping every second point of one axis, and operators on them (black-box multigrid, Dendy 1982,
+/// one axis at a time). The coarse points are the odd ones of an axis that ends with zeros, and the even ones of a
+/// periodic axis, whose first and last point are both coarse if their number is odd.
 namespace prdp::kernels {
 
 /// How a point between two coarse points of an axis is made of them: fields over all fine points, of which those of
@@ -18,8 +18,8 @@ struct Weights {
 /// The number of coarse points.
 inline int64_t coarse_points(int64_t n, bool periodic) { return periodic ? (n + 1) / 2 : n / 2; }
 
-/// The interpolation and the restriction along an axis that belong to an operator. Of a symmetric one they are the same;
-/// else interpolation comes from the symmetric part and restriction from the transpose (Dendy 1983).
+/// The interpolation and the restriction along an axis that belong to an operator. Of a symmetric one they are the
+/// same; else interpolation comes from the symmetric part and restriction from the transpose (Dendy 1983).
 template <class T>
 struct AxisTransfer {
   Weights<T> interpolation, restriction;

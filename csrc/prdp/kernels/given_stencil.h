@@ -19,8 +19,8 @@ inline std::array<Run, 2> runs(int64_t offset, int64_t n, bool periodic, bool tr
   return {{inner, offset > 0 ? Run{n - offset, 0, offset} : Run{0, n + offset, -offset}}};
 }
 
-/// The rows of factor times the stencil with these coefficients, each (nz, ny, nx) and one for each offset that `pattern`
-/// was given; or of its transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
+/// The rows of factor times the stencil with these coefficients, each (nz, ny, nx) and one for each offset that
+/// `pattern` was given; or of its transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
 template <class T>
 StencilRows<T> assemble_rows(std::shared_ptr<const StencilPattern> pattern, const std::vector<const T*>& coefficients,
                              T factor, bool transposed) {
@@ -77,8 +77,11 @@ struct GivenStencil {
     const auto key = [given_stencil = *this, from, count = given * points] {
       return given_stencil.of_matrix().add(from, count).key();
     };
-    const auto raw = [given_stencil = *this, fields, factor, points] { return given_stencil.raw(fields, factor, points); };
-    return std::make_unique<Stencil<T>>(std::move(rows), channels, factor, typename Stencil<T>::Source{key, raw, transposed});
+    const auto raw = [given_stencil = *this, fields, factor, points] {
+      return given_stencil.raw(fields, factor, points);
+    };
+    return std::make_unique<Stencil<T>>(std::move(rows), channels, factor,
+                                        typename Stencil<T>::Source{key, raw, transposed});
   }
 
  private:

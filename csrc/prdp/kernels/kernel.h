@@ -81,8 +81,8 @@ class Kernel {
   /// What multigrid makes its coarse grids of; nothing if the operator is not of that kind.
   virtual std::optional<GridOperator<T>> grid_operator() const { return std::nullopt; }
 
-  /// M⁻¹ made of V-cycles; null if the operator has no coarse grids, or these no inverse diagonal. M⁻ᵀ needs `transpose`,
-  /// the kernel of Aᵀ, where A is not symmetric.
+  /// M⁻¹ made of V-cycles; null if the operator has no coarse grids, or these no inverse diagonal. M⁻ᵀ needs
+  /// `transpose`, the kernel of Aᵀ, where A is not symmetric.
   virtual std::unique_ptr<Preconditioner<T>> multigrid(const Kernel* transpose, int64_t smoothing) const;
 
   virtual std::shared_ptr<const Factors<T>> factorise() const = 0;

@@ -87,8 +87,8 @@ class SineTransform final : public Factors<T> {
       for (int64_t k = 0; k < n; ++k) s(j, k) = static_cast<T>(sine[(j + 1) * (k + 1) % (2 * (n + 1))]);
     return s;
   }
-  /// Calls body(first, count) for the n rows of a product whose rows take `work` multiplications each, with looks for an
-  /// interruption in between.
+  /// Calls body(first, count) for the n rows of a product whose rows take `work` multiplications each, with looks for
+  /// an interruption in between.
   template <class Body>
   static void in_pieces(int64_t n, int64_t work, const Body& body) {
     const int64_t each = std::max<int64_t>(int64_t{1 << 26} / std::max<int64_t>(work, 1), 16);

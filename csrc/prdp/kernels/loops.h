@@ -62,11 +62,11 @@ struct StaggeredStencil {
   const T* weights;
 };
 
-/// The coefficients of a coarse operator at a row of coarse points, Galerkin's product with the fine one along one axis.
-/// "Before" and "after" are the fine points on either side of a coarse one, "here". Fine coefficients with one offset in
-/// the other axes: lower, centre and upper along this one, null where there is none but the centre. The weights by which
-/// a fine point is interpolated from the coarse points to its left and right belong to the column, those of the
-/// restriction to the row.
+/// The coefficients of a coarse operator at a row of coarse points, Galerkin's product with the fine one along one
+/// axis. "Before" and "after" are the fine points on either side of a coarse one, "here". Fine coefficients with one
+/// offset in the other axes: lower, centre and upper along this one, null where there is none but the centre. The
+/// weights by which a fine point is interpolated from the coarse points to its left and right belong to the column,
+/// those of the restriction to the row.
 template <class T>
 struct Collapse {
   const T *lower_before, *lower_here, *lower_after;

@@ -14,7 +14,9 @@ namespace prdp::kernels {
 template <class T>
 class MatrixKernel : public Kernel<T> {
  public:
-  bool has_zero_diagonal() const final { return std::find(diagonal_.begin(), diagonal_.end(), T(0)) != diagonal_.end(); }
+  bool has_zero_diagonal() const final {
+    return std::find(diagonal_.begin(), diagonal_.end(), T(0)) != diagonal_.end();
+  }
   void divide_by_diagonal(const T* b, T* c) const final {
     for (int64_t i = 0; i < n(); ++i) c[i] = b[i] / diagonal_[i];
   }
@@ -38,8 +40,7 @@ class MatrixKernel : public Kernel<T> {
   template <class Body>
   void for_each_part(int64_t work, const Body& body) const {
     const int64_t each = std::max<int64_t>(kBlock * n() / std::max<int64_t>(work, 1), 1);
-    shared_rows::for_each((n() + each - 1) / each,
-                          [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
+    shared_rows::for_each((n() + each - 1) / each, [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
   }
 
   std::vector<T> diagonal_;

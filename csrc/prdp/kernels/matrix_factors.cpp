@@ -18,9 +18,9 @@ struct DenseLU {
 
   explicit DenseLU(const Eigen::MatrixXd& m)
       : lu(m),
-        is_regular(lu.matrixLU().diagonal().cwiseAbs().minCoeff() >
-                   std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows()) *
-                       m.cwiseAbs().rowwise().sum().maxCoeff()) {}
+        is_regular(lu.matrixLU().diagonal().cwiseAbs().minCoeff() > std::numeric_limits<double>::epsilon() *
+                                                                        static_cast<double>(m.rows()) *
+                                                                        m.cwiseAbs().rowwise().sum().maxCoeff()) {}
   int64_t bytes() const { return lu.rows() * lu.rows() * static_cast<int64_t>(sizeof(double)); }
 };
 

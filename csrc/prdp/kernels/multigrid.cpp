@@ -34,9 +34,8 @@ std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kerne
     std::shared_ptr<const Hierarchy<T>> hierarchy;
     int64_t bytes() const { return hierarchy ? hierarchy->bytes() : 0; }
   };
-  const auto kept = factor_cache::find_or_make<Kept>(given->key, [&] {
-    return std::make_shared<Kept>(Kept{Hierarchy<T>::make(std::move(given->stencil))});
-  });
+  const auto kept = factor_cache::find_or_make<Kept>(
+      given->key, [&] { return std::make_shared<Kept>(Kept{Hierarchy<T>::make(std::move(given->stencil))}); });
   if (!kept->hierarchy) return nullptr;
   return std::unique_ptr<Multigrid>(new Multigrid(kept->hierarchy, a, transpose, given->transposed, smoothing));
 }
@@ -112,7 +111,9 @@ const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
   for (size_t s = 1; s < level.p.size(); ++s, std::swap(x, y)) a.smooth(b, x, y, level.p[s], level.q[s]);
 
   a.residual(b, x, r);
-  const auto vector = [&](size_t t) { return t == 0 ? r : level.memory.vector(kBetween + static_cast<int64_t>(t) - 1); };
+  const auto vector = [&](size_t t) {
+    return t == 0 ? r : level.memory.vector(kBetween + static_cast<int64_t>(t) - 1);
+  };
   const auto grid = [&](size_t t) -> const PaddedGrid& { return t == 0 ? level.grid : level.between[t - 1]; };
   auto& next = levels_[l + 1];
   const size_t last = transfers.size() - 1;
@@ -161,11 +162,12 @@ std::unique_ptr<Preconditioner<T>> Kernel<T>::multigrid(const Kernel<T>* transpo
 }
 template <class T>
 std::unique_ptr<Preconditioner<T>> NavierStokes<T>::multigrid(const Kernel<T>* transpose, int64_t smoothing) const {
-  return std::make_unique<SaddlePointPreconditioner<T>>(*this, dynamic_cast<const NavierStokes<T>*>(transpose), smoothing);
+  return std::make_unique<SaddlePointPreconditioner<T>>(*this, dynamic_cast<const NavierStokes<T>*>(transpose),
+                                                        smoothing);
 }
 
-#define PRDP_INSTANTIATE(T)                                                                                     \
-  template std::unique_ptr<Preconditioner<T>> Kernel<T>::multigrid(const Kernel<T>*, int64_t) const;            \
+#define PRDP_INSTANTIATE(T)                                                                          \
+  template std::unique_ptr<Preconditioner<T>> Kernel<T>::multigrid(const Kernel<T>*, int64_t) const; \
   template std::unique_ptr<Preconditioner<T>> NavierStokes<T>::multigrid(const Kernel<T>*, int64_t) const;
 PRDP_INSTANTIATE(float)
 PRDP_INSTANTIATE(double)

@@ -12,8 +12,8 @@ namespace prdp::kernels {
 template <class T>
 class Multigrid final : public Preconditioner<T> {
  public:
-  /// Null if the operator has no grid, or its coarse grids no inverse diagonal. `transpose`, the kernel of Aᵀ, is needed
-  /// for apply_transpose() where A is not symmetric.
+  /// Null if the operator has no grid, or its coarse grids no inverse diagonal. `transpose`, the kernel of Aᵀ, is
+  /// needed for apply_transpose() where A is not symmetric.
   static std::unique_ptr<Multigrid> make(const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing);
 
   T apply(const T* r, T* z) override;

@@ -14,8 +14,8 @@ void restrict_row(const T* middle, const T* before, const T* weight_before, cons
 }
 
 template <class T>
-void add_interpolated(const T* before, const T* weight_before, const T* after, const T* weight_after,
-                      T* __restrict out, int64_t n) {
+void add_interpolated(const T* before, const T* weight_before, const T* after, const T* weight_after, T* __restrict out,
+                      int64_t n) {
   for (int64_t i = 0; i < n; ++i) out[i] += weight_before[i] * before[i] + weight_after[i] * after[i];
 }
 

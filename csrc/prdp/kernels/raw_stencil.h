@@ -6,8 +6,8 @@
 
 namespace prdp::kernels {
 
-/// A stencil with neighbours at most one cell away, as contiguous fields (nz, ny, nx) of coefficients. What points beyond
-/// the grid is kept: no product uses it, but the weights of interpolation need it.
+/// A stencil with neighbours at most one cell away, as contiguous fields (nz, ny, nx) of coefficients. What points
+/// beyond the grid is kept: no product uses it, but the weights of interpolation need it.
 template <class T>
 struct RawStencil {
   explicit RawStencil(const StencilGrid& on) : grid(on) {}

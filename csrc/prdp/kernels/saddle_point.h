@@ -10,14 +10,17 @@ namespace prdp::kernels {
 
 /// M for the linearised Navier-Stokes equations [[C, G], [D, 0]]: the block triangular matrix [[Ĉ, G], [0, Ŝ]]. Ĉ⁻¹ is
 /// a number of Jacobi sweeps; they converge, as the rows of C sum to 1/dt and its other entries are negative. Ŝ⁻¹
-/// approximates the inverse of the Schur complement -D C⁻¹ G as if there were no winds: (1/dt) (-L)⁻¹ + ν, with a V-cycle
-/// for the Laplacian of the pressure (Cahouet and Chabard 1988).
+/// approximates the inverse of the Schur complement -D C⁻¹ G as if there were no winds: (1/dt) (-L)⁻¹ + ν, with a
+/// V-cycle for the Laplacian of the pressure (Cahouet and Chabard 1988).
 template <class T>
 class SaddlePointPreconditioner final : public Preconditioner<T> {
  public:
   /// `transpose`, the kernel of Aᵀ, is needed for apply_transpose().
   SaddlePointPreconditioner(const NavierStokes<T>& a, const NavierStokes<T>* transpose, int64_t smoothing)
-      : a_(a), transpose_(transpose), sweeps_(kSweepsPerSmoothing * smoothing), laplacian_(laplacian_of(a.parameters())) {
+      : a_(a),
+        transpose_(transpose),
+        sweeps_(kSweepsPerSmoothing * smoothing),
+        laplacian_(laplacian_of(a.parameters())) {
     cycle_ = Multigrid<T>::make(*laplacian_, nullptr, smoothing);
     memory_.prepare(kVectors, a.length(), a.layout().halo);
   }
@@ -54,8 +57,8 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
     const double y = p.ny > 1 ? std::pow(static_cast<double>(p.ny) / p.length_y, 2) : 0.0;
     const double x = p.nx > 1 ? std::pow(static_cast<double>(p.nx) / p.length_x, 2) : 0.0;
     const double largest = std::max(x, y);
-    const T along[] = {static_cast<T>(2 * (x + y) / largest), static_cast<T>(-x / largest), static_cast<T>(-x / largest),
-                       static_cast<T>(-y / largest), static_cast<T>(-y / largest)};
+    const T along[] = {static_cast<T>(2 * (x + y) / largest), static_cast<T>(-x / largest),
+                       static_cast<T>(-x / largest), static_cast<T>(-y / largest), static_cast<T>(-y / largest)};
     auto rows = std::make_shared<StencilRows<T>>(p.pattern(2));
     for (int64_t j = 0; j < p.ny; ++j)
       for (int64_t k = 0; k < 5; ++k) std::fill_n(rows->coefficient(j, k), p.nx, along[k]);
@@ -92,7 +95,7 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
     }
   }
 
-  const NavierStokes<T>&a_;
+  const NavierStokes<T>& a_;
   const NavierStokes<T>* transpose_;
   int64_t sweeps_;
   std::unique_ptr<Stencil<T>> laplacian_;

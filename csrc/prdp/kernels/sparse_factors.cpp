@@ -72,7 +72,8 @@ std::vector<int64_t> pivots(std::vector<std::vector<double>> vectors) {
   std::vector<int64_t> found;
   for (size_t k = 0; k < vectors.size(); ++k) {
     const auto& v = vectors[k];
-    const auto largest = std::max_element(v.begin(), v.end(), [](double a, double b) { return std::abs(a) < std::abs(b); });
+    const auto largest =
+        std::max_element(v.begin(), v.end(), [](double a, double b) { return std::abs(a) < std::abs(b); });
     const auto at = largest - v.begin();
     found.push_back(at);
     for (size_t j = k + 1; j < vectors.size(); ++j) {

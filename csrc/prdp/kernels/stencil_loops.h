@@ -106,7 +106,8 @@ void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body&
   const T* from[kMostOffsets];
   for (int64_t line = lines.begin; line < lines.end; ++line) {
     const int64_t at = line * a.row;
-    const T *const w = a.coefficients + line * a.count * a.row, *const wrap_values = a.wrap_values + line * a.wrap_count;
+    const T *const w = a.coefficients + line * a.count * a.row, *const wrap_values =
+                                                                    a.wrap_values + line * a.wrap_count;
     for (int64_t k = 0; k < a.count; ++k) {
       const auto& o = a.offsets[k].along;
       from[k] = v + (round(line / a.ny + o[0], a.nz) * a.ny + round(line % a.ny + o[1], a.ny)) * a.row + o[2];

@@ -108,8 +108,8 @@ class StencilRows {
     }
     return static_cast<double>(largest);
   }
-  /// Calls body(row of the grid, coefficient, point of the row, value) for all coefficients, those that leave a periodic
-  /// row along x included.
+  /// Calls body(row of the grid, coefficient, point of the row, value) for all coefficients, those that leave a
+  /// periodic row along x included.
   template <class Body>
   void for_each_coefficient(const Body& body) const {
     for (int64_t r = 0; r < rows(); ++r)

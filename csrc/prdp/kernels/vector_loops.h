@@ -54,8 +54,8 @@ T dot(const T* a, const T* b, int64_t n) {
   return sum;
 }
 
-/// Calls body(i, k) for each register i of n values, k being 0 and 1 in turn: for two sums at once, as an addition waits
-/// for the one before it.
+/// Calls body(i, k) for each register i of n values, k being 0 and 1 in turn: for two sums at once, as an addition
+/// waits for the one before it.
 template <class T, class Body>
 void for_each_in_turn(int64_t n, const Body& body) {
   int64_t i = 0;

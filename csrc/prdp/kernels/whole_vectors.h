@@ -69,9 +69,7 @@ class WholeVectors {
   }
   /// x += alpha p and r -= alpha q; returns ‖r‖². p may be r.
   T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) const {
-    return sum(n, [&](int64_t i, int64_t end) {
-      return loops_.descend(alpha, p + i, q + i, x + i, r + i, end - i);
-    });
+    return sum(n, [&](int64_t i, int64_t end) { return loops_.descend(alpha, p + i, q + i, x + i, r + i, end - i); });
   }
   /// out = w∘x, entry by entry; returns x·out.
   T weigh(const T* w, const T* x, T* out, int64_t n) const {

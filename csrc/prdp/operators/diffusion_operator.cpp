@@ -62,14 +62,15 @@ OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const s
 DiffusionOperator::DiffusionOperator(const OperatorSpec& spec) : shape_(spec.shape) {
   TORCH_CHECK_VALUE(spec.tensors.size() == 2, "Diffusion: takes two tensors, kappa and shift");
   kappa_ = spec.tensors[0];
-  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa_.dim() == dim() + 2 && kappa_.sym_sizes().slice(2) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_)),
+  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa_.dim() == dim() + 2 &&
+                        kappa_.sym_sizes().slice(2) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_)),
                     "Diffusion: kappa must have shape (batch or 1, *shape), got ", kappa_.sym_sizes());
   TORCH_CHECK_TYPE(kappa_.scalar_type() == at::kFloat || kappa_.scalar_type() == at::kDouble,
                    "Diffusion: kappa must be float32 or float64, got ", kappa_.scalar_type());
   shift_ = spec.tensors[1].to(kappa_.scalar_type());
-  TORCH_CHECK_VALUE(shift_.dim() == 0 || (shift_.dim() == kappa_.dim() &&
-                                          shift_.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2)),
-                    "Diffusion: shift must be a number or have the shape of kappa, got ", shift_.sym_sizes());
+  TORCH_CHECK_VALUE(
+      shift_.dim() == 0 || (shift_.dim() == kappa_.dim() && shift_.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2)),
+      "Diffusion: shift must be a number or have the shape of kappa, got ", shift_.sym_sizes());
   const auto axes = static_cast<size_t>(dim());
   TORCH_CHECK_VALUE(spec.parameters.size() == 3 * axes + 1, "Diffusion: expected ", 3 * axes + 1, " parameters, got ",
                     spec.parameters.size());
@@ -103,7 +104,8 @@ void DiffusionOperator::check_parameters() const {
   const auto wrong = kappa_.le(0);
   if (!wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
-  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ", kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
+  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
+                    kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
                     " in sample ", index[0]);
 }
 
@@ -173,7 +175,7 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
 }
 
 at::Tensor DiffusionOperator::coefficients() const {
-  auto diagonal = shift_.expand_as(shift_.dim() == 0 ? kappa_ : shift_);
+  auto diagonal = shift_ + 0.0 * kappa_;  // NaN where kappa is not finite, which a harmonic mean would lose
   std::vector<at::Tensor> all{at::Tensor()};
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (const auto& face : faces(axis)) {

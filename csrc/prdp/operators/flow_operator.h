@@ -20,7 +20,8 @@ class FlowOperator : public Operator {
   /// Vectors have `channels` channels.
   FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels);
 
-  /// The kernels that make(parameters) makes of the winds of each sample, kernels::UpwindParameters; Make is a template.
+  /// The kernels that make(parameters) makes of the winds of each sample, kernels::UpwindParameters; Make is a
+  /// template.
   template <class Make>
   std::shared_ptr<const kernels::Kernels> upwind_kernels(const at::Tensor& b, bool transposed, const Make& make) const;
   /// Of the channel that blows along a grid axis: (batch or 1, 1, *shape).

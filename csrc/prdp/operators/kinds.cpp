@@ -52,4 +52,14 @@ const std::vector<OperatorKind> kKinds{
 
 const OperatorKind& operator_kind(const std::string& kind) { return row_of(kKinds, "operator", kind); }
 
+void check_devices(const OperatorSpec& a, const at::Tensor& b) {
+  for (const auto& t : a.tensors) {
+    const bool beside = t.device() == b.device() || (t.dim() == 0 && t.is_cpu()) || t.sym_numel() == 0 ||
+                        (is_function(a) && t.is_meta() == b.is_meta());
+    TORCH_CHECK_VALUE(beside, operator_kind(a.kind).title, ": a tensor of it is on ", t.device(),
+                      " but the vector is on ", b.device(),
+                      t.is_meta() ? "; it has no values: give it some, as with to_empty and load_state_dict" : "");
+  }
+}
+
 }  // namespace prdp

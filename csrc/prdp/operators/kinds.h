@@ -36,4 +36,8 @@ const Row& row_of(const std::vector<Row>& rows, const char* table, const std::st
 /// Raises ValueError for an unknown kind.
 const OperatorKind& operator_kind(const std::string& kind);
 
+/// Raises ValueError unless the tensors of A can be used with b: on its device, or plain numbers on the CPU. A kernel
+/// for fake tensors must not answer for real ones: its results are memory that nobody wrote.
+void check_devices(const OperatorSpec& a, const at::Tensor& b);
+
 }  // namespace prdp

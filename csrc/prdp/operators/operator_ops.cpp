@@ -1,6 +1,5 @@
-#include <torch/library.h>
-
 #include <ATen/core/grad_mode.h>
+#include <torch/library.h>
 
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/disguises.h"

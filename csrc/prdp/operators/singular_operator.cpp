@@ -160,7 +160,8 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
           a->set_null_spaces({layout, 0, layout.planes, *right}, {layout, 0, layout.planes, *left});
           return a;
         };
-        return std::make_shared<const kernels::Kernels>(kernels::Kernels{kernels::KernelBatch<T>{batch.is_shared, make}});
+        return std::make_shared<const kernels::Kernels>(
+            kernels::Kernels{kernels::KernelBatch<T>{batch.is_shared, make}});
       },
       regular->of_dtype);
 }

@@ -47,6 +47,9 @@ class SingularOperator final : public Operator {
   const char* title_;
 };
 
+/// Whether the null spaces of an operator are named.
+inline bool is_singular(const OperatorSpec& a) { return a.kind.starts_with("singular_"); }
+
 /// For `kind` of the operator, which is not singular, and its two bases.
 template <class T>
 std::unique_ptr<Operator> make_singular(const OperatorSpec& spec, const char* title) {

@@ -235,9 +235,9 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
   if (transposed)
     for (auto& offset : offsets)
       for (auto& cells : offset.along) cells = -cells;
-  const auto of_samples = [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
-                           pattern = std::make_shared<kernels::StencilPattern>(
-                               grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
+  const auto of_samples =
+      [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
+       pattern = std::make_shared<kernels::StencilPattern>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                          transposed};
     return {c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};

@@ -187,8 +187,8 @@ class GmresMethod {
     c.g = c.cos * c.g;
   }
 
-  /// y = argmin ‖r - A V y‖. Where that takes a step so long that its rounding exceeds r, A is singular to the dtype, and
-  /// y is damped; its derivative is that of a constant there.
+  /// y = argmin ‖r - A V y‖. Where that takes a step so long that its rounding exceeds r, A is singular to the dtype,
+  /// and y is damped; its derivative is that of a constant there.
   void minimise(int64_t columns) {
     using std::sqrt;
     const Scalar size = space_.constant(sqrt(residual2_));

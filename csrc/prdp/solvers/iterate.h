@@ -71,8 +71,8 @@ inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n)
 template <class Method>
 inline constexpr bool kHasRecursiveResidual = requires { Method::kHasRecursiveResidual; };
 
-/// Methods for definite operators: a truncated iterate may have a residual above ‖b‖ and still be nearer to the solution
-/// than zero, in the norm of A.
+/// Methods for definite operators: a truncated iterate may have a residual above ‖b‖ and still be nearer to the
+/// solution than zero, in the norm of A.
 template <class Method>
 inline constexpr bool kDescendsEnergy = requires { Method::kDescendsEnergy; };
 

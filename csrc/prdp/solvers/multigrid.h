@@ -10,8 +10,7 @@ namespace prdp {
 template <VectorSpace Space>
 class MultigridMethod {
  public:
-  explicit MultigridMethod(Space& space)
-      : x(space.vector()), space_(space), r_(space.vector()), z_(space.vector()) {}
+  explicit MultigridMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), z_(space.vector()) {}
 
   void start() {
     space_.fill_zero(x);

@@ -20,8 +20,7 @@ class SampleSystem {
     by_diagonal_ = preconditioner.is_diagonal();
     preconditioner_.reset();
     if (by_diagonal_) preconditioner_ = std::make_unique<kernels::DiagonalPreconditioner<T>>(a);
-    else if (preconditioner.is_multigrid())
-      preconditioner_ = a.multigrid(transpose, preconditioner.smoothing());
+    else if (preconditioner.is_multigrid()) preconditioner_ = a.multigrid(transpose, preconditioner.smoothing());
     return preconditioner_ || !preconditioner;
   }
 

@@ -2,8 +2,8 @@
 
 #include <ATen/EmptyTensor.h>
 
-#include "prdp/solvers/methods.h"
 #include "prdp/kernels/share_samples.h"
+#include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_samples.h"
 
 namespace prdp {

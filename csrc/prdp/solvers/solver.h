@@ -11,16 +11,7 @@
 namespace prdp {
 
 /// What each of them is, methods.h says.
-enum class Method {
-  kJacobi,
-  kChebyshev,
-  kSteepestDescent,
-  kConjugateGradient,
-  kBiCGStab,
-  kGmres,
-  kMultigrid,
-  kDirect
-};
+enum class Method { kJacobi, kChebyshev, kSteepestDescent, kConjugateGradient, kBiCGStab, kGmres, kMultigrid, kDirect };
 
 /// Smoothing steps of multigrid before and after each coarse grid.
 inline constexpr int64_t kDefaultSmoothing = 2;
@@ -96,9 +87,7 @@ struct CG {
   int64_t max_iter;
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
-  operator Solver() const {
-    return {Method::kConjugateGradient, max_iter, rtol, kDefaultRestart, preconditioner};
-  }
+  operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
 /// For any operator; two products with A per iteration. Preconditioned from the right.
 struct BiCGStab {

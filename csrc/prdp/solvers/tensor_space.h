@@ -162,9 +162,7 @@ class TensorSpace {
   static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
     return omega ? before + *omega * (x + change - before) : x + change;
   }
-  Vector jacobi_change(const Vector& c, const Vector& x) {
-    return c - product(x) / diagonal();
-  }
+  Vector jacobi_change(const Vector& c, const Vector& x) { return c - product(x) / diagonal(); }
   /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
   const at::Tensor& diagonal();
   /// A v, not scaled.

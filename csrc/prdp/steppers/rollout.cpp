@@ -10,6 +10,7 @@
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/disguises.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
@@ -60,7 +61,9 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
   options.check(equation.kind.c_str());
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);
-  make_operator(equation_operator(equation, u))->check_vector(u);
+  const auto a = equation_operator(equation, u);
+  make_operator(a)->check_vector(u);
+  check_devices(a, u);
 }
 
 /// Below autograd.
@@ -97,8 +100,12 @@ Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_vie
   const auto of_dtype = [&](at::ScalarType dtype) {
     return at::empty_symint({u.sym_size(0), solves}, u.options().dtype(dtype));
   };
-  return {at::empty_symint(sizes, u.options()), of_dtype(at::kLong), of_dtype(u.scalar_type()), of_dtype(at::kLong),
-          of_dtype(at::kLong), of_dtype(u.scalar_type())};
+  return {at::empty_symint(sizes, u.options()),
+          of_dtype(at::kLong),
+          of_dtype(u.scalar_type()),
+          of_dtype(at::kLong),
+          of_dtype(at::kLong),
+          of_dtype(u.scalar_type())};
 }
 
 template <class... Options>

@@ -35,7 +35,8 @@ void Reports::push(const SolveInfo& info) {
 }
 
 void Reports::reverse() {
-  for (auto* list : {&iterations_, &residual_, &status_, &applications_, &floor_}) std::reverse(list->begin(), list->end());
+  for (auto* list : {&iterations_, &residual_, &status_, &applications_, &floor_})
+    std::reverse(list->begin(), list->end());
 }
 
 SolveInfo Reports::joined(const at::Tensor& u) const {
