@@ -195,7 +195,12 @@ class Stepper(torch.nn.Module):
         return self.info is not None and all(bool(report.solved.all()) for report in reports)
 
     def extra_repr(self):
-        return f"solver={self.method}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
+        by = (
+            ""
+            if self.preconditioner is None or self.method == "multigrid"
+            else f", preconditioner={self.preconditioner!r}"
+        )
+        return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
 
 
 def _as_graph_input(stepper):

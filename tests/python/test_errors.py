@@ -52,8 +52,8 @@ def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
     without = torch.ones(5, device="meta")
     function = operators.Function(lambda v, k: k * v, tensors=(without,))
     for call in (
-        lambda: prdp.Heat((5,), nu, 1.0)(torch.zeros(1, 1, 5)),
-        lambda: prdp.Heat((5,), nu, 1.0).rollout(torch.zeros(1, 1, 5), 2),
+        lambda: prdp.Heat((5,), nu, 1.0, prdp.CG(3))(torch.zeros(1, 1, 5)),
+        lambda: prdp.Heat((5,), nu, 1.0, prdp.CG(3)).rollout(torch.zeros(1, 1, 5), 2),
         lambda: prdp.linear_solve(operators.Heat((5,), nu, 1.0), torch.zeros(1, 1, 5), prdp.Jacobi(1)),
         lambda: prdp.linear_solve(function, torch.zeros(1, 5), prdp.CG(1)),
     ):
@@ -214,12 +214,11 @@ def unsuited():
     multigrid = (
         'preconditioner "multigrid" is for Heat, Poisson, Burgers, Diffusion, NavierStokes, and Stencil .* not for this'
     )
-    flow = operators.NavierStokes(field((8, 8), channels=2), 1e-3, 1e-2)
     cycles = "the method Multigrid is for Heat, Poisson, Burgers, Diffusion, and Stencil"
     return [
         (burgers, prdp.Chebyshev(1), chebyshev),
         (function, prdp.Chebyshev(5), chebyshev),
-        (flow, prdp.Multigrid(3), cycles),
+        (function, prdp.Multigrid(3), cycles),
         (function, prdp.GMRES(3, preconditioner="multigrid"), multigrid),
         (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi and preconditioner"),
     ]

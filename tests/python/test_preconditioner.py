@@ -120,7 +120,17 @@ def test_it_solves_in_the_loops_and_in_plain_tensors(name, solver, dtype):
     method = solver(60, rtol)
     u, info = prdp.linear_solve(a, b, method)
     v, report = _C.solve_with_tensors(
-        b, a.tensors, a.kind, a.shape, a.parameters, False, method.method, 60, rtol, method.restart
+        b,
+        a.tensors,
+        a.kind,
+        a.shape,
+        a.parameters,
+        False,
+        method.method,
+        60,
+        rtol,
+        method.restart,
+        preconditioner="diagonal",
     )
     assert statuses(info) == ["CONVERGED"] * 3 and bool((info.residual <= rtol).all())
     assert bool((report[2] == 1).all()) and bool(((report[0] - info.iterations).abs() <= 1).all())
@@ -139,7 +149,17 @@ def test_plain_tensors_take_the_same_iterations(name, solver):
         method = solver(k)
         u, info = prdp.linear_solve(a, b, method)
         v, report = _C.solve_with_tensors(
-            b, a.tensors, a.kind, a.shape, a.parameters, False, method.method, k, 0.0, method.restart
+            b,
+            a.tensors,
+            a.kind,
+            a.shape,
+            a.parameters,
+            False,
+            method.method,
+            k,
+            0.0,
+            method.restart,
+            preconditioner="diagonal",
         )
         torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10 * float(u.abs().max()))
         torch.testing.assert_close(info.operator_applications, report[3])
@@ -206,7 +226,17 @@ def test_a_diagonal_matrix_takes_one_iteration_however_its_entries_spread(solver
     if plain:
         a = operators.Matrix(d.diag())
         u, report = _C.solve_with_tensors(
-            b, a.tensors, a.kind, a.shape, a.parameters, False, solver(1).method, 1, 1e-5, 3
+            b,
+            a.tensors,
+            a.kind,
+            a.shape,
+            a.parameters,
+            False,
+            solver(1).method,
+            1,
+            1e-5,
+            3,
+            preconditioner="diagonal",
         )
         assert prdp.SolveStatus(report[2].item()).name == status
     else:
@@ -312,10 +342,12 @@ def test_steps_and_their_controller_take_it():
 
 
 def test_arguments_are_checked():
-    with pytest.raises(ValueError, match="Jacobi: takes no preconditioner, got 'diagonal'; CG and GMRES take one"):
+    with pytest.raises(
+        ValueError, match="Jacobi: the method Jacobi takes no preconditioner; CG, BiCGStab and GMRES take one"
+    ):
         prdp.Jacobi(3, preconditioner="diagonal")
     for kind in (prdp.Chebyshev, prdp.SteepestDescent, prdp.Direct):
-        with pytest.raises(ValueError, match=f"{kind.__name__}: takes no preconditioner"):
+        with pytest.raises(ValueError, match=f"{kind.__name__}: the method {kind.__name__} takes no preconditioner"):
             kind(3, preconditioner="diagonal")
     allowed = "allowed: None, 'diagonal', 'multigrid', or an operator$"
     with pytest.raises(ValueError, match=f"CG: unknown preconditioner 'stokes'; {allowed}"):

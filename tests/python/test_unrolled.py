@@ -3,12 +3,13 @@ iterates kept or some."""
 
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field, spd_matrices, statuses
+from helpers import field, spd_matrices, statuses
 from torch.autograd import gradcheck
 from torch.library import opcheck
 
 import prdp_torch as prdp
 from prdp_torch import operators
+from prdp_torch.solvers import flat_preconditioner
 
 pytestmark = pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
 
@@ -236,8 +237,20 @@ def test_the_op_behind_it_passes_opcheck():
     b, nu = field((5,)), torch.tensor(1e-3, dtype=torch.float64)
     # One to be taken back, one that is solved: its derivative is a solve.
     said = torch.tensor([4, 3]), torch.tensor([-1, 1]), torch.tensor([0.1, 0.0], dtype=torch.float64)
-    for method in METHODS:
-        options = (method, 4, 1e-5, 3, *NO_PRECONDITIONER, "unrolled", None, None, "raise", 0, 2)
+    for make in METHODS.values():
+        options = (
+            make(4).method,
+            4,
+            1e-5,
+            3,
+            *flat_preconditioner(make(4).preconditioner),
+            "unrolled",
+            None,
+            None,
+            "raise",
+            0,
+            2,
+        )
         args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
         assert set(opcheck(torch.ops.prdp.unrolled_vjp.default, args).values()) == {"SUCCESS"}
 
