@@ -15,12 +15,12 @@ class Diffusion:
     """The operator of an implicit Euler step of u_t = ∇·(κ ∇u) on a periodic grid, for an `ImplicitStep`: assembled
     when κ changes, and the same for all steps of a rollout."""
 
-    def __init__(self, dt):
-        self.dt = dt
+    def __init__(self, dt, length):
+        self.dt, self.length = dt, length
         self._assembled = None
 
     def take(self, kappa):
-        self._assembled = operators.Stencil(*_C.diffusion_stencil(kappa, self.dt), "periodic")
+        self._assembled = operators.Stencil(*_C.diffusion_stencil(kappa, self.dt, self.length), "periodic")
 
     def __call__(self, u):
         return self._assembled
@@ -28,7 +28,7 @@ class Diffusion:
 
 def make_stepper(scene, **options):
     """The step of the scene; its operator needs a κ before the first one."""
-    return ImplicitStep(Diffusion(scene.physics.dt), **options)
+    return ImplicitStep(Diffusion(scene.physics.dt, scene.physics.length), **options)
 
 
 def misfit(scene, stepper, problem, theta):
@@ -54,7 +54,7 @@ def make_task(scene, steppers, seed):
             group["lr"] = scene.learning_rate(number)
         optimiser.zero_grad()
         squared = misfit(scene, stepper, problem, theta)
-        loss = squared + scene.field.smoothing * _C.roughness(theta)
+        loss = squared + scene.field.smoothing * _C.roughness(theta, scene.physics.length)
         loss.backward()
         optimiser.step()
         relative = math.sqrt(squared.detach())

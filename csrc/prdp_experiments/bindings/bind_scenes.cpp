@@ -13,6 +13,10 @@ void bind_scenes(py::module_& m) {
       .def_readonly("shape", &Scene::Physics::shape)
       .def_readonly("nu", &Scene::Physics::nu)
       .def_readonly("dt", &Scene::Physics::dt)
+      .def_property_readonly("length",
+                             [](const Scene::Physics& p) {
+                               return p.lengths.empty() ? std::vector<double>(p.shape.size(), 1.0) : p.lengths;
+                             })
       .def_property_readonly("channels", &Scene::Physics::channels)
       .def_property_readonly("periodic", &Scene::Physics::periodic)
       .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);

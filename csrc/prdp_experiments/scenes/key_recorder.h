@@ -51,6 +51,9 @@ class KeyRecorder {
     add(key, "whole numbers >= " + written(least), written(target), false);
   }
   void numbers(const std::vector<double>& target, const Key& key) { add(key, "numbers", written(target), false); }
+  void sides(const std::vector<double>&, size_t, const Key& key) {
+    add(key, "number > 0, or a list of them", "1", false);
+  }
   void check(bool, const char*, const char*) const {}
 
  private:

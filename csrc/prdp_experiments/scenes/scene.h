@@ -25,8 +25,11 @@ struct Scene {
     std::string equation;
     std::vector<int64_t> shape;
     double nu = 0.0, dt = 0.0;  // length²/time, time; poisson has neither, diffusion no nu
+    std::vector<double> lengths{};  // the sides of the domain, as a Grid takes them: empty where all are 1
 
     bool periodic() const;  // of the grid
+    /// The side of the domain along an axis of `shape`.
+    double length(int64_t axis) const { return lengths.empty() ? 1.0 : lengths[axis]; }
     /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
     int64_t channels() const;
     /// Whether an exact solve costs about as much as an iterative one. On periodic grids of two and more dimensions it

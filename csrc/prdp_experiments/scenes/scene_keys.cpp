@@ -1,5 +1,7 @@
 #include <algorithm>
 #include <filesystem>
+#include <functional>
+#include <numeric>
 
 #include "prdp/solvers/methods.h"
 #include "prdp_experiments/files/whole_files.h"
@@ -45,6 +47,13 @@ void read_physics(Section& s, Scene& scene) {
   s.wholes(p.shape, 1, {"shape", "unknowns per axis, in 1 to 3 axes: `[N]`, `[Ny, Nx]` or `[Nz, Ny, Nx]`"});
   s.check(!p.shape.empty() && p.shape.size() <= 3, "shape", "expected 1 to 3 extents");
   s.check(p.shape.size() == 2 || !corrector(scene).holds, "shape", "expected 2 extents");
+  s.check(std::accumulate(p.shape.begin(), p.shape.end(), 1.0, std::multiplies<>()) <= kMostCounted, "shape",
+          "expected at most 1000000000 unknowns");
+  s.sides(p.lengths, p.shape.size(),
+          {.name = "length",
+           .means = "side of the domain, one number or one per axis in the order of `shape`",
+           .unit = "length",
+           .optional = true});
   const When has_nu{p.equation != "poisson" && p.equation != "diffusion", "not for `poisson` and `diffusion`"};
   const When has_dt{p.equation != "poisson", "not for `poisson`"};
   s.at_least(p.nu, 0.0, {"nu", "viscosity or diffusivity", "length²/time", has_nu});

@@ -1,6 +1,7 @@
 #pragma once
 #include <c10/util/Exception.h>
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <set>
@@ -114,6 +115,16 @@ class TomlSection {
   }
   void numbers(std::vector<double>& target, const Key& key) {
     if (given(key)) target = values<double>(key.name, "numbers");
+  }
+  /// A number > 0 for each axis, or one for all of them. They are left out where all are 1.
+  void sides(std::vector<double>& target, size_t axes, const Key& key) {
+    if (!given(key)) return;
+    if (table_[key.name].is_array()) target = values<double>(key.name, "numbers");
+    else target.assign(axes, value<double>(key.name, "a number, or a list of numbers"));
+    if (target.size() != axes) fail(key.name, "expected one number, or one per axis");
+    for (const double x : target)
+      if (!(x > 0.0) || !std::isfinite(x)) fail(key.name, bound(">", 0.0, x) + " and be finite");
+    if (std::all_of(target.begin(), target.end(), [](double x) { return x == 1.0; })) target.clear();
   }
   /// A condition on what has been read already.
   void check(bool holds, const char* key, const std::string& expected) const {
