@@ -6,6 +6,7 @@ import torch
 
 from prdp_torch import operators
 from prdp_torch.experiments import _C
+from prdp_torch.experiments.checkpoint import load_optimiser, state_of
 from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed
@@ -64,10 +65,10 @@ def make_task(scene, steppers, seed):
         return float(_C.relative_error(theta.detach().exp(), problem.reference))
 
     def state():
-        return {"theta": theta.detach(), "optimiser": optimiser.state_dict()}
+        return {"theta": theta.detach(), **state_of(optimiser)}
 
-    def load(saved):
-        theta.detach().copy_(saved["theta"])
-        optimiser.load_state_dict(saved["optimiser"])
+    def load(saved, updates):
+        theta.detach().copy_(saved.take("theta", theta))
+        load_optimiser(saved, optimiser, updates)
 
     return Task(updates, metric, lambda _: relative, state, load)

@@ -64,10 +64,11 @@ class ResNet(torch.nn.Module):
         return self.project(x)
 
 
-def make_network(scene, seed):
-    """Make the network of a scene. The same seed gives the same weights in Python and in C++."""
+def make_network(scene, seed, without_memory=False):
+    """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
+    it on the device "meta", for weights that are loaded into it."""
     physics, network = scene.physics, scene.network
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), torch.device("meta" if without_memory else "cpu"):
         torch.manual_seed(seed)
         if network.kind == "mlp":
             made = MLP(physics.channels * math.prod(physics.shape), network.hidden)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import fields
-from prdp_torch.experiments import _C, network_task, records
+from prdp_torch.experiments import network_task, records
 from prdp_torch.experiments.networks import make_network
 
 
@@ -53,20 +53,18 @@ def load_trained(run_folder, seed=0):
         >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
-    record = records.read(path)
-    settings = record["settings"]
-    scene = _C.parse_scene(settings["text"], f"{settings['scene']}.toml")
-    scene.backward, scene.training.intervals = settings["backward"], settings["intervals"]
+    record = records.read_training(path)
+    scene = records.scene_of(path, record)
     if not scene.trains_network:
         raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
     if "diverged" in record["curves"]:
         raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
-    network = records.read_weights(path, make_network(scene, seed))
+    network = records.read_weights(path, make_network(scene, seed, without_memory=True), record)
     if network is None:
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
-    return Trained(network.eval(), network_task.propagator(scene, network), scene, record["curves"])
+    return Trained(network, network_task.propagator(scene, network), scene, record["curves"])
 
 
 def _record_in(folder, name):

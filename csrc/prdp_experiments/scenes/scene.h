@@ -6,12 +6,9 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/steppers/steppers.h"
+#include "prdp_experiments/files/most_counted.h"
 
 namespace prdp {
-
-/// The largest number of seeds, intervals or iterations that a scene or a command may ask for. Costs are products of
-/// these numbers, and the limit keeps them from overflowing.
-inline constexpr int64_t kMostCounted = 1'000'000'000;
 
 /// A training experiment: the content of a scene file. Python and C++ share this reader.
 struct Scene {

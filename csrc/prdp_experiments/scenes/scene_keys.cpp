@@ -118,6 +118,11 @@ void read_network(Section& s, Scene& scene) {
   s.wholes(n.hidden, 1, {"hidden", "widths of the hidden layers", "", mlp});
   s.whole(n.blocks, 1, {"blocks", "residual blocks", "", resnet});
   s.whole(n.width, 1, {"width", "channels of the blocks", "", resnet});
+  constexpr int64_t kWidest = 1'000'000, kMostBlocks = 10'000;
+  s.check(std::all_of(n.hidden.begin(), n.hidden.end(), [](int64_t width) { return width <= kWidest; }), "hidden",
+          "expected layers of at most 1000000 units");
+  s.check(n.width <= kWidest, "width", "expected at most 1000000 channels");
+  s.check(n.blocks <= kMostBlocks, "blocks", "expected at most 10000 blocks");
   s.flag(n.zero_output, {.name = "zero_output", .means = "whether the last layer starts at zero", .optional = true});
 }
 

@@ -39,9 +39,9 @@ Task FieldTraining::task() {
         tensors["theta"] = theta_;
         optimiser_.save(tensors);
       },
-      [this](const TensorMap& tensors) {
-        theta_.detach().copy_(entry(tensors, "theta", theta_.scalar_type(), theta_.sizes()));
-        optimiser_.load(tensors);
+      [this](Saved& saved, int64_t updates) {
+        theta_.detach().copy_(saved.take("theta", theta_.scalar_type(), theta_.sizes()));
+        optimiser_.load(saved, updates);
       },
   };
 }

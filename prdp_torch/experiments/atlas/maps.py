@@ -112,7 +112,7 @@ def run(folder, names=(), quick=False, show=lambda name, answer, seconds: None):
             about = {"map": name, "question": chosen.question, "answer": data["answer"], "quick": quick}
             records.write(folder / f"{name}.json", {**about, "seed": problems.SEED, "seconds": round(seconds, 1),
                                                      **environment, "data": data})  # fmt: skip
-            chosen.draw(data).savefig(folder / f"{name}.png", dpi=110)
+            records.write_picture(folder / f"{name}.png", chosen.draw(data), dpi=110)
             show(name, data["answer"], seconds)
     finally:
         torch.set_num_threads(threads)
