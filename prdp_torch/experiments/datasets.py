@@ -63,7 +63,7 @@ def reference(scene, steps, on_data=None):
 
 
 def export(scene, path, steps=None, on_data=None):
-    """Write the trajectories of a scene to an HDF5 file that `[data] file` reads. Returns their shape.
+    """Write the trajectories of a scene to a file that `[data] file` reads, HDF5 or .npz. Returns their shape.
 
     Args:
         scene: a scene that trains a network and makes its own data.

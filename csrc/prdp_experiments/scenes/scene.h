@@ -39,8 +39,8 @@ struct Scene {
     // For a corrector: the grid of the reference solution, and the K of the converged solves behind the metric.
     std::vector<int64_t> reference_shape{};
     int64_t valid_max_iter = 0;
-    // HDF5 file of trajectories in place of random initial states, relative to the folder of the scene file; empty if
-    // there is none. Only the Python trainer reads it.
+    // HDF5 or .npz file of trajectories in place of random initial states, relative to the folder of the scene file;
+    // empty if there is none. Only the Python trainer reads it.
     std::string file{};
     bool fresh = false;  // new training samples in every epoch (fresh_data.h)
   };

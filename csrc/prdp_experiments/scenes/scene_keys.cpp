@@ -84,7 +84,7 @@ template <class Section>
 void read_data(Section& s, Scene& scene) {
   auto& d = scene.data;
   s.text(d.file, {.name = "file",
-                  .means = "HDF5 file of trajectories, in place of random initial states",
+                  .means = "HDF5 or `.npz` file of trajectories, in place of random initial states",
                   .unit = "path relative to the scene file",
                   .optional = true});
   const When random{d.file.empty(), "not with `file`"};
