@@ -110,6 +110,9 @@ class Network:
     def kind(self) -> str:
         ...
     @property
+    def python(self) -> str:
+        ...
+    @property
     def width(self) -> int:
         ...
     @property

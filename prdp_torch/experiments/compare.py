@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -144,6 +145,8 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
     network = make_network(scene, seed) if scene.trains_network else None
     curves = train(scene, refinement, seed, network, callbacks, on_data, checkpoint)
     record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
+    if scene.network.python:
+        record["folder"] = str(Path(scene.path).resolve().parent)  # where load_trained finds the class again
     records.write_training(path, record, network)
     checkpoint.remove()
     return curves

@@ -86,7 +86,7 @@ def _metric(scene, data, network):
     def metric():
         mine = math.nan  # of a process without a sample
         if len(start):
-            with torch.no_grad():
+            with datasets.evaluating(network):
                 mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
         return processes.mean([mine], len(start))[0]
 

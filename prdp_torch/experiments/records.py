@@ -14,7 +14,7 @@ import torch
 
 from prdp_torch import processes
 from prdp_torch._C import VERSION
-from prdp_torch.experiments import _C, datasets
+from prdp_torch.experiments import _C, datasets, own_networks
 
 
 def environment():
@@ -64,7 +64,11 @@ def _commit():
 def identity(scene):
     """What a training must agree on to be the same one, however many intervals it goes on for."""
     same = {"scene": scene.name, "text": scene.text, "backward": scene.backward}
-    return {**same, "data": datasets.fingerprint(scene)} if scene.data.file else same
+    if scene.data.file:
+        same["data"] = datasets.fingerprint(scene)
+    if scene.network.python:
+        same["network"] = own_networks.fingerprint(scene)
+    return same
 
 
 def settings(scene):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import fields
-from prdp_torch.experiments import network_task, records
+from prdp_torch.experiments import network_task, own_networks, records
 from prdp_torch.experiments.networks import make_network
 
 
@@ -48,6 +48,9 @@ def load_trained(run_folder, seed=0):
         ValueError: no record or no weights are there, they are damaged or do not belong together, or the
             training diverged.
 
+    If the scene has a network of your own, `network = "module:Class"`, the module is imported from where it was for the
+    training. Then load only records that you trust; other records run no code.
+
     Examples:
         >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
         >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
@@ -60,6 +63,8 @@ def load_trained(run_folder, seed=0):
     if "diverged" in record["curves"]:
         raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
     network = records.read_weights(path, make_network(scene, seed, without_memory=True), record)
+    if scene.network.python:
+        own_networks.warn_if_changed(scene, record["settings"].get("network"))
     if network is None:
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"

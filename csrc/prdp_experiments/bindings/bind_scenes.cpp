@@ -31,6 +31,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("valid_max_iter", &Scene::Data::valid_max_iter)
       .def_readonly("reference_shape", &Scene::Data::reference_shape);
   py::class_<Scene::Network>(m, "Network")
+      .def_readonly("python", &Scene::Network::python)
       .def_readonly("kind", &Scene::Network::kind)
       .def_readonly("hidden", &Scene::Network::hidden)
       .def_readonly("blocks", &Scene::Network::blocks)

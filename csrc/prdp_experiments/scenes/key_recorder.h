@@ -20,6 +20,12 @@ class KeyRecorder {
     KeyRecorder inner(keys_, key.name);
     read(inner, scene);
   }
+  template <class Read>
+  void section_or_text(Scene& scene, const std::string&, Read read, const char* form, const Key& key) {
+    section(scene, read, key);
+    for (auto& entry : keys_)
+      if (entry.table == table_ && entry.name == key.name) entry.value += c10::str(", or text `", form, "`");
+  }
   void text(const std::string& target, const Key& key) { add(key, "text", quoted(target), false); }
   void choice(const std::string& target, const Choices& choices, const Key& key) {
     add(key, names(choices), quoted(target), false);

@@ -45,6 +45,7 @@ struct Scene {
     bool fresh = false;  // new training samples in every epoch (fresh_data.h)
   };
   struct Network {
+    std::string python{};  // "module:Class" of the Python trainer, in place of all the rest
     std::string kind;             // "mlp" or "resnet"
     std::vector<int64_t> hidden;  // mlp
     int64_t blocks = 0, width = 0;  // resnet

@@ -222,7 +222,12 @@ void read_all(Section& s, Scene& scene) {
   s.section(scene, read_physics<Section>, {"physics", "the equation"});
   s.section(scene, read_solver<Section>, {"solver", "the solver in the training"});
   s.section(scene, read_data<Section>, {"data", "training and validation samples", "", network(scene)});
-  s.section(scene, read_network<Section>, {"network", "the network", "", network(scene)});
+  s.section_or_text(scene, scene.network.python, read_network<Section>, "module:Class",
+                    {"network", "the network, or a class of your own for the Python trainer", "", network(scene)});
+  const auto& own = scene.network.python;
+  const auto colon = own.find(':');
+  const bool two_names = colon != own.npos && colon > 0 && colon + 1 < own.size() && own.rfind(':') == colon;
+  s.check(own.empty() || two_names, "network", "expected a table, or \"module:Class\"");
   s.section(scene, read_training<Section>, {"training", "loss, optimiser and length"});
   s.section(scene, read_field<Section>, {"field", "the diffusivity field and its snapshots", "", field(scene)});
   s.section(scene, read_parameters<Section>, {"parameters", "the amplitudes", "", parameters(scene)});

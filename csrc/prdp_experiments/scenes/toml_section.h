@@ -52,6 +52,13 @@ class TomlSection {
     read(section, scene);
     section.finish();
   }
+  /// Reads an inner table, or a text in its place.
+  template <class Read>
+  void section_or_text(Scene& scene, std::string& target, Read read, const char* form, const Key& key) {
+    if (!table_[key.name].is_string()) return section(scene, read, key);
+    text(target, key);
+    if (target.empty()) fail(key.name, std::string("expected a table, or \"") + form + '"');
+  }
   void text(std::string& target, const Key& key) {
     if (given(key)) target = value<std::string>(key.name, "a string");
   }

@@ -295,6 +295,8 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
 
 Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed,
                      const std::filesystem::path& weights, const OnInterval& on_interval, const OnProgress& on_data) {
+  TORCH_CHECK_VALUE(scene.network.python.empty(), "network: '", scene.network.python,
+                    "' is a class in Python, which prdp_train cannot make; run prdp train ", scene.path);
   auto network = make_network(scene, seed);
   if (!weights.empty()) load_weights(weights, *network.ptr());
   auto data = make_dataset(scene, on_data);
