@@ -57,7 +57,7 @@ sanitize: $(STAMPS)/configure
 	$(BIN)/cmake --build build-thread --parallel $$(nproc) --target prdp_tests
 	build-thread/prdp_tests --gtest_brief=1 --gtest_filter='Threads.*'
 
-# What is read is at most 4 KiB: whatever asks for 64 MiB at once because of it is a fault.
+# What is read is at most 8 KiB: whatever asks for 64 MiB at once because of it is a fault.
 FUZZ_SECONDS ?= 60
 CLANG ?= clang++
 fuzz: $(STAMPS)/configure
@@ -66,7 +66,7 @@ fuzz: $(STAMPS)/configure
 	$(BIN)/cmake --build build-fuzz
 	for target in scene files operators; do \
 	  mkdir -p build-fuzz/found/$$target; corpus=tests/fuzz/corpus/$$target; [ $$target = scene ] && corpus=examples/scenes; \
-	  PRDP_FUZZ_TARGET=$$target OMP_NUM_THREADS=1 build-fuzz/prdp_fuzz -malloc_limit_mb=64 -timeout=20 -max_len=4096 \
+	  PRDP_FUZZ_TARGET=$$target OMP_NUM_THREADS=1 build-fuzz/prdp_fuzz -malloc_limit_mb=64 -timeout=20 -max_len=8192 \
 	    -max_total_time=$(FUZZ_SECONDS) -verbosity=0 -print_final_stats=1 -artifact_prefix=build-fuzz/$$target- \
 	    build-fuzz/found/$$target $$corpus || exit 1; \
 	done

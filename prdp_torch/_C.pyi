@@ -2,9 +2,15 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'clear_factorisations', 'close_adjoint_log', 'count_factorisations', 'join_adjoint_logs', 'linear_solve', 'open_adjoint_log', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'join_adjoint_logs', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
+        ...
+    @property
+    def number(self) -> int:
+        ...
+class AdjointLog:
+    def __init__(self) -> None:
         ...
     @property
     def number(self) -> int:
@@ -84,12 +90,12 @@ def check_options(who: str, method: str, max_iter: typing.SupportsInt | typing.S
     ...
 def check_solver(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex) -> None:
     ...
+def check_start(start: str) -> None:
+    ...
 def clear_factorisations() -> None:
     """
     Frees those that are kept for later solves.
     """
-def close_adjoint_log(log: typing.SupportsInt | typing.SupportsIndex) -> None:
-    ...
 def count_factorisations() -> int:
     """
     How many sparse factorisations were made so far.
@@ -98,7 +104,7 @@ def join_adjoint_logs(logs: collections.abc.Sequence[typing.SupportsInt | typing
     ...
 def linear_solve(b: typing.Any, tensors: collections.abc.Sequence[typing.Any], kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex, adjoint_log: typing.SupportsInt | typing.SupportsIndex, x0: typing.Any | None) -> typing.Any:
     ...
-def open_adjoint_log() -> int:
+def physical_memory() -> float:
     ...
 def product_rule(lambda_: torch.Tensor, v: torch.Tensor, tensors: collections.abc.Sequence[torch.Tensor], kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex]) -> list[torch.Tensor]:
     """

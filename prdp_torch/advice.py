@@ -8,6 +8,7 @@ import torch
 from prdp_torch import _C, _check
 from prdp_torch.solvers import GMRES, Direct
 from prdp_torch.stepper import Stepper
+from prdp_torch.steppers import EquationStepper
 from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
 
 WORTH_REFINING = 0.1  # of an update
@@ -64,7 +65,7 @@ class Update:
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
 
 
-def advise(step, sample, seconds=5.0):
+def advise(step, sample, seconds=5.0, dtypes=None):
     """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
 
     Args:
@@ -72,6 +73,9 @@ def advise(step, sample, seconds=5.0):
         sample: states (batch, channel, *shape) to step from, as many as a batch of the training has.
         seconds: the limit for each solver. A solver that does not reach a tolerance in time is marked
             MAX_ITER.
+        dtypes: those to try beside that of the sample, such as (torch.float64,). None tries the other one of float32
+            and float64 for the built-in steps, and none for a step of your own: its functions may hold tensors that
+            `step.to(dtype)` does not reach. Its batch is never changed.
 
     Returns:
         An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-3 and 1e-5,
@@ -97,26 +101,41 @@ def advise(step, sample, seconds=5.0):
         )
     if not sample.isfinite().all():
         raise ValueError("advise: sample holds NaN or Inf")
-    return advise_on(step, sample.detach(), checked_limit(seconds), Update())
+    others = _other_dtypes(step, sample, dtypes)
+    return advise_on(step, sample.detach(), checked_limit(seconds), Update(), others)
 
 
-def advise_on(step, sample, seconds, update):
+def _other_dtypes(step, sample, dtypes):
+    """The dtypes to try beside that of the sample, checked."""
+    both = torch.float32, torch.float64
+    if dtypes is None:
+        dtypes = both if isinstance(step, EquationStepper) else ()
+    if not isinstance(dtypes, (tuple, list)) or not set(dtypes) <= set(both):
+        raise ValueError(f"advise: dtypes must hold torch.float32 and torch.float64 only, got {dtypes!r}")
+    return [dtype for dtype in both if dtype in dtypes and dtype != sample.dtype]
+
+
+def advise_on(step, sample, seconds, update, other_dtypes):
     """Advise on a step that is a part of `update`, an `Update`."""
     rows, refused = measure(step, sample, candidates(step), seconds)
     best = update.fastest(rows, TOLERANCES[-1])
-    other = torch.float64 if sample.dtype == torch.float32 else torch.float32
     threads = f"threads: {torch.get_num_threads()}"
     notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}; {threads}.", *update.notes, *refused]
-    try:
-        trials = candidates(step) if best is None else [best.solver]
-        others, _ = measure(copy.deepcopy(step).to(other), sample.to(other), trials, seconds)
-    except (ValueError, TypeError, RuntimeError) as error:
-        notes.append(f"{_name(other)} was not tried: {_C.sentence(str(error))}.")
-        others = []
+    others = []
+    for other in other_dtypes:
+        try:
+            trials = candidates(step) if best is None else [best.solver]
+            others += measure(copy.deepcopy(step).to(other), sample.to(other), trials, seconds)[0]
+        except (ValueError, TypeError, RuntimeError) as error:
+            notes.append(f"{_name(other)} was not tried: {_C.sentence(str(error))}.")
     twin = update.fastest(others, TOLERANCES[-1])
     if best is not None and twin is not None:
         ratio = update.physics(twin) / update.physics(best)
-        notes.append(f"{best.name} in {_name(other)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}.")
+        notes.append(
+            f"{best.name} in {_name(twin.dtype)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}."
+        )
+    if best is None and not other_dtypes and not isinstance(step, EquationStepper):
+        notes.append("Only the dtype of the sample was tried, as the step is your own; dtypes=... tries others.")
     if best is not None and not isinstance(best.solver, Direct):
         notes.append(_start_gain(best, measure_with_start(step, sample, best)))
     words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)

@@ -96,7 +96,12 @@ class _Attached:
         wanted = self.state_dict().keys()
         if not isinstance(state, dict) or state.keys() != wanted:
             raise ValueError(f"{type(self).__name__}: expected a state of {', '.join(wanted)}, got {state!r:.80}")
-        self._load(**state)
+        try:
+            self._load(**state)
+        except TypeError:
+            raise ValueError(
+                f"{type(self).__name__}: expected a state as state_dict() returns it, got {state!r:.80}"
+            ) from None
         self._push()
 
     def __reduce__(self):

@@ -1,6 +1,7 @@
 """Functions of periodic velocity fields on the staggered grid of `NavierStokes`. All are differentiable.
 
-Fields are (batch, 2 or 3, Ny, Nx) on the unit square, dx = 1/N. Channel 0 is u₁ along x, the last axis, on
+Fields are (batch, 2 or 3, Ny, Nx) with dx = length/N. `length` is the side of the domain, one number or one per axis,
+(y, x), as the steps take it. Channel 0 is u₁ along x, the last axis, on
 the left face of a cell. Channel 1 is u₂ along y on its lower face. A third channel, the pressure in the cell's centre,
 has no influence.
 """
@@ -16,30 +17,34 @@ from prdp_torch.steppers import EquationStepper
 _Y, _X = -2, -1
 
 
-def divergence(u):
+def divergence(u, length=1.0):
     """∂u₁/∂x + ∂u₂/∂y in the cell centres by forward differences: (batch, 1, Ny, Nx)."""
     u1, u2 = _velocity("divergence", u)
-    return _forward(u1, _X) + _forward(u2, _Y)
+    ly, lx = _sides("divergence", length)
+    return _forward(u1, _X, lx) + _forward(u2, _Y, ly)
 
 
-def curl(u):
+def curl(u, length=1.0):
     """The vorticity ∂u₂/∂x - ∂u₁/∂y at the lower left corner of each cell by backward differences:
     (batch, 1, Ny, Nx)."""
     u1, u2 = _velocity("curl", u)
-    return _backward(u2, _X) - _backward(u1, _Y)
+    ly, lx = _sides("curl", length)
+    return _backward(u2, _X, lx) - _backward(u1, _Y, ly)
 
 
-def project(u):
+def project(u, length=1.0):
     """Remove the divergence of a velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
     This is the nearest field without discrete divergence. The mean velocity and the pressure do not change."""
     u1, u2 = _velocity("project", u)
+    ly, lx = _sides("project", length)
     ny, nx = u.shape[-2:]
     ky, kx = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (ny, nx // 2 + 1))
     # Eigenvalues of D G, the five-point Laplacian.
-    symbol = -((2 * ny * torch.sin(math.pi / ny * ky)[:, None]) ** 2) - (2 * nx * torch.sin(math.pi / nx * kx)) ** 2
+    symbol = -((2 * ny / ly * torch.sin(math.pi / ny * ky)[:, None]) ** 2)
+    symbol = symbol - (2 * nx / lx * torch.sin(math.pi / nx * kx)) ** 2
     symbol[0, 0] = 1.0  # the mean of φ, which G does not see
-    phi = torch.fft.irfft2(torch.fft.rfft2(divergence(u)) / symbol, s=(ny, nx))
-    return torch.cat([u1 - _backward(phi, _X), u2 - _backward(phi, _Y), u[:, 2:]], dim=1)
+    phi = torch.fft.irfft2(torch.fft.rfft2(divergence(u, length)) / symbol, s=(ny, nx))
+    return torch.cat([u1 - _backward(phi, _X, lx), u2 - _backward(phi, _Y, ly), u[:, 2:]], dim=1)
 
 
 def downsample(u):
@@ -76,9 +81,17 @@ def _velocity(who, u):
     return u[:, 0:1], u[:, 1:2]
 
 
-def _forward(v, axis):
-    return (v.roll(-1, axis) - v) * v.shape[axis]
+def _sides(who, length):
+    """The sides along y and x."""
+    sides = _check.lengths(who, length, 2) or [1.0, 1.0]
+    if not all(0.0 < side < math.inf for side in sides):
+        raise ValueError(f"{who}: length must be finite and > 0, got {length!r}")
+    return sides
 
 
-def _backward(v, axis):
-    return (v - v.roll(1, axis)) * v.shape[axis]
+def _forward(v, axis, length):
+    return (v.roll(-1, axis) - v) * (v.shape[axis] / length)
+
+
+def _backward(v, axis, length):
+    return (v - v.roll(1, axis)) * (v.shape[axis] / length)

@@ -5,6 +5,7 @@ A vector is (batch, channel, *shape) for operators on grids, with one channel un
 `linear_solve`.
 """
 
+import math
 import warnings
 
 import torch
@@ -43,8 +44,28 @@ class Operator:
         return torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
 
     def dense(self, dtype=torch.float64):
-        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n."""
+        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n: ValueError if
+        it would not fit into the memory of the machine."""
+        self._check_dense_fits(dtype)
         return torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
+
+    def _unknowns(self):
+        """The length of a vector, in all its channels."""
+        return math.prod(self.shape)
+
+    def _check_dense_fits(self, dtype):
+        axes = _C.batched_axes(self.kind)
+        if axes is None:  # a Function, whose vectors may be of any length
+            return
+        axes = [len(self.shape) + 2 if n < 0 else n for n in axes]
+        batch = max((t.shape[0] for t, n in zip(self.tensors, axes, strict=True) if t.dim() == n > 0), default=1)
+        n, there = self._unknowns(), _C.physical_memory()
+        needed = 2 * batch * n * n * dtype.itemsize  # the columns, and the matrix
+        if needed > there:
+            raise ValueError(
+                f"{type(self).__name__}: dense() of {n} unknowns would take {needed / 1e9:.3g} GB, and this machine "
+                f"has {there / 1e9:.3g} GB; apply() needs no matrix"
+            )
 
 
 class Poisson(Operator):
@@ -101,6 +122,9 @@ class Burgers(Operator):
     def __init__(self, winds, nu, dt, length=1.0):
         super().__init__(*flow("Burgers", "winds", winds, nu, dt, length))
 
+    def _unknowns(self):
+        return self.tensors[0].shape[1] * super()._unknowns()
+
 
 class NavierStokes(Operator):
     """The operator of an implicit Euler step of the incompressible Navier-Stokes equations on a periodic staggered
@@ -126,6 +150,9 @@ class NavierStokes(Operator):
 
     def __init__(self, velocity, nu, dt, length=1.0):
         super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt, length))
+
+    def _unknowns(self):
+        return 3 * super()._unknowns()
 
 
 class Stencil(Operator):
@@ -350,6 +377,9 @@ class Matrix(Operator):
                 f"{tensors[0].shape[-1]}"
             )
         super().__init__([], [], tensors, _null_spaces("Matrix", nullspace, left_nullspace, tensors[-1]))
+
+    def _unknowns(self):
+        return self.tensors[0].shape[-1] - (self.kind == "csr")
 
     @classmethod
     def csr(cls, crow, col, values, size, nullspace=None, left_nullspace=None):

@@ -27,10 +27,8 @@ class AdjointLog:
     """Where a backward pass leaves the report of its adjoint solve: nobody is there to return it to."""
 
     def __init__(self):
-        self.number = _C.open_adjoint_log()
-
-    def __del__(self, close=_C.close_adjoint_log):
-        close(self.number)
+        self._kept = _C.AdjointLog()  # closes the log with it
+        self.number = self._kept.number
 
     def read(self):
         entry = _C.read_adjoint_log(self.number)

@@ -184,6 +184,15 @@ class Stepper(torch.nn.Module):
         self._max_iter = int(k)
 
     @property
+    def start(self):
+        return self._start
+
+    @start.setter
+    def start(self, start):
+        _C.check_start(_check.string(type(self).__name__, "start", start))
+        self._start = start
+
+    @property
     def adjoint_info(self):
         return self._last_log.read()
 

@@ -24,6 +24,11 @@ OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<doub
 /// One that is not an operator.
 Preconditioner preconditioner_of_kind(std::string kind) { return OperatorSpec{std::move(kind), {}, {}, {}}; }
 
+/// A log that is closed with it, by no code of Python: an interruption cannot come between.
+struct KeptLog {
+  AdjointLog log = open_adjoint_log();
+};
+
 /// FailuresOfStep for Python's `with`.
 class StepOfRollout {
  public:
@@ -168,8 +173,10 @@ void bind_solvers(py::module_& m) {
       py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"), py::arg("checkpoint_every"),
       py::arg("start") = "zero");
 
-  m.def("open_adjoint_log", &adjoint_log::open);
-  m.def("close_adjoint_log", &adjoint_log::close, py::arg("log"));
+  m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
+  py::class_<KeptLog>(m, "AdjointLog").def(py::init<>()).def_property_readonly("number", [](const KeptLog& kept) {
+    return *kept.log;
+  });
   m.def(
       "read_adjoint_log",
       [](int64_t log) -> std::optional<py::tuple> {

@@ -5,6 +5,7 @@
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/disguises.h"
 #include "prdp/steppers/equation.h"
+#include "prdp/steppers/memory.h"
 
 /// The ops step and linear_solve without the arguments that they are flattened into: a call of an op with twenty of
 /// them costs more than a small solve. None where somebody watches; then the op is to be called.
@@ -60,6 +61,7 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
   if (!nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0))) return py::none();
   const OperatorSpec a{std::move(kind), std::move(shape), std::move(parameters), unwrapped(tensors)};
   return report([&, rhs = THPVariable_Unpack(b.ptr()), start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
+    check_memory(options, rhs);
     return linear_solve(a, rhs, with(options, max_iter, adjoint_log), start);
   });
   END_HANDLE_TH_ERRORS_PYBIND
@@ -82,6 +84,7 @@ void bind_steps(py::module_& m) {
           [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters, int64_t picard_steps) {
             return Equation{std::move(kind), std::move(shape), std::move(parameters), {}, picard_steps};
           }));
+  m.def("physical_memory", &physical_memory);
   m.def("step", &call_step, py::arg("u"), py::arg("tensors"), py::arg("equation"), py::arg("options"),
         py::arg("max_iter"), py::arg("adjoint_log"));
   m.def("linear_solve", &call_linear_solve, py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),

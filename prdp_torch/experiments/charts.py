@@ -9,6 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
 from PIL import Image
 
+from prdp_torch.experiments import _C
+
 WIDTH = 9.2  # inches, of every picture
 
 # Colours that stay apart in greyscale and for colour-blind readers.
@@ -38,10 +40,12 @@ def make_figure(panels=1, height=4.2):
 
 
 def write_png(figure, path, dpi):
-    """Write a figure as a small file: without an alpha channel, as it is opaque, and compressed with care."""
-    image = io.BytesIO()
+    """Write a figure as a small file, whole or not at all: without an alpha channel, as it is opaque, and compressed
+    with care. ValueError if it cannot be written."""
+    image, small = io.BytesIO(), io.BytesIO()
     figure.savefig(image, format="png", dpi=dpi)
-    Image.open(image).convert("RGB").save(path, optimize=True, dpi=(dpi, dpi))
+    Image.open(image).convert("RGB").save(small, format="png", optimize=True, dpi=(dpi, dpi))
+    _C.write_whole(path, small.getvalue())
 
 
 def error_measure(scene):

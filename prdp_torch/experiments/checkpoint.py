@@ -1,17 +1,12 @@
 """Checkpoints: the state of a running training, so that it can continue after it was killed."""
 
-import io
 import json
-import pickle
 import warnings
 
 import torch
 
 from prdp_torch import processes
 from prdp_torch.experiments import _C
-
-# What torch.load raises.
-_DAMAGED = (RuntimeError, EOFError, pickle.UnpicklingError)
 
 
 class Checkpoint(_C.Checkpoint):
@@ -32,37 +27,53 @@ class Checkpoint(_C.Checkpoint):
         if processes.is_first():
             super().remove()
 
-    def save(self, state):
-        """Save a state made of tensors, state_dicts and plain values. ValueError if it cannot be written."""
-        if not processes.is_first():
-            return
-        content = io.BytesIO()
-        torch.save(state, content)
-        self.write(content.getvalue())
+    def save(self, tensors, curves, controller):
+        """Save named tensors, the curves of `training.train` and the `state_dict` of a controller. ValueError if the
+        file cannot be written."""
+        if processes.is_first():
+            self.write(_C.pack_state(tensors, curves, **controller))
 
-    def load(self):
-        """Return the state that was saved last, or None if there is none with these settings. If the file is damaged,
-        warn and return the state before it. ValueError if there is none before it either."""
-        content = processes.from_first(self.read)
-        if content is None:
-            state = None
-        else:
-            try:
-                state = _unpacked(content)
-            except _DAMAGED:
-                state = self.load_before()
-        if self.notice:
-            warnings.warn(self.notice, stacklevel=3)
-        return state
+    def found(self):
+        """Return what `restore` takes, the same in all processes: the files that are there, the last one first.
+        ValueError if all of them are damaged."""
+        return processes.from_first(self.find)
 
-    def load_before(self):
-        """Return the state before the one that `load` has returned, for a trainer that can make no sense of that;
-        `notice` then says so. ValueError if there is none."""
-        try:
-            return _unpacked(processes.from_first(self.read_before))
-        except _DAMAGED:
-            self.refuse()
+    def restore(self, found, load):
+        """Call load(saved) with the tensors that were saved last, a `_C.Saved`. Where they are damaged, or load raises
+        ValueError, warn and go on with those saved before. Return whether there were any. ValueError if all of them
+        are refused."""
+        there = super().restore(found, load)
+        if self.notice and processes.is_first():
+            warnings.warn(self.notice, stacklevel=5)
+        return there
 
 
-def _unpacked(content):
-    return torch.load(io.BytesIO(content), weights_only=True)  # tensors and plain values; no code is run
+def check_tensors(network):
+    """TypeError, naming the entry, for a network whose state_dict holds what a checkpoint cannot keep."""
+    for name, value in network.state_dict().items():
+        if not isinstance(value, torch.Tensor):
+            raise TypeError(
+                "train: the state_dict of network must hold tensors only, for its checkpoint, got "
+                f"{type(value).__name__} for '{name}'"
+            )
+
+
+def state_of(optimiser):
+    """The state of an Adam by names, which `load_optimiser` takes."""
+    state = optimiser.state_dict()["state"]
+    return {f"optimiser.{i}.{part}": value for i, parts in state.items() for part, value in parts.items()}
+
+
+def load_optimiser(saved, optimiser, updates):
+    """Take the state of an Adam after so many updates from a `_C.Saved`. A parameter may have had no gradient yet."""
+    state = {}
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    for i, parameter in enumerate(parameters):
+        if saved.has(f"optimiser.{i}.step"):
+            state[i] = {
+                "step": saved.take(f"optimiser.{i}.step", torch.zeros(()), 1, updates),
+                "exp_avg": saved.take(f"optimiser.{i}.exp_avg", parameter),
+                "exp_avg_sq": saved.take(f"optimiser.{i}.exp_avg_sq", parameter, 0),
+            }
+    optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+    return state

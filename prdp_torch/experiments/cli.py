@@ -208,12 +208,12 @@ def compare(
 @command
 def export(
     scene: SceneName,
-    out: Annotated[Path | None, typer.Option(help="The file; default SCENE.h5.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The file, HDF5 or .npz; default SCENE.h5.")] = None,
     steps: Annotated[
         int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
     ] = None,
 ):
-    """Write the trajectories of a scene as HDF5, in PDEBench's layout."""
+    """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
     path = out or Path(f"{loaded.name}.h5")
     with _progress() as progress:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -130,6 +131,8 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
     a record of the same settings and another number of intervals, which would be lost."""
     path = folder / label / f"seed_{seed}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
+    if processes.is_first():
+        _C.settle_weights(path)
     versions = environment["versions"]
     checkpoint = Checkpoint(
         path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.identity(scene), versions=versions
@@ -142,6 +145,8 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
     network = make_network(scene, seed) if scene.trains_network else None
     curves = train(scene, refinement, seed, network, callbacks, on_data, checkpoint)
     record = {"label": label, "seed": seed, "settings": records.settings(scene), **environment, "curves": curves}
+    if scene.network.python:
+        record["folder"] = str(Path(scene.path).resolve().parent)  # where load_trained finds the class again
     records.write_training(path, record, network)
     checkpoint.remove()
     return curves
@@ -150,7 +155,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
 def _finished(path, scene, checkpoint):
     """The curves of the record at `path` if it is of this training. ValueError if it is of another length, and no
     checkpoint is left to go on from."""
-    record = records.read(path)
+    record = records.read_training(path)
     if record is None:
         return None
     intervals = record["settings"].pop("intervals")
@@ -159,12 +164,10 @@ def _finished(path, scene, checkpoint):
     if intervals == scene.training.intervals:
         checkpoint.remove_before(path)
     else:
-        if checkpoint.read() is None:
+        if not checkpoint.find():
             _C.refuse_finished(path, intervals, scene.training.intervals)
         return None
-    curves = record["curves"]
-    curves["metric"] = [math.nan if value is None else value for value in curves["metric"]]
-    return curves
+    return record["curves"]
 
 
 def summarise(scene, rows):

@@ -1,5 +1,6 @@
 """What a network is trained on: data that the scene makes, a file of trajectories, or your own tensors."""
 
+import contextlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,7 +64,7 @@ def reference(scene, steps, on_data=None):
 
 
 def export(scene, path, steps=None, on_data=None):
-    """Write the trajectories of a scene to an HDF5 file that `[data] file` reads. Returns their shape.
+    """Write the trajectories of a scene to a file that `[data] file` reads, HDF5 or .npz. Returns their shape.
 
     Args:
         scene: a scene that trains a network and makes its own data.
@@ -94,6 +95,21 @@ def fingerprint(scene):
         raise ValueError(f"data: cannot read '{path}': {error.strerror}") from None
 
 
+@contextlib.contextmanager
+def evaluating(network):
+    """A network, or any function, in evaluation mode and without gradients: running means stay as they are. Then every
+    module is in its mode again."""
+    modes = [(m, m.training) for m in network.modules()] if isinstance(network, torch.nn.Module) else []
+    try:
+        for module, _ in modes:
+            module.training = False
+        with torch.no_grad():
+            yield
+    finally:
+        for module, mode in modes:
+            module.training = mode
+
+
 def check_network(scene, network, states):
     """Raise TypeError or ValueError unless the network takes states of the scene to states, and can be trained."""
     if not isinstance(network, torch.nn.Module):
@@ -108,16 +124,11 @@ def check_network(scene, network, states):
             f"train: the scene computes in {wanted.removeprefix('torch.')}, but network has parameters in "
             f"{', '.join(sorted(other))}; call network.to({wanted})"
         )
-    modes = [(module, module.training) for module in network.modules()]
-    network.eval()  # the trial leaves running means as they are
     try:
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        with evaluating(network), torch.random.fork_rng(devices=[]):
             answer = network(states)
     except RuntimeError as error:
         raise ValueError(f"train: network fails on states {tuple(states.shape)}: {sentence(str(error))}") from error
-    finally:
-        for module, mode in modes:
-            module.training = mode
     if not isinstance(answer, torch.Tensor) or answer.shape != states.shape:
         got = tuple(answer.shape) if isinstance(answer, torch.Tensor) else type(answer).__name__
         raise ValueError(f"train: network must keep the shape of its input, {tuple(states.shape)}, got {got}")

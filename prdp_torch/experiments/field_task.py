@@ -6,6 +6,7 @@ import torch
 
 from prdp_torch import operators
 from prdp_torch.experiments import _C
+from prdp_torch.experiments.checkpoint import load_optimiser, state_of
 from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed
@@ -15,12 +16,12 @@ class Diffusion:
     """The operator of an implicit Euler step of u_t = ∇·(κ ∇u) on a periodic grid, for an `ImplicitStep`: assembled
     when κ changes, and the same for all steps of a rollout."""
 
-    def __init__(self, dt):
-        self.dt = dt
+    def __init__(self, dt, length):
+        self.dt, self.length = dt, length
         self._assembled = None
 
     def take(self, kappa):
-        self._assembled = operators.Stencil(*_C.diffusion_stencil(kappa, self.dt), "periodic")
+        self._assembled = operators.Stencil(*_C.diffusion_stencil(kappa, self.dt, self.length), "periodic")
 
     def __call__(self, u):
         return self._assembled
@@ -28,7 +29,7 @@ class Diffusion:
 
 def make_stepper(scene, **options):
     """The step of the scene; its operator needs a κ before the first one."""
-    return ImplicitStep(Diffusion(scene.physics.dt), **options)
+    return ImplicitStep(Diffusion(scene.physics.dt, scene.physics.length), **options)
 
 
 def misfit(scene, stepper, problem, theta):
@@ -54,7 +55,7 @@ def make_task(scene, steppers, seed):
             group["lr"] = scene.learning_rate(number)
         optimiser.zero_grad()
         squared = misfit(scene, stepper, problem, theta)
-        loss = squared + scene.field.smoothing * _C.roughness(theta)
+        loss = squared + scene.field.smoothing * _C.roughness(theta, scene.physics.length)
         loss.backward()
         optimiser.step()
         relative = math.sqrt(squared.detach())
@@ -64,10 +65,10 @@ def make_task(scene, steppers, seed):
         return float(_C.relative_error(theta.detach().exp(), problem.reference))
 
     def state():
-        return {"theta": theta.detach(), "optimiser": optimiser.state_dict()}
+        return {"theta": theta.detach(), **state_of(optimiser)}
 
-    def load(saved):
-        theta.detach().copy_(saved["theta"])
-        optimiser.load_state_dict(saved["optimiser"])
+    def load(saved, updates):
+        theta.detach().copy_(saved.take("theta", theta))
+        load_optimiser(saved, optimiser, updates)
 
     return Task(updates, metric, lambda _: relative, state, load)

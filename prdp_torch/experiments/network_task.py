@@ -6,6 +6,7 @@ import torch
 
 from prdp_torch import fields, processes
 from prdp_torch.experiments import _C, datasets
+from prdp_torch.experiments.checkpoint import load_optimiser, state_of
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.task import Task
@@ -38,19 +39,26 @@ def make_task(scene, steppers, seed, network, data):
             yield float(loss.detach()), processes.share(batch)
 
     def state():
-        parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-        return {**parts, "shuffling": generator.get_state()}
+        weights = {f"network.{name}": value for name, value in network.state_dict().items()}
+        return {**weights, **state_of(optimiser), "shuffling": generator.get_state()}
 
-    def load(saved):
-        network.load_state_dict(saved["network"])
-        optimiser.load_state_dict(saved["optimiser"])
-        generator.set_state(saved["shuffling"])
+    def load(saved, updates):
+        trained = load_optimiser(saved, optimiser, updates)
+        parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+        finite = {parameters[i].data_ptr() for i in trained}  # a buffer, such as a mask, may hold Inf
+        network.load_state_dict(
+            {
+                name: saved.take(f"network.{name}", value, finite=value.data_ptr() in finite)
+                for name, value in network.state_dict().items()
+            }
+        )
+        saved.restore("shuffling", generator)
 
     # The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
     def of_a_step(metric):
         return math.sqrt(metric) / scene.data.valid_steps
 
-    return Task(updates, _metric(scene, data, network), of_a_step, state, load)
+    return Task(updates, _metric(scene, data, network), of_a_step, state, load, train.updates_per_epoch)
 
 
 class _TrainingSamples:
@@ -58,14 +66,14 @@ class _TrainingSamples:
 
     def __init__(self, scene, data):
         self.count = len(data.train_start)
-        self._updates = math.ceil(self.count / scene.training.batch)  # of an epoch
+        self.updates_per_epoch = math.ceil(self.count / scene.training.batch)
         self._fresh = _C.FreshData(scene, data) if scene.data.fresh else None
         self._take(data)
 
     def begin(self, update):
         """Take the samples of the epoch that begins with this update."""
         if self._fresh is not None:
-            self._take(self._fresh.epoch(update // self._updates))
+            self._take(self._fresh.epoch(update // self.updates_per_epoch))
 
     def _take(self, data):
         self.start, self.first, self.end = data.train_start, data.train_first, data.train_end
@@ -78,7 +86,7 @@ def _metric(scene, data, network):
     def metric():
         mine = math.nan  # of a process without a sample
         if len(start):
-            with torch.no_grad():
+            with datasets.evaluating(network):
                 mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
         return processes.mean([mine], len(start))[0]
 

@@ -1,9 +1,11 @@
-"""The scenes' networks, twins of those in C++: same parameter names, order and initialisation."""
+"""The scenes' networks. `MLP` and `ResNet` are twins of those in C++: same names, order and initialisation."""
 
 import math
 from itertools import pairwise
 
 import torch
+
+from prdp_torch.experiments import own_networks
 
 
 class MLP(torch.nn.Module):
@@ -64,10 +66,13 @@ class ResNet(torch.nn.Module):
         return self.project(x)
 
 
-def make_network(scene, seed):
-    """Make the network of a scene. The same seed gives the same weights in Python and in C++."""
+def make_network(scene, seed, without_memory=False):
+    """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
+    it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is."""
+    if scene.network.python:
+        return own_networks.make(scene, seed)
     physics, network = scene.physics, scene.network
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), torch.device("meta" if without_memory else "cpu"):
         torch.manual_seed(seed)
         if network.kind == "mlp":
             made = MLP(physics.channels * math.prod(physics.shape), network.hidden)

@@ -27,7 +27,7 @@ def make_task(scene, steppers, seed):
     def metric():
         return float(_C.relative_error(theta.detach(), problem.reference))
 
-    def load(saved):
-        theta.detach().copy_(saved["theta"])
+    def load(saved, updates):
+        theta.detach().copy_(saved.take("theta", theta))
 
     return Task(updates, metric, lambda _: misfit, lambda: {"theta": theta.detach()}, load)

@@ -14,7 +14,7 @@ import torch
 
 from prdp_torch import processes
 from prdp_torch._C import VERSION
-from prdp_torch.experiments import _C, datasets
+from prdp_torch.experiments import _C, datasets, own_networks
 
 
 def environment():
@@ -64,7 +64,11 @@ def _commit():
 def identity(scene):
     """What a training must agree on to be the same one, however many intervals it goes on for."""
     same = {"scene": scene.name, "text": scene.text, "backward": scene.backward}
-    return {**same, "data": datasets.fingerprint(scene)} if scene.data.file else same
+    if scene.data.file:
+        same["data"] = datasets.fingerprint(scene)
+    if scene.network.python:
+        same["network"] = own_networks.fingerprint(scene)
+    return same
 
 
 def settings(scene):
@@ -90,7 +94,7 @@ def alone_in(folders):
 def write(path, content):
     """Write JSON (or text) whole or not at all. NaN is null. ValueError if it cannot be written."""
     text = content if isinstance(content, str) else _json(content)
-    _C.write_whole([(path, (text + "\n").encode())])
+    _C.write_whole(path, (text + "\n").encode())
 
 
 def write_training(path, record, network=None):
@@ -99,19 +103,45 @@ def write_training(path, record, network=None):
     then still there, with its weights. Of several processes the first one writes."""
     if not processes.is_first():
         return
-    weights = []
+    weights = b""
     if network is not None:
         content = io.BytesIO()
         torch.save(network.state_dict(), content)
-        weights = [(weights_of(path), content.getvalue())]
-        record = {**record, "weights": _C.fingerprint(content.getvalue())}
-    _C.write_whole([*weights, (path, _C.seal_record(_json(record)).encode())])
+        weights = content.getvalue()
+        record = {**record, "weights": _C.fingerprint(weights)}
+    _C.write_training(path, _json(record), weights)
 
 
 def read(path):
-    """A record, None where there is none. ValueError, naming it, for one that is damaged."""
+    """What `write_training` wrote; None where there is no file. ValueError, naming it, for one that is damaged."""
     text = _C.read_record(path)
     return None if text is None else json.loads(text)
+
+
+def read_training(path):
+    """The record of a training, with NaN in its curves where they hold it; None where there is no file. ValueError,
+    naming the file and what is wrong, for any other file: every key, type, range and length is checked."""
+    text = _C.read_training(path)
+    if text is None:
+        return None
+    record = json.loads(text)
+    for name in ("metric", "error"):
+        record["curves"][name] = [math.nan if value is None else value for value in record["curves"][name]]
+    return record
+
+
+def scene_of(path, record):
+    """The scene of a training as it ran, from its record at `path`. ValueError, naming the record, if it is none."""
+    settings = record["settings"]
+    try:
+        name = f"{settings['scene']}.toml"
+        scene = _C.parse_scene(settings["text"], str(Path(record["folder"], name)) if "folder" in record else name)
+        scene.backward, scene.training.intervals = settings["backward"], settings["intervals"]
+    except ValueError as error:
+        raise ValueError(
+            f"record: '{path}' holds no scene that can be read: {error}; delete it, and its training is run again"
+        ) from None
+    return scene
 
 
 def weights_of(path):
@@ -119,19 +149,28 @@ def weights_of(path):
     return path.with_suffix(".pt")
 
 
-def read_weights(path, network):
-    """Load the weights that belong to the record at `path` into a network of the same make. None if the record or its
-    weights are not there, ValueError if the weights are not those of the record."""
-    record, weights = read(path), weights_of(path)
-    if record is None or not weights.exists():
+def read_weights(path, network, record=None):
+    """Load the weights that belong to the record at `path` into a network of the same make, and return it in
+    evaluation mode. None if the record or its weights are not there, ValueError if the weights are not those of the
+    record, or of another network."""
+    record = read_training(path) if record is None else record
+    content = None if record is None else _C.read_weights(path, record.get("weights", ""))
+    if content is None:
         return None
-    content = weights.read_bytes()
-    if record.get("weights") != _C.fingerprint(content):
-        raise ValueError(
-            f"weights: '{weights}' is damaged or not of the record beside it; delete it, and its pictures are left out"
+    try:
+        saved = _C.Saved(content)
+        parameters = dict(network.named_parameters())
+        network.load_state_dict(
+            {name: saved.take(name, value, finite=name in parameters) for name, value in network.state_dict().items()},
+            assign=any(parameter.is_meta for parameter in parameters.values()),
         )
-    network.load_state_dict(torch.load(io.BytesIO(content), weights_only=True))
-    return network
+        saved.finish()
+    except ValueError as error:
+        raise ValueError(
+            f"weights: '{weights_of(path)}' is not of the network of the record beside it: {error}; delete both, and "
+            "the training is run again"
+        ) from None
+    return network.eval()
 
 
 def _json(content):

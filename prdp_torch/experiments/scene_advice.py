@@ -26,6 +26,7 @@ def advise_scene(scene, seconds=5.0):
         # A corrector's first solve starts from data, which need no gradient.
         adjoints = 0 if scene.backward == "none" else 1
         update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
+    other = torch.float64 if sample.dtype == torch.float32 else torch.float32
     cotangent = random_cotangent(step, sample)
     run(step, sample, cotangent)  # to warm up
     physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
@@ -40,7 +41,7 @@ def advise_scene(scene, seconds=5.0):
             f"The network is the larger part, {milliseconds(update.network)}; in bfloat16 autocast it takes "
             f"{milliseconds(low)}, {low / update.network:.2g} times that."
         )
-    return advise_on(step, sample, seconds, update)
+    return advise_on(step, sample, seconds, update, [other])
 
 
 def _network_seconds(network, u, most):

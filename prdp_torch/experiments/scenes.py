@@ -52,9 +52,9 @@ def make_stepper(scene, direct=False, max_iter=None):
     if physics.equation == "diffusion":
         return field_task.make_stepper(scene, **options)
     if physics.equation == "poisson":
-        return steppers.Poisson(physics.shape, **options)
+        return steppers.Poisson(physics.shape, length=physics.length, **options)
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
-    return kinds[physics.equation](physics.shape, physics.nu, physics.dt, **options)
+    return kinds[physics.equation](physics.shape, physics.nu, physics.dt, length=physics.length, **options)
 
 
 def _solver(scene, max_iter):

@@ -12,5 +12,6 @@ class Task(NamedTuple):
     updates: Callable
     metric: Callable
     error: Callable  # the metric → the relative error of what is trained, as far as a user knows it
-    state: Callable  # all that the updates change
-    load: Callable  # its inverse
+    state: Callable  # all that the updates change, as tensors by name
+    load: Callable  # (these as a _C.Saved, the number of updates) →; ValueError where they are of another task
+    updates_per_interval: int = 1

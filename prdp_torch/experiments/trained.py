@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch import fields
-from prdp_torch.experiments import _C, network_task, records
+from prdp_torch.experiments import network_task, own_networks, records
 from prdp_torch.experiments.networks import make_network
 
 
@@ -48,25 +48,28 @@ def load_trained(run_folder, seed=0):
         ValueError: no record or no weights are there, they are damaged or do not belong together, or the
             training diverged.
 
+    If the scene has a network of your own, `network = "module:Class"`, the module is imported from where it was for the
+    training. Then load only records that you trust; other records run no code.
+
     Examples:
         >>> emulator = prdp.load_trained("runs/heat_1d-train/prdp")
         >>> states = emulator.rollout(u0, steps=10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
-    record = records.read(path)
-    settings = record["settings"]
-    scene = _C.parse_scene(settings["text"], f"{settings['scene']}.toml")
-    scene.backward, scene.training.intervals = settings["backward"], settings["intervals"]
+    record = records.read_training(path)
+    scene = records.scene_of(path, record)
     if not scene.trains_network:
         raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
     if "diverged" in record["curves"]:
         raise ValueError(f"load_trained: the training of '{path}' diverged, {record['curves']['diverged']}")
-    network = records.read_weights(path, make_network(scene, seed))
+    network = records.read_weights(path, make_network(scene, seed, without_memory=True), record)
+    if scene.network.python:
+        own_networks.warn_if_changed(scene, record["settings"].get("network"))
     if network is None:
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
-    return Trained(network.eval(), network_task.propagator(scene, network), scene, record["curves"])
+    return Trained(network, network_task.propagator(scene, network), scene, record["curves"])
 
 
 def _record_in(folder, name):

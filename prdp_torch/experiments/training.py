@@ -5,13 +5,13 @@ import functools
 import math
 import sys
 import time
-import warnings
 from typing import NamedTuple
 
 import torch
 
 from prdp_torch import processes
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
+from prdp_torch.experiments.checkpoint import check_tensors
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.solve import SolveStatus
 
@@ -102,7 +102,9 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
             raise TypeError(f"train: callbacks must be functions of an Interval, got {callback!r}")
     if not scene.trains_network and (data is not None or network is not None):
         raise ValueError(f"train: the task '{scene.task}' trains no network: it takes neither data nor network")
-    saved = None if checkpoint is None else checkpoint.load()
+    if checkpoint is not None and isinstance(network, torch.nn.Module):
+        check_tensors(network)
+    found = [] if checkpoint is None else checkpoint.found()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
@@ -111,7 +113,7 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
     else:
         task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
     try:
-        run.go(task, saved)
+        run.go(task, found)
     except _Diverged as divergence:
         run.give_up(str(divergence))
     return run.curves
@@ -139,12 +141,11 @@ class _Run:
         self.callbacks = callbacks
         self.curves = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
 
-    def go(self, task, saved):
+    def go(self, task, found):
         stopped = False
-        if saved is None:
+        if not self._restores(task, found):
             self._observe(task, 0)
         else:
-            self._restore(task, saved)
             for number in range(1, self._done() + 1):
                 stopped = self._tell(number, resumed=True)
         while not stopped and self._done() < self.intervals:
@@ -181,31 +182,23 @@ class _Run:
         return len(self.curves["seconds"])
 
     def _keep(self, task):
-        controller = self.controller.state_dict()
-        state = {"task": task.state(), "controller": controller, "curves": self.curves}
-        self.checkpoint.save({**state, "random": torch.get_rng_state()})
+        tensors = {**task.state(), "random": torch.get_rng_state()}
+        self.checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
-    def _restore(self, task, saved):
-        if not self._loads(task, saved):
-            if not self._loads(task, self.checkpoint.load_before()):
-                self.checkpoint.refuse()
-            if processes.is_first():
-                warnings.warn(self.checkpoint.notice, stacklevel=4)
-        self.checkpoint.check_length(self._done(), self.intervals)
-
-    def _loads(self, task, saved):
-        """Whether the state is one of this training. Where it is not, some of it may have been taken."""
-        try:
-            task.load(saved["task"])
-            self.controller.load_state_dict(saved["controller"])
-            torch.set_rng_state(saved["random"])
-            curves = saved["curves"]
-            whole = curves.keys() == self.curves.keys() and len(curves["metric"]) == len(curves["seconds"]) + 1
-        except (RuntimeError, KeyError, TypeError, ValueError, AttributeError):
+    def _restores(self, task, found):
+        """Whether there is a checkpoint to continue from."""
+        if self.checkpoint is None or not self.checkpoint.restore(found, functools.partial(self._load, task)):
             return False
-        if whole:
-            self.curves = curves
-        return whole
+        self.checkpoint.check_length(self._done(), self.intervals)
+        return True
+
+    def _load(self, task, saved):
+        """Take the state of this training. ValueError where it is another's; some of it may have been taken."""
+        curves, controller = saved.progress(task.updates_per_interval)
+        task.load(saved, len(curves["update_loss"]))
+        self.controller.load_state_dict(controller)
+        saved.restore("random", torch.default_generator)
+        self.curves = curves
 
     def _run_interval(self, task, number):
         k, rtol = self.controller.max_iter, self.steppers[0].rtol
@@ -245,6 +238,8 @@ class _Run:
             raise _Diverged(f"interval {done}: the metric is {metric}")
         self.curves["metric"].append(metric)
         error = task.error(metric)
+        if not math.isfinite(error):
+            raise _Diverged(f"interval {done}: the relative error is {error}")
         self.curves["error"].append(error)
         if self.watches_error:
             self.controller.step(error)

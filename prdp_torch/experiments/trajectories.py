@@ -61,7 +61,7 @@ def field(scene, states):
     """What the pictures show of states (time, channels, *shape), as (time, *shape): the vorticity of a flow,
     else the first component."""
     if scene.physics.equation == "navier_stokes":
-        states = fields.curl(states)
+        states = fields.curl(states, scene.physics.length)
     return states[:, 0]
 
 

@@ -9,8 +9,10 @@
 #include "../fuzz/targets.h"
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/operator.h"
-#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/files/record_keys.h"
+#include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/scenes/scene.h"
+#include "prdp_experiments/training/progress.h"
 
 /// A short run of what `make fuzz` does at length: the corpus, and copies of it with bytes changed, moved or left out.
 /// A fault ends the process, or throws what the target does not let pass.
@@ -64,6 +66,10 @@ TEST(Fuzz, TheCorpusHoldsFilesThatAreRead) {
   const auto content = [](const char* name) { return read(corpus("files") / name).substr(1); };
   EXPECT_EQ(prdp::unpack(content("tensors")).size(), 1);
   for (const auto* name : {"weights", "weights_of_dict"}) EXPECT_EQ(prdp::unpack(content(name)).size(), 4) << name;
+  EXPECT_NO_THROW(prdp::check_training(prdp::parse_shallow(prdp::seal_record(content("training")))));
+  prdp::Saved progress(prdp::unpack(content("progress")));
+  EXPECT_EQ(prdp::train::load_progress(progress, 1).done(), 1);
+  EXPECT_NO_THROW(progress.finish());
 }
 
 /// What fuzzing has found.

@@ -10,11 +10,12 @@
 #include "prdp/operators/operator.h"
 #include "prdp/solvers/methods.h"
 #include "prdp_experiments/files/checkpoint.h"
+#include "prdp_experiments/files/record.h"
 #include "prdp_experiments/files/seal.h"
-#include "prdp_experiments/files/tensor_map.h"
 #include "prdp_experiments/networks/mlp.h"
 #include "prdp_experiments/networks/weights.h"
 #include "prdp_experiments/scenes/scene.h"
+#include "prdp_experiments/training/progress.h"
 
 namespace prdp_fuzz {
 
@@ -82,15 +83,21 @@ void files(std::string_view input) {
   static const File file("fuzz");
   static prdp::MLP network(3, std::vector<int64_t>{2});
   Bytes bytes(input);
-  const auto kind = bytes.below(6);
+  const auto kind = bytes.below(8);
   const std::string content(bytes.rest());
   refused_or_done([&] {
     if (kind == 0) prdp::read_record(file.holding(content));
-    if (kind == 1) prdp::read_sealed(file.holding(content), "checkpoint", "it is made again");
+    if (kind == 1) prdp::open_sealed(file.holding(content), "checkpoint");
     if (kind == 2) prdp::unpack(content);
     if (kind == 3) prdp::unpack_weights(content, *network);
     if (kind == 4) prdp::read_record(file.holding(prdp::seal_record(content)));
-    if (kind == 5) prdp::Checkpoint(file.holding(content), "settings").read();
+    if (kind == 5) prdp::Checkpoint(file.holding(content), "settings").find();
+    if (kind == 6) prdp::read_training(file.holding(prdp::seal_record(content)));
+    if (kind == 7) {
+      prdp::Saved saved(prdp::unpack(content));
+      prdp::train::load_progress(saved, 1);
+      saved.finish();
+    }
   });
 }
 

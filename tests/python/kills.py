@@ -1,9 +1,10 @@
-"""Trainings that are killed at random moments, and must end as those that were left alone, bit for bit.
+"""Trainings that are killed, and must end as those that were left alone, bit for bit.
 
     python tests/python/kills.py --kills 100 --out docs/stability/kills.json
 
-kills each trainer so many times in each task, prints a table and keeps its rows, each in the place of an older one of
-the same trainer and task. test_kills.py does so a few times.
+kills each trainer so many times in each task at random moments, and so many times between the renames that put files
+in their places (kills_at_renames.py). It prints a table and keeps its rows, each in the place of an older one of the
+same trainer and task. test_kills.py does so a few times.
 """
 
 import argparse
@@ -35,6 +36,7 @@ TASKS = {
     "field": (small_field, 40),
 }
 TRAINERS = ("python", "cpp")
+AT_RENAMES = "emulator, at renames"
 
 
 @dataclass
@@ -148,6 +150,15 @@ def _is_whole(path):
     return mark.endswith(_C.fingerprint(rest).encode())
 
 
+def counted(trainer, task, kills, folder, dice):
+    """The `Count` of one row."""
+    if task != AT_RENAMES:
+        return kill(trainer, task, kills, folder, dice)
+    import kills_at_renames  # which needs this module
+
+    return kills_at_renames.kill(trainer, kills, folder, dice)
+
+
 def keep(path, row):
     rows = json.loads(path.read_text()) if path.exists() else []
     others = [old for old in rows if (old["trainer"], old["task"]) != (row["trainer"], row["task"])]
@@ -159,7 +170,7 @@ def main():
     parser.add_argument("--kills", type=int, default=100, help="of each trainer in each task")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--trainers", nargs="+", choices=TRAINERS, default=TRAINERS)
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--tasks", nargs="+", choices=[*TASKS, AT_RENAMES], default=[*TASKS, AT_RENAMES])
     parser.add_argument("--out", type=Path, help="a file for the record, in JSON; rows of other kills in it stay")
     given = parser.parse_args()
     rows, environment = [], records.environment()
@@ -167,10 +178,10 @@ def main():
     print("| trainer | task | kills | with files | trainings | lost | damaged files |\n|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for trainer in given.trainers:
-            for task in given.tasks:
+            for number, task in enumerate(given.tasks):
                 dice = random.Random(f"{given.seed} {trainer} {task}")
                 started = time.monotonic()
-                count = asdict(kill(trainer, task, given.kills, Path(folder) / f"{trainer}_{task}", dice))
+                count = asdict(counted(trainer, task, given.kills, Path(folder) / f"{trainer}_{number}", dice))
                 print("|", " | ".join(map(str, (trainer, task, *count.values()))), "|", flush=True)
                 seconds = round(time.monotonic() - started, 1)
                 rows.append({"trainer": trainer, "task": task, **count, "seconds": seconds, **environment})

@@ -15,8 +15,8 @@ from prdp_torch.experiments import scene_advice, scenes
 from prdp_torch.trials import Row, Solve, measure_with_start, random_cotangent
 
 
-def advise(step, sample, seconds=1.0):
-    return prdp.advise(step, sample, seconds=seconds)
+def advise(step, sample, seconds=1.0, **options):
+    return prdp.advise(step, sample, seconds=seconds, **options)
 
 
 def own_step(operator, rhs=None):
@@ -86,9 +86,50 @@ def test_a_function_without_diagonal_leaves_out_jacobi():
 def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype():
     k = torch.full((16,), 2.0)
     step = own_step(lambda u: prdp.operators.Matrix(torch.diag(k)))
-    advice = advise(step, torch.randn(2, 16))
+    advice = advise(step, torch.randn(2, 16), dtypes=(torch.float64,))
     assert any(note.startswith("float64 was not tried: ") for note in advice.notes)
     assert {row.dtype for row in advice.rows} == {torch.float32} and "Use " in advice.recommendation
+
+
+def test_a_step_of_ones_own_sees_its_batch_and_its_dtype_alone():
+    """Its functions may hold tensors of both."""
+    seen = set()
+    kappa = 1 + torch.rand(4, 1, 16, generator=torch.Generator().manual_seed(0))
+
+    def operator(u):
+        seen.add((tuple(u.shape), u.dtype))
+        assert u.dtype == torch.float32
+        return prdp.operators.Stencil(torch.cat([2 * kappa + 1, -kappa, -kappa], 1), [(0,), (-1,), (1,)])
+
+    advice = advise(own_step(operator), field((16,), batch=4, dtype=torch.float32))
+    assert seen == {((4, 1, 16), torch.float32)}
+    assert rows(advice, "Direct", torch.float32)[1e-5].solved
+    assert not any("Direct was not tried" in note or "float64" in note for note in advice.notes)
+    assert {row.dtype for row in advice.rows} == {torch.float32}
+
+
+def test_the_other_dtype_of_a_step_of_ones_own_is_tried_where_it_is_asked_for():
+    step = prdp.ImplicitStep(lambda u: prdp.operators.Poisson((2000,)), None, prdp.CG(1))
+    u = field((2000,), batch=1, dtype=torch.float32)
+    asked = advise(step, u, seconds=0.2, dtypes=(torch.float64,))
+    assert asked.recommendation.startswith("Use float64 with Direct: no solver reaches 1e-5 in the dtype")
+    alone = advise(step, u, seconds=0.2)
+    assert any(note.startswith("Only the dtype of the sample was tried") for note in alone.notes)
+    assert {row.dtype for row in alone.rows} == {torch.float32}
+    built_in = advise(prdp.Poisson((2000,), prdp.CG(1)), u, seconds=0.2, dtypes=())
+    assert {row.dtype for row in built_in.rows} == {torch.float32}
+    for wrong in ((torch.float16,), "float64", torch.float64):
+        with pytest.raises(ValueError, match=r"advise: dtypes must hold torch\.float32 and torch\.float64 only"):
+            advise(step, u, dtypes=wrong)
+
+
+def test_a_factorisation_of_the_batch_that_takes_too_long_is_left_out():
+    kappa = torch.rand(40, 5, 60, 60, generator=torch.Generator().manual_seed(0)) + 0.1
+    kappa[:, 0] += 10
+    cross = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+    step = own_step(lambda u: prdp.operators.Stencil(kappa, cross))
+    advice = advise(step, field((60, 60), batch=40, dtype=torch.float32), seconds=0.01)
+    assert any(re.match(r"Direct was not tried: the batch takes some [\d.]+ s forward and", n) for n in advice.notes)
 
 
 def test_a_solver_that_diverges_is_named():

@@ -4,7 +4,14 @@ import time
 
 import pytest
 import torch
-from trainings import frequent_checkpoints, scene_of, without_seconds  # noqa: F401, a fixture of every test here
+from trainings import (  # noqa: F401, a fixture of every test here
+    checkpoint_of,
+    frequent_checkpoints,
+    restored,
+    scene_of,
+    state,
+    without_seconds,
+)
 
 import prdp_torch as prdp
 from prdp_torch.experiments import compare, records, scenes
@@ -105,7 +112,7 @@ def test_a_finished_record_needs_no_checkpoint(tmp_path):
     assert recorded(scene, tmp_path, True) == curves
     (tmp_path / "prdp/seed_0.json").write_text("{")
     with pytest.raises(
-        ValueError, match=r"record: '.*seed_0.json' is damaged or of another version; delete it, and its training"
+        ValueError, match=r"record: '.*seed_0.json' is damaged or of another version: its content .*; delete it"
     ):
         recorded(scene, tmp_path, True)
 
@@ -154,70 +161,110 @@ def test_a_loop_of_ones_own_goes_on_as_the_readme_says(tmp_path):
 
 def test_a_state_comes_back_and_another_settings_does_not(tmp_path):
     path = tmp_path / "kept"
-    checkpoint = Checkpoint(path, seed=0, text="two\nlines")
-    assert checkpoint.load() is None
-    state = {"u": torch.tensor([1.0, float("nan")]), "k": 3, "curve": [0.1, float("inf")], "history": [(1.0, True)]}
-    checkpoint.save(state)
-    found = Checkpoint(path, seed=0, text="two\nlines").load()
-    assert torch.equal(found.pop("u").isnan(), state.pop("u").isnan()) and found == state
+    checkpoint = checkpoint_of(path, text="two\nlines")
+    assert checkpoint.find() == [] and restored(checkpoint) is None
+    tensors, curves, controller = state(3)
+    checkpoint.save({**tensors, "u": torch.tensor([1.0, float("inf")]), "shared": tensors["theta"]}, curves, controller)
+
+    def load(saved):
+        assert saved.take("u", torch.zeros(2), finite=False).tolist() == [1.0, float("inf")]
+        assert float(saved.take("theta", torch.zeros(()))) == float(saved.take("shared", torch.zeros(()))) == 3.0
+        assert saved.progress(1) == (curves, {**controller, "history": list(map(tuple, controller["history"]))})
+
+    again = checkpoint_of(path, text="two\nlines")
+    assert again.restore(again.find(), load)
+    other = checkpoint_of(path, text="two\nlines", seed=1)
     with pytest.warns(UserWarning, match=f"'{path}' is of other settings or another version; it is not used"):
-        assert Checkpoint(path, seed=1, text="two\nlines").load() is None
+        assert restored(other) is None
     assert list(tmp_path.iterdir()) == [path]
     checkpoint.remove()
     checkpoint.remove()
-    assert checkpoint.load() is None and list(tmp_path.iterdir()) == []
+    assert restored(checkpoint) is None and list(tmp_path.iterdir()) == []
 
 
 def test_two_checkpoints_are_kept(tmp_path):
     path = tmp_path / "kept"
     before = tmp_path / "kept.before"
-    checkpoint = Checkpoint(path, seed=0)
-    for state in range(3):
-        checkpoint.save(state)
-        assert checkpoint.load() == state and checkpoint.notice == ""
+    checkpoint = checkpoint_of(path)
+    for number in range(3):
+        checkpoint.save(*state(number))
+        assert restored(checkpoint) == number and checkpoint.notice == ""
     whole = path.read_bytes()
     for damage in (whole[:-1], b"", b"something else\n", whole.replace(b"seed", b"need")):
         path.write_bytes(damage)
-        with pytest.warns(UserWarning, match=f"'{path}' is damaged; the training goes on from the one before"):
-            assert checkpoint.load() == 1
-    Checkpoint(path, seed=7).save("foreign")
-    Checkpoint(tmp_path / "other", seed=0).save(5)
+        words = f"'{path}' is damaged or of another version: its content .*; the training goes on from the one before"
+        with pytest.warns(UserWarning, match=words):
+            assert restored(checkpoint) == 1
+    checkpoint_of(path, seed=7).save(*state(9))
+    checkpoint_of(tmp_path / "other").save(*state(5))
     (tmp_path / "other").rename(before)
     with pytest.warns(UserWarning, match=f"'{path}' is of other settings or another version; it is not used"):
-        assert checkpoint.load() == 5
+        assert restored(checkpoint) == 5
     path.unlink()
-    assert checkpoint.load() == 5
+    assert restored(checkpoint) == 5
     before.write_bytes(b"damaged")
-    with pytest.raises(ValueError, match=f"checkpoint: '{before}' is damaged or of another version; delete it"):
-        checkpoint.load()
+    with pytest.raises(ValueError, match=f"checkpoint: '{before}' is damaged or of another version: .*; delete it"):
+        restored(checkpoint)
     checkpoint.remove()
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_damaged_checkpoint_does_not_take_the_place_of_the_good_one_before(tmp_path):
+    checkpoint = checkpoint_of(tmp_path / "kept")
+    for number in range(2):
+        checkpoint.save(*state(number))
+    (tmp_path / "kept").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match="goes on from the one before"):
+        assert restored(checkpoint) == 0
+    checkpoint.save(*state(2))
+    (tmp_path / "kept").write_bytes(b"damaged again")
+    with pytest.warns(UserWarning, match="goes on from the one before"):
+        assert restored(checkpoint) == 0
+    checkpoint.save(*state(3))
+    checkpoint.save(*state(4))
+    (tmp_path / "kept").unlink()
+    assert restored(checkpoint) == 3
+
+
 def test_a_changed_byte_or_a_missing_end_is_found(tmp_path):
     path = tmp_path / "kept"
-    checkpoint = Checkpoint(path, seed=0)
-    checkpoint.save({"weight": torch.arange(6.0)})
+    checkpoint = checkpoint_of(path)
+    checkpoint.save(*state(1))
     whole = path.read_bytes()
     changed = (whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :] for i in range(0, len(whole), 3))
     for damaged in (*changed, *(whole[:n] for n in range(0, len(whole), 50)), whole + b"\0"):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=f"checkpoint: '{path}' is damaged or of another version; delete it"):
-            checkpoint.load()
+        with pytest.raises(ValueError, match=f"checkpoint: '{path}' is damaged or of another version: .*; delete it"):
+            checkpoint.find()
     path.write_bytes(whole)
-    assert checkpoint.load()["weight"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert restored(checkpoint) == 1
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path):
     folder, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     folder.mkdir()
-    checkpoint = Checkpoint(folder / "kept", seed=0)
-    checkpoint.save(1)
+    checkpoint = checkpoint_of(folder / "kept")
+    checkpoint.save(*state(1))
     folder.rename(elsewhere)
     with pytest.raises(ValueError, match=f"cannot write '{folder}/kept': No such file or directory"):
-        checkpoint.save(2)
+        checkpoint.save(*state(2))
     elsewhere.rename(folder)
-    assert checkpoint.load() == 1
+    assert restored(checkpoint) == 1
+
+
+def test_a_network_that_a_checkpoint_cannot_keep_is_refused_before_any_work(tmp_path):
+    class Talking(Linear):
+        def get_extra_state(self):
+            return {"epoch": 1}
+
+        def set_extra_state(self, state):
+            pass
+
+    scene = scenes.load("heat_1d")
+    scene.training.intervals = 1
+    train(scene, Refinement.constant(1), network=Talking())
+    with pytest.raises(TypeError, match="must hold tensors only, for its checkpoint, got dict for '_extra_state'"):
+        train(scene, Refinement.constant(1), network=Talking(), checkpoint=Checkpoint(tmp_path / "kept"))
 
 
 def test_checkpoints_are_ten_seconds_apart_or_as_the_environment_says(tmp_path, monkeypatch):

@@ -187,7 +187,7 @@ def test_a_comparison_has_rows_of_the_direct_solver_and_a_looser_tolerance(tmp_p
     "before, after, where, message",
     [
         ('"diffusion"', '"heat"', "equation =", "physics.equation: unknown name 'heat'; allowed: diffusion"),
-        ("dt = 0.05", "dt = 0.05\nnu = 1.0", "nu =", "unknown name 'physics.nu'; allowed: dt, equation, shape"),
+        ("dt = 0.05", "dt = 0.05\nnu = 1.0", "nu =", "unknown name 'physics.nu'; allowed: dt, equation, length, shape"),
         ('"cg"', '"chebyshev"', "method", "solver.method: unknown name 'chebyshev'; allowed: jacobi, steepest"),
         ("[field]", "[fields]", "", "field: missing; the table holds:"),
         ("mean = 0.02", "mean = 0.0", "mean =", "field.mean: must be > 0, got 0"),

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import reseal, tiny, written
+from trainings import checkpoint_of, restored, state
 from typer.testing import CliRunner
 
 from prdp_torch.experiments import _C, cli, compare, records, scenes
@@ -111,9 +112,9 @@ def test_damaged_records_and_weights_are_refused(tmp_path):
 
 
 def test_damaged_checkpoints_are_refused(tmp_path):
-    checkpoint = Checkpoint(tmp_path / "kept", seed=0)
-    checkpoint.save({"weights": torch.randn(50)})
-    refused(tmp_path / "kept", checkpoint.load)
+    checkpoint = checkpoint_of(tmp_path / "kept")
+    checkpoint.save(*state(1, torch.randn(50)))
+    refused(tmp_path / "kept", checkpoint.find)
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
@@ -133,7 +134,7 @@ def test_a_checkpoint_that_is_a_folder_is_one_line(tmp_path, trainer):
     checkpoint.mkdir(parents=True)
     for resume in ([], ["--resume"]):
         status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1, *resume)
-        assert status == 2 and f"'{checkpoint}': it is" in errors and errors.count("\n") == 1
+        assert status == 2 and f"'{checkpoint}'" in errors and ": it is " in errors and errors.count("\n") == 1
 
 
 # ---- forgery
@@ -172,20 +173,22 @@ def test_no_checkpoint_runs_code(tmp_path):
     process.communicate()
     script = io.BytesIO()
     torch.jit.save(torch.jit.script(Forged()), script)
-    bomb = io.BytesIO()
+    bomb, none = io.BytesIO(), io.BytesIO()
     torch.save(Bomb(str(tmp_path / "crater")), bomb)
-    for state in (script.getvalue(), bomb.getvalue(), b"", b"nothing"):
+    torch.save(None, none)
+    contents = (script.getvalue(), bomb.getvalue(), none.getvalue(), b"", b"nothing")
+    for content in contents:
         for file in (path, *path.parent.glob("*.before")):
-            reseal(file, state)
+            reseal(file, content)
         status, errors = run("cpp", HEAT, "--out", tmp_path / "cpp", "--resume")
         assert status == 2 and f"'{path}' is damaged or of another version" in errors and "code was run" not in errors
 
-    checkpoint = Checkpoint(tmp_path / "kept", seed=0)
-    checkpoint.save(1)
-    for state in (script.getvalue(), bomb.getvalue(), b"", b"nothing"):
-        reseal(tmp_path / "kept", state)
-        with pytest.raises(ValueError, match="is damaged or of another version"):
-            checkpoint.load()
+    checkpoint = checkpoint_of(tmp_path / "kept")
+    checkpoint.save(*state(1))
+    for content in contents:
+        reseal(tmp_path / "kept", content)
+        with pytest.raises(ValueError, match="is damaged or of another version: expected named tensors; delete it"):
+            restored(checkpoint)
     assert not (tmp_path / "crater").exists()
 
 

@@ -50,8 +50,6 @@ def stop(process, checkpoint, signal):
 def seconds_in(trainer, checkpoint):
     """Of the intervals that it holds."""
     state = torch.load(io.BytesIO(checkpoint.read_bytes().split(b"\n", 2)[2]), weights_only=True)  # behind two lines
-    if trainer == "python":
-        return state["curves"]["seconds"]
     return state[state.index("seconds") + 1].tolist()  # names and tensors by turns
 
 
@@ -95,7 +93,8 @@ def test_a_damaged_checkpoint_is_one_line_and_harms_nothing(tmp_path, trainer):
     status, errors = run(*arguments, "--resume")
     assert status == 2 and checkpoint.read_text() == "nothing of the kind\n"
     assert errors.endswith(
-        f"checkpoint: '{checkpoint}' is damaged or of another version; delete it, and its training starts afresh\n"
+        f"checkpoint: '{checkpoint}' is damaged or of another version: its content is not that of its fingerprint; "
+        "delete it, and its training starts afresh\n"
     )
     assert errors.count("\n") == 1
     status, errors = run(*arguments)
@@ -126,7 +125,8 @@ def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp
     checkpoint.write_bytes(damaged)
     status, errors = run(trainer, scene, tmp_path / "killed", *arguments, "--resume")
     assert status == 0
-    assert f"checkpoint: '{checkpoint}' is damaged; the training goes on from the one before\n" in errors
+    assert f"checkpoint: '{checkpoint}' is damaged or of another version: its content is not that" in errors
+    assert errors.count("; the training goes on from the one before\n") == 1
     curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
     assert without_seconds(curves) == without_seconds(alone)
     assert [path.name for path in record.parent.iterdir()] == ["seed_0.json"]
@@ -135,11 +135,8 @@ def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp
 def without_a_part(trainer, content):
     """A state that lacks what is loaded last."""
     state = torch.load(io.BytesIO(content), weights_only=True)
-    if trainer == "python":
-        del state["curves"]["failed"]
-    else:
-        last = state.index("history_residual")
-        state = (*state[:last], *state[last + 2 :])
+    last = state.index("history_residual")
+    state = (*state[:last], *state[last + 2 :])
     changed = io.BytesIO()
     torch.save(state, changed)
     return changed.getvalue()
@@ -159,7 +156,9 @@ def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_f
     reseal(checkpoint, change(trainer, content))
     status, errors = run(trainer, scene, tmp_path / "killed", *arguments, "--resume")
     assert status == 0, errors
-    assert errors.count(f"checkpoint: '{checkpoint}' is damaged; the training goes on from the one before\n") == 1
+    words = {b"no state at all": "expected named tensors"}.get(change(trainer, content), "there is no tensor 'history_")
+    assert f"checkpoint: '{checkpoint}' is damaged or of another version: {words}" in errors
+    assert errors.count("; the training goes on from the one before\n") == 1
     curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
     assert without_seconds(curves) == without_seconds(alone)
 
@@ -174,7 +173,8 @@ def test_where_both_checkpoints_were_tampered_with_it_is_one_line(tmp_path, trai
     status, errors = run(trainer, scene, out, "--intervals", 300, "--resume")
     assert status == 2
     assert errors.endswith(
-        f"checkpoint: '{checkpoint}' is damaged or of another version; delete it, and its training starts afresh\n"
+        f"checkpoint: '{checkpoint}' is damaged or of another version: expected named tensors; delete it, and its "
+        "training starts afresh\n"
     )
     assert errors.count("\n") == 1
     assert not (out / "prdp/seed_0.json").exists()

@@ -41,9 +41,15 @@ def applies(words, content):
 
 def an_example(value):
     """A value that the list allows for a key, and one that it does not allow."""
-    kind, _, bound = value.partition(" >")
+    kind, _, bound = value.removesuffix(", or a list of them").partition(" >")
     least = 1e6 if "`" in bound else float(bound.strip("= ") or 0)  # a bound by another key is below a million
-    simple = {"table": ({}, 1), "numbers": ([1.0], 1.0), "text": ("x", 1), "`true`, `false`": (True, 1)}
+    simple = {
+        "table": ({}, 1),
+        "table, or text `module:Class`": ({}, "Class"),
+        "numbers": ([1.0], 1.0),
+        "text": ("x", 1),
+        "`true`, `false`": (True, 1),
+    }
     if value in simple:
         return simple[value]
     if kind == "number":
@@ -112,6 +118,7 @@ def test_the_defaults_are_those_of_a_scene_without_the_keys():
     content = tomllib.loads(scenes.available()["heat_1d"].read_text())
     scene = load(content)
     read = {
+        ("physics", "length"): f"{scene.physics.length[0]:g}",
         ("solver", "on_failure"): f"`{scene.on_failure}`",
         ("solver", "start"): f"`{scene.start}`",
         ("data", "file"): scene.data.file or "none",

@@ -150,6 +150,7 @@ def test_poisson_3p_saves_what_the_paper_saves_at_the_same_error(name, least):
 
 
 def test_the_trainer_takes_any_network():
+    torch.manual_seed(0)
     network = Linear()
     before = network.layer.weight.detach().clone()
     curves = train(short("heat_1d"), Refinement.constant(25), network=network)

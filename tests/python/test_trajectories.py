@@ -149,7 +149,7 @@ def test_weights_that_do_not_fit_are_refused_with_the_remedy(tmp_path, damage):
     rows, _ = trained(scene, tmp_path)
     path = tmp_path / "prdp/seed_0.pt"
     damage(path)
-    with pytest.raises(ValueError, match=f"weights: '{path}' is damaged or not of the record beside it; delete it"):
+    with pytest.raises(ValueError, match=f"weights: '{path}' is damaged or not of the record beside it; delete both"):
         trajectories.collect(scene, rows, tmp_path)
 
 

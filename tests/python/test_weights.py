@@ -77,11 +77,15 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
     renamed = {f"x{name}": value for name, value in state.items()}
     wide = {name: value.double() for name, value in state.items()}
     less = dict(list(state.items())[1:])
+    more = {**state, "more": torch.zeros(1)}
+    unknown = {**state, "layers.0.bias": state["layers.0.bias"] * torch.nan}
     bomb = state | {"layers.0.weight": Bomb(str(tmp_path / "crater"))}
     for content, words in [
         (renamed, "weights: there is no tensor 'layers.0.weight'"),
-        (wide, "weights: 'layers.0.weight' must be Float of sizes [64, 30]"),
-        (less, "weights: the network has 8 tensors, the file 7"),
+        (wide, "weights: tensor 'layers.0.weight' is Double of sizes [64, 30], expected Float of sizes [64, 30]"),
+        (less, "weights: there is no tensor 'layers.0.weight'"),
+        (more, "weights: nobody knows its tensor 'more'"),
+        (unknown, "weights: tensor 'layers.0.bias' holds NaN or Inf"),
         (bomb, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it"),
         (None, "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it"),
     ]:
@@ -89,7 +93,7 @@ def test_weights_that_do_not_fit_are_one_line_and_run_no_code(tmp_path):
         torch.save(content, saved)
         (tmp_path / "given.pt").write_bytes(saved.getvalue() if content is not None else b"nothing of the kind")
         status, errors = prdp_train(path, "--out", tmp_path / "out", "--weights", tmp_path / "given.pt")
-        assert status == 2 and words in errors and errors.count("\n") == 1
+        assert status == 2 and words in errors and f"'{tmp_path / 'given.pt'}'" in errors and errors.count("\n") == 1
     status, errors = prdp_train(path, "--out", tmp_path / "out", "--weights", tmp_path / "missing.pt")
     assert status == 2 and "weights: cannot read" in errors
     assert not (tmp_path / "crater").exists()

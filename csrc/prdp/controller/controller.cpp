@@ -23,6 +23,8 @@ constexpr double kLargeResidual = 0.1;
 constexpr size_t kGrown = 3;
 constexpr double kGrowth = 2.0, kRoundingOfMetric = 1e-3;
 
+bool is_size(double x) { return std::isfinite(x) && x >= 0.0; }
+
 }  // namespace
 
 std::optional<std::string> Controller::warning() const {
@@ -34,9 +36,28 @@ std::optional<std::string> Controller::warning() const {
 }
 
 void Controller::check_metric(double metric, const char* what) {
-  const bool good = std::isfinite(metric) && metric >= 0.0;
+  const bool good = is_size(metric);
   refused_ = good ? std::nullopt : std::optional(metric);
   TORCH_CHECK_VALUE(good, name(), ": ", what, " must be finite and >= 0, got ", metric);
+}
+
+void Controller::check_solves(const Solves& solves) const {
+  for (const auto& [what, value] : {std::pair("error", solves.error), std::pair("residual", solves.residual)})
+    TORCH_CHECK_VALUE(!value || is_size(*value), name(), ": ", what, " must be finite and >= 0, got ", *value);
+}
+
+void Controller::check_state(const State& state, bool is_ignored) const {
+  TORCH_CHECK_VALUE(state.max_iter >= 0, name(), ": state has max_iter = ", state.max_iter, ", expected >= 0");
+  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, name(), ": state has checkpoint = ", state.checkpoint, ", expected >= 0");
+  for (const auto& record : state.history) {
+    TORCH_CHECK_VALUE(is_ignored || (is_size(record.metric) && is_size(record.smoothed)), name(),
+                      ": state has a metric that is not finite and >= 0");
+    TORCH_CHECK_VALUE(record.max_iter >= 0, name(), ": state has a record of max_iter = ", record.max_iter,
+                      ", expected >= 0");
+    for (const auto& value : {record.error, record.residual})
+      TORCH_CHECK_VALUE(!value || is_size(*value), name(),
+                        ": state has a record of an error or residual that is not finite and >= 0, ", *value);
+  }
 }
 
 std::string Controller::about_metric() const {
@@ -83,7 +104,10 @@ std::string Controller::about_residual() const {
 
 int64_t adjoint_share(const char* who, double ratio, int64_t max_iter) {
   TORCH_CHECK_VALUE(ratio > 0.0 && ratio <= 1.0, who, ": adjoint_ratio must be > 0 and <= 1, got ", ratio);
-  return static_cast<int64_t>(std::ceil(ratio * static_cast<double>(max_iter) - 1e-9));
+  const auto most = static_cast<double>(max_iter);
+  const double share = std::ceil(ratio * most - 1e-9);
+  // Beyond 2⁵³ `most` is rounded, and may lie beyond the largest int64.
+  return share < most ? std::max<int64_t>(1, static_cast<int64_t>(share)) : max_iter;
 }
 
 }  // namespace prdp

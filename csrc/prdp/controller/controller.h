@@ -69,6 +69,10 @@ class Controller {
  protected:
   /// Raises ValueError unless the metric, called `what` in the message, is finite and >= 0. warning() then reports it.
   void check_metric(double metric, const char* what);
+  /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0.
+  void check_solves(const Solves& solves) const;
+  /// Raises ValueError for a state that no controller can have reached; a metric that `is_ignored` may be anything.
+  void check_state(const State& state, bool is_ignored = false) const;
   virtual const char* name() const = 0;
   /// What the user should do about the warning, as the end of a sentence.
   virtual const char* remedy() const = 0;
@@ -82,7 +86,8 @@ class Controller {
   std::optional<double> refused_;  // the metric of the last step(), if it raised an error
 };
 
-/// ⌈ratio · K⌉, the iterations of an adjoint solve. Raises ValueError in the name of `who` unless 0 < ratio <= 1.
+/// ⌈ratio · K⌉, the iterations of an adjoint solve: at least one where K is. Raises ValueError in the name of `who`
+/// unless 0 < ratio <= 1.
 int64_t adjoint_share(const char* who, double ratio, int64_t max_iter);
 
 }  // namespace prdp

@@ -21,6 +21,7 @@ Budget LinearSchedule::budget() const {
 }
 
 bool LinearSchedule::step(double metric, const Solves& solves) {
+  check_solves(solves);
   const int64_t before = state_.max_iter;
   state_.max_iter = before + std::min(increment_, maximum_ - before);
   const bool raised = state_.max_iter > before;
@@ -29,6 +30,7 @@ bool LinearSchedule::step(double metric, const Solves& solves) {
 }
 
 void LinearSchedule::load_state(State state) {
+  check_state(state, /*is_ignored=*/true);
   TORCH_CHECK_VALUE(state.max_iter >= initial_ && state.max_iter <= maximum_, "LinearSchedule: max_iter must lie in [",
                     initial_, ", ", maximum_, "], got ", state.max_iter);
   state_ = std::move(state);

@@ -49,6 +49,7 @@ bool PRDPController::should_refine() const {
 }
 
 bool PRDPController::step(double metric, const Solves& solves) {
+  check_solves(solves);
   check_metric(metric, "metric");
   const double alpha = 2.0 / (static_cast<double>(settings_.window) + 1.0);
   const auto& history = state_.history;
@@ -70,12 +71,7 @@ bool PRDPController::step(double metric, const Solves& solves) {
 void PRDPController::load_state(State state) {
   TORCH_CHECK_VALUE(state.max_iter >= settings_.initial && (!settings_.maximum || state.max_iter <= *settings_.maximum),
                     "PRDPController: state has max_iter = ", state.max_iter, ", below initial or above maximum");
-  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "PRDPController: state has checkpoint = ", state.checkpoint,
-                    ", expected >= 0");
-  for (const auto& record : state.history)
-    TORCH_CHECK_VALUE(std::isfinite(record.metric) && std::isfinite(record.smoothed) && record.metric >= 0.0 &&
-                          record.smoothed >= 0.0,
-                      "PRDPController: state has a metric that is not finite and >= 0");
+  check_state(state);
   state_ = std::move(state);
 }
 

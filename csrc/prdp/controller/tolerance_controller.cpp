@@ -32,6 +32,7 @@ Budget ToleranceController::budget() const {
 }
 
 bool ToleranceController::step(double error, const Solves& solves) {
+  check_solves(solves);
   check_metric(error, "error");
   const double before = rtol();
   state_.checkpoint = std::min(state_.checkpoint, error);
@@ -41,11 +42,8 @@ bool ToleranceController::step(double error, const Solves& solves) {
 }
 
 void ToleranceController::load_state(State state) {
-  TORCH_CHECK_VALUE(state.checkpoint >= 0.0, "ToleranceController: state has a smallest error of ", state.checkpoint,
-                    ", expected >= 0");
-  for (const auto& record : state.history)
-    TORCH_CHECK_VALUE(std::isfinite(record.metric) && record.metric >= 0.0,
-                      "ToleranceController: state has an error that is not finite and >= 0");
+  check_state(state);
+  TORCH_CHECK_VALUE(state.max_iter >= 1, name(), ": state has max_iter = ", state.max_iter, ", expected >= 1");
   state.max_iter = settings_.maximum;
   state_ = std::move(state);
 }

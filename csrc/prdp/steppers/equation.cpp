@@ -8,6 +8,7 @@
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/steppers/equation_kinds.h"
+#include "prdp/steppers/memory.h"
 #include "prdp/steppers/stepper.h"
 
 namespace prdp {
@@ -50,6 +51,7 @@ at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& b
 }
 
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
+  check_memory(options, u);
   const auto b = equation_rhs(equation, u);
   auto result = linear_solve(equation_operator(equation, u), b, options, start_of_step(options, u));
   for (int64_t k = 1; k < equation.picard_steps; ++k) {

@@ -1,6 +1,7 @@
 #include "prdp/steppers/implicit_step.h"
 
 #include "prdp/solvers/solve.h"
+#include "prdp/steppers/memory.h"
 #include "prdp/steppers/rollout_vjp.h"
 
 namespace prdp {
@@ -18,6 +19,7 @@ ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward ba
 
 SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
   TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());
+  check_memory(options_, u);
   const auto a = operator_(u);
   const auto b = rhs(u);
   TORCH_CHECK_VALUE(b.sizes() == u.sizes() && b.scalar_type() == u.scalar_type(), who_,

@@ -14,6 +14,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
+#include "prdp/steppers/memory.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
@@ -59,6 +60,7 @@ Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArray
 
 void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
   options.check(equation.kind.c_str());
+  check_memory(options, u);
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);
   const auto a = equation_operator(equation, u);

@@ -39,11 +39,11 @@ void bind_data(py::module_& m) {
         py::call_guard<py::gil_scoped_release>());
   m.def(
       "diffusion_stencil",
-      [](const at::Tensor& kappa, double dt) {
-        const auto stencil = diffusion_stencil(kappa, dt);
+      [](const at::Tensor& kappa, double dt, const std::vector<double>& lengths) {
+        const auto stencil = diffusion_stencil(kappa, dt, lengths);
         return std::make_pair(stencil.coefficients, stencil.offsets);
       },
-      py::arg("kappa"), py::arg("dt"));
+      py::arg("kappa"), py::arg("dt"), py::arg("lengths") = std::vector<double>());
   m.def("observed", &observed, py::arg("states"), py::arg("scene"));
-  m.def("roughness", &roughness, py::arg("theta"));
+  m.def("roughness", &roughness, py::arg("theta"), py::arg("lengths") = std::vector<double>());
 }

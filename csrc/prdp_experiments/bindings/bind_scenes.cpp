@@ -13,6 +13,10 @@ void bind_scenes(py::module_& m) {
       .def_readonly("shape", &Scene::Physics::shape)
       .def_readonly("nu", &Scene::Physics::nu)
       .def_readonly("dt", &Scene::Physics::dt)
+      .def_property_readonly("length",
+                             [](const Scene::Physics& p) {
+                               return p.lengths.empty() ? std::vector<double>(p.shape.size(), 1.0) : p.lengths;
+                             })
       .def_property_readonly("channels", &Scene::Physics::channels)
       .def_property_readonly("periodic", &Scene::Physics::periodic)
       .def_property_readonly("direct_is_cheap", &Scene::Physics::direct_is_cheap);
@@ -27,6 +31,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("valid_max_iter", &Scene::Data::valid_max_iter)
       .def_readonly("reference_shape", &Scene::Data::reference_shape);
   py::class_<Scene::Network>(m, "Network")
+      .def_readonly("python", &Scene::Network::python)
       .def_readonly("kind", &Scene::Network::kind)
       .def_readonly("hidden", &Scene::Network::hidden)
       .def_readonly("blocks", &Scene::Network::blocks)

@@ -18,8 +18,8 @@ at::Tensor shuffled(int64_t samples, at::Generator& generator) {
 
 namespace {
 
-/// The unknowns' places on an axis of the unit domain, i/N where it is periodic, else between the
-/// boundary points, (i + 1)/(N + 1).
+/// The unknowns' places on an axis, as parts of its length: i/N where it is periodic, else between the boundary points,
+/// (i + 1)/(N + 1).
 at::Tensor unknowns_on_axis(const Scene::Physics& physics, int64_t axis) {
   const int64_t n = physics.shape[axis], first = physics.periodic() ? 0 : 1;
   const double dx = 1.0 / static_cast<double>(n + first);
@@ -66,8 +66,10 @@ namespace {
 /// validation.
 at::Tensor starts(const Scene& scene, int64_t samples) {
   const auto& d = scene.data;
-  TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5; run prdp train ", scene.path);
-  if (scene.task == Scene::Task::kCorrector) return random_flow(d.reference_shape, samples, d.seed);
+  TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5 and .npz; run prdp train ",
+                    scene.path);
+  if (scene.task == Scene::Task::kCorrector)
+    return random_flow(d.reference_shape, samples, d.seed, scene.physics.lengths);
   return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
 }
 

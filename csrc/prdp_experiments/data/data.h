@@ -8,8 +8,8 @@
 namespace prdp {
 
 /// Random truncated Fourier series (paper, appendix E): for n = 1 … modes, every product of sin(2πn·) and cos(2πn·)
-/// over the axes, with amplitudes uniform in (-1, 1). Returns their values at the unknowns, (samples, channels,
-/// *shape). The same seed gives the same series in Python and C++.
+/// over the axes, in units of their lengths, with amplitudes uniform in (-1, 1). Returns their values at the unknowns,
+/// (samples, channels, *shape). The same seed gives the same series in Python and C++.
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
@@ -41,7 +41,7 @@ at::Tensor validation_trajectories(const Scene& scene, int64_t steps, const OnPr
 /// The same for all samples, the training samples first.
 at::Tensor all_trajectories(const Scene& scene, int64_t steps, const OnProgress& on_progress = {});
 
-/// The problem of the task "parameters": find the amplitudes θ of the load p(x) = Σ_i θ_i sin(2πi x).
+/// The problem of the task "parameters": find the amplitudes θ of the load p(x) = Σ_i θ_i sin(2πi x/L).
 struct ParameterProblem {
   at::Tensor modes;      // (P, N): the sines at the unknowns
   at::Tensor start;      // (P,): θ at the beginning

@@ -5,8 +5,9 @@
 #include <cstdlib>
 #include <filesystem>
 
+#include "prdp_experiments/files/saved.h"
 #include "prdp_experiments/files/seal.h"
-#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/files/whole_files.h"
 
 namespace prdp {
 
@@ -37,16 +38,18 @@ TensorMap tensors_of(const Dataset& d) {
   return tensors;
 }
 
-Dataset dataset_of(const TensorMap& tensors, const Scene& scene) {
+Dataset dataset_of(Saved saved, const Scene& scene) {
   const auto states = [&](const char* name, int64_t samples) {
     std::vector<int64_t> sizes{samples, scene.physics.channels()};
     sizes.insert(sizes.end(), scene.physics.shape.begin(), scene.physics.shape.end());
-    return entry(tensors, name, scene.dtype, sizes);
+    return saved.take(name, scene.dtype, sizes);
   };
   const auto [train, valid] = std::pair(scene.data.train, scene.data.valid);
-  return {states("train_start", train), states("train_end", train), states("valid_start", valid),
-          states("valid_end", valid),
-          scene.task == Scene::Task::kCorrector ? states("train_first", train) : at::Tensor()};
+  Dataset data{states("train_start", train), states("train_end", train), states("valid_start", valid),
+               states("valid_end", valid),
+               scene.task == Scene::Task::kCorrector ? states("train_first", train) : at::Tensor()};
+  saved.finish();
+  return data;
 }
 
 }  // namespace
@@ -55,17 +58,18 @@ Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make)
   constexpr const char *kKind = "data", *kRemedy = "it is made again";
   const auto settings = c10::str("prdp data ", kFormat, ": ", data_settings(scene));
   const auto path = cache_folder() / (scene.physics.equation + '-' + fingerprint(settings) + ".data");
-  if (const auto found = read_sealed(path, kKind, kRemedy)) {
-    TORCH_CHECK_VALUE(found->settings == settings, "data: '", path.string(), "' holds '", found->settings, "', not '",
-                      settings, "'; delete it, and ", kRemedy);
+  if (const auto found = open_sealed(path, kKind)) {
+    if (!found->sealed) refuse_damaged(path, kKind, found->wrong, kRemedy);
+    const auto& [of, content] = *found->sealed;
+    if (of != settings) refuse_damaged(path, kKind, c10::str("it holds '", of, "', not '", settings, "'"), kRemedy);
     try {
-      return dataset_of(unpack(found->content), scene);
-    } catch (const c10::ValueError&) {
-      refuse_damaged(path, kKind, kRemedy);
+      return dataset_of(Saved(unpack(content)), scene);
+    } catch (const c10::ValueError& error) {
+      refuse_damaged(path, kKind, error.what_without_backtrace(), kRemedy);
     }
   }
   const auto data = make();
-  write_sealed(path, kKind, {settings, pack(tensors_of(data))});
+  write_whole({path, seal(kKind, {settings, pack(tensors_of(data))})});
   return data;
 }
 

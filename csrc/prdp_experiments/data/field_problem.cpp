@@ -8,13 +8,22 @@
 
 namespace prdp {
 
-DiffusionStencil diffusion_stencil(const at::Tensor& kappa, double dt) {
+namespace {
+
+/// 1/dx of a periodic axis.
+double per_length(const at::Tensor& field, const std::vector<double>& lengths, int64_t axis) {
+  return static_cast<double>(field.size(axis)) / (lengths.empty() ? 1.0 : lengths[axis]);
+}
+
+}  // namespace
+
+DiffusionStencil diffusion_stencil(const at::Tensor& kappa, double dt, const std::vector<double>& lengths) {
   const int64_t dim = kappa.dim();
   at::Tensor centre;
   std::vector<at::Tensor> sides;
   DiffusionStencil stencil{{}, {std::vector<int64_t>(dim, 0)}};
   for (int64_t axis = 0; axis < dim; ++axis) {
-    const auto n = static_cast<double>(kappa.size(axis));
+    const double n = per_length(kappa, lengths, axis);
     const auto after = (kappa + kappa.roll(-1, axis)) * (0.5 * dt * n * n);  // between a point and the next
     const auto before = after.roll(1, axis);
     centre = (centre.defined() ? centre : at::ones_like(kappa)) + after + before;
@@ -39,7 +48,7 @@ FieldProblem make_field_problem(const Scene& scene, int64_t seed) {
   const auto theta = at::full_like(pattern, f.mean).log();
   const auto reference = (theta + f.contrast * pattern).exp();
 
-  const auto [coefficients, offsets] = diffusion_stencil(reference, scene.physics.dt);
+  const auto [coefficients, offsets] = diffusion_stencil(reference, scene.physics.dt, scene.physics.lengths);
   ImplicitStep exact(stencil(coefficients, offsets, {Boundary::kPeriodic}), nullptr, scene.reference_solver());
   const auto states = observed(exact.rollout(start, f.steps), scene);
   TORCH_CHECK(exact.converged(), "data: a reference solve stopped at a residual of ",
@@ -54,10 +63,10 @@ at::Tensor observed(const at::Tensor& states, const Scene& scene) {
   return states.slice(1, scene.field.every, std::nullopt, scene.field.every);
 }
 
-at::Tensor roughness(const at::Tensor& theta) {
+at::Tensor roughness(const at::Tensor& theta, const std::vector<double>& lengths) {
   at::Tensor squares;
   for (int64_t axis = 0; axis < theta.dim(); ++axis) {
-    const auto slope = (theta.roll(-1, axis) - theta) * static_cast<double>(theta.size(axis));
+    const auto slope = (theta.roll(-1, axis) - theta) * per_length(theta, lengths, axis);
     squares = squares.defined() ? squares + slope.square() : slope.square();
   }
   return squares.mean();

@@ -13,12 +13,13 @@ constexpr int64_t kSamplesAtOnce = 25;
 constexpr double kSmoothing = 3e-3;  // ν Δt
 
 /// Eigenvalues of the periodic five-point Laplacian, as at::fft_rfft2 orders them.
-at::Tensor laplacian_symbol(const std::vector<int64_t>& shape) {
-  const auto along = [](int64_t n, int64_t waves) {
+at::Tensor laplacian_symbol(const Grid& grid) {
+  const auto along = [&](int64_t axis, int64_t waves) {
     const auto k = at::arange(waves, at::TensorOptions().dtype(at::kDouble));
-    return -(2.0 * static_cast<double>(n) * (k * (std::numbers::pi / static_cast<double>(n))).sin()).square();
+    const auto n = static_cast<double>(grid.shape()[axis]);
+    return -((k * (std::numbers::pi / n)).sin() * (2.0 * n / grid.length(axis))).square();
   };
-  return along(shape[0], shape[0]).unsqueeze(1) + along(shape[1], shape[1] / 2 + 1);
+  return along(kY, grid.shape()[kY]).unsqueeze(1) + along(kX, grid.shape()[kX] / 2 + 1);
 }
 
 /// v with its Fourier coefficients divided by `symbol`.
@@ -27,8 +28,8 @@ at::Tensor divide_modes(const at::Tensor& v, const at::Tensor& symbol) {
 }
 
 /// u - G φ with D G φ = D u.
-at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor symbol) {
-  symbol = symbol.clone();
+at::Tensor without_divergence(const at::Tensor& u, const Grid& grid) {
+  const auto symbol = laplacian_symbol(grid);
   symbol[0][0] = 1.0;  // the mean of φ, which G does not see
   const auto divergence =
       forward_difference(u.narrow(1, 0, 1), grid, kX) + forward_difference(u.narrow(1, 1, 1), grid, kY);
@@ -38,16 +39,17 @@ at::Tensor without_divergence(const at::Tensor& u, const Grid& grid, at::Tensor 
 
 }  // namespace
 
-at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed) {
-  const Grid grid("random_flow", shape, Boundary::kPeriodic);
+at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed,
+                       const std::vector<double>& lengths) {
+  const Grid unit("random_flow", shape, Boundary::kPeriodic), grid("random_flow", shape, Boundary::kPeriodic, lengths);
   auto generator = make_generator(seed);
   const auto real = at::TensorOptions().dtype(at::kDouble);
-  const auto symbol = laplacian_symbol(shape);
+  const auto symbol = laplacian_symbol(unit);
   auto u = divide_modes(at::randn({samples, 2, shape[0], shape[1]}, generator, real), 1.0 - kSmoothing * symbol);
   u = u - u.mean({-2, -1}, /*keepdim=*/true);
   u = u / u.square().mean({-2, -1}, /*keepdim=*/true).sqrt();
   const auto pressure = at::zeros({samples, 1, shape[0], shape[1]}, real);
-  return at::cat({without_divergence(u, grid, symbol), pressure}, 1);
+  return at::cat({without_divergence(u, grid), pressure}, 1);
 }
 
 at::Tensor downsample(const at::Tensor& u) { return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2); }

@@ -4,9 +4,10 @@
 namespace prdp {
 
 /// Random initial flows (samples, 3, Ny, Nx) in float64 (paper, appendix E): standard normal noise, smoothed by one
-/// implicit heat step with ν Δt = 3e-3, then scaled to mean 0 and standard deviation 1 for each sample and component,
-/// then projected to zero discrete divergence. The pressure is 0.
-at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed);
+/// implicit heat step with ν Δt = 3e-3, in units of the sides of the domain, then scaled to mean 0 and standard
+/// deviation 1 for each sample and component, then projected to zero discrete divergence. The pressure is 0.
+at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64_t seed,
+                       const std::vector<double>& lengths = {});
 
 /// Every second point of the last two axes, at the indices 1, 3, …
 at::Tensor downsample(const at::Tensor& u);

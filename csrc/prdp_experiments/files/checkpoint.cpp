@@ -2,9 +2,12 @@
 
 #include <c10/util/Exception.h>
 
+#include <algorithm>
 #include <cstdlib>
+#include <utility>
 
 #include "prdp_experiments/files/seal.h"
+#include "prdp_experiments/files/whole_files.h"
 
 namespace prdp {
 
@@ -25,17 +28,6 @@ double seconds() {
   return value;
 }
 
-/// Gives the file a second name, which replaces that of an older one. Where it cannot, there is no second file.
-void keep_as(const fs::path& second, const fs::path& path) {
-  auto unfinished = second;
-  unfinished += ".part";  // what a kill leaves is removed with the other unfinished files
-  std::error_code error;
-  fs::remove(unfinished, error);
-  fs::create_hard_link(path, unfinished, error);
-  if (error) fs::copy_file(path, unfinished, error);  // not every file system has links
-  if (!error) fs::rename(unfinished, second, error);
-}
-
 }  // namespace
 
 Checkpoint::Checkpoint(fs::path path, std::string settings)
@@ -46,58 +38,54 @@ Checkpoint::Checkpoint(fs::path path, std::string settings)
 bool Checkpoint::due() const { return Clock::now() - last_ >= pause_; }
 
 void Checkpoint::write(std::string state) {
-  keep_as(before_, path_);
-  write_sealed(path_, kKind, {settings_, std::move(state)});
+  const auto file = seal(kKind, {settings_, std::move(state)});
+  last_is_good_ ? write_keeping({path_, file}, before_) : write_whole({path_, file});
+  last_is_good_ = true;
   last_ = Clock::now();
 }
 
-std::optional<std::string> Checkpoint::read() {
+std::vector<Checkpoint::Found> Checkpoint::find() {
   notice_.clear();
-  found_before_ = false;
-  std::optional<c10::ValueError> damage;
-  try {
-    if (auto state = found_in(path_)) return state;
-  } catch (const c10::ValueError& error) {
-    damage = error;
-  }
-  try {
-    if (auto state = found_in(before_)) {
-      if (damage) note_damage();
-      found_before_ = true;
-      return state;
-    }
-  } catch (const c10::ValueError& error) {
-    if (!damage) damage = error;
-  }
-  if (damage) throw *damage;
-  return std::nullopt;
+  std::vector<Found> found;
+  find_in(path_, found);
+  last_is_good_ = !found.empty() && found[0].wrong.empty();
+  find_in(before_, found);
+  const auto usable = [](const Found& one) { return one.wrong.empty(); };
+  if (!found.empty() && std::none_of(found.begin(), found.end(), usable))
+    refuse_damaged(found[0].path, kKind, found[0].wrong, kRemedy);
+  return found;
 }
 
-std::string Checkpoint::read_before() {
-  std::optional<std::string> state;
-  try {
-    if (!found_before_) state = found_in(before_);
-  } catch (const c10::ValueError&) {
-  }
-  if (!state) refuse();
-  note_damage();
-  return *std::move(state);
-}
-
-void Checkpoint::refuse() const { refuse_damaged(found_before_ ? before_ : path_, kKind, kRemedy); }
-
-/// None where the file is not there, or is of other settings, which it notes. Raises ValueError for a damaged one.
-std::optional<std::string> Checkpoint::found_in(const fs::path& path) {
-  auto found = read_sealed(path, kKind, kRemedy);
-  if (!found) return std::nullopt;
-  if (found->settings == settings_) return std::move(found->content);
+void Checkpoint::find_in(const fs::path& path, std::vector<Found>& found) {
+  auto opened = open_sealed(path, kKind);
+  if (!opened) return;
+  if (!opened->sealed) return found.push_back({path, {}, opened->wrong});
+  if (opened->sealed->settings == settings_) return found.push_back({path, std::move(opened->sealed->content), {}});
   if (notice_.empty())
     notice_ = c10::str("checkpoint: '", path.string(), "' is of other settings or another version; it is not used");
-  return std::nullopt;
 }
 
-void Checkpoint::note_damage() {
-  notice_ = c10::str("checkpoint: '", path_.string(), "' is damaged; the training goes on from the one before");
+bool Checkpoint::restore(const std::vector<Found>& found, const Load& load) {
+  const Found* first = nullptr;
+  std::string wrong;
+  for (const auto& one : found) {
+    auto fault = one.wrong;
+    if (fault.empty()) {
+      try {
+        Saved saved(unpack(one.state));
+        load(saved);
+        saved.finish();
+        if (first) notice_ = damage(first->path, kKind, wrong) + "; the training goes on from the one before";
+        return true;
+      } catch (const c10::ValueError& error) {
+        fault = error.what_without_backtrace();
+      }
+    }
+    if (one.path == path_) last_is_good_ = false;
+    if (!std::exchange(first, first ? first : &one)) wrong = fault;
+  }
+  if (first) refuse_damaged(first->path, kKind, wrong, kRemedy);
+  return false;
 }
 
 void Checkpoint::check_length(int64_t done, int64_t intervals) const {

@@ -2,14 +2,17 @@
 #include <chrono>
 #include <cstdint>
 #include <filesystem>
-#include <optional>
+#include <functional>
 #include <string>
+#include <vector>
+
+#include "prdp_experiments/files/saved.h"
 
 namespace prdp {
 
-/// The file that keeps a training while it runs: every trainer puts its own state into it, as bytes. It also holds
-/// the settings that the state belongs to, and the fingerprint of both (seal.h). The one before is kept as well, under
-/// the same name with ".before" behind it.
+/// The file that keeps a training while it runs: every trainer puts its own state into it, as named tensors. It also
+/// holds the settings that the state belongs to, and the fingerprint of both (seal.h). The one before is kept as well,
+/// under the same name with ".before" behind it.
 class Checkpoint {
  public:
   /// `settings`: one line, all that the state depends on. A checkpoint is due every ten seconds, or every
@@ -21,16 +24,23 @@ class Checkpoint {
   /// Replaces the file, whole or not at all. Raises ValueError, naming it, where it cannot be written; the last one is
   /// then still there.
   void write(std::string state);
-  /// The state last written; that of the one before where the last is damaged, missing or of other settings; none
-  /// where there is neither. Raises ValueError, naming the file and the remedy, for a damaged one without another.
-  std::optional<std::string> read();
-  /// The state of the one before, for a trainer that can make no sense of what read() has returned. Raises that
-  /// ValueError where there is none, or read() has returned it already.
-  std::string read_before();
-  /// Raises that ValueError: where the trainer can make no sense of the one before either.
-  [[noreturn]] void refuse() const;
-  /// What was wrong with files that the last call of the two passed over, in a sentence; empty where nothing was.
+
+  /// One of the two files, as it was found: its state, or what is wrong with it.
+  struct Found {
+    std::filesystem::path path;
+    std::string state, wrong;
+  };
+  /// Those that are there, the last one first, without those of other settings, which it notes. Raises ValueError,
+  /// naming the file, what is wrong and the remedy, if there are only damaged ones.
+  std::vector<Found> find();
+  /// Takes what a trainer needs out of the tensors. Raises ValueError where they are not of its training.
+  using Load = std::function<void(Saved&)>;
+  /// Loads the first that load() accepts, and notes what was wrong with the one before it. A state that load() refuses
+  /// may have been taken in part. Returns false if nothing was found, and raises that ValueError if it accepts none.
+  bool restore(const std::vector<Found>& found, const Load& load);
+  /// What was wrong with files that the two have passed over, in a sentence; empty where nothing was.
   const std::string& notice() const { return notice_; }
+
   /// Raises ValueError for a state of more intervals than the training is to have.
   void check_length(int64_t done, int64_t intervals) const;
   /// Removes both files, where they are there. Raises ValueError where one cannot be removed.
@@ -41,15 +51,14 @@ class Checkpoint {
  private:
   using Clock = std::chrono::steady_clock;
 
-  std::optional<std::string> found_in(const std::filesystem::path& path);
-  void note_damage();
+  void find_in(const std::filesystem::path& path, std::vector<Found>& found);
 
   std::filesystem::path path_, before_;
   std::string settings_;
   std::chrono::duration<double> pause_;
   Clock::time_point last_ = Clock::now();
   std::string notice_;
-  bool found_before_ = false;  // that read() has returned the state of the one before
+  bool last_is_good_ = true;  // and becomes the one before
 };
 
 }  // namespace prdp

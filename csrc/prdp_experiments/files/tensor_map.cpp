@@ -14,14 +14,4 @@ std::string pack(const TensorMap& tensors) {
   return {bytes.data(), bytes.size()};
 }
 
-const at::Tensor& entry(const TensorMap& tensors, const std::string& name, at::ScalarType dtype,
-                        at::IntArrayRef sizes) {
-  const auto found = tensors.find(name);
-  TORCH_CHECK_VALUE(found != tensors.end(), "no tensor '", name, "'");
-  const auto& tensor = found->second;
-  TORCH_CHECK_VALUE(tensor.defined() && tensor.scalar_type() == dtype && tensor.sizes() == sizes, "tensor '", name,
-                    "' is not ", dtype, " of sizes ", sizes);
-  return tensor;
-}
-
 }  // namespace prdp

@@ -16,7 +16,4 @@ std::string pack(const TensorMap& tensors);
 /// them is run, and memory is taken in proportion to their length. Raises ValueError for other bytes.
 TensorMap unpack(std::string_view bytes);
 
-/// The tensor of this name. Raises ValueError if there is none of this dtype and these sizes.
-const at::Tensor& entry(const TensorMap& tensors, const std::string& name, at::ScalarType dtype, at::IntArrayRef sizes);
-
 }  // namespace prdp

@@ -26,11 +26,18 @@ using Value = std::variant<std::monostate, int64_t, std::string_view, Name, Item
 struct Items : std::vector<Value> {};
 
 at::ScalarType dtype_of(const Name& storage) {
-  static const std::unordered_map<std::string_view, at::ScalarType> known{
-      {"DoubleStorage", at::kDouble},     {"FloatStorage", at::kFloat}, {"HalfStorage", at::kHalf},
-      {"BFloat16Storage", at::kBFloat16}, {"LongStorage", at::kLong},   {"IntStorage", at::kInt},
-      {"ShortStorage", at::kShort},       {"CharStorage", at::kChar},   {"ByteStorage", at::kByte},
-      {"BoolStorage", at::kBool}};
+  static const std::unordered_map<std::string_view, at::ScalarType> known{{"DoubleStorage", at::kDouble},
+                                                                          {"FloatStorage", at::kFloat},
+                                                                          {"HalfStorage", at::kHalf},
+                                                                          {"BFloat16Storage", at::kBFloat16},
+                                                                          {"LongStorage", at::kLong},
+                                                                          {"IntStorage", at::kInt},
+                                                                          {"ShortStorage", at::kShort},
+                                                                          {"CharStorage", at::kChar},
+                                                                          {"ByteStorage", at::kByte},
+                                                                          {"BoolStorage", at::kBool},
+                                                                          {"ComplexFloatStorage", at::kComplexFloat},
+                                                                          {"ComplexDoubleStorage", at::kComplexDouble}};
   return known.at(storage.name);
 }
 

@@ -3,7 +3,7 @@
 #include <caffe2/serialize/inline_container.h>
 #include <torch/csrc/jit/serialization/pickler.h>
 
-#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/files/saved.h"
 #include "prdp_experiments/files/whole_files.h"
 
 namespace prdp {
@@ -17,16 +17,6 @@ TensorMap read(std::string_view bytes) {
     TORCH_CHECK_VALUE(false,
                       "weights: expected a dict of tensors, as torch.save(network.state_dict(), path) writes it");
   }
-}
-
-/// The tensor of this name. Raises ValueError if there is none like `wanted`.
-const at::Tensor& found(const TensorMap& state, const std::string& name, const at::Tensor& wanted) {
-  const auto entry = state.find(name);
-  TORCH_CHECK_VALUE(entry != state.end(), "weights: there is no tensor '", name, "'");
-  const auto& tensor = entry->second;
-  TORCH_CHECK_VALUE(tensor.sizes() == wanted.sizes() && tensor.scalar_type() == wanted.scalar_type(), "weights: '",
-                    name, "' must be ", wanted.scalar_type(), " of sizes ", wanted.sizes());
-  return tensor;
 }
 
 }  // namespace
@@ -56,19 +46,23 @@ std::string pack_weights(const torch::nn::Module& network) {
 }
 
 void unpack_weights(const std::string& bytes, torch::nn::Module& network) {
-  const auto state = read(bytes);
+  Saved state(read(bytes));
   const auto weights = network.named_parameters();
-  TORCH_CHECK_VALUE(state.size() == weights.size(), "weights: the network has ", weights.size(), " tensors, the file ",
-                    state.size());
   std::vector<at::Tensor> tensors;
-  for (const auto& weight : weights) tensors.push_back(found(state, weight.key(), weight.value()));
+  try {
+    for (const auto& weight : weights)
+      tensors.push_back(state.take(weight.key(), weight.value().scalar_type(), weight.value().sizes()));
+    state.finish();
+  } catch (const c10::ValueError& error) {
+    TORCH_CHECK_VALUE(false, "weights: ", error.what_without_backtrace());
+  }
   const torch::NoGradGuard no_grad;
   for (size_t i = 0; i < tensors.size(); ++i) weights[i].value().detach().copy_(tensors[i]);
 }
 
 void save_weights(const std::filesystem::path& path, const torch::nn::Module& network) {
   const auto bytes = pack_weights(network);
-  write_whole({{path, bytes}});
+  write_whole({path, bytes});
 }
 
 void load_weights(const std::filesystem::path& path, torch::nn::Module& network) {

@@ -20,6 +20,12 @@ class KeyRecorder {
     KeyRecorder inner(keys_, key.name);
     read(inner, scene);
   }
+  template <class Read>
+  void section_or_text(Scene& scene, const std::string&, Read read, const char* form, const Key& key) {
+    section(scene, read, key);
+    for (auto& entry : keys_)
+      if (entry.table == table_ && entry.name == key.name) entry.value += c10::str(", or text `", form, "`");
+  }
   void text(const std::string& target, const Key& key) { add(key, "text", quoted(target), false); }
   void choice(const std::string& target, const Choices& choices, const Key& key) {
     add(key, names(choices), quoted(target), false);
@@ -51,6 +57,9 @@ class KeyRecorder {
     add(key, "whole numbers >= " + written(least), written(target), false);
   }
   void numbers(const std::vector<double>& target, const Key& key) { add(key, "numbers", written(target), false); }
+  void sides(const std::vector<double>&, size_t, const Key& key) {
+    add(key, "number > 0, or a list of them", "1", false);
+  }
   void check(bool, const char*, const char*) const {}
 
  private:

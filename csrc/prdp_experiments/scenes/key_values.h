@@ -38,6 +38,9 @@ class KeyValues {
     write(value, key);
   }
   void wholes(const std::vector<int64_t>& value, int64_t, const Key& key) { write(at::IntArrayRef(value), key); }
+  void sides(const std::vector<double>& value, size_t, const Key& key) {
+    for (const double x : value) write(x, key);
+  }
   void check(bool, const char*, const char*) const {}
 
   std::string line() const { return text_.str(); }

@@ -22,9 +22,9 @@ Solver Scene::reference_solver() const {
 }
 
 Stepper Scene::stepper(Solver with) const {
-  Equation equation{physics.equation, physics.shape, {}, {}};
+  Equation equation{physics.equation, physics.shape, physics.lengths, {}};
   if (physics.equation != "poisson") {
-    equation.parameters = {physics.dt};
+    equation.parameters.insert(equation.parameters.begin(), physics.dt);
     equation.tensors = {at::scalar_tensor(physics.nu, at::kDouble)};
   }
   return {std::move(equation), options(std::move(with))};

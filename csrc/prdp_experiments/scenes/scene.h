@@ -6,12 +6,9 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/steppers/steppers.h"
+#include "prdp_experiments/files/most_counted.h"
 
 namespace prdp {
-
-/// The largest number of seeds, intervals or iterations that a scene or a command may ask for. Costs are products of
-/// these numbers, and the limit keeps them from overflowing.
-inline constexpr int64_t kMostCounted = 1'000'000'000;
 
 /// A training experiment: the content of a scene file. Python and C++ share this reader.
 struct Scene {
@@ -25,8 +22,11 @@ struct Scene {
     std::string equation;
     std::vector<int64_t> shape;
     double nu = 0.0, dt = 0.0;  // length²/time, time; poisson has neither, diffusion no nu
+    std::vector<double> lengths{};  // the sides of the domain, as a Grid takes them: empty where all are 1
 
     bool periodic() const;  // of the grid
+    /// The side of the domain along an axis of `shape`.
+    double length(int64_t axis) const { return lengths.empty() ? 1.0 : lengths[axis]; }
     /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
     int64_t channels() const;
     /// Whether an exact solve costs about as much as an iterative one. On periodic grids of two and more dimensions it
@@ -39,12 +39,13 @@ struct Scene {
     // For a corrector: the grid of the reference solution, and the K of the converged solves behind the metric.
     std::vector<int64_t> reference_shape{};
     int64_t valid_max_iter = 0;
-    // HDF5 file of trajectories in place of random initial states, relative to the folder of the scene file; empty if
-    // there is none. Only the Python trainer reads it.
+    // HDF5 or .npz file of trajectories in place of random initial states, relative to the folder of the scene file;
+    // empty if there is none. Only the Python trainer reads it.
     std::string file{};
     bool fresh = false;  // new training samples in every epoch (fresh_data.h)
   };
   struct Network {
+    std::string python{};  // "module:Class" of the Python trainer, in place of all the rest
     std::string kind;             // "mlp" or "resnet"
     std::vector<int64_t> hidden;  // mlp
     int64_t blocks = 0, width = 0;  // resnet

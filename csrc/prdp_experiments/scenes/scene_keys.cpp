@@ -1,5 +1,7 @@
 #include <algorithm>
 #include <filesystem>
+#include <functional>
+#include <numeric>
 
 #include "prdp/solvers/methods.h"
 #include "prdp_experiments/files/whole_files.h"
@@ -45,6 +47,13 @@ void read_physics(Section& s, Scene& scene) {
   s.wholes(p.shape, 1, {"shape", "unknowns per axis, in 1 to 3 axes: `[N]`, `[Ny, Nx]` or `[Nz, Ny, Nx]`"});
   s.check(!p.shape.empty() && p.shape.size() <= 3, "shape", "expected 1 to 3 extents");
   s.check(p.shape.size() == 2 || !corrector(scene).holds, "shape", "expected 2 extents");
+  s.check(std::accumulate(p.shape.begin(), p.shape.end(), 1.0, std::multiplies<>()) <= kMostCounted, "shape",
+          "expected at most 1000000000 unknowns");
+  s.sides(p.lengths, p.shape.size(),
+          {.name = "length",
+           .means = "side of the domain, one number or one per axis in the order of `shape`",
+           .unit = "length",
+           .optional = true});
   const When has_nu{p.equation != "poisson" && p.equation != "diffusion", "not for `poisson` and `diffusion`"};
   const When has_dt{p.equation != "poisson", "not for `poisson`"};
   s.at_least(p.nu, 0.0, {"nu", "viscosity or diffusivity", "length²/time", has_nu});
@@ -74,7 +83,7 @@ template <class Section>
 void read_data(Section& s, Scene& scene) {
   auto& d = scene.data;
   s.text(d.file, {.name = "file",
-                  .means = "HDF5 file of trajectories, in place of random initial states",
+                  .means = "HDF5 or `.npz` file of trajectories, in place of random initial states",
                   .unit = "path relative to the scene file",
                   .optional = true});
   const When random{d.file.empty(), "not with `file`"};
@@ -108,6 +117,11 @@ void read_network(Section& s, Scene& scene) {
   s.wholes(n.hidden, 1, {"hidden", "widths of the hidden layers", "", mlp});
   s.whole(n.blocks, 1, {"blocks", "residual blocks", "", resnet});
   s.whole(n.width, 1, {"width", "channels of the blocks", "", resnet});
+  constexpr int64_t kWidest = 1'000'000, kMostBlocks = 10'000;
+  s.check(std::all_of(n.hidden.begin(), n.hidden.end(), [](int64_t width) { return width <= kWidest; }), "hidden",
+          "expected layers of at most 1000000 units");
+  s.check(n.width <= kWidest, "width", "expected at most 1000000 channels");
+  s.check(n.blocks <= kMostBlocks, "blocks", "expected at most 10000 blocks");
   s.flag(n.zero_output, {.name = "zero_output", .means = "whether the last layer starts at zero", .optional = true});
 }
 
@@ -207,7 +221,12 @@ void read_all(Section& s, Scene& scene) {
   s.section(scene, read_physics<Section>, {"physics", "the equation"});
   s.section(scene, read_solver<Section>, {"solver", "the solver in the training"});
   s.section(scene, read_data<Section>, {"data", "training and validation samples", "", network(scene)});
-  s.section(scene, read_network<Section>, {"network", "the network", "", network(scene)});
+  s.section_or_text(scene, scene.network.python, read_network<Section>, "module:Class",
+                    {"network", "the network, or a class of your own for the Python trainer", "", network(scene)});
+  const auto& own = scene.network.python;
+  const auto colon = own.find(':');
+  const bool two_names = colon != own.npos && colon > 0 && colon + 1 < own.size() && own.rfind(':') == colon;
+  s.check(own.empty() || two_names, "network", "expected a table, or \"module:Class\"");
   s.section(scene, read_training<Section>, {"training", "loss, optimiser and length"});
   s.section(scene, read_field<Section>, {"field", "the diffusivity field and its snapshots", "", field(scene)});
   s.section(scene, read_parameters<Section>, {"parameters", "the amplitudes", "", parameters(scene)});

@@ -1,6 +1,7 @@
 #pragma once
 #include <c10/util/Exception.h>
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <set>
@@ -50,6 +51,13 @@ class TomlSection {
     TomlSection section(*inner, file_, full(key.name));
     read(section, scene);
     section.finish();
+  }
+  /// Reads an inner table, or a text in its place.
+  template <class Read>
+  void section_or_text(Scene& scene, std::string& target, Read read, const char* form, const Key& key) {
+    if (!table_[key.name].is_string()) return section(scene, read, key);
+    text(target, key);
+    if (target.empty()) fail(key.name, std::string("expected a table, or \"") + form + '"');
   }
   void text(std::string& target, const Key& key) {
     if (given(key)) target = value<std::string>(key.name, "a string");
@@ -114,6 +122,16 @@ class TomlSection {
   }
   void numbers(std::vector<double>& target, const Key& key) {
     if (given(key)) target = values<double>(key.name, "numbers");
+  }
+  /// A number > 0 for each axis, or one for all of them. They are left out where all are 1.
+  void sides(std::vector<double>& target, size_t axes, const Key& key) {
+    if (!given(key)) return;
+    if (table_[key.name].is_array()) target = values<double>(key.name, "numbers");
+    else target.assign(axes, value<double>(key.name, "a number, or a list of numbers"));
+    if (target.size() != axes) fail(key.name, "expected one number, or one per axis");
+    for (const double x : target)
+      if (!(x > 0.0) || !std::isfinite(x)) fail(key.name, bound(">", 0.0, x) + " and be finite");
+    if (std::all_of(target.begin(), target.end(), [](double x) { return x == 1.0; })) target.clear();
   }
   /// A condition on what has been read already.
   void check(bool holds, const char* key, const std::string& expected) const {

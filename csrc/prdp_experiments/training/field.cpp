@@ -18,12 +18,12 @@ FieldTraining::FieldTraining(const Scene& scene, Solver solver, int64_t seed)
 void FieldTraining::update(int64_t number, const OnUpdate& on_update) {
   for (auto& group : optimiser_.param_groups()) group.options().set_lr(scene_.learning_rate(number));
   optimiser_.zero_grad();
-  const auto [coefficients, offsets] = diffusion_stencil(theta_.exp(), scene_.physics.dt);
+  const auto [coefficients, offsets] = diffusion_stencil(theta_.exp(), scene_.physics.dt, scene_.physics.lengths);
   assembled_ = stencil(coefficients, offsets, {Boundary::kPeriodic});
   auto states = step_.rollout(problem_.start, scene_.field.steps);
   if (scene_.on_failure == OnFailure::kZeroGrad) states = detach_failed(states, step_.info()->status);
   const auto squared = normalised_mse(observed(states, scene_), problem_.snapshots);
-  const auto loss = squared + scene_.field.smoothing * roughness(theta_);
+  const auto loss = squared + scene_.field.smoothing * roughness(theta_, scene_.physics.lengths);
   loss.backward();
   optimiser_.step();
   misfit_ = std::sqrt(squared.item<double>());
@@ -39,9 +39,9 @@ Task FieldTraining::task() {
         tensors["theta"] = theta_;
         optimiser_.save(tensors);
       },
-      [this](const TensorMap& tensors) {
-        theta_.detach().copy_(entry(tensors, "theta", theta_.scalar_type(), theta_.sizes()));
-        optimiser_.load(tensors);
+      [this](Saved& saved, int64_t updates) {
+        theta_.detach().copy_(saved.take("theta", theta_.scalar_type(), theta_.sizes()));
+        optimiser_.load(saved, updates);
       },
   };
 }

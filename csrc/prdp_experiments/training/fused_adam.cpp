@@ -51,7 +51,7 @@ void FusedAdam::save(TensorMap& tensors) const {
   const auto& parameters = param_groups()[0].params();
   for (size_t i = 0; i < parameters.size(); ++i) {
     const auto found = state_.find(parameters[i].unsafeGetTensorImpl());
-    if (found == state_.end()) continue;  // it had no gradient yet
+    TORCH_INTERNAL_ASSERT(found != state_.end());  // every update has a gradient for every parameter
     const auto& state = static_cast<const torch::optim::AdamParamState&>(*found->second);
     tensors[name_of(i, "step")] = at::tensor({state.step()}, at::kLong);
     tensors[name_of(i, "mean")] = state.exp_avg();
@@ -59,16 +59,16 @@ void FusedAdam::save(TensorMap& tensors) const {
   }
 }
 
-void FusedAdam::load(const TensorMap& tensors) {
+void FusedAdam::load(Saved& saved, int64_t updates) {
   const auto& parameters = param_groups()[0].params();
   for (size_t i = 0; i < parameters.size(); ++i) {
-    if (!tensors.contains(name_of(i, "step"))) continue;
     const auto dtype = parameters[i].scalar_type();
     const auto sizes = parameters[i].sizes();
     auto state = std::make_unique<torch::optim::AdamParamState>();
-    state->step(entry(tensors, name_of(i, "step"), at::kLong, {1}).item<int64_t>());
-    state->exp_avg(entry(tensors, name_of(i, "mean"), dtype, sizes).contiguous());
-    state->exp_avg_sq(entry(tensors, name_of(i, "square"), dtype, sizes).contiguous());
+    const Range steps{.least = static_cast<double>(updates), .most = static_cast<double>(updates)};
+    state->step(saved.list<int64_t>(name_of(i, "step"), 1, steps)[0]);
+    state->exp_avg(saved.take(name_of(i, "mean"), dtype, sizes).contiguous());
+    state->exp_avg_sq(saved.take(name_of(i, "square"), dtype, sizes, {.least = 0.0}).contiguous());
     state_[parameters[i].unsafeGetTensorImpl()] = std::move(state);
   }
 }

@@ -1,7 +1,7 @@
 #pragma once
 #include <torch/optim/adam.h>
 
-#include "prdp_experiments/files/tensor_map.h"
+#include "prdp_experiments/files/saved.h"
 
 namespace prdp::train {
 
@@ -13,10 +13,10 @@ class FusedAdam : public torch::optim::Adam {
   using Adam::Adam;
   torch::Tensor step(LossClosure closure = nullptr) override;
 
-  /// Steps and moments of the first group's parameters, by their order. Loading raises ValueError for tensors that
-  /// do not fit.
+  /// Steps and moments of the first group's parameters, by their order, after so many updates. Loading raises
+  /// ValueError for tensors that do not fit.
   void save(TensorMap& tensors) const;
-  void load(const TensorMap& tensors);
+  void load(Saved& saved, int64_t updates);
 };
 
 }  // namespace prdp::train

@@ -8,18 +8,18 @@
 #include <csignal>
 #include <cstdio>
 #include <filesystem>
-#include <nlohmann/json.hpp>
 #include <thread>
 #include <utility>
 
 #include "prdp/sentence.h"
+#include "prdp_experiments/files/record.h"
 #include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/files/whole_files.h"
 #include "prdp_experiments/training/training.h"
 
 namespace {
 
-using Json = nlohmann::ordered_json;
+using prdp::Json;
 namespace fs = std::filesystem;
 
 volatile std::sig_atomic_t interrupted = 0;
@@ -85,10 +85,10 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, c
 /// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on
 /// from.
 bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
-  const auto text = prdp::read_record(path);
-  if (!text) return false;
-  auto found = Json::parse(*text).value("settings", Json::object());
-  const auto intervals = found.value("intervals", int64_t{0});
+  const auto kept = prdp::read_training(path);
+  if (!kept) return false;
+  auto found = kept->at("settings");
+  const auto intervals = found.at("intervals").get<int64_t>();
   found.erase("intervals");
   const auto wanted = identity.scene.training.intervals;
   if (found != identity.settings()) return false;
@@ -96,7 +96,7 @@ bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& c
     checkpoint.remove_before(path);
     return true;
   }
-  if (!checkpoint.read()) prdp::refuse_finished(path, intervals, wanted);
+  if (checkpoint.find().empty()) prdp::refuse_finished(path, intervals, wanted);
   return false;
 }
 
@@ -138,12 +138,9 @@ int run(const Options& options, const std::string& command) {
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
     const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
+    prdp::settle_weights(file);
     auto checkpoint = checkpoint_of(file, options, identity, refinement.label, seed);
-    if (options.resume) {
-      if (is_done(file, identity, checkpoint)) continue;
-      checkpoint.read();
-      if (!checkpoint.notice().empty()) std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint.notice().c_str());
-    }
+    if (options.resume && is_done(file, identity, checkpoint)) continue;
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
       if (std::exchange(first, false) || done % 10 == 0)
@@ -153,12 +150,9 @@ int run(const Options& options, const std::string& command) {
       if (interrupted) throw Interrupted{};
       if (slow) std::fprintf(stderr, "data: %ld of %ld reference steps\n", done, total);
     };
-    const auto curves = prdp::train::train(scene, refinement, seed, identity.weights, on_interval, checkpoint, on_data);
-    const auto text = prdp::seal_record(text_of(record(identity, refinement.label, seed, command, curves), 1));
-    std::vector<prdp::NewFile> files;
-    if (!curves.weights.empty()) files.push_back({fs::path(file).replace_extension(".pt"), curves.weights});
-    files.push_back({file, text});
-    prdp::write_whole(files);
+    const auto curves = prdp::train::train(scene, refinement, seed, options.weights, on_interval, checkpoint, on_data);
+    const auto text = text_of(record(identity, refinement.label, seed, command, curves), 1);
+    prdp::write_training(file, text, curves.weights);
     checkpoint.remove();
     if (curves.diverged.empty()) {
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());

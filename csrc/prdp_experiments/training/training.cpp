@@ -25,6 +25,7 @@
 #include "prdp_experiments/training/field.h"
 #include "prdp_experiments/training/fused_adam.h"
 #include "prdp_experiments/training/loss.h"
+#include "prdp_experiments/training/progress.h"
 #include "prdp_experiments/training/state.h"
 
 namespace prdp::train {
@@ -89,7 +90,7 @@ class Run {
         watches_error_(refinement.watches_error),
         controller_(refinement.controller()),
         checkpoint_(checkpoint),
-        saved_(checkpoint.read()) {
+        found_(checkpoint.find()) {
     if (refinement.start)
       for (auto* stepper : steppers_) stepper->options().start = *refinement.start;
     take_budget();
@@ -98,12 +99,7 @@ class Run {
   Curves go(const Task& task, const OnInterval& on_interval) {
     const auto report = [&] { on_interval(done(), curves_.metric.back(), controller_->max_iter()); };
     try {
-      if (saved_) {
-        restore(task);
-        report();
-      } else {
-        observe(task, 0);
-      }
+      restores(task) ? report() : observe(task, 0);
       while (done() < intervals_) {
         run_interval(task, done() + 1);
         observe(task, done());
@@ -127,29 +123,23 @@ class Run {
   void keep(const Task& task) {
     TensorMap tensors;
     task.save(tensors);
-    save(tensors, curves_, *controller_);
+    save(tensors, curves_, controller_->state());
     checkpoint_.write(pack(tensors));
   }
 
-  void restore(const Task& task) {
-    if (!loads(task, *saved_)) {
-      if (!loads(task, checkpoint_.read_before())) checkpoint_.refuse();
-      std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint_.notice().c_str());
-    }
+  /// Whether there is a checkpoint to go on from.
+  bool restores(const Task& task) {
+    const bool there = checkpoint_.restore(found_, [&](Saved& saved) {
+      auto progress = load_progress(saved, task.updates_per_interval);
+      task.load(saved, static_cast<int64_t>(progress.curves.update_loss.size()));
+      controller_->load_state(std::move(progress.controller));
+      curves_ = std::move(progress.curves);
+    });
+    if (!checkpoint_.notice().empty()) std::fprintf(stderr, "prdp_train: warning: %s\n", checkpoint_.notice().c_str());
+    if (!there) return false;
     checkpoint_.check_length(done(), intervals_);
     take_budget();
-  }
-
-  /// Whether the state is one of this training. Where it is not, some of it may have been taken.
-  bool loads(const Task& task, const std::string& state) {
-    try {
-      const auto tensors = unpack(state);
-      task.load(tensors);
-      load(tensors, curves_, *controller_);
-      return true;
-    } catch (const c10::Error&) {
-      return false;
-    }
+    return true;
   }
 
   void run_interval(const Task& task, int64_t done) {
@@ -198,6 +188,8 @@ class Run {
     curves_.metric.push_back(metric);
     auto solves = last_solves({steppers_.begin(), steppers_.end()});
     solves.error = task.error(metric);
+    if (!std::isfinite(*solves.error))
+      throw Diverged{interval + ": the relative error is " + std::to_string(*solves.error)};
     curves_.error.push_back(*solves.error);
     controller_->step(watches_error_ ? *solves.error : metric, solves);
     curves_.warning = controller_->warning().value_or("");
@@ -231,7 +223,7 @@ class Run {
   bool watches_error_;
   std::unique_ptr<Controller> controller_;
   Checkpoint& checkpoint_;
-  std::optional<std::string> saved_;
+  std::vector<Checkpoint::Found> found_;
   Curves curves_;
 };
 
@@ -301,10 +293,12 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
   return {loss_of, metric};
 }
 
-Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed, const std::string& weights,
-                     const OnInterval& on_interval, const OnProgress& on_data) {
+Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t seed,
+                     const std::filesystem::path& weights, const OnInterval& on_interval, const OnProgress& on_data) {
+  TORCH_CHECK_VALUE(scene.network.python.empty(), "network: '", scene.network.python,
+                    "' is a class in Python, which prdp_train cannot make; run prdp train ", scene.path);
   auto network = make_network(scene, seed);
-  if (!weights.empty()) unpack_weights(weights, *network.ptr());
+  if (!weights.empty()) load_weights(weights, *network.ptr());
   auto data = make_dataset(scene, on_data);
   FreshData fresh(scene, data);
   const auto objective = scene.task == Scene::Task::kEmulator ? emulator(scene, steppers, data, network)
@@ -335,12 +329,12 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   };
   auto& module = *network.ptr();
   const auto save_all = [&](TensorMap& tensors) { save(tensors, module, optimiser, generator); };
-  const auto load_all = [&](const TensorMap& tensors) { load(tensors, module, optimiser, generator); };
+  const auto load_all = [&](Saved& saved, int64_t done) { load(saved, done, module, optimiser, generator); };
   // The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
   const auto error = [n = static_cast<double>(scene.data.valid_steps)](double squared) {
     return std::sqrt(squared) / n;
   };
-  auto curves = run.go({updates, metric, error, save_all, load_all}, on_interval);
+  auto curves = run.go({updates, metric, error, save_all, load_all, updates_of_epoch}, on_interval);
   curves.weights = pack_weights(module);
   return curves;
 }
@@ -364,15 +358,15 @@ Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const On
   };
   const auto metric = [&] { return relative_error(theta.detach(), problem.reference).item<double>(); };
   const auto save_theta = [&](TensorMap& tensors) { tensors["theta"] = theta; };
-  const auto load_theta = [&](const TensorMap& tensors) {
-    theta.detach().copy_(entry(tensors, "theta", theta.scalar_type(), theta.sizes()));
+  const auto load_theta = [&](Saved& saved, int64_t) {
+    theta.detach().copy_(saved.take("theta", theta.scalar_type(), theta.sizes()));
   };
   return run.go({updates, metric, [&](double) { return misfit; }, save_theta, load_theta}, on_interval);
 }
 
 }  // namespace
 
-Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::string& weights,
+Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::filesystem::path& weights,
              const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data) {
   TORCH_CHECK_VALUE(weights.empty() || scene.trains_network(), "weights: the scene '", scene.name,
                     "' trains no network");

@@ -1,0 +1,43 @@
+#include "prdp/steppers/memory.h"
+
+#include <ATen/Parallel.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <iomanip>
+#include <sstream>
+
+#include "prdp/solvers/methods.h"
+
+namespace prdp {
+
+namespace {
+
+std::string gigabytes(double bytes) {
+  std::ostringstream text;
+  text << std::setprecision(3) << bytes / 1e9 << " GB";
+  return text.str();
+}
+
+}  // namespace
+
+double physical_memory() {
+  return static_cast<double>(sysconf(_SC_PHYS_PAGES)) * static_cast<double>(sysconf(_SC_PAGE_SIZE));
+}
+
+void check_memory(const SolveOptions& options, const at::Tensor& b) {
+  const auto& solver = options.solver;
+  constexpr int64_t kAlwaysFits = 1000;
+  if (solver.restart <= kAlwaysFits || traits(solver.method).counts != Counts::kCycles) return;
+  if (!b.is_cpu() || b.dim() == 0 || b.numel() == 0) return;
+  const int64_t batch = b.size(0), unknowns = b.numel() / batch;
+  // The basis, and the products of its vectors with each other.
+  const auto m = static_cast<double>(std::min(solver.restart, unknowns));
+  const auto samples = static_cast<double>(std::min<int64_t>(batch, at::get_num_threads()));
+  const double bytes = samples * m * (static_cast<double>(unknowns) + m) * static_cast<double>(b.element_size());
+  TORCH_CHECK_VALUE(bytes <= physical_memory(), "GMRES: restart = ", solver.restart, " on ", unknowns,
+                    " unknowns would take ", gigabytes(bytes), ", and this machine has ", gigabytes(physical_memory()),
+                    "; lower restart");
+}
+
+}  // namespace prdp

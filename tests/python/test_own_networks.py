@@ -1,0 +1,156 @@
+"""`network = "module:Class"` in a scene file: trained, resumed, loaded again; what is wrong is said in words."""
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import assert_refused, written
+
+import prdp_torch as prdp
+from prdp_torch.experiments import _C, compare, records, scenes
+from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.refinement import Refinement
+
+TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
+SOURCE = """
+import torch
+{more}
+
+class Net(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.norm = torch.nn.BatchNorm1d(1)
+        self.layer = torch.nn.Linear(30, 30)
+        self.register_buffer("mask", torch.full((30,), float("inf")))
+
+    def forward(self, u):
+        return self.layer(self.norm(u)).minimum(self.mask)
+
+
+class Wide(torch.nn.Module):
+    def __init__(self, width):
+        super().__init__()
+
+
+Broken = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path, request):
+    """The name of a module beside the scene that no other test has imported."""
+    name = f"nets_{abs(hash(request.node.nodeid))}"
+    (tmp_path / f"{name}.py").write_text(SOURCE.format(more=""))
+    yield name
+    sys.modules.pop(name, None)
+
+
+def scene_with(tmp_path, network, name="own"):
+    """The path of a copy of heat_1d with this network."""
+    path = Path(written(tmp_path, ('[network]\nkind = "mlp"\nhidden = [64, 64, 64]\n', ""), name=name))
+    path.write_text(path.read_text().replace("task =", f'network = "{network}"\ntask =', 1))
+    return str(path)
+
+
+def trained(scene, folder, intervals=3, resume=False):
+    scene.training.intervals = intervals
+    return compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, folder, records.environment(), resume)
+
+
+def test_an_own_network_is_trained_and_found_again(tmp_path, module):
+    scene = scenes.load(scene_with(tmp_path, f"{module}:Net"))
+    curves = trained(scene, tmp_path / "run")
+    assert curves["metric"][-1] < curves["metric"][0]
+    del sys.modules[module]
+    emulator = prdp.load_trained(tmp_path / "run")
+    assert type(emulator.network).__name__ == "Net" and not emulator.network.training
+    data = _C.make_dataset(scene)
+    with torch.no_grad():
+        states = emulator.rollout(data.valid_start, 2)
+    assert float(_C.normalised_mse(states[:, -1], data.valid_end)) == pytest.approx(curves["metric"][-1], rel=1e-6)
+
+
+def test_the_seed_sets_its_weights(tmp_path, module):
+    scene = scenes.load(scene_with(tmp_path, f"{module}:Net"))
+    one, same, other = (make_network(scene, seed).layer.weight for seed in (0, 0, 1))
+    assert torch.equal(one, same) and not torch.equal(one, other)
+
+
+def test_the_command_trains_it_wherever_it_is_called(tmp_path, module):
+    scene = scene_with(tmp_path, f"{module}:Net")
+    command = [sys.executable, "-m", "prdp_torch", "train", scene, "--out", tmp_path / "run", "--intervals", "1"]
+    done = subprocess.run(command, cwd="/", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert prdp.load_trained(tmp_path / "run").network.mask.isinf().all()
+
+
+def test_a_changed_class_is_another_training_and_load_trained_warns(tmp_path, module):
+    scene = scenes.load(scene_with(tmp_path, f"{module}:Net"))
+    trained(scene, tmp_path / "run", intervals=1)
+    record = tmp_path / "run/prdp/seed_0.json"
+    before = record.read_bytes()
+    trained(scene, tmp_path / "run", intervals=1, resume=True)
+    assert record.read_bytes() == before
+    (tmp_path / f"{module}.py").write_text(SOURCE.format(more="# changed"))
+    with pytest.warns(UserWarning, match=f"{module}.py' has changed since the training"):
+        prdp.load_trained(tmp_path / "run")
+    trained(scene, tmp_path / "run", intervals=1, resume=True)
+    assert record.read_bytes() != before
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prdp.load_trained(tmp_path / "run")
+
+
+def test_the_cpp_trainer_says_that_it_cannot(tmp_path, module):
+    scene = scene_with(tmp_path, f"{module}:Net")
+    done = subprocess.run([TRAINER, scene, "--out", tmp_path / "cpp"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    words = f"network: '{module}:Net' is a class in Python, which prdp_train cannot make; run prdp train {scene}\n"
+    assert done.stderr == f"prdp_train: {words}"
+
+
+@pytest.mark.parametrize(
+    "network, message",
+    [
+        ("nowhere_at_all:Net", "there is no module 'nowhere_at_all' in '{folder}', nor where Python looks"),
+        ("{module}:Gone", "'{folder}/{module}.py' has no such name, Gone"),
+        ("{module}:Broken", "'{folder}/{module}.py' has no subclass of torch.nn.Module, Broken"),
+        ("os:abort", "has no subclass of torch.nn.Module, abort"),
+        ("{module}:Wide", "Wide() raised TypeError: "),
+    ],
+)
+def test_what_is_no_network_is_refused_in_words(tmp_path, module, network, message):
+    network = network.format(module=module)
+    scene = scenes.load(scene_with(tmp_path, network))
+    with pytest.raises(ValueError) as error:
+        make_network(scene, 0)
+    text = str(error.value)
+    assert text.startswith(f"network: '{network}' of the scene '{scene.path}': ") and "\n" not in text
+    assert message.format(folder=tmp_path, module=module) in text
+
+
+def test_a_module_that_raises_is_refused_in_words(tmp_path, module):
+    scene = scenes.load(scene_with(tmp_path, f"{module}:Net"))
+    for more, words in (
+        ("1 / 0", "raised ZeroDivisionError: division"),
+        ("import gone_gone", "raised No module named"),
+    ):
+        (tmp_path / f"{module}.py").write_text(SOURCE.format(more=more))
+        with pytest.raises(ValueError, match=f"network: .*its module {words}"):
+            make_network(scene, 0)
+
+
+def test_two_modules_of_one_name_are_not_mistaken(tmp_path, module):
+    make_network(scenes.load(scene_with(tmp_path, f"{module}:Net")), 0)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / f"{module}.py").write_text(SOURCE.format(more=""))
+    with pytest.raises(ValueError, match=f"another module '{module}' is imported already, '{tmp_path}/{module}.py'"):
+        make_network(scenes.load(scene_with(tmp_path / "other", f"{module}:Net")), 0)
+
+
+@pytest.mark.parametrize("network", ["Net", ":Net", "nets:", "a:b:c", ""])
+def test_a_text_that_names_no_class_is_refused_with_its_line(tmp_path, network):
+    assert_refused(scene_with(tmp_path, network), "network =", 'network: expected a table, or "module:Class"')
