@@ -1,0 +1,143 @@
+"""The pictures of the tasks: each a matplotlib figure, made from the rows of a record."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.mosaic import solvers
+
+# Okabe and Ito's colours, which colour-blind readers can tell apart: one per library, a dash per variant.
+STYLES = {
+    "ours": ("#D55E00", "-", "o"),
+    "jax_cfd": ("#0072B2", "--", "^"),
+    "jax_cfd_central": ("#0072B2", "-", "^"),
+    "jax_cfd_cg": ("#0072B2", ":", "^"),
+    "phiflow": ("#009E73", "--", "s"),
+    "phiflow_central": ("#009E73", "-", "s"),
+    "exponax": ("#CC79A7", "-", "D"),
+    "torch_fem": ("#009E73", "-", "s"),
+    "scipy": ("#222222", "-", "D"),
+}
+
+
+def of(task, rows):
+    """{file name: figure} of a task; nothing where there is nothing to draw."""
+    rows = [row for row in rows if "result" in row]
+    return DRAWN[task](rows) if rows and task in DRAWN else {}
+
+
+def cost(rows):
+    found = {}
+    for dim in (2, 3):
+        of_dim = [row for row in rows if row["case"]["dim"] == dim]
+        if of_dim:
+            found[f"cost_{dim}d"] = _cost(of_dim, dim)
+    return found
+
+
+def _cost(rows, dim):
+    """Rows: seconds, memory. Columns: against N at the steps most cases share, against steps at their N."""
+    steps, n = _usual(rows, "steps"), _usual(rows, "n")
+    figure = Figure(figsize=(10.5, 7.4), layout="constrained")
+    panels = figure.subplots(2, 2, sharey="row", sharex="col")
+    columns = (("n", "steps", steps, f"N, {steps} steps"), ("steps", "n", n, f"steps, N = {n}"))
+    for panel_row, (key, name, scale) in zip(
+        panels, (("seconds", "seconds", 1.0), ("bytes", "MB at the peak", 1e-6)), strict=True
+    ):
+        for axes, (along, fixed, value, label) in zip(panel_row, columns, strict=True):
+            chosen = [row for row in rows if row["case"][fixed] == value]
+            for part, face in (("gradient", None), ("forward", "white")):
+                _lines(
+                    axes, chosen, lambda r: r["case"][along], lambda r: scale * r["result"][f"{part}_{key}"], face  # noqa: B023
+                )
+            axes.set(xscale="log", yscale="log")
+            ticks = sorted({row["case"][along] for row in chosen})
+            axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+            axes.minorticks_off()
+            if panel_row is panels[-1]:
+                axes.set(xlabel=label)
+        panel_row[0].set(ylabel=name)
+    figure.suptitle(f"A rollout in {dim}D and its gradient (filled), and the rollout alone (white)")
+    _legend(figure, panels[0, 0], panels[0, 1])
+    return figure
+
+
+def _usual(rows, key):
+    values = [row["case"][key] for row in rows]
+    return max(sorted(set(values)), key=lambda value: len({str(r["case"]) for r in rows if r["case"][key] == value}))
+
+
+def gradient(rows):
+    figure = Figure(figsize=(10.5, 4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, dim in zip(panels, (2, 3), strict=True):
+        of_dim = [row for row in rows if row["case"]["dim"] == dim and row["result"]["finite"]]
+        _lines(axes, of_dim, lambda r: r["case"]["steps"], lambda r: r["result"]["median_error"])
+        axes.set(xscale="log", yscale="log", xlabel="steps", title=f"{dim}D, 16 cells per axis")
+    panels[0].set(ylabel="median relative error of the gradient")
+    _legend(figure, *panels)
+    return {"gradient": figure}
+
+
+def design(rows):
+    figure = Figure(figsize=(10.5, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for row in rows:
+        colour, line, _ = STYLES[row["solver"]]
+        label = solvers.FLOWS[row["solver"]].label
+        left.plot(row["result"]["drags"], color=colour, ls=line, label=label)
+        profile = row["result"]["profile"]
+        right.plot(profile, (np.arange(len(profile)) + 0.5) / len(profile), color=colour, ls=line)
+    left.set(xlabel="iteration", ylabel="mean drag")
+    right.set(xlabel="velocity of the inflow", ylabel="y")
+    _legend(figure, left)
+    return {"design": figure}
+
+
+def recovery(rows):
+    figure = Figure(figsize=(7.5, 4), layout="constrained")
+    axes = figure.subplots()
+    for row in rows:
+        colour, line, _ = STYLES[row["solver"]]
+        losses = row["result"]["losses"]
+        label = solvers.FLOWS[row["solver"]].label
+        axes.plot(1 + np.arange(len(losses)), losses, color=colour, ls=line, label=label)
+    axes.set(yscale="log", xlabel="iteration of L-BFGS", ylabel="mean squared misfit")
+    _legend(figure, axes)
+    return {"recovery": figure}
+
+
+def conduction(rows):
+    rows = [row for row in rows if row["case"]["what"] == "cost"]
+    figure = Figure(figsize=(10.5, 4), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for axes, (key, name, scale) in zip(
+        panels, (("seconds", "seconds", 1.0), ("bytes", "MB at the peak", 1e-6)), strict=True
+    ):
+        for part, face in (("gradient", None), ("forward", "white")):
+            _lines(axes, rows, lambda r: r["case"]["nx"], lambda r: scale * r["result"][f"{part}_{key}"], face)  # noqa: B023
+        axes.set(xscale="log", yscale="log", xlabel="cells along x", ylabel=name)
+    _legend(figure, *panels, family=solvers.CONDUCTION)
+    return {"conduction": figure} if rows else {}
+
+
+def _lines(axes, rows, x, y, face=None):
+    """A line per solver through its rows."""
+    for name, (colour, line, mark) in STYLES.items():
+        points = sorted((x(row), y(row)) for row in rows if row["solver"] == name)
+        if points:
+            axes.plot(*zip(*points, strict=True), color=colour, ls=line, marker=mark, mfc=face or colour, ms=5,
+                      label=name if face is None else None)  # fmt: skip
+    axes.grid(alpha=0.3, lw=0.4)
+
+
+def _legend(figure, *panels, family=solvers.FLOWS):
+    """One entry per solver, whichever panel it is in."""
+    handles = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(family[label].label if label in family else label, handle)
+    if handles:
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False)
+
+
+DRAWN = {"cost": cost, "gradient": gradient, "design": design, "recovery": recovery, "conduction": conduction}
