@@ -14,6 +14,7 @@ STYLES = {
     "phiflow": ("#009E73", "--", "s"),
     "phiflow_central": ("#009E73", "-", "s"),
     "exponax": ("#CC79A7", "-", "D"),
+    "exponax_stored": ("#CC79A7", ":", "D"),
     "torch_fem": ("#009E73", "-", "s"),
     "scipy": ("#222222", "-", "D"),
 }
@@ -46,9 +47,7 @@ def _cost(rows, dim):
         for axes, (along, fixed, value, label) in zip(panel_row, columns, strict=True):
             chosen = [row for row in rows if row["case"][fixed] == value]
             for part, face in (("gradient", None), ("forward", "white")):
-                _lines(
-                    axes, chosen, lambda r: r["case"][along], lambda r: scale * r["result"][f"{part}_{key}"], face  # noqa: B023
-                )
+                _lines(axes, chosen, along, f"{part}_{key}", scale, face)
             axes.set(xscale="log", yscale="log")
             ticks = sorted({row["case"][along] for row in chosen})
             axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
@@ -71,7 +70,7 @@ def gradient(rows):
     panels = figure.subplots(1, 2, sharey=True)
     for axes, dim in zip(panels, (2, 3), strict=True):
         of_dim = [row for row in rows if row["case"]["dim"] == dim and row["result"]["finite"]]
-        _lines(axes, of_dim, lambda r: r["case"]["steps"], lambda r: r["result"]["median_error"])
+        _lines(axes, of_dim, "steps", "median_error")
         axes.set(xscale="log", yscale="log", xlabel="steps", title=f"{dim}D, 16 cells per axis")
     panels[0].set(ylabel="median relative error of the gradient")
     _legend(figure, *panels)
@@ -114,16 +113,16 @@ def conduction(rows):
         panels, (("seconds", "seconds", 1.0), ("bytes", "MB at the peak", 1e-6)), strict=True
     ):
         for part, face in (("gradient", None), ("forward", "white")):
-            _lines(axes, rows, lambda r: r["case"]["nx"], lambda r: scale * r["result"][f"{part}_{key}"], face)  # noqa: B023
+            _lines(axes, rows, "nx", f"{part}_{key}", scale, face)
         axes.set(xscale="log", yscale="log", xlabel="cells along x", ylabel=name)
     _legend(figure, *panels, family=solvers.CONDUCTION)
     return {"conduction": figure} if rows else {}
 
 
-def _lines(axes, rows, x, y, face=None):
-    """A line per solver through its rows."""
+def _lines(axes, rows, along, value, scale=1.0, face=None):
+    """A line per solver: a number of the result against one of the case."""
     for name, (colour, line, mark) in STYLES.items():
-        points = sorted((x(row), y(row)) for row in rows if row["solver"] == name)
+        points = sorted((row["case"][along], scale * row["result"][value]) for row in rows if row["solver"] == name)
         if points:
             axes.plot(*zip(*points, strict=True), color=colour, ls=line, marker=mark, mfc=face or colour, ms=5,
                       label=name if face is None else None)  # fmt: skip

@@ -32,8 +32,17 @@ class Record:
 
     def add(self, solver, case, found):
         self.rows = [row for row in self.rows if (row["solver"], row["case"]) != (solver, case)]
-        self.rows.append({"solver": solver, "case": case, "commit": self.head["commit"], **found})
+        self.rows.append({"solver": solver, "case": case, "commit": self.head["commit"], **_short(found)})
         records.write(self.path, {**self.head, "rows": self.rows})
+
+
+def _short(value):
+    """Numbers to six digits, so that records stay small."""
+    if isinstance(value, dict):
+        return {key: _short(of_key) for key, of_key in value.items()}
+    if isinstance(value, list):
+        return [_short(entry) for entry in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def run(task, names, folder, environment, quick, again, limit, report):
@@ -41,8 +50,8 @@ def run(task, names, folder, environment, quick, again, limit, report):
     module, known = family(task)
     record = Record(folder / f"{task}.json", environment, quick)
     for case in module.cases(quick):
-        for name in known if names is None else [name for name in names if name in known]:
-            if record.has(name, case) and not again:
+        for name in (name for name in known if names is None or name in names):
+            if task not in (known[name].tasks or (task,)) or (record.has(name, case) and not again):
                 continue
             found = in_a_process(task, name, case, limit)
             record.add(name, case, found)

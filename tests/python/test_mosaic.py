@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
+import prdp_torch as prdp
 from benchmarks.mosaic import case as cases_
 from benchmarks.mosaic import charts, differences, fields, optimise, reference, runner, solvers, tables, tasks
 from benchmarks.mosaic.solvers.ours_conduction import Ours as Volumes
+from benchmarks.mosaic.tasks import forward, gradient
 from benchmarks.mosaic.tasks.conduction import Plate
 from benchmarks.mosaic.tasks.design import Cylinder
 
@@ -126,6 +128,20 @@ def test_conduction_reaches_the_closed_forms_and_its_gradient_the_differences():
     wrong = differences.compare(volumes.forward, rho, 1.01 * volumes.compliance(rho)[1], directions=5)
     assert wrong["median_error"] == pytest.approx(0.01, rel=0.1)  # the best of the steps
     assert differences.compare(volumes.forward, rho, np.full_like(rho, np.nan), directions=5) == {"finite": False}
+
+
+@pytest.mark.skipif(not hasattr(prdp, "Flow"), reason="this prdp_torch has no Flow")
+def test_this_library_runs_the_tasks():
+    flow = solvers.load(solvers.FLOWS, "ours")
+    exact = forward.run(flow, {"field": "taylor_green", "n": 32, "nu": 0.05, "dt": 0.01, "steps": 10})
+    assert exact["error"] < 1e-2 and exact["divergence"] < 1e-4
+    compared = gradient.run(flow, {"dim": 2, "n": 8, "steps": 3})
+    assert compared["cosine"] > 0.99999 and compared["median_error"] < 1e-4
+    cylinder = Cylinder(n=32, steps=6)
+    mean_drag, flat = flow(cylinder.box()).mean_drag(cylinder), np.full(32, cylinder.speed)
+    direction = np.random.default_rng(0).standard_normal(32)
+    slope = (mean_drag(flat + 0.03 * direction)[0] - mean_drag(flat - 0.03 * direction)[0]) / 0.06
+    assert mean_drag(flat)[1] @ direction == pytest.approx(slope, rel=1e-2)
 
 
 def test_adam_walks_by_its_learning_rate():

@@ -42,16 +42,20 @@ class Entry(NamedTuple):
     cls: str
     needs: str  # the package, as it is imported
     label: str
+    tasks: tuple = None  # those that it is for, all where this is None
 
 
 FLOWS = {
     "ours": Entry("ours", "Ours", "prdp_torch", "prdp_torch"),
     "jax_cfd": Entry("jax_cfd_projection", "VanLeer", "jax_cfd", "JAX-CFD, FFT, van Leer"),
     "jax_cfd_central": Entry("jax_cfd_projection", "Central", "jax_cfd", "JAX-CFD, FFT, central"),
-    "jax_cfd_cg": Entry("jax_cfd_projection", "CentralCG", "jax_cfd", "JAX-CFD, CG, central"),
+    "jax_cfd_cg": Entry(
+        "jax_cfd_projection", "CentralCG", "jax_cfd", "JAX-CFD, CG, central", ("forward", "cost", "gradient")
+    ),
     "phiflow": Entry("phiflow_projection", "SemiLagrangian", "phi", "PhiFlow, CG, semi-Lagrangian"),
     "phiflow_central": Entry("phiflow_projection", "Central", "phi", "PhiFlow, CG, central"),
     "exponax": Entry("exponax_spectral", "Spectral", "exponax", "Exponax, spectral"),
+    "exponax_stored": Entry("exponax_spectral", "Stored", "exponax", "Exponax, spectral, not recomputed", ("cost",)),
 }
 CONDUCTION = {
     "ours": Entry("ours_conduction", "Ours", "prdp_torch", "prdp_torch, CG on Stencil"),

@@ -45,3 +45,9 @@ class Spectral(JaxFlow):
 
     def step(self, carry):
         return self.stepper(carry)
+
+
+class Stored(Spectral):
+    """Faster, with several times the memory."""
+
+    RECOMPUTE = False

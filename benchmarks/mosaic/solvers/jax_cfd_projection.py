@@ -48,6 +48,5 @@ class Central(VanLeer):
 
 
 class CentralCG(Central):
-
     def solve(self):
         return partial(cfd.pressure.solve_cg, rtol=self.box.rtol, atol=0.0)

@@ -1,9 +1,10 @@
-"""This library: finite volumes as an `operators.Stencil`, solved by CG with the diagonal, differentiated by itself."""
+"""This library: finite volumes as an `operators.Stencil`, solved by CG and differentiated by itself."""
 
 import torch
 
 import prdp_torch as prdp
 
+PRECONDITIONER = "multigrid" if hasattr(prdp, "Multigrid") else "diagonal"
 OFFSETS = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
 
 
@@ -12,7 +13,7 @@ class Ours:
 
     def __init__(self, plate):
         self.plate = plate
-        self.solver = prdp.CG(20 * plate.nx, rtol=1e-10, preconditioner="diagonal")
+        self.solver = prdp.CG(20 * plate.nx, rtol=1e-10, preconditioner=PRECONDITIONER)
 
     def temperatures(self, rho):
         with torch.no_grad():
@@ -54,7 +55,10 @@ class Ours:
         b = torch.zeros_like(k)
         b[:, -1] = self.plate.flux * self.plate.h
         operator = prdp.operators.Stencil(coefficients, OFFSETS, boundary="zero")
-        return prdp.linear_solve(operator, b[None, None], self.solver)[0][0, 0]
+        u, info = prdp.linear_solve(operator, b[None, None], self.solver)
+        if info.status[0] < 0:
+            raise RuntimeError(f"CG: residual {info.residual[0]:.1e} after {info.iterations[0]} iterations")
+        return u[0, 0]
 
 
 def _harmonic(a, b):

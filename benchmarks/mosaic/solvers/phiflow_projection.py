@@ -17,7 +17,6 @@ from benchmarks.mosaic.solvers.jax_rollout import JaxFlow
 
 
 class _Projection(JaxFlow):
-
     def __init__(self, box):
         super().__init__(box)
         phi.math.set_global_precision(64 if box.double else 32)
@@ -72,12 +71,10 @@ class _Projection(JaxFlow):
 
 
 class SemiLagrangian(_Projection):
-
     def advect(self, v):
         return phi.advect.semi_lagrangian(v, v, self.box.dt)
 
 
 class Central(_Projection):
-
     def advect(self, v):
         return v + self.box.dt * phi.advect.differential(v, v, order=2)
