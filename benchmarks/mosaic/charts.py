@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from benchmarks.mosaic import solvers
 
@@ -35,27 +36,25 @@ def cost(rows):
     return found
 
 
+PARTS = (  # of a result, with the name of the axis and what it is scaled by
+    ("forward_seconds", "rollout, seconds", 1.0),
+    ("gradient_seconds", "rollout and gradient, seconds", 1.0),
+    ("gradient_bytes", "rollout and gradient, MB at the peak", 1e-6),
+)
+
+
 def _cost(rows, dim):
-    """Rows: seconds, memory. Columns: against N at the steps most cases share, against steps at their N."""
+    """Columns: against N with the number of steps that most cases share, against steps with their N."""
     steps, n = _usual(rows, "steps"), _usual(rows, "n")
-    figure = Figure(figsize=(10.5, 7.4), layout="constrained")
-    panels = figure.subplots(2, 2, sharey="row", sharex="col")
-    columns = (("n", "steps", steps, f"N, {steps} steps"), ("steps", "n", n, f"steps, N = {n}"))
-    for panel_row, (key, name, scale) in zip(
-        panels, (("seconds", "seconds", 1.0), ("bytes", "MB at the peak", 1e-6)), strict=True
-    ):
-        for axes, (along, fixed, value, label) in zip(panel_row, columns, strict=True):
-            chosen = [row for row in rows if row["case"][fixed] == value]
-            for part, face in (("gradient", None), ("forward", "white")):
-                _lines(axes, chosen, along, f"{part}_{key}", scale, face)
-            axes.set(xscale="log", yscale="log")
-            ticks = sorted({row["case"][along] for row in chosen})
-            axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
-            axes.minorticks_off()
-            if panel_row is panels[-1]:
-                axes.set(xlabel=label)
+    figure = Figure(figsize=(10.5, 10), layout="constrained")
+    panels = figure.subplots(3, 2, sharey="row", sharex="col")
+    for panel_row, (part, name, scale) in zip(panels, PARTS, strict=True):
+        for axes, along, fixed, value in zip(panel_row, ("n", "steps"), ("steps", "n"), (steps, n), strict=True):
+            _lines(axes, [row for row in rows if row["case"][fixed] == value], along, part, scale)
         panel_row[0].set(ylabel=name)
-    figure.suptitle(f"A rollout in {dim}D and its gradient (filled), and the rollout alone (white)")
+    panels[-1, 0].set(xlabel=f"N, {steps} steps")
+    panels[-1, 1].set(xlabel=f"steps, N = {n}")
+    figure.suptitle(f"{dim}D")
     _legend(figure, panels[0, 0], panels[0, 1])
     return figure
 
@@ -71,7 +70,7 @@ def gradient(rows):
     for axes, dim in zip(panels, (2, 3), strict=True):
         of_dim = [row for row in rows if row["case"]["dim"] == dim and row["result"]["finite"]]
         _lines(axes, of_dim, "steps", "median_error")
-        axes.set(xscale="log", yscale="log", xlabel="steps", title=f"{dim}D, 16 cells per axis")
+        axes.set(xlabel="steps", title=f"{dim}D, 16 cells per axis")
     panels[0].set(ylabel="median relative error of the gradient")
     _legend(figure, *panels)
     return {"gradient": figure}
@@ -107,25 +106,25 @@ def recovery(rows):
 
 def conduction(rows):
     rows = [row for row in rows if row["case"]["what"] == "cost"]
-    figure = Figure(figsize=(10.5, 4), layout="constrained")
-    panels = figure.subplots(1, 2)
-    for axes, (key, name, scale) in zip(
-        panels, (("seconds", "seconds", 1.0), ("bytes", "MB at the peak", 1e-6)), strict=True
-    ):
-        for part, face in (("gradient", None), ("forward", "white")):
-            _lines(axes, rows, "nx", f"{part}_{key}", scale, face)
-        axes.set(xscale="log", yscale="log", xlabel="cells along x", ylabel=name)
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for axes, (part, name, scale) in zip(panels, PARTS, strict=True):
+        _lines(axes, rows, "nx", part, scale)
+        axes.set(xlabel="cells along x", ylabel=name.replace("rollout", "solve"))
     _legend(figure, *panels, family=solvers.CONDUCTION)
     return {"conduction": figure} if rows else {}
 
 
-def _lines(axes, rows, along, value, scale=1.0, face=None):
+def _lines(axes, rows, along, value, scale=1.0):
     """A line per solver: a number of the result against one of the case."""
     for name, (colour, line, mark) in STYLES.items():
         points = sorted((row["case"][along], scale * row["result"][value]) for row in rows if row["solver"] == name)
         if points:
-            axes.plot(*zip(*points, strict=True), color=colour, ls=line, marker=mark, mfc=face or colour, ms=5,
-                      label=name if face is None else None)  # fmt: skip
+            axes.plot(*zip(*points, strict=True), color=colour, ls=line, marker=mark, ms=5, label=name)
+    axes.set(xscale="log", yscale="log")
+    ticks = sorted({row["case"][along] for row in rows})
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.grid(alpha=0.3, lw=0.4)
 
 

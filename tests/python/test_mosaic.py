@@ -12,6 +12,7 @@ from benchmarks.mosaic.solvers.ours_conduction import Ours as Volumes
 from benchmarks.mosaic.tasks import forward, gradient
 from benchmarks.mosaic.tasks.conduction import Plate
 from benchmarks.mosaic.tasks.design import Cylinder
+from docs import flow_tables
 
 LENGTH = 2 * np.pi
 GRIDS = (fields.low_faces, fields.high_faces, fields.corners)
@@ -223,3 +224,13 @@ def test_every_task_has_its_tables_and_charts(task):
     drawn = charts.of(task, rows)
     assert bool(drawn) == (task not in ("forward", "horizon"))
     assert json.dumps(module.cases(False)) and len(module.cases(True)) < len(module.cases(False)) + (task == "design")
+
+
+def test_a_page_gets_its_tables_from_the_records(tmp_path, monkeypatch):
+    case = tasks_case("cost")
+    rows = [{"solver": "ours", "case": case, "result": MADE_UP["cost"]}]
+    (tmp_path / "cost.json").write_text(json.dumps({"rows": rows}))
+    monkeypatch.setattr(flow_tables, "RECORDS", tmp_path)
+    place = "<!-- docs/flow_tables.py writes cost, 2D: seconds, forward and gradient -->\nold\n<!-- end -->\n"
+    page = flow_tables.with_tables(f"before\n{place}after\n")
+    assert "old" not in page and "| prdp_torch | 2.5 s |" in page and page == flow_tables.with_tables(page)
