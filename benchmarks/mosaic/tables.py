@@ -40,9 +40,9 @@ def missing(task, rows):
     family = solvers.CONDUCTION if task == "conduction" else solvers.FLOWS
     reasons = {}
     for row in rows:
-        for key in ("cannot", "failed"):
+        for key in ("cannot", "unavailable", "failed"):
             if key in row:
-                case = "" if key == "cannot" else ", ".join(f"{name} {value}" for name, value in row["case"].items())
+                case = "" if key != "failed" else ", ".join(f"{name} {value}" for name, value in row["case"].items())
                 reasons.setdefault((row["solver"], row[key]), []).append(case)
     body = [[family[name].label, "; ".join(filter(None, of_reason)), reason]
             for (name, reason), of_reason in reasons.items()]  # fmt: skip

@@ -211,16 +211,18 @@ MADE_UP = {  # a result per task, as its `run` returns it
 @pytest.mark.parametrize("task", tasks.NAMES)
 def test_every_task_has_its_tables_and_charts(task):
     module, family = runner.family(task)
-    first, second, third = list(family)[:3]
+    first, second, third, last = *list(family)[:3], list(family)[-1]
     rows = []
     for case in module.cases(False):
         rows.append({"solver": first, "case": case, "result": MADE_UP[task]})
         rows.append({"solver": second, "case": case, "cannot": "it knows no obstacles"})
         rows.append({"solver": third, "case": case, "failed": "took more than 1 s"})
+        rows.append({"solver": last, "case": case, "unavailable": "it is not installed"})
     found = tables.of(task, rows)
     *of_task, reasons = found.values()
     assert all(family[first].label in table and "|" in table for table in of_task)
-    assert reasons.count("it knows no obstacles") == 1 and reasons.count("took more than 1 s") == 1
+    said = [reasons.count(why) for why in ("it knows no obstacles", "took more than 1 s", "it is not installed")]
+    assert said == [1, 1, 1]
     drawn = charts.of(task, rows)
     assert bool(drawn) == (task not in ("forward", "horizon"))
     assert json.dumps(module.cases(False)) and len(module.cases(True)) < len(module.cases(False)) + (task == "design")
