@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from docs import performance_tables, result_tables
+from docs import flow_tables, performance_tables, result_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -21,6 +21,13 @@ def test_the_tables_of_speed_are_those_of_the_records():
     text = performance_tables.PAGE.read_text()
     assert len(performance_tables.TABLE.findall(text)) == len(performance_tables.TABLES)
     assert text == performance_tables.with_tables(text), "run: python -m docs.performance_tables"
+
+
+@pytest.mark.skipif(not flow_tables.RECORDS.exists(), reason="there are no records of flows yet")
+def test_the_tables_of_flows_are_those_of_the_records():
+    text = flow_tables.PAGE.read_text()
+    assert flow_tables.TABLE.search(text)
+    assert text == flow_tables.with_tables(text), "run: python -m docs.flow_tables"
 
 
 @pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)
