@@ -1,0 +1,113 @@
+#include "prdp/steppers/flow/tendency.h"
+
+namespace prdp {
+
+namespace {
+
+/// Views of a component of a field with ghosts, the grid's size along all axes but those that say otherwise.
+class Padded {
+ public:
+  Padded(const FlowBox& box, const at::Tensor& all) : box_(box), all_(all) {}
+  /// Channel c, at the neighbour one `way` along an axis.
+  at::Tensor at(int64_t c, int64_t axis, int64_t way) const {
+    auto view = all_.select(1, c);
+    for (int64_t a = 0; a < box_.dim(); ++a) view = view.narrow(a + 1, 1 + (a == axis ? way : 0), box_.shape()[a]);
+    return view;
+  }
+  /// The N + 1 values along `axis` that begin at the ghost (0) or at the first cell (1), at the neighbour one `way`
+  /// along the axis `other`.
+  at::Tensor edges(int64_t c, int64_t axis, int64_t begin, int64_t other = -1, int64_t way = 0) const {
+    auto view = all_.select(1, c);
+    for (int64_t a = 0; a < box_.dim(); ++a)
+      view = a == axis ? view.narrow(a + 1, begin, box_.shape()[a] + 1)
+                       : view.narrow(a + 1, 1 + (a == other ? way : 0), box_.shape()[a]);
+    return view;
+  }
+
+ private:
+  const FlowBox& box_;
+  const at::Tensor& all_;
+};
+
+/// (u·∇) of the component along `along`: its derivative along `axis`, times the velocity along that axis.
+at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t axis, Advection kind) {
+  const int64_t c = box.channel_of(along), d = axis + 1, n = box.shape()[axis];
+  const auto before = u.edges(c, axis, 0), after = u.edges(c, axis, 1);
+  // The velocity through the edges between neighbours.
+  const auto through = axis == along
+                           ? (before + after) * 0.5
+                           : (u.edges(box.channel_of(axis), axis, 1, along, -1) + u.edges(box.channel_of(axis), axis, 1)) * 0.5;
+  const auto low = [&](const at::Tensor& t) { return t.narrow(d, 0, n); };
+  const auto high = [&](const at::Tensor& t) { return t.narrow(d, 1, n); };
+  if (kind == Advection::kCentral)
+    return (high(through) * high(after) - low(through) * low(before)) * (0.5 / box.dx(axis));
+  const auto jump = after - before, size = through.abs();
+  return (low((through + size) * jump) + high((through - size) * jump)) * (0.5 / box.dx(axis));
+}
+
+at::Tensor laplacian(const FlowBox& box, const Padded& u, int64_t c) {
+  at::Tensor sum = u.at(c, 0, 0) * -box.sum_of_couplings();
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    sum = sum.add(u.at(c, axis, -1) + u.at(c, axis, 1), 1.0 / (box.dx(axis) * box.dx(axis)));
+  return sum;
+}
+
+}  // namespace
+
+at::Tensor with_boundary_values(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& fields = equation.box->fields(u.options());
+  const auto inside = fields.free.defined() ? u * fields.free : u;
+  return fields.inlet.defined() ? inside + fields.inlet * equation.inflow : inside;
+}
+
+at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& box = *equation.box;
+  const auto& fields = box.fields(u.options());
+  auto padded = u;
+  // The open axis first: the other axes then take its ghosts along.
+  std::vector<int64_t> axes;
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    axes.insert(axis == box.open_axis() ? axes.begin() : axes.end(), axis);
+  for (const int64_t axis : axes) {
+    const int64_t d = axis + 2, n = box.shape()[axis];
+    const auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
+    switch (box.boundary(axis)) {
+      case FlowBoundary::kPeriodic: padded = at::cat({last, padded, first}, d); break;
+      case FlowBoundary::kWall: padded = at::cat({-first, padded, fields.high_sign[axis] * last}, d); break;
+      case FlowBoundary::kOpen: padded = at::cat({2 * equation.inflow - first, padded, last}, d); break;
+    }
+  }
+  return padded;
+}
+
+at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& box = *equation.box;
+  const auto& fields = box.fields(u.options());
+  const auto ghosts = with_ghosts(equation, u);
+  const Padded padded(box, ghosts);
+  std::vector<at::Tensor> components;
+  for (int64_t c = 0; c < box.dim(); ++c) {
+    auto viscous = laplacian(box, padded, c);
+    if (fields.friction.defined()) viscous = viscous - fields.friction.select(1, c) * u.select(1, c);
+    auto sum = viscous * equation.nu;
+    for (int64_t axis = 0; axis < box.dim(); ++axis)
+      sum = sum - advection(box, padded, box.dim() - 1 - c, axis, equation.advection);
+    components.push_back(sum);
+  }
+  auto all = at::stack(components, 1);
+  if (equation.force.defined()) all = all + equation.force;
+  return fields.free.defined() ? all * fields.free : all;
+}
+
+at::Tensor courant_numbers(const FlowEquation& equation, const at::Tensor& u) {
+  const at::NoGradGuard no_grad;
+  const auto& box = *equation.box;
+  at::Tensor sum;
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    const auto of_axis = u.select(1, box.channel_of(axis)).abs() * (equation.dt / box.dx(axis));
+    sum = sum.defined() ? sum + of_axis : of_axis;
+  }
+  return sum.flatten(1).amax(1);
+}
+
+}  // namespace prdp
