@@ -224,3 +224,18 @@ def test_heat_1d_converges_in_the_papers_25_jacobi_sweeps():
     heat = prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(100))
     heat(torch.tensor(g["u"], dtype=torch.float32)[:, None])
     assert heat.info.iterations.tolist() == [25, 25, 25]
+
+
+@pytest.mark.parametrize("preconditioner", [None, "diagonal", "multigrid"])
+def test_a_batch_may_begin_with_a_sample_that_needs_no_iteration(preconditioner):
+    b = torch.zeros(3, 1, 9, 8, dtype=torch.float64)
+    b[1] = 1.0
+    b[2, 0, 3] = -2.0
+    u, info = prdp.linear_solve(
+        prdp.operators.Heat((9, 8), 0.1, 1.0), b, prdp.CG(100, rtol=1e-12, preconditioner=preconditioner)
+    )
+    alone, _ = prdp.linear_solve(
+        prdp.operators.Heat((9, 8), 0.1, 1.0), b[1:], prdp.CG(100, rtol=1e-12, preconditioner=preconditioner)
+    )
+    assert info.iterations[0] == 0
+    assert torch.equal(u[1:], alone)

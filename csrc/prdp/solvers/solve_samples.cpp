@@ -126,18 +126,20 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
     return own.get();
   };
   int64_t s = begin;
-  const kernels::Kernel<T>* a = nullptr;
+  const kernels::Kernel<T>*a = nullptr, *set = nullptr;  // of sample s, and the one that the system is made of
   const auto& solver = batch.solver;
   // Goes to the next sample that is to be iterated, and sets its system; false behind the last.
   const auto find_next = [&] {
     for (; s < end; ++s) {
-      const auto* before = a;
       a = kernel_of(s);
       if (settled_beforehand(batch, s, a)) continue;
-      if (a == before && shared) return true;
-      if (system.set(*a, solver.preconditioner, shared ? shared->factors : factors_of(*a, solver))) return true;
+      if (shared && a == set) return true;
+      set = nullptr;
+      if (system.set(*a, solver.preconditioner, shared ? shared->factors : factors_of(*a, solver))) {
+        set = a;
+        return true;
+      }
       hand_out_zeros(batch, s, SolveStatus::kZeroDiagonal, 1.0);
-      a = nullptr;
     }
     return false;
   };
