@@ -26,6 +26,10 @@ struct Call : torch::CustomClassHolder {
   SolveOptions options;
 };
 
+/// Functions of autograd take no undefined tensors: an empty one stands for none.
+at::Tensor or_empty(const at::Tensor& t, const at::Tensor& u) { return t.defined() ? t : at::empty({0}, u.options()); }
+at::Tensor or_undefined(const at::Tensor& t) { return t.numel() == 0 ? at::Tensor() : t; }
+
 /// The states u, …, and the reports of the steps.
 SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps, bool all_states,
                 const SolveOptions& options) {
@@ -55,7 +59,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, const at::Tensor& nu, const at::Tensor& force,
                                const at::Tensor& inflow, const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
-    const auto equation = call->equation.with_tensors({nu, force, inflow});
+    const auto equation = call->equation.with_tensors({nu, or_undefined(force), or_undefined(inflow)});
     const auto [out, info] = run(equation, u, call->steps, call->all_states, call->options);
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
@@ -70,7 +74,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
     variable_list out(5);
     if (!grads[0].defined()) return out;
-    const auto equation = call->equation.with_tensors({saved[1], saved[2], saved[3]});
+    const auto equation = call->equation.with_tensors({saved[1], or_undefined(saved[2]), or_undefined(saved[3])});
     std::vector<int64_t> needed(4);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
@@ -142,7 +146,7 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
   call->steps = steps;
   call->all_states = all_states;
   call->options = options;
-  const auto out = FlowSteps::apply(u, equation.nu, equation.force, equation.inflow, call);
+  const auto out = FlowSteps::apply(u, equation.nu, or_empty(equation.force, u), or_empty(equation.inflow, u), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
 }
 
