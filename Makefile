@@ -11,6 +11,8 @@ BIN := .venv/bin
 STAMPS := .stamps
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MAKEFLAGS :=
+CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
+  -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
 .PHONY: demo test docs tidy sanitize fuzz bench-peers clean
 
@@ -38,7 +40,7 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)
 tidy: $(STAMPS)/configure $(BIN)/clang-tidy
-	$(BIN)/cmake -S . -B build-tidy -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_TESTS=OFF -DCMAKE_DISABLE_PRECOMPILE_HEADERS=ON > build/tidy.log
+	$(CONFIGURE) -B build-tidy -DPRDP_TESTS=OFF -DCMAKE_DISABLE_PRECOMPILE_HEADERS=ON > build/tidy.log
 	find csrc -name '*.cpp' | xargs -P $$(nproc) -n 1 $(BIN)/clang-tidy -p build-tidy --quiet \
 	  --extra-arg=-idirafter --extra-arg=$(GCC_HEADERS) --extra-arg=-Wno-unknown-warning-option
 
@@ -48,10 +50,10 @@ $(BIN)/clang-tidy: $(STAMPS)/python
 
 # ThreadSanitizer watches what has threads; csrc/prdp/threads/interruption.h shares loops in a way that it understands.
 sanitize: $(STAMPS)/configure
-	$(BIN)/cmake -S . -B build-address -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=address,undefined > build/sanitize.log
+	$(CONFIGURE) -B build-address -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=address,undefined > build/sanitize.log
 	$(BIN)/cmake --build build-address --parallel $$(nproc) --target prdp_tests
 	UBSAN_OPTIONS=print_stacktrace=1 build-address/prdp_tests --gtest_brief=1
-	$(BIN)/cmake -S . -B build-thread -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=thread > build/sanitize.log
+	$(CONFIGURE) -B build-thread -DPRDP_PYTHON=OFF -DPRDP_SANITIZE=thread > build/sanitize.log
 	$(BIN)/cmake --build build-thread --parallel $$(nproc) --target prdp_tests
 	build-thread/prdp_tests --gtest_brief=1 --gtest_filter='Threads.*'
 
@@ -99,8 +101,8 @@ $(STAMPS)/python: requirements.txt | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.txt
 	@mkdir -p $(STAMPS) && touch $@
 
-$(STAMPS)/configure: $(STAMPS)/system $(STAMPS)/python
-	$(BIN)/cmake -S . -B build -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python > build.log 2>&1 || { cat build.log; exit 1; }
+$(STAMPS)/configure: Makefile $(STAMPS)/system $(STAMPS)/python
+	$(CONFIGURE) -B build > build.log 2>&1 || { cat build.log; exit 1; }
 	@mv build.log build/configure.log && touch $@
 
 # After the build, so that pip only has to register what is there.

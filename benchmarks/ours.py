@@ -41,11 +41,11 @@ def methods(problem):
     if problem.name.startswith("burgers"):
         jacobi = {"Jacobi": (lambda k: prdp.Jacobi(k, rtol=0.0), budgets(2 * problem.k))}
         return {"GMRES(2)": (problem.solver, budgets(problem.k))} | jacobi | exact
-    stokes = {
-        "GMRES(6), Stokes": (
-            lambda k: prdp.GMRES(k, rtol=0.0, restart=6, preconditioner="stokes"), [1, 2, 4, 8])
+    multigrid = {
+        "GMRES(6), multigrid": (
+            lambda k: prdp.GMRES(k, rtol=0.0, restart=6, preconditioner="multigrid"), [1, 2, 4, 8])
     }  # fmt: skip
-    return {"GMRES(8)": (problem.solver, budgets(problem.k))} | stokes | exact
+    return {"GMRES(8)": (problem.solver, budgets(problem.k))} | multigrid | exact
 
 
 def entries(problem, modes=("implicit", "unrolled")):

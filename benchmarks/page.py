@@ -9,13 +9,14 @@ import jinja2
 from benchmarks import charts, memory
 from benchmarks.problems import DIFFUSION, PROBLEMS
 from prdp_torch.experiments import records
+from prdp_torch.experiments.charts import write_png
 
 
 def write(results, environment, folder):
     """`page.html` and PNG files, from {suite: what it found}."""
     parts = list(sections(results))
     for part in parts:
-        part["figure"].savefig(folder / f"{part['name']}.png", dpi=130)
+        write_png(part["figure"], folder / f"{part['name']}.png", dpi=130)
         svg = io.BytesIO()
         part["figure"].savefig(svg, format="svg")
         part["svg"] = base64.b64encode(svg.getvalue()).decode()

@@ -7,6 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from prdp_torch.experiments.charts import write_png
+
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 ROWS = {  # label: title, colour, marker
     "converged": ("converged", "#222222", "*"),
@@ -103,9 +105,9 @@ def over_the_training(found):
 
 def main():
     found = summaries()
-    error_against_cost(found).savefig(RESULTS / "refinement.png", dpi=110)
-    time_against_products(found).savefig(RESULTS / "time_saved.png", dpi=110)
-    over_the_training(found).savefig(RESULTS / "refinement_training.png", dpi=110)
+    write_png(error_against_cost(found), RESULTS / "refinement.png", dpi=110)
+    write_png(time_against_products(found), RESULTS / "time_saved.png", dpi=110)
+    write_png(over_the_training(found), RESULTS / "refinement_training.png", dpi=110)
 
 
 if __name__ == "__main__":

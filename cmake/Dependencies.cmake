@@ -13,10 +13,7 @@ if(NOT Torch_DIR)
   endif()
   list(APPEND CMAKE_PREFIX_PATH ${torch_prefix})
 endif()
-find_package(Torch REQUIRED)
-execute_process(
-  COMMAND ${Python_EXECUTABLE} -c "import torch; print(torch.__version__)"
-  OUTPUT_VARIABLE torch_version OUTPUT_STRIP_TRAILING_WHITESPACE)
+include(${CMAKE_CURRENT_LIST_DIR}/prdpTorch.cmake)
 
 execute_process(
   COMMAND ${Python_EXECUTABLE} -c "import pathlib, cmeel; print(pathlib.Path(cmeel.__file__).parent.parent / 'cmeel.prefix')"
@@ -30,15 +27,23 @@ if(NOT Eigen3_FOUND)
   message(FATAL_ERROR "prdp: Eigen was not found; apt-get install libeigen3-dev or pip install cmeel-eigen")
 endif()
 
-# A header-only library as an imported target, or one sentence about what to install.
-function(prdp_header_library name header debian)
+# A header-only library as an imported target. The part of the project that needs it is left out where it is AUTO and
+# the header is not found; where the part was asked for, one sentence says what to install.
+function(prdp_header_library part name header debian)
   find_path(${name}_INCLUDE_DIR ${header})
-  if(NOT ${name}_INCLUDE_DIR)
-    message(FATAL_ERROR "prdp: <${header}> was not found; apt-get install ${debian}")
+  if(${name}_INCLUDE_DIR)
+    add_library(prdp_${name} INTERFACE)
+    target_include_directories(prdp_${name} SYSTEM INTERFACE ${${name}_INCLUDE_DIR})
+  elseif(${part} STREQUAL "AUTO")
+    message(STATUS "prdp: without ${part}, as <${header}> was not found; apt-get install ${debian}")
+    set(${part} OFF PARENT_SCOPE)
+  elseif(${part})
+    message(FATAL_ERROR "prdp: <${header}> was not found; apt-get install ${debian}, or configure with -D${part}=OFF")
   endif()
-  add_library(prdp_${name} INTERFACE)
-  target_include_directories(prdp_${name} SYSTEM INTERFACE ${${name}_INCLUDE_DIR})
 endfunction()
-prdp_header_library(tomlplusplus toml++/toml.h libtomlplusplus-dev)
-prdp_header_library(json nlohmann/json.hpp nlohmann-json3-dev)
-prdp_header_library(cli11 CLI/CLI.hpp libcli11-dev)
+prdp_header_library(PRDP_EXPERIMENTS tomlplusplus toml++/toml.h libtomlplusplus-dev)
+prdp_header_library(PRDP_TRAINER json nlohmann/json.hpp nlohmann-json3-dev)
+prdp_header_library(PRDP_TRAINER cli11 CLI/CLI.hpp libcli11-dev)
+if(NOT PRDP_EXPERIMENTS)
+  set(PRDP_TRAINER OFF)
+endif()

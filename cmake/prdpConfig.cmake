@@ -1,3 +1,2 @@
-include(CMakeFindDependencyMacro)
-find_dependency(Torch)
+include("${CMAKE_CURRENT_LIST_DIR}/prdpTorch.cmake")
 include("${CMAKE_CURRENT_LIST_DIR}/prdpTargets.cmake")

@@ -10,7 +10,7 @@ import importlib
 
 from prdp_torch import _load
 
-_load.check_torch()
+_load.load_library()
 
 from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402

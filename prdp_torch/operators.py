@@ -17,10 +17,12 @@ class Operator:
 
     kind: str
 
-    def __init__(self, shape, parameters, tensors):
+    def __init__(self, shape, parameters, tensors, null_spaces=()):
         self.shape = shape
         self.parameters = parameters
-        self.tensors = [full_precision(t) for t in tensors]
+        self.tensors = [full_precision(t) for t in (*tensors, *null_spaces)]
+        if null_spaces:
+            self.kind = "singular_" + self.kind
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
@@ -142,6 +144,9 @@ class Stencil(Operator):
             coefficient has no influence, but it must be finite.
         offsets: k tuples of whole numbers, one entry for each axis of shape, at most two cells along each.
         boundary: "zero" (v is 0 outside the grid) or "periodic", one for all axes or one for each.
+        nullspace: what A maps to zero, where it is singular: "constant" (in each channel), or vectors (k, *shape). Then
+            b, u and cotangents are taken without their part there, and a b that has one beyond rtol is INCONSISTENT.
+        left_nullspace: what Aᵀ maps to zero, as many vectors. None takes those of nullspace, as for symmetric A.
 
     Raises:
         ValueError, TypeError: the arguments do not fit together. This is checked before any work.
@@ -152,7 +157,7 @@ class Stencil(Operator):
 
     kind = "stencil"
 
-    def __init__(self, coefficients, offsets, boundary="zero"):
+    def __init__(self, coefficients, offsets, boundary="zero", nullspace=None, left_nullspace=None):
         dim = _check.dense("Stencil", "coefficients", coefficients).dim() - 2
         if not 1 <= dim <= 3:
             raise ValueError(
@@ -168,13 +173,12 @@ class Stencil(Operator):
             )
         periodic = [float(b == "periodic") for b in self.boundary]
         cells = [float(n) for offset in self.offsets for n in offset]
-        super().__init__(list(coefficients.shape[2:]), periodic + cells, [coefficients])
+        null_spaces = _null_spaces("Stencil", nullspace, left_nullspace, coefficients)
+        super().__init__(list(coefficients.shape[2:]), periodic + cells, [coefficients], null_spaces)
 
     def __repr__(self):
-        shape, coefficients = tuple(self.shape), tuple(self.tensors[0].shape)
-        return (
-            f"Stencil(shape={shape}, offsets={self.offsets}, boundary={self.boundary}, tensors=[tensor{coefficients}])"
-        )
+        shape, tensors = tuple(self.shape), ", ".join(f"tensor{tuple(t.shape)}" for t in self.tensors)
+        return f"Stencil(shape={shape}, offsets={self.offsets}, boundary={self.boundary}, tensors=[{tensors}])"
 
 
 class Function(Operator):
@@ -189,6 +193,8 @@ class Function(Operator):
         diagonal: `diagonal(*tensors)` returns the diagonal of A in a shape that broadcasts against the vectors.
             `Jacobi` and `preconditioner="diagonal"` need it.
         symmetric: whether A = Aᵀ. Then matvec is used for both.
+        nullspace, left_nullspace: as for `Stencil`; a vector has the shape of a channel of b (batch, channel, *shape),
+            or of b without its batch axis if b has two axes.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
     the functions with each other. A `Function` cannot be created inside `torch.compile`.
@@ -196,7 +202,16 @@ class Function(Operator):
 
     kind = "function"
 
-    def __init__(self, matvec, transpose=None, tensors=(), diagonal=None, symmetric=False):
+    def __init__(
+        self,
+        matvec,
+        transpose=None,
+        tensors=(),
+        diagonal=None,
+        symmetric=False,
+        nullspace=None,
+        left_nullspace=None,
+    ):
         for name, function in (("matvec", matvec), ("transpose", transpose), ("diagonal", diagonal)):
             if not callable(function) and (name == "matvec" or function is not None):
                 raise TypeError(f"Function: {name} must be callable, got {function!r}")
@@ -216,18 +231,22 @@ class Function(Operator):
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
         )
-        super().__init__([self._products.number], [], tensors)
+        self._null_spaces = _null_spaces("Function", nullspace, left_nullspace, None)
+        super().__init__([self._products.number], [], tensors, self._null_spaces)
 
     def __reduce__(self):
         matvec, transpose, diagonal, symmetric = self._made_of
-        return Function, (matvec, transpose, tuple(self.tensors), diagonal, symmetric)
+        tensors = tuple(self.tensors[: len(self.tensors) - len(self._null_spaces)])
+        return Function, (matvec, transpose, tensors, diagonal, symmetric, *(self._null_spaces or (None, None)))
 
 
 class Matrix(Operator):
     """A matrix: a tensor (n, n) or (batch, n, n), dense or sparse CSR. A sparse one gets gradients on its pattern; if
-    you need them, use `Matrix.csr`, because torch may make the gradient of a CSR tensor dense."""
+    you need them, use `Matrix.csr`, because torch may make the gradient of a CSR tensor dense.
 
-    def __init__(self, matrix):
+    `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n)."""
+
+    def __init__(self, matrix, nullspace=None, left_nullspace=None):
         if not isinstance(matrix, torch.Tensor):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
@@ -247,10 +266,10 @@ class Matrix(Operator):
                 f"linear_solve: a CSR matrix of {matrix.shape[-1]} rows needs a crow of one more, got "
                 f"{tensors[0].shape[-1]}"
             )
-        super().__init__([], [], tensors)
+        super().__init__([], [], tensors, _null_spaces("Matrix", nullspace, left_nullspace, tensors[-1]))
 
     @classmethod
-    def csr(cls, crow, col, values, size):
+    def csr(cls, crow, col, values, size, nullspace=None, left_nullspace=None):
         """A sparse matrix by its compressed rows, as `torch.sparse_csr_tensor` takes them.
 
         Args:
@@ -259,6 +278,7 @@ class Matrix(Operator):
             values: (nnz,), or (batch, nnz) for a matrix per sample on one pattern; float32 or float64. The
                 gradient arrives here, in this shape.
             size: (n, n) or n; (batch, n, n) with values (batch, nnz).
+            nullspace, left_nullspace: "constant" or vectors (k, n), as for `Stencil`.
 
         Raises TypeError or ValueError where the shapes do not fit each other.
         """
@@ -282,7 +302,8 @@ class Matrix(Operator):
         made = cls.__new__(cls)
         made.kind = "csr"
         pattern = [index.expand(*batch, -1) for index in (crow, col)]
-        Operator.__init__(made, [], [], [*pattern, values])
+        null_spaces = _null_spaces("Matrix.csr", nullspace, left_nullspace, values)
+        Operator.__init__(made, [], [], [*pattern, values], null_spaces)
         return made
 
 
@@ -298,6 +319,23 @@ def _warn_of_csr_gradient(matrix):
             "operators.Matrix.csr(crow, col, values, size) takes it to the values directly",
             stacklevel=4,
         )
+
+
+def _null_spaces(who, right, left, like):
+    """The two bases for the compiled library, an empty one for "constant"; none without a null space."""
+    if right is None and left is None:
+        return ()
+    if right is None:
+        raise ValueError(f"{who}: left_nullspace= stands beside nullspace=, which is missing")
+    return tuple(_basis(who, *named, like) for named in (("nullspace", right), ("left_nullspace", right if left is None else left)))
+
+
+def _basis(who, name, value, like):
+    if isinstance(value, str) and value == "constant":
+        return torch.empty(0) if like is None else like.new_empty(0)
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{who}: {name} must be None, 'constant' or a tensor (k, *shape), got {value!r:.80}")
+    return _check.dense(who, name, value).detach()
 
 
 def as_operator(who, name, value):

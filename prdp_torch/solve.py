@@ -191,9 +191,7 @@ def linear_solve(
     every = checkpoint_number(checkpoint_every)
     if not compiling:
         preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
-        options = _last_options.of(
-            solver.method, solver.rtol, solver.restart, *preconditioner, *settings, every, False
-        )
+        options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings, every, False)
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )

@@ -22,9 +22,9 @@ class Solver:
         max_iter: K >= 0, the maximum number of iterations.
         rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
         preconditioner: only for `CG`, `BiCGStab` and `GMRES`. M ≈ A, whose inverse they apply in every iteration:
-            None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of `prdp_torch.operators` whose product is M⁻¹ r, such as
-            `Function(apply, transpose)`. The adjoint solve applies its transpose. Derivatives take it for a constant,
-            except the diagonal in unrolled mode.
+            None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of
+            `prdp_torch.operators` whose product is M⁻¹ r, such as `Function(apply, transpose)`. The adjoint solve
+            applies its transpose. Derivatives take it for a constant, except the diagonal in unrolled mode.
 
     Raises:
         ValueError, TypeError: an argument is out of range or of a wrong type.
@@ -62,7 +62,7 @@ def check_preconditioner(who, preconditioner):
 
 
 def flat_preconditioner(preconditioner):
-    """Kind, shape, parameters and tensors of a preconditioner, and whether it is transposed, for the compiled library."""
+    """A preconditioner for the compiled library: kind, shape, parameters, tensors, and whether it is transposed."""
     if isinstance(preconditioner, Operator):
         return preconditioner.kind, preconditioner.shape, preconditioner.parameters, preconditioner.tensors, False
     if isinstance(preconditioner, Multigrid):

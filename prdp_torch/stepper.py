@@ -116,7 +116,9 @@ class Stepper(torch.nn.Module):
         if steps > 0:
             report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=True)]
         else:
-            report = [u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)]
+            report = [
+                u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)
+            ]
         self._keep(report, log)
         # A rollout without gradients, such as a validation, leaves the report of the last backward pass.
         if states.requires_grad:

@@ -157,7 +157,13 @@ def run(trial, sample, cotangent, solver=None, max_runs=1, deadline=float("inf")
 
 def _solve(info, seconds):
     worst = SolveStatus(int(info.status.min())).name
-    return Solve(int(info.iterations.max()), int(info.operator_applications.max()), median(seconds), worst, bool(info.solved.all()))
+    return Solve(
+        int(info.iterations.max()),
+        int(info.operator_applications.max()),
+        median(seconds),
+        worst,
+        bool(info.solved.all()),
+    )
 
 
 def _copy(step):

@@ -17,13 +17,14 @@ def main():
     parser.add_argument("--quick", action="store_true", help="the smallest part, to see that it runs")
     options = parser.parse_args()
     from benchmarks.studies.trainings import Study
+    from prdp_torch.experiments.charts import write_png
 
     module = importlib.import_module(f"benchmarks.studies.{options.study}")
     study = Study(options.out / options.study, lambda text: print(text, file=sys.stderr, flush=True))
     with contextlib.suppress(KeyboardInterrupt):  # what is done is written
         module.run(study, options.seeds, options.quick)
     study.write(options.out / f"{options.study}.json")
-    module.chart(study.rows).savefig(options.out / f"{options.study}.png", dpi=110)
+    write_png(module.chart(study.rows), options.out / f"{options.study}.png", dpi=110)
     print(module.table(study.rows))
 
 

@@ -10,7 +10,7 @@ import torch
 import prdp_torch as prdp
 from benchmarks.studies.trainings import variant
 from prdp_torch.experiments import _C, records, trajectory_charts
-from prdp_torch.experiments.charts import make_figure
+from prdp_torch.experiments.charts import make_figure, write_png
 from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.trajectories import Course, Trajectories
@@ -43,7 +43,7 @@ def run(study, seeds, quick):
             courses.append(course)
     if not quick:
         shown = Trajectories(states[:, : PICTURES + 1], courses, [])
-        trajectory_charts.snapshots(scene, shown).savefig(study.folder / "snapshots.png", dpi=110)
+        write_png(trajectory_charts.snapshots(scene, shown), study.folder / "snapshots.png", dpi=110)
 
 
 def _seed(path):

@@ -1,11 +1,13 @@
 """The pictures of a comparison, each as a matplotlib figure."""
 
+import io
 from itertools import pairwise
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
+from PIL import Image
 
 WIDTH = 9.2  # inches, of every picture
 
@@ -33,6 +35,13 @@ def _style(row, rows):
 def make_figure(panels=1, height=4.2):
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(1, panels, squeeze=False)[0]
+
+
+def write_png(figure, path, dpi):
+    """Write a figure as a small file: without an alpha channel, as it is opaque, and compressed with care."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=dpi)
+    Image.open(image).convert("RGB").save(path, optimize=True, dpi=(dpi, dpi))
 
 
 def error_measure(scene):

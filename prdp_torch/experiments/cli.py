@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import typer
 from rich import box
 from rich.console import Console
@@ -15,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from prdp_torch import processes
-from prdp_torch._C import sentence
+from prdp_torch._C import VERSION, sentence
 from prdp_torch.experiments import _C, datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
@@ -38,6 +39,20 @@ Seeds = Annotated[int | None, typer.Option(**COUNT, help="How many seeds, counte
 Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(**COUNT, help="Epochs (or updates) in place of the scene's.")]
+
+
+def print_versions(asked):
+    if asked:
+        print(f"prdp_torch {VERSION}, torch {torch.__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[bool, typer.Option("--version", is_eager=True, callback=print_versions, help="Print the versions.")]
+
+
+@app.callback()
+def _about(version: Version = False):
+    pass  # the option has done it
 
 
 def out(default):

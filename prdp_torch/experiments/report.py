@@ -163,7 +163,7 @@ def write(scene, rows, table, shown, folder):
     drawn = charts.all_charts(scene, rows, table)
     learned = trajectory_charts.pictures(scene, shown) if shown else []
     for name, figure, _ in [*drawn, *learned]:
-        figure.savefig(folder / f"{name}.png", dpi=120)
+        charts.write_png(figure, folder / f"{name}.png", dpi=120)
     animation = folder / "trajectories.gif"
     animation.unlink(missing_ok=True)
     if shown and len(scene.physics.shape) == 2:

@@ -62,7 +62,7 @@ def test_products_keep_their_dtype(operator):
 STEPS = [
     (prdp.Heat, 1, (16,), prdp.CG(5)),
     (prdp.Burgers, 2, (8, 8), prdp.GMRES(3)),
-    (prdp.NavierStokes, 3, (8, 8), prdp.GMRES(5, preconditioner="stokes")),
+    (prdp.NavierStokes, 3, (8, 8), prdp.GMRES(5, preconditioner="multigrid")),
 ]
 
 

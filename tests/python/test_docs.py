@@ -1,4 +1,4 @@
-"""The README and the pages of docs/: every Python block runs, and what the others name exists."""
+"""The README, its neighbours and the pages of docs/: every Python block runs, and what the others name exists."""
 
 import inspect
 import re
@@ -17,7 +17,7 @@ import prdp_torch as prdp
 from prdp_torch.experiments import cli, scenes
 
 ROOT = Path(__file__).parents[2]
-PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
+PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))}
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r'^--8<-- "(.*)"$', re.MULTILINE)
 COMMAND = typer.main.get_command(cli.app)
@@ -138,7 +138,7 @@ def test_the_page_of_the_command_line_names_every_option_of_the_cpp_trainer():
 
 @pytest.mark.parametrize("block", blocks("cpp"), ids=lambda block: f"{block.page}:{block.line}")
 def test_the_cpp_blocks_use_public_names(block):
-    headers = re.findall(r"^  (csrc/\S+\.h)\)?$", (ROOT / "CMakeLists.txt").read_text(), re.MULTILINE)
+    headers = re.findall(r"^ +(csrc/\S+\.h)\)?$", (ROOT / "CMakeLists.txt").read_text(), re.MULTILINE)
     public = "".join((ROOT / header).read_text() for header in headers)
     for header in re.findall(r"#include <(prdp\w*/[^>]+)>", block.code):
         assert f"csrc/{header}" in headers

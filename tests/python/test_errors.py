@@ -1,6 +1,7 @@
 """Bad input: clear errors before any work, tested by their words."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -166,17 +167,43 @@ def test_a_missing_or_foreign_build_says_what_to_do(monkeypatch, tmp_path):
         _load.check_torch()
 
 
+def test_a_build_for_cuda_is_that_for_the_cpu(monkeypatch, tmp_path):
+    from prdp_torch import _load
+
+    monkeypatch.setattr(_load, "_BUILT_FOR", tmp_path / "built_for_torch.txt")
+    release = torch.__version__.partition("+")[0]
+    for built_for in (release, f"{release}+cpu", f"{release}+cu130"):
+        (tmp_path / "built_for_torch.txt").write_text(f"{built_for}\n")
+        _load.check_torch()
+    (tmp_path / "built_for_torch.txt").write_text(f"{release}.1\n")
+    with pytest.raises(ImportError, match="rebuild prdp_torch for this one with 'pip install --force-reinstall --no-d"):
+        _load.check_torch()
+
+
+def test_a_library_that_cannot_be_loaded_says_what_to_do(monkeypatch):
+    from prdp_torch import _load
+
+    def refuse(name):
+        raise ImportError(f"{name}: undefined symbol: _ZN3c10")
+
+    monkeypatch.setattr(_load, "importlib", SimpleNamespace(import_module=refuse))
+    with pytest.raises(ImportError, match=r"for another build of torch .*: undefined symbol: .*; rebuild it with 'pip"):
+        _load.load_library()
+
+
 def unsuited():
     """Methods that an operator does not support, and the words for it."""
     burgers = operators.Burgers(field((8,)), 1e-3, 1e-2)
     function = operators.Function(lambda v: v, lambda v: v)
     chebyshev = "Chebyshev: the spectrum is known of Heat and Poisson operators alone"
-    stokes = 'preconditioner "stokes" is for NavierStokes operators alone'
+    multigrid = 'preconditioner "multigrid" is for Heat, Poisson, Burgers, NavierStokes, and Stencil .* not for this'
+    flow = operators.NavierStokes(field((8, 8), channels=2), 1e-3, 1e-2)
+    cycles = "the method Multigrid is for Heat, Poisson, Burgers, and Stencil"
     return [
         (burgers, prdp.Chebyshev(1), chebyshev),
         (function, prdp.Chebyshev(5), chebyshev),
-        (burgers, prdp.GMRES(3, preconditioner="stokes"), stokes),
-        (function, prdp.GMRES(3, preconditioner="stokes"), stokes),
+        (flow, prdp.Multigrid(3), cycles),
+        (function, prdp.GMRES(3, preconditioner="multigrid"), multigrid),
         (function, prdp.Jacobi(1), "Function: its diagonal, which Jacobi and preconditioner"),
     ]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers import field, golden, statuses
+from helpers import NO_PRECONDITIONER, field, golden, statuses
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
@@ -87,8 +87,10 @@ def test_the_cpu_loops_equal_the_plain_tensors(dtype, transposed):
         ("navier_stokes", [7, 17], field((7, 17), channels=2, dtype=dtype), consistent((7, 17), seed=1, dtype=dtype)),
     )
     for kind, shape, winds, b in cases:
-        arguments = ([winds, nu], kind, shape, [0.1], transposed, "gmres", 3, 0.0, 4)
-        u, iterations, _, _, applications = torch.ops.prdp.linear_solve(b, *arguments, "none", None, None, "raise", 0)
+        arguments = ([winds, nu], kind, shape, [0.1], transposed, "gmres", 3, 0.0, 4, *NO_PRECONDITIONER)
+        u, iterations, _, _, applications, _ = torch.ops.prdp.linear_solve(
+            b, *arguments, "none", None, None, "raise", 0
+        )
         v, report = _C.solve_with_tensors(b, *arguments)
         np.testing.assert_allclose(u, v, rtol=0, atol=200 * torch.finfo(dtype).eps * v.abs().max())
         assert iterations.tolist() == report[0].tolist() and applications.tolist() == report[3].tolist()

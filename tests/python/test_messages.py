@@ -66,7 +66,8 @@ TABLE = [
        rf"{name} on NavierStokes: [\d.]+ % of b are a mean of its pressure channel, which no flow can have")
       for name, solver in (("SteepestDescent", prdp.SteepestDescent(9)), ("CG", prdp.CG(9)),
                            (r"GMRES\(10\)", prdp.GMRES(9)), ("Direct", prdp.Direct()),
-                           (r'GMRES\(10\) with preconditioner="stokes"', prdp.GMRES(9, preconditioner="stokes")))],
+                           (r'GMRES\(10\) with preconditioner="multigrid"',
+                            prdp.GMRES(9, preconditioner="multigrid")))],
     *[("OVERFLOW", 0.1 * torch.eye(3), torch.full((3,), 3e38), solver,
        rf"{name} on Matrix: a number left the range of float32 \(‖A‖ is 0.1, ‖b‖ is 5.2e\+38\); take float64")
       for name, solver in (("Jacobi", prdp.Jacobi(9)), ("SteepestDescent", prdp.SteepestDescent(9)), ("CG", prdp.CG(9)),

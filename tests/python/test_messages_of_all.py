@@ -21,7 +21,7 @@ SOLVERS = {
     "BiCGStab": prdp.BiCGStab(K),
     "GMRES(3)": prdp.GMRES(K, restart=3),
     'GMRES(3) with preconditioner="diagonal"': prdp.GMRES(K, restart=3, **BY_DIAGONAL),
-    'GMRES(3) with preconditioner="stokes"': prdp.GMRES(K, restart=3, preconditioner="stokes"),
+    'GMRES(3) with preconditioner="multigrid"': prdp.GMRES(K, restart=3, preconditioner="multigrid"),
     "Direct": prdp.Direct(),
 }
 DIVIDING = [name for name in SOLVERS if name == "Jacobi" or "diagonal" in name]
@@ -33,8 +33,8 @@ def is_refused(method, operator):
     """Methods that do not suit an operator, whatever its numbers are."""
     if method == "Chebyshev":
         return operator not in ("Heat", "Poisson")
-    if "stokes" in method:
-        return operator != "NavierStokes"
+    if "multigrid" in method:
+        return operator in ("Function", "Matrix", "CSR")
     return operator == "Function" and method in DIVIDING
 
 

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -78,7 +79,7 @@ def test_the_source_archive_can_be_built(tmp_path):
     (source,) = (path for path in tmp_path.glob("prdp_torch-*") if path.is_dir())
 
     def files(root):
-        names = ("cmake", "csrc", "examples", "prdp_torch")
+        names = ("cmake", "csrc", "examples", "packaging", "prdp_torch")
         found = {path.relative_to(root) for name in names for path in (root / name).rglob("*") if path.is_file()}
         made = {".so", ".pyc"}
         return {path for path in found if path.suffix not in made and path.name != "built_for_torch.txt"}
@@ -91,6 +92,9 @@ def test_the_source_archive_can_be_built(tmp_path):
 def test_the_wheel_works_in_an_environment_of_its_own(tmp_path):
     setup(tmp_path, "build", "--build-base", tmp_path / "base", "bdist_wheel", "--dist-dir", tmp_path)
     (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        assert f"Requires-Dist: torch=={torch.__version__.partition('+')[0]}\n" in archive.read(metadata).decode()
     run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "fresh")
     python = tmp_path / "fresh" / "bin" / "python"
     run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)

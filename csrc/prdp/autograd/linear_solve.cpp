@@ -52,15 +52,22 @@ Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
 
+void check_multigrid(const Operator& a, const OperatorSpec& spec, const Solver& solver) {
+  if (!solver.preconditioner.is_multigrid()) return;
+  const bool alone = solver.method == Method::kMultigrid;
+  TORCH_CHECK_VALUE(alone ? a.has_coarse_grids() : a.has_multigrid_preconditioner(), role_of(spec), ": ",
+                    alone ? "the method Multigrid" : "preconditioner \"multigrid\"",
+                    " is for Heat, Poisson, Burgers,", alone ? "" : " NavierStokes,",
+                    " and Stencil with neighbours at most one cell away, not for this ",
+                    operator_kind(spec.kind).title);
+}
+
 std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
                                            const at::Tensor& x0) {
   options.check(role_of(spec));
   auto a = make_operator(spec);
   a->check_vector(b);
-  TORCH_CHECK_VALUE(!options.solver.preconditioner.is_multigrid() || a->has_coarse_grids(), role_of(spec),
-                    ": multigrid is for Heat, Poisson, Burgers, and for Stencil with neighbours at most one cell away; "
-                    "it makes no coarse grids of this ",
-                    operator_kind(spec.kind).title);
+  check_multigrid(*a, spec, options.solver);
   TORCH_CHECK_VALUE(
       !x0.defined() ||
           (x0.sym_sizes() == b.sym_sizes() && x0.scalar_type() == b.scalar_type() && x0.device() == b.device()),
@@ -110,7 +117,7 @@ at::Tensor without_derivative(const at::Tensor& x0) {
 Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                          const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
-  if (differentiable && at::GradMode::is_enabled() && a.kind == "function" && is_plain(b) && all_plain(a.tensors))
+  if (differentiable && at::GradMode::is_enabled() && is_function(a) && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
   const bool reverse =
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
@@ -158,6 +165,7 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
                                 const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
   a->check_parameters();
+  a->check_null_spaces(b);
   const auto& s = options.solver;
   auto result = solve(*a, b, {s, {}, true, x0});
   auto& info = result.info;

@@ -13,7 +13,7 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
     : Node(torch::autograd::collect_next_edges(b, at::TensorList(a.tensors))),
       a_(std::move(a)),
       options_(std::move(options)) {
-  if (a_.kind == "function") products_ = RegisteredProducts::find(a_.shape[0]);
+  if (is_function(a_)) products_ = RegisteredProducts::find(a_.shape[0]);
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {

@@ -31,6 +31,9 @@ struct GridOperator {
   bool transposed;
 };
 
+template <class T>
+class Preconditioner;
+
 /// A on one sample in padded memory: everything that the CPU loops know of an operator. It may be used by several
 /// threads at once. What it computes with is factor()·A, where the factor is a power of two: entries far from the
 /// order of one are scaled, so that products of several of them neither overflow nor underflow.
@@ -77,6 +80,10 @@ class Kernel {
   virtual void residual(const T* b, const T* x, T* r) const;
   /// What multigrid makes its coarse grids of; nothing if the operator is not of that kind.
   virtual std::optional<GridOperator<T>> grid_operator() const { return std::nullopt; }
+
+  /// M⁻¹ made of V-cycles; null if the operator has no coarse grids, or these no inverse diagonal. M⁻ᵀ needs `transpose`,
+  /// the kernel of Aᵀ, where A is not symmetric.
+  virtual std::unique_ptr<Preconditioner<T>> multigrid(const Kernel* transpose, int64_t smoothing) const;
 
   virtual std::shared_ptr<const Factors<T>> factorise() const = 0;
 

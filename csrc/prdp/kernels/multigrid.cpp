@@ -1,5 +1,6 @@
 #include "prdp/kernels/multigrid.h"
 
+#include "prdp/kernels/saddle_point.h"
 #include "prdp/kernels/stencil.h"
 
 namespace prdp::kernels {
@@ -154,6 +155,21 @@ const T* Multigrid<T>::solve_coarsest(const T* b, bool transposed) {
   return x;
 }
 
+template <class T>
+std::unique_ptr<Preconditioner<T>> Kernel<T>::multigrid(const Kernel<T>* transpose, int64_t smoothing) const {
+  return Multigrid<T>::make(*this, transpose, smoothing);
+}
+template <class T>
+std::unique_ptr<Preconditioner<T>> NavierStokes<T>::multigrid(const Kernel<T>* transpose, int64_t smoothing) const {
+  return std::make_unique<SaddlePointPreconditioner<T>>(*this, dynamic_cast<const NavierStokes<T>*>(transpose), smoothing);
+}
+
+#define PRDP_INSTANTIATE(T)                                                                                     \
+  template std::unique_ptr<Preconditioner<T>> Kernel<T>::multigrid(const Kernel<T>*, int64_t) const;            \
+  template std::unique_ptr<Preconditioner<T>> NavierStokes<T>::multigrid(const Kernel<T>*, int64_t) const;
+PRDP_INSTANTIATE(float)
+PRDP_INSTANTIATE(double)
+#undef PRDP_INSTANTIATE
 template class Multigrid<float>;
 template class Multigrid<double>;
 

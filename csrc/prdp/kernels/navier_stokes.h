@@ -22,7 +22,7 @@ class NavierStokes final : public Kernel<T> {
 
   double norm() const override {
     const double x = std::abs(inverse_dx_), y = std::abs(inverse_dy_);
-    return std::max({velocity_[0].norm() + 2 * x, velocity_[1].norm() + 2 * y, 2 * (x + y)});
+    return std::max({velocity_[0]->norm() + 2 * x, velocity_[1]->norm() + 2 * y, 2 * (x + y)});
   }
   bool has_zero_diagonal() const override { return true; }  // the pressure's: what divides by it is never called
   void divide_by_diagonal(const T*, T*) const override {}
@@ -30,20 +30,21 @@ class NavierStokes final : public Kernel<T> {
   T jacobi_sweep(const T*, const T*, T*, const T*) const override { return T(0); }
 
   void apply(const T* v, T* out) const override {
-    const StaggeredStencil<T> a{{velocity_[0].neighbours(), velocity_[1].neighbours()}, weights_.data()};
+    const StaggeredStencil<T> a{{velocity_[0]->neighbours(), velocity_[1]->neighbours()}, weights_.data()};
     const int64_t each = std::max<int64_t>(kBlock / layout().row, 1), rows = layout().rows;
     shared_rows::for_each((rows + each - 1) / each, [&](int64_t p) {
       loops<T>().apply_staggered(a, {p * each, std::min(rows, (p + 1) * each)}, v, out);
     });
   }
   std::shared_ptr<const Factors<T>> factorise() const override;
+  std::unique_ptr<Preconditioner<T>> multigrid(const Kernel<T>* transpose, int64_t smoothing) const override;
 
   /// Calls body(row, column, value) for the entries of A as applied; those that coincide one by one.
   template <class Body>
   void for_each_entry(const Body& body) const {
     const int64_t n = ny() * nx();
     for (int64_t c = 0; c < 2; ++c)
-      velocity_[c].for_each_entry([&](int64_t i, int64_t j, T a) { body(c * n + i, c * n + j, a); });
+      velocity_[c]->for_each_entry([&](int64_t i, int64_t j, T a) { body(c * n + i, c * n + j, a); });
     // Backward differences of the pressure; D = -Gᵀ.
     const auto gradient = [&](int64_t u, int64_t p, T value) {
       body(u, 2 * n + p, value);
@@ -62,6 +63,9 @@ class NavierStokes final : public Kernel<T> {
   /// Tells the matrix from others, the same for its transpose.
   FactorKey key() const { return parameters_.key(2); }
   bool transposed() const { return parameters_.transposed; }
+  const UpwindParameters<T>& parameters() const { return parameters_; }
+  /// C1 or C2, times factor().
+  const std::shared_ptr<const StencilRows<T>>& velocity(int64_t channel) const { return velocity_[channel]; }
 
  private:
   enum Weight { kX, kXLower, kXUpper, kY, kWeights };  // of StaggeredStencil
@@ -71,7 +75,7 @@ class NavierStokes final : public Kernel<T> {
         parameters_(p),
         inverse_dx_(inverse_spacing(p.nx, p.length_x, factor)),
         inverse_dy_(inverse_spacing(p.ny, p.length_y, factor)),
-        velocity_{c1(p, factor), c2(p, factor)},
+        velocity_{std::make_shared<StencilRows<T>>(c1(p, factor)), std::make_shared<StencilRows<T>>(c2(p, factor))},
         weights_(kWeights * layout().row, T(0)) {
     for (int64_t i = 0; i < nx(); ++i) {
       weight(kX)[i] = inverse_dx_;
@@ -79,8 +83,8 @@ class NavierStokes final : public Kernel<T> {
       weight(kXUpper)[i] = i + 1 < nx() ? inverse_dx_ : T(0);
       weight(kY)[i] = inverse_dy_;
     }
-    const std::vector<std::vector<T>> constant{
-        std::vector<T>(ny() * nx(), static_cast<T>(1.0 / std::sqrt(static_cast<double>(ny() * nx()))))};
+    const std::vector<std::vector<double>> constant{
+        std::vector<double>(ny() * nx(), 1.0 / std::sqrt(static_cast<double>(ny() * nx())))};
     const NullSpace<T> pressure(layout(), 2, 1, constant);
     Base::set_null_spaces(pressure, pressure);
   }
@@ -130,7 +134,7 @@ class NavierStokes final : public Kernel<T> {
 
   UpwindParameters<T> parameters_;
   T inverse_dx_, inverse_dy_;  // negative in the transpose
-  StencilRows<T> velocity_[2];
+  std::shared_ptr<const StencilRows<T>> velocity_[2];
   std::vector<T> weights_;  // rows of the padded length
 };
 

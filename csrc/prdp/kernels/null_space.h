@@ -12,9 +12,10 @@ template <class T>
 class NullSpace {
  public:
   /// `basis`: orthonormal vectors of one field, contiguous, one after the other. The fields are those from `first` on.
-  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<std::vector<T>>& basis)
+  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<std::vector<double>>& basis)
       : layout_(layout), first_(first), fields_(fields) {
-    for (const auto& v : basis) {
+    for (const auto& q : basis) {
+      const std::vector<T> v(q.begin(), q.end());
       basis_.emplace_back(layout.plane, T(0));
       loops<T>().copy_rows(T(1), v.data(), layout.nx, basis_.back().data(), layout.row, layout.rows, layout.nx);
     }

@@ -48,6 +48,9 @@ class RegisteredProducts {
   int64_t number_ = 0;
 };
 
+/// Whether the operator is made of RegisteredProducts, whose number is the first entry of its shape.
+inline bool is_function(const OperatorSpec& a) { return a.kind == "function" || a.kind == "singular_function"; }
+
 /// A product that captures a tensor which requires grad, instead of getting it as an argument, would silently lose its
 /// gradient. After this call, the operator's next product below autograd raises ValueError in that case. This
 /// happens once for each RegisteredProducts, at the cost of recording one product.

@@ -5,6 +5,7 @@
 #include "prdp/operators/laplacian_operator.h"
 #include "prdp/operators/matrix_operator.h"
 #include "prdp/operators/navier_stokes_operator.h"
+#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/stencil_operator.h"
 
 namespace prdp {
@@ -16,6 +17,16 @@ std::unique_ptr<Operator> make(const OperatorSpec& spec) {
   return std::make_unique<T>(spec);
 }
 
+constexpr const char* kStencil = "Stencil";
+constexpr const char* kMatrix = "Matrix";
+constexpr const char* kFunction = "Function";
+
+/// With the bases of the two null spaces behind the other tensors.
+template <class T, const char* const& title>
+std::unique_ptr<Operator> singular(const OperatorSpec& spec) {
+  return make_singular<T>(spec, title);
+}
+
 using Axes = std::vector<int64_t>;
 
 const std::vector<OperatorKind> kKinds{
@@ -23,10 +34,14 @@ const std::vector<OperatorKind> kKinds{
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
     {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
     {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, /*has_pressure=*/true},
-    {"stencil", "Stencil", make<StencilOperator>, Axes{kLikeState}},
-    {"dense", "Matrix", make<DenseOperator>, Axes{3}},
-    {"function", "Function", make<FunctionOperator>, std::nullopt},
-    {"csr", "Matrix", make<CsrOperator>, Axes{2, 2, 2}},
+    {"stencil", kStencil, make<StencilOperator>, Axes{kLikeState}},
+    {"dense", kMatrix, make<DenseOperator>, Axes{3}},
+    {"function", kFunction, make<FunctionOperator>, std::nullopt},
+    {"csr", kMatrix, make<CsrOperator>, Axes{2, 2, 2}},
+    {"singular_stencil", kStencil, singular<StencilOperator, kStencil>, Axes{kLikeState, 0, 0}},
+    {"singular_dense", kMatrix, singular<DenseOperator, kMatrix>, Axes{3, 0, 0}},
+    {"singular_csr", kMatrix, singular<CsrOperator, kMatrix>, Axes{2, 2, 2, 0, 0}},
+    {"singular_function", kFunction, singular<FunctionOperator, kFunction>, std::nullopt},
 };
 
 }  // namespace

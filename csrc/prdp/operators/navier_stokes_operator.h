@@ -34,6 +34,7 @@ class NavierStokesOperator final : public FlowOperator {
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve(regular_matrix().mT(), b); }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+  bool has_multigrid_preconditioner() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:

@@ -50,6 +50,7 @@ class Transposed final : public Operator {
   explicit Transposed(std::unique_ptr<Operator> a) : a_(std::move(a)) {}
   void check_vector(const at::Tensor& b) const override { a_->check_vector(b); }
   void check_parameters() const override { a_->check_parameters(); }
+  void check_null_spaces(const at::Tensor& b) const override { a_->check_null_spaces(b); }
   at::Tensor apply(const at::Tensor& v) const override { return a_->apply_transpose(v); }
   at::Tensor apply_transpose(const at::Tensor& v) const override { return a_->apply(v); }
   at::Tensor diagonal() const override { return a_->diagonal(); }
@@ -70,6 +71,7 @@ class Transposed final : public Operator {
   }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
   bool has_coarse_grids() const override { return a_->has_coarse_grids(); }
+  bool has_multigrid_preconditioner() const override { return a_->has_multigrid_preconditioner(); }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override {
     return a_->kernels(b, !transposed);
   }

@@ -31,6 +31,9 @@ class Operator {
   /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu.
   virtual void check_parameters() const {}
 
+  /// Raises ValueError if what somebody named as a null space is none, for vectors like b.
+  virtual void check_null_spaces(const at::Tensor& /*b*/) const {}
+
   /// A v and Aᵀ v, differentiable in v and in the tensors of A.
   virtual at::Tensor apply(const at::Tensor& v) const = 0;
   virtual at::Tensor apply_transpose(const at::Tensor& v) const = 0;
@@ -61,6 +64,8 @@ class Operator {
 
   /// Whether multigrid can make coarse grids of it: a stencil whose neighbours lie at most one cell away.
   virtual bool has_coarse_grids() const { return false; }
+  /// Whether there is a preconditioner made of V-cycles.
+  virtual bool has_multigrid_preconditioner() const { return has_coarse_grids(); }
   /// A, or Aᵀ, for the CPU loops on vectors with the shape and dtype of b; null if there are no such loops.
   virtual std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const;
 

@@ -1,8 +1,13 @@
 #include <torch/library.h>
 
-#include "prdp/operators/operator.h"
+#include <ATen/core/grad_mode.h>
 
-/// The operators as torch ops, made of plain tensor operations: autograd goes through them.
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/disguises.h"
+#include "prdp/operators/tensors.h"
+
+/// The operators as torch ops, made of plain tensor operations, so that autograd goes through them; without it, of the
+/// CPU loops.
 namespace prdp {
 
 namespace {
@@ -16,6 +21,9 @@ at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view k
                  at::ArrayRef<double> parameters, bool transposed) {
   const auto a = make_operator(spec(tensors, kind, shape, parameters, transposed));
   a->check_vector(v);
+  const bool recorded = at::GradMode::is_enabled() && (v.requires_grad() || any_requires_grad(tensors));
+  if (!recorded && nobody_watches() && is_plain(v) && all_plain(tensors) && !has_tangent(v) && !any_tangent(tensors))
+    return apply_on_loops(*a, v, /*transposed=*/false);
   return a->apply(v);
 }
 

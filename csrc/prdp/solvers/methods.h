@@ -161,8 +161,7 @@ constexpr int64_t vectors_of(Method method, int64_t restart) {
 
 /// Whether the solver refuses an operator with a zero on its diagonal.
 inline bool divides_by_diagonal(const Solver& solver) {
-  const auto& m = solver.preconditioner;
-  return traits(solver.method).divides_by_diagonal || m.is_diagonal() || m.is_multigrid();
+  return traits(solver.method).divides_by_diagonal || solver.preconditioner.is_diagonal();
 }
 
 /// Iterations, or those vectors that so many cycles build up.

@@ -109,8 +109,16 @@ class SampleSpace {
   }
   bool is_preconditioned() const { return system_.preconditioner(); }
   bool is_preconditioned_by_diagonal() const { return system_.by_diagonal(); }
-  Scalar precondition(const T* v, Vector out) { return system_.preconditioner()->apply(v, out); }
-  void precondition_transpose(const T* v, Vector out) { system_.preconditioner()->apply_transpose(v, out); }
+  Scalar precondition(const T* v, Vector out) {
+    const Scalar product = system_.preconditioner()->apply(v, out);
+    if (!system_.by_diagonal()) project_solution(out);  // cycles leave rounding there, which they would amplify
+    return product;
+  }
+  /// The transpose of this without a diagonal; v is overwritten.
+  void precondition_transpose(Vector v, Vector out) {
+    project_solution(v);
+    system_.preconditioner()->apply_transpose(v, out);
+  }
   void divide_by_diagonal(const T* b, Vector c) { system_.a().divide_by_diagonal(b, c); }
   /// n Jacobi sweeps of x, overwriting next; and one from x to next, which returns ‖b - A x‖². With
   /// omega, Chebyshev's, where next holds the iterate before x, before and (the n) after.

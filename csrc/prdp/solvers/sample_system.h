@@ -1,7 +1,7 @@
 #pragma once
 #include <memory>
 
-#include "prdp/kernels/multigrid.h"
+#include "prdp/kernels/preconditioner.h"
 #include "prdp/solvers/solver.h"
 
 namespace prdp {
@@ -21,7 +21,7 @@ class SampleSystem {
     preconditioner_.reset();
     if (by_diagonal_) preconditioner_ = std::make_unique<kernels::DiagonalPreconditioner<T>>(a);
     else if (preconditioner.is_multigrid())
-      preconditioner_ = kernels::Multigrid<T>::make(a, transpose, preconditioner.smoothing());
+      preconditioner_ = a.multigrid(transpose, preconditioner.smoothing());
     return preconditioner_ || !preconditioner;
   }
 

@@ -189,6 +189,7 @@ int main(int argc, char** argv) {
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
   app.add_option("--weights", options.weights, "file of weights that the network begins with, in place of the seed's");
   app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
+  app.set_version_flag("--version", "prdp_torch " PRDP_VERSION ", torch " TORCH_VERSION);
   k->excludes(s)->excludes(d)->excludes(a);
   s->excludes(d)->excludes(a);
   d->excludes(a);

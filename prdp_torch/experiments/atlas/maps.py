@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from prdp_torch.experiments import records
+from prdp_torch.experiments import charts, records
 from prdp_torch.experiments.atlas import gradients, problems, solves
 
 
@@ -112,7 +112,7 @@ def run(folder, names=(), quick=False, show=lambda name, answer, seconds: None):
             about = {"map": name, "question": chosen.question, "answer": data["answer"], "quick": quick}
             records.write(folder / f"{name}.json", {**about, "seed": problems.SEED, "seconds": round(seconds, 1),
                                                      **environment, "data": data})  # fmt: skip
-            chosen.draw(data).savefig(folder / f"{name}.png", dpi=110)
+            charts.write_png(chosen.draw(data), folder / f"{name}.png", dpi=110)
             show(name, data["answer"], seconds)
     finally:
         torch.set_num_threads(threads)

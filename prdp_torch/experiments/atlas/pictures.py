@@ -30,7 +30,7 @@ def titled(question, answer, panels=1, height=4.4):
 
 def _style(name):
     method = next((m for m in COLOURS if name.startswith(m)), None)
-    dashed = any(word in name for word in ("diagonal", "stokes", "unrolled", "float64"))
+    dashed = any(word in name for word in ("diagonal", "multigrid", "unrolled", "float64"))
     return {"color": COLOURS.get(method, "#666666"), "ls": "--" if dashed else "-"}
 
 

@@ -187,7 +187,7 @@ def flow_solvers(quick):
         "CG": CG(4000),
         "BiCGStab": BiCGStab(2000),
         **{f"GMRES({m})": _gmres(m, 4000) for m in (2, 8, 20, 50)},
-        'GMRES(8), "stokes"': _gmres(8, 4000, preconditioner="stokes"),
+        "GMRES(8), multigrid": _gmres(8, 4000, preconditioner="multigrid"),
     }
     return _table_of_solvers(x, problems.flow, solvers)
 
@@ -197,11 +197,11 @@ def flow_grid(quick):
     solvers = {
         "BiCGStab": BiCGStab(4000),
         "GMRES(8)": _gmres(8, 8000),
-        'GMRES(8), "stokes"': _gmres(8, 8000, preconditioner="stokes"),
+        "GMRES(8), multigrid": _gmres(8, 8000, preconditioner="multigrid"),
     }
     data = lines(x, problems.flow_of_size, solvers)
-    taken = [data["lines"][name][-1] for name in ("GMRES(8)", 'GMRES(8), "stokes"')]
-    answer = f'at {x[-1]}²: GMRES(8) {taken[0] or math.nan:,.0f} products, with "stokes" {taken[1]:,.0f}'
+    taken = [data["lines"][name][-1] for name in ("GMRES(8)", "GMRES(8), multigrid")]
+    answer = f"at {x[-1]}²: GMRES(8) {taken[0] or math.nan:,.0f} products, with multigrid {taken[1]:,.0f}"
     return {**data, "answer": answer}
 
 

@@ -1,0 +1,22 @@
+# LibTorch as the target prdp::torch: its headers and the libraries that the CPU needs, as torch's own extensions for
+# setuptools link them. find_package(Torch) asks for the CUDA toolkit where torch was built with CUDA; nothing here does.
+find_path(Torch_DIR TorchConfig.cmake HINTS ${CMAKE_PREFIX_PATH} $ENV{CMAKE_PREFIX_PATH}
+  PATH_SUFFIXES Torch share/cmake/Torch)
+if(NOT Torch_DIR)
+  message(FATAL_ERROR "prdp: LibTorch was not found; give the folder that torch.utils.cmake_prefix_path names in CMAKE_PREFIX_PATH")
+endif()
+include(${Torch_DIR}/TorchConfigVersion.cmake)
+if(PACKAGE_VERSION VERSION_LESS 2.13)  # nodes of autograd were shared_ptr
+  message(FATAL_ERROR "prdp: needs PyTorch 2.13 or newer, found ${PACKAGE_VERSION} in ${Torch_DIR}; pip install torch==2.13.0")
+endif()
+get_filename_component(TORCH_INSTALL_PREFIX ${Torch_DIR}/../../.. ABSOLUTE)
+if(NOT TARGET prdp::torch)
+  add_library(prdp::torch INTERFACE IMPORTED)
+  target_include_directories(prdp::torch INTERFACE
+    ${TORCH_INSTALL_PREFIX}/include ${TORCH_INSTALL_PREFIX}/include/torch/csrc/api/include)
+  # libtorch registers the kernels of all devices, so it is loaded although no symbol of it is used.
+  set(torch_libraries ${TORCH_INSTALL_PREFIX}/lib/${CMAKE_SHARED_LIBRARY_PREFIX})
+  target_link_libraries(prdp::torch INTERFACE
+    -Wl,--no-as-needed ${torch_libraries}torch${CMAKE_SHARED_LIBRARY_SUFFIX} -Wl,--as-needed
+    ${torch_libraries}torch_cpu${CMAKE_SHARED_LIBRARY_SUFFIX} ${torch_libraries}c10${CMAKE_SHARED_LIBRARY_SUFFIX})
+endif()

@@ -1,0 +1,168 @@
+#include "prdp/operators/singular_operator.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include "prdp/kernels/kernel.h"
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/dense.h"
+
+namespace prdp {
+
+namespace {
+
+/// The unknowns of one channel of v, as its last axis: (…, n).
+at::Tensor by_channel(const at::Tensor& v) { return v.dim() < 3 ? v : v.flatten(2); }
+
+/// Orthonormal vectors in double by Gram and Schmidt, twice.
+at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
+  std::vector<at::Tensor> done;
+  for (int64_t k = 0; k < rows.size(0); ++k) {
+    auto q = rows[k];
+    const auto whole = q.norm();
+    for (int pass = 0; pass < 2; ++pass)
+      for (const auto& other : done) q = q - other.dot(q) * other;
+    const auto left = q.norm();
+    constexpr double independent = 1e-6;
+    TORCH_CHECK_VALUE((left > independent * whole).item<bool>(), title, ": vector ", k,
+                      " of a null space is zero, not finite, or depends on those before it");
+    done.push_back(q / left);
+  }
+  return at::stack(done);
+}
+
+}  // namespace
+
+SingularOperator::SingularOperator(std::unique_ptr<Operator> a, at::Tensor right, at::Tensor left, const char* title)
+    : a_(std::move(a)), right_(right.detach()), left_(left.detach()), title_(title) {
+  const auto count = [&](const at::Tensor& basis) { return is_constant(basis) ? c10::SymInt(1) : basis.sym_size(0); };
+  TORCH_CHECK_VALUE(count(right_) == count(left_), title_,
+                    ": nullspace and left_nullspace must hold as many vectors, got ", count(right_), " and ",
+                    count(left_));
+}
+
+void SingularOperator::check_vector(const at::Tensor& b) const {
+  a_->check_vector(b);
+  for (const auto& basis : {right_, left_}) {
+    if (is_constant(basis)) continue;
+    const auto channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
+    TORCH_CHECK_VALUE(basis.dim() >= 2 && basis.sym_sizes().slice(1) == channel, title_,
+                      ": a null space must have shape (k, *shape) with the shape of a channel, ", channel, ", got ",
+                      basis.sym_sizes());
+    TORCH_CHECK_VALUE(basis.device() == b.device(), title_, ": its null space is on ", basis.device(),
+                      " but the vector is on ", b.device());
+  }
+}
+
+at::Tensor SingularOperator::orthonormal(const at::Tensor& basis, const at::Tensor& v) const {
+  if (is_constant(basis)) {
+    const auto n = by_channel(v).sym_size(-1);
+    return at::full_symint({1, n}, 1.0 / std::sqrt(static_cast<double>(n.expect_int())), v.options());
+  }
+  return orthonormalised(basis.flatten(1).to(at::kDouble), title_).to(v.scalar_type());
+}
+
+at::Tensor SingularOperator::without(const at::Tensor& basis, const at::Tensor& v) const {
+  const auto channels = by_channel(v);
+  if (is_constant(basis)) return (channels - channels.mean({-1}, /*keepdim=*/true)).reshape_as(v);
+  const auto q = orthonormal(basis, v.detach());
+  return (channels - at::matmul(at::matmul(channels, q.mT()), q)).reshape_as(v);
+}
+
+void SingularOperator::check_is_mapped_to_zero(const at::Tensor& basis, const at::Tensor& b, bool transposed) const {
+  const at::NoGradGuard no_grad;
+  const auto product = [&](const at::Tensor& v) { return apply_on_loops(*a_, v, transposed); };
+  // How large products can be: that of a vector which changes its sign from point to point.
+  const auto alternating = 1.0 - 2.0 * at::arange(by_channel(b).size(-1), b.options()).remainder(2.0);
+  const auto largest = [](const at::Tensor& v) { return v.abs().amax().item<double>(); };
+  const auto as_vector = [&](const at::Tensor& q) { return q.expand_as(by_channel(b)).reshape_as(b); };
+  const double magnitude = largest(product(as_vector(alternating)));
+  const auto q = orthonormal(basis, b);
+  const double rounding = 200.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
+                                                                 : std::numeric_limits<double>::epsilon());
+  for (int64_t k = 0; k < q.size(0); ++k) {
+    const auto v = q[k] / q[k].abs().amax();
+    const double left = largest(product(as_vector(v)));
+    if (!std::isfinite(left) || !std::isfinite(magnitude)) return;  // said of each sample by its status
+    TORCH_CHECK_VALUE(left <= rounding * magnitude, title_, ": vector ", k, " of ",
+                      transposed ? "left_nullspace" : "nullspace", " is not in the null space of ",
+                      transposed ? "Aᵀ" : "A", ": a product has entries of ", left, " where ‖v‖∞ is 1",
+                      transposed ? "; give left_nullspace= if A is not symmetric" : "");
+  }
+}
+
+void SingularOperator::check_null_spaces(const at::Tensor& b) const {
+  if (b.numel() == 0) return;
+  check_is_mapped_to_zero(right_, b, /*transposed=*/false);
+  check_is_mapped_to_zero(left_, b, /*transposed=*/true);
+}
+
+namespace {
+
+/// P_r (A + ‖A‖ Q_l Q_rᵀ)⁻¹ P_l b, where the columns of Q_l and Q_r span the null spaces of Aᵀ and A.
+template <class Product>
+at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const at::Tensor& q_left,
+                         const Product& product) {
+  const int64_t batch = b.size(0), n = b.numel() / batch, channels = n / q_right.size(-1);
+  std::vector<at::Tensor> columns;
+  for (int64_t j = 0; j < n; ++j) {
+    auto unit = at::zeros({batch, n}, b.options());
+    unit.select(1, j).fill_(1.0);
+    columns.push_back(product(unit.view_as(b)).reshape({batch, n}));
+  }
+  const auto a = at::stack(columns, -1);
+  const auto q = at::kron(at::eye(channels, b.options()), at::matmul(q_left.mT(), q_right));
+  const auto scale = a.detach().abs().amax({-2, -1}, /*keepdim=*/true);
+  return solve_dense(a + scale * q, b.flatten(1).unsqueeze(-1)).reshape_as(b);
+}
+
+}  // namespace
+
+at::Tensor SingularOperator::solve_directly(const at::Tensor& b) const {
+  const auto like = b.detach();
+  return project_solution(solve_regular(project(b), orthonormal(right_, like), orthonormal(left_, like),
+                                        [this](const at::Tensor& v) { return apply(v); }));
+}
+at::Tensor SingularOperator::solve_transpose_directly(const at::Tensor& b) const {
+  const auto like = b.detach();
+  return project(solve_regular(project_solution(b), orthonormal(left_, like), orthonormal(right_, like),
+                               [this](const at::Tensor& v) { return apply_transpose(v); }));
+}
+
+std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  auto products = a_->product_rule(lambda, u);
+  products.resize(products.size() + 2);
+  return products;
+}
+
+std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
+  auto chosen = a_->select(index);
+  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), right_, left_, title_) : nullptr;
+}
+
+std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {
+  const auto regular = a_->kernels(b, transposed);
+  if (!regular) return nullptr;
+  const auto rows_of = [&](const at::Tensor& basis) {
+    const auto q = orthonormal(basis, b.detach()).to(at::kDouble).contiguous();
+    std::vector<std::vector<double>> rows;
+    for (int64_t k = 0; k < q.size(0); ++k)
+      rows.emplace_back(q[k].const_data_ptr<double>(), q[k].const_data_ptr<double>() + q.size(1));
+    return rows;
+  };
+  const auto right = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? left_ : right_));
+  const auto left = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? right_ : left_));
+  return std::visit(
+      [&]<class T>(const kernels::KernelBatch<T>& batch) {
+        const auto make = [regular, &batch, right, left](int64_t s) {
+          auto a = batch.make(s);
+          if (!a) return a;
+          const auto& layout = a->layout();
+          a->set_null_spaces({layout, 0, layout.planes, *right}, {layout, 0, layout.planes, *left});
+          return a;
+        };
+        return std::make_shared<const kernels::Kernels>(kernels::Kernels{kernels::KernelBatch<T>{batch.is_shared, make}});
+      },
+      regular->of_dtype);
+}
+
+}  // namespace prdp

@@ -1,0 +1,60 @@
+#pragma once
+#include <memory>
+
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
+/// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
+/// solutions onto those of least norm. Its kind is "singular_" and that of A; its tensors are those of A and the two
+/// bases.
+class SingularOperator final : public Operator {
+ public:
+  /// `right` and `left`: (k, *shape), the same for every sample, and for every channel that a vector (batch, channel,
+  /// *shape) has; empty for the constant vector. Raises ValueError if they do not fit each other.
+  SingularOperator(std::unique_ptr<Operator> a, at::Tensor right, at::Tensor left, const char* title);
+
+  void check_vector(const at::Tensor& b) const override;
+  void check_parameters() const override { a_->check_parameters(); }
+  /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero.
+  void check_null_spaces(const at::Tensor& b) const override;
+
+  at::Tensor apply(const at::Tensor& v) const override { return a_->apply(v); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return a_->apply_transpose(v); }
+  at::Tensor diagonal() const override { return a_->diagonal(); }
+  at::Tensor norm() const override { return a_->norm(); }
+  at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
+  at::Tensor project_solution(const at::Tensor& v) const override { return without(right_, v); }
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+  std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
+  bool has_coarse_grids() const override { return a_->has_coarse_grids(); }
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+
+ private:
+  bool is_constant(const at::Tensor& basis) const { return basis.sym_numel() == 0; }
+  /// An orthonormal basis (k, n) in the dtype of v, with n the unknowns of a channel.
+  at::Tensor orthonormal(const at::Tensor& basis, const at::Tensor& v) const;
+  at::Tensor without(const at::Tensor& basis, const at::Tensor& v) const;
+  void check_is_mapped_to_zero(const at::Tensor& basis, const at::Tensor& b, bool transposed) const;
+
+  std::unique_ptr<Operator> a_;
+  at::Tensor right_, left_;
+  const char* title_;
+};
+
+/// For `kind` of the operator, which is not singular, and its two bases.
+template <class T>
+std::unique_ptr<Operator> make_singular(const OperatorSpec& spec, const char* title) {
+  TORCH_CHECK_VALUE(spec.tensors.size() >= 2, title, ": its null spaces are missing");
+  OperatorSpec regular = spec;
+  const auto left = regular.tensors.back(), right = *(regular.tensors.end() - 2);
+  regular.tensors.resize(spec.tensors.size() - 2);
+  return std::make_unique<SingularOperator>(std::make_unique<T>(regular), right, left, title);
+}
+
+}  // namespace prdp

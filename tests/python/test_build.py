@@ -1,0 +1,107 @@
+"""What a build takes: the torch of its environment, and only the headers that are there."""
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+CMAKE = Path(sys.executable).with_name("cmake")
+sys.path.append(str(ROOT / "packaging"))
+import prdp_backend  # noqa: E402
+
+PINNED = re.search(r"^torch==.*$", (ROOT / "requirements.txt").read_text(), re.MULTILINE)[0]
+
+
+@pytest.fixture
+def environment(tmp_path, monkeypatch):
+    """The packages of an environment of its own, which an isolated build cannot import."""
+    monkeypatch.setattr(sys, "path", [])
+    monkeypatch.setattr(prdp_backend.sysconfig, "get_path", lambda kind: str(tmp_path))
+    monkeypatch.setattr(prdp_backend.site, "getsitepackages", lambda: [])
+    monkeypatch.setattr(prdp_backend.site, "getusersitepackages", lambda: str(tmp_path / "user"))
+    return tmp_path
+
+
+def fake_torch(folder, version):
+    """What a build reads first of a torch."""
+    cmake = folder / "torch" / "share" / "cmake" / "Torch"
+    cmake.mkdir(parents=True)
+    (folder / "torch" / "__init__.py").touch()
+    (folder / "torch" / "version.py").write_text(
+        f"from typing import Optional\n__version__ = '{version}'\ncuda = None\n"
+    )
+    (cmake / "TorchConfig.cmake").touch()
+    (cmake / "TorchConfigVersion.cmake").write_text(f'set(PACKAGE_VERSION "{version.partition("+")[0]}")\n')
+    return cmake
+
+
+def test_an_isolated_build_takes_the_torch_behind_it(environment):
+    fake_torch(environment, "2.98.1+cu130")
+    assert prdp_backend.find_torch() == (environment / "torch", "2.98.1+cu130")
+    assert prdp_backend.requirement() == "torch==2.98.1"  # for the CPU as for CUDA
+    assert prdp_backend.get_requires_for_build_wheel() == prdp_backend.get_requires_for_build_editable() == []
+
+
+def test_a_build_without_torch_asks_for_the_tested_one(environment):
+    assert prdp_backend.find_torch() is None and prdp_backend.requirement() == "torch"
+    assert prdp_backend.get_requires_for_build_wheel() == [PINNED]
+
+
+@pytest.mark.parametrize("kind", ["wheel", "editable"])
+def test_without_isolation_and_without_torch_one_sentence_says_what_to_type(environment, kind):
+    with pytest.raises(SystemExit, match=f"has no torch to build against; leave out .*, or first pip install {PINNED}"):
+        getattr(prdp_backend, f"prepare_metadata_for_build_{kind}")(str(environment))
+
+
+def test_the_installed_package_requires_the_torch_that_it_was_built_against():
+    required = importlib.metadata.requires("prdp_torch")
+    assert f"torch=={torch.__version__.partition('+')[0]}" in required
+
+
+def test_type_checkers_find_an_editable_installation():
+    """They follow a path, and not the import hook that setuptools writes by default."""
+    files = importlib.metadata.files("prdp_torch")
+    (path,) = (file for file in files if file.suffix == ".pth")
+    assert path.read_text().strip() == str(ROOT)
+
+
+def configure(folder, *options, **run):
+    tools = (f"-DCMAKE_MAKE_PROGRAM={CMAKE.with_name('ninja')}", f"-DPython_EXECUTABLE={sys.executable}")
+    command = (CMAKE, "-S", ROOT, "-B", folder, "-G", "Ninja", *tools, *options)
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    return done.returncode, " ".join((done.stdout + done.stderr).split())
+
+
+NO_SYSTEM_HEADERS = "-DCMAKE_FIND_USE_CMAKE_SYSTEM_PATH=OFF"
+
+
+def test_only_the_library_is_built_where_no_header_of_the_system_is_found(tmp_path):
+    status, said = configure(tmp_path, NO_SYSTEM_HEADERS)
+    assert status == 0, said
+    assert "without PRDP_EXPERIMENTS, as <toml++/toml.h> was not found; apt-get install libtomlplusplus-dev" in said
+    rules = (tmp_path / "build.ninja").read_text()
+    targets = "\n".join(re.findall(r"^build (\S+)", rules, re.MULTILINE))
+    assert "libprdp.so" in targets and "CMakeFiles/_C.dir" in targets
+    assert not re.search(r"experiments|prdp_train|prdp_tests", targets)
+
+
+def test_a_part_that_was_asked_for_is_not_left_out(tmp_path):
+    status, said = configure(tmp_path, NO_SYSTEM_HEADERS, "-DPRDP_EXPERIMENTS=ON")
+    assert status != 0
+    assert "<toml++/toml.h> was not found; apt-get install libtomlplusplus-dev, or configure with -DPRDP_EXP" in said
+
+
+def test_a_torch_that_is_too_old_is_refused_in_one_sentence(tmp_path):
+    status, said = configure(tmp_path / "build", f"-DTorch_DIR={fake_torch(tmp_path, '2.12.1+cu130')}")
+    assert status != 0 and "prdp: needs PyTorch 2.13 or newer, found 2.12.1 in " in said
+
+
+def test_warnings_stop_no_user():
+    """A newer compiler than ours may warn of something new. The Makefile makes them errors."""
+    assert 'option(PRDP_WERROR "Treat warnings as errors" OFF)' in (ROOT / "CMakeLists.txt").read_text()
+    assert "-DPRDP_WERROR=ON" in (ROOT / "Makefile").read_text()
