@@ -26,7 +26,7 @@ class Flow(Stepper):
         length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/N.
         obstacle: bool (*shape), True in solid cells. Their faces carry no velocity.
         force: acceleration, (d,) or (batch or 1, d, *shape).
-        inflow: velocity at the low end of the open axis, (d,), or (batch or 1, d, *shape) with extent 1 along that axis.
+        inflow: velocity at the low end of the open axis, (d,), or (batch or 1, d, *shape) with extent 1 along it.
         advection: "central" is of second order and conserves the energy; it needs about dt <= 2 nu/|u|². "upwind" is of
             first order and stable without viscosity.
         diffusion: "implicit" solves with `solver`, and "explicit" needs nu dt Σ 2/dx² <= 1.
@@ -119,8 +119,8 @@ class Flow(Stepper):
         return self._equation().pressure(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
 
     def divergence(self, u):
-        """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last cells
-        before an open end, whose high faces take what mass conservation gives."""
+        """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
+        cells before an open end, whose high faces take what mass conservation gives."""
         return self._equation().divergence(_check.dense("Flow", "u", u))
 
     def _equation(self):

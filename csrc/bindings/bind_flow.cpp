@@ -1,3 +1,5 @@
+#include <torch/csrc/Exceptions.h>
+
 #include "bindings.h"
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/flow/steps.h"
@@ -32,8 +34,18 @@ SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
   return options;
 }
 
-py::tuple report(const SolveResult& result) {
-  const auto& [u, info] = result;
+/// The result of a call, with the errors that torch would raise.
+template <class Call>
+auto without_lock(const Call& call) {
+  HANDLE_TH_ERRORS
+  const py::gil_scoped_release no_gil;
+  return call();
+  END_HANDLE_TH_ERRORS_PYBIND
+}
+
+template <class Solve>
+py::tuple report(const Solve& solve) {
+  const auto [u, info] = without_lock(solve);
   return py::make_tuple(u, info.iterations, info.residual, info.status, info.operator_applications, info.floor);
 }
 
@@ -49,35 +61,30 @@ void bind_flow(py::module_& m) {
       .def(
           "step",
           [](const FlowEquation& e, const at::Tensor& u, const SolveOptions& options, int64_t k, int64_t log) {
-            const auto found = [&] {
-              const py::gil_scoped_release no_gil;
-              return flow_next(e, u, with(options, k, log));
-            }();
-            return report(found);
+            return report([&] { return flow_next(e, u, with(options, k, log)); });
           },
           py::arg("u"), py::arg("options"), py::arg("max_iter"), py::arg("adjoint_log"))
       .def(
           "rollout",
           [](const FlowEquation& e, const at::Tensor& u, int64_t steps, const SolveOptions& options, int64_t k,
-             int64_t log) {
-            const auto found = [&] {
-              const py::gil_scoped_release no_gil;
-              return flow_rollout(e, u, steps, with(options, k, log));
-            }();
-            return report(found);
-          },
+             int64_t log) { return report([&] { return flow_rollout(e, u, steps, with(options, k, log)); }); },
           py::arg("u"), py::arg("steps"), py::arg("options"), py::arg("max_iter"), py::arg("adjoint_log"))
       .def(
           "project",
           [](const FlowEquation& e, const at::Tensor& u, const SolveOptions& options, int64_t k) {
-            return flow_project(e, u, with(options, k, 0));
+            return without_lock([&] { return flow_project(e, u, with(options, k, 0)); });
           },
-          py::call_guard<py::gil_scoped_release>(), py::arg("u"), py::arg("options"), py::arg("max_iter"))
+          py::arg("u"), py::arg("options"), py::arg("max_iter"))
       .def(
           "pressure",
           [](const FlowEquation& e, const at::Tensor& u, const SolveOptions& options, int64_t k) {
-            return flow_pressure(e, u, with(options, k, 0));
+            return without_lock([&] { return flow_pressure(e, u, with(options, k, 0)); });
           },
-          py::call_guard<py::gil_scoped_release>(), py::arg("u"), py::arg("options"), py::arg("max_iter"))
-      .def("divergence", &flow_divergence_of_state, py::call_guard<py::gil_scoped_release>(), py::arg("u"));
+          py::arg("u"), py::arg("options"), py::arg("max_iter"))
+      .def(
+          "divergence",
+          [](const FlowEquation& e, const at::Tensor& u) {
+            return without_lock([&] { return flow_divergence_of_state(e, u); });
+          },
+          py::arg("u"));
 }

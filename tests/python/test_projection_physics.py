@@ -43,7 +43,9 @@ def test_upwind_advection_converges():
 def test_poiseuille_flow_between_walls(n):
     """Without pressure gradient but with a force: u = f/(2 nu) y (1 - y)."""
     nu, force = 0.5, 4.0
-    flow = prdp.Flow((n, 4), nu, 0.5, boundary=("wall", "periodic"), length=(1.0, 4 / n), force=(force, 0.0), solver=EXACT)
+    flow = prdp.Flow(
+        (n, 4), nu, 0.5, boundary=("wall", "periodic"), length=(1.0, 4 / n), force=(force, 0.0), solver=EXACT
+    )
     u = torch.zeros(1, 2, n, 4, dtype=torch.float64)
     with torch.no_grad():
         for _ in range(60):
@@ -58,7 +60,9 @@ def test_poiseuille_flow_between_walls(n):
 @pytest.mark.parametrize("boundary", ["periodic", "wall", "open", "mixed"])
 def test_a_projected_velocity_has_no_divergence_and_stays_itself(shape, boundary):
     d = len(shape)
-    kinds = {"mixed": ["wall", "periodic", "open"][-d:], "open": ["wall"] * (d - 1) + ["open"]}.get(boundary, [boundary] * d)
+    kinds = {"mixed": ["wall", "periodic", "open"][-d:], "open": ["wall"] * (d - 1) + ["open"]}.get(
+        boundary, [boundary] * d
+    )
     inflow = torch.linspace(1, 2, d, dtype=torch.float64) if "open" in kinds else None
     flow = prdp.Flow(shape, 0.1, 1e-3, boundary=kinds, inflow=inflow, solver=EXACT)
     u = random_velocity(shape, batch=2)
@@ -105,5 +109,7 @@ def test_a_vortex_is_carried_along():
     x, y = positions((64, 64), 0, 2 * math.pi)
     step = (flow(u) - u)[0, 0] / 1e-3
     # u_t = -(0.5 ∂x + 0.5 ∂y) u - 2 nu (u - 0.5) for the vortex that is carried along
-    expected = -0.5 * torch.cos(x) * torch.cos(y) + 0.5 * torch.sin(x) * torch.sin(y) - 0.1 * torch.sin(x) * torch.cos(y)
+    expected = (
+        -0.5 * torch.cos(x) * torch.cos(y) + 0.5 * torch.sin(x) * torch.sin(y) - 0.1 * torch.sin(x) * torch.cos(y)
+    )
     assert (step - expected).abs().max() < 0.01

@@ -81,8 +81,9 @@ void raise_or_warn(const std::string& text, OnFailure on_failure) {
   if (step_now > 0) whole << "step " << step_now << " of " << steps_in_all << ": ";
   whole << text;
   if (on_failure == OnFailure::kRaise)
-    whole << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
-            "the failed ones have no gradient, and a training goes on";
+    whole
+        << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
+           "the failed ones have no gradient, and a training goes on";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
   warning_sink()(whole.str());
 }

@@ -1,5 +1,7 @@
 #include "prdp/steppers/flow/box.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include <algorithm>
 #include <cmath>
 
@@ -42,8 +44,8 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
   TORCH_CHECK_VALUE(std::count(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen) <= 1,
                     "Flow: at most one axis may be 'open'");
   if (obstacle_.defined()) {
-    TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool, "Flow: obstacle must be a bool tensor, true in solid cells, got ",
-                     obstacle_.scalar_type());
+    TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
+                     "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle_.scalar_type());
     TORCH_CHECK_VALUE(obstacle_.sizes() == at::IntArrayRef(shape_), "Flow: obstacle must have the shape of the grid, ",
                       at::IntArrayRef(shape_), ", got ", obstacle_.sizes());
     obstacle_ = obstacle_.detach().to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
@@ -81,11 +83,10 @@ const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
   if (!is_new) return entry->second;
   auto& found = entry->second = fields_;
   const at::NoGradGuard no_grad;
-  for (auto* t : {&found.cells, &found.free, &found.inlet, &found.friction, &found.pressure, &found.cells_of_parts})
+  for (auto* t : {&found.cells, &found.free, &found.inlet, &found.friction, &found.pressure, &found.closed_parts})
     if (t->defined()) *t = t->to(options.device(), dtype);
   for (auto* list : {&found.diffusion, &found.high_sign})
     for (auto& t : *list) t = t.to(options.device(), dtype);
-  if (found.part.defined()) found.part = found.part.to(options.device());
   return found;
 }
 

@@ -27,8 +27,9 @@ struct FlowFields {
   at::Tensor pressure;                // (1, 2 d + 1, *shape): coefficients of -div grad
   std::vector<at::Tensor> diffusion;  // (1, 2 d + 1, *shape) for each component: -Δ; a single one if all are the same
   std::vector<at::Tensor> high_sign;  // per axis, (d, 1, …): the ghost beyond its high wall is so many times the last
-  at::Tensor part;                    // (cells,) int64: the closed part that a cell belongs to; undefined: one, of all
-  at::Tensor cells_of_parts;          // (parts,); the last one takes the cells of no closed part
+  /// (parts, *shape): 1 in the cells of each closed part of the fluid, where the pressure has no level; empty for one
+  /// part of all cells, undefined if there are none.
+  at::Tensor closed_parts;
 };
 
 /// A box of cells with a staggered grid (Harlow and Welch 1965): pressures in the centres, and each component of the
@@ -50,8 +51,6 @@ class FlowBox {
   /// The axis with an inflow, or -1.
   int64_t open_axis() const;
   int64_t channel_of(int64_t axis) const { return dim() - 1 - axis; }
-  /// Whether no open end sets the level of the pressure in some part of the fluid.
-  bool has_closed_parts() const { return fields_.part.defined() || open_axis() < 0; }
   /// Σ_axes 2 / dx².
   double sum_of_couplings() const;
 

@@ -6,11 +6,11 @@ namespace prdp {
 
 namespace {
 
-/// I - ν dt Δ for system k.
-FlowSystem diffusion_system(const FlowEquation& e, const at::Tensor& pattern, const SolveOptions& options) {
+/// I - ν dt Δ from -Δ.
+OperatorSpec diffusion_operator(const FlowEquation& e, const at::Tensor& pattern) {
   const auto scaled = pattern * (e.nu * e.dt);
   const auto coefficients = at::cat({scaled.narrow(1, 0, 1) + 1.0, scaled.narrow(1, 1, scaled.size(1) - 1)}, 1);
-  return {stencil_of(*e.box, coefficients), options};
+  return stencil_of(*e.box, coefficients);
 }
 
 }  // namespace
@@ -32,7 +32,7 @@ at::Tensor diffuse(const FlowEquation& equation, const at::Tensor& change, const
   std::vector<at::Tensor> parts;
   for (size_t k = 0; k < patterns.size(); ++k) {
     const auto b = change.narrow(1, static_cast<int64_t>(k) * width, width);
-    parts.push_back(solve(*equation.box, diffusion_system(equation, patterns[k], options), b, info));
+    parts.push_back(solve(diffusion_operator(equation, patterns[k]), b, options, info));
   }
   return parts.size() == 1 ? parts[0] : at::cat(parts, 1);
 }
@@ -47,8 +47,8 @@ DiffuseVjp diffuse_vjp(const FlowEquation& equation, const at::Tensor& cotangent
     const auto of_system = [&](const at::Tensor& t) {
       return t.defined() ? t.narrow(1, static_cast<int64_t>(k) * width, width) : t;
     };
-    const auto system = diffusion_system(equation, patterns[k], options);
-    const auto found = solve_vjp(*equation.box, system, of_system(cotangent), of_system(result), info);
+    const auto a = diffusion_operator(equation, patterns[k]);
+    const auto found = solve_vjp(a, of_system(cotangent), of_system(result), options, info);
     parts.push_back(found.b);
     if (!found.coefficients.defined()) continue;
     const auto share = (found.coefficients * patterns[k]).sum() * equation.dt;

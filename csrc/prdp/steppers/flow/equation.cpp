@@ -12,7 +12,8 @@ void check_field(const char* name, const at::Tensor& t, std::vector<int64_t> of_
   TORCH_CHECK_TYPE(at::isFloatingType(t.scalar_type()), "Flow: ", name, " must hold real numbers, got ",
                    t.scalar_type());
   const bool uniform = t.dim() == 1 && t.size(0) == d;
-  const bool field = t.dim() == static_cast<int64_t>(of_sample.size()) + 1 && t.sizes().slice(1) == at::IntArrayRef(of_sample);
+  const bool field =
+      t.dim() == static_cast<int64_t>(of_sample.size()) + 1 && t.sizes().slice(1) == at::IntArrayRef(of_sample);
   std::ostringstream expected;
   for (const int64_t n : of_sample) expected << ", " << n;
   TORCH_CHECK_VALUE(uniform || field, "Flow: ", name, " must have shape (", d, ",) or (batch or 1", expected.str(),
@@ -76,8 +77,9 @@ void FlowEquation::check(const at::Tensor& u) const {
   box->check_velocity(u);
   check();
   for (const auto* t : {&force, &inflow})
-    TORCH_CHECK_VALUE(!t->defined() || t->dim() == 1 || t->size(0) == 1 || t->size(0) == u.size(0), "Flow: ",
-                      t == &force ? "force" : "inflow", " holds ", t->size(0), " samples, u holds ", u.size(0));
+    TORCH_CHECK_VALUE(!t->defined() || t->dim() == 1 || t->size(0) == 1 || t->size(0) == u.size(0),
+                      "Flow: ", t == &force ? "force" : "inflow", " holds ", t->size(0), " samples, u holds ",
+                      u.size(0));
 }
 
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {

@@ -1,5 +1,7 @@
 #include "prdp/steppers/flow/fields.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include <deque>
 
 namespace prdp {
@@ -48,11 +50,11 @@ Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
   return parts;
 }
 
-/// Numbers the parts without an open end, whose pressure has no level, and counts their cells.
-void set_closed_parts(const FlowBox& box, const at::Tensor& fluid, FlowFields& fields) {
+/// The parts without an open end, as FlowFields has them.
+at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid) {
   const int64_t open = box.open_axis();
   const auto parts = find_parts(box, fluid);
-  if (open < 0 && parts.count == 1 && !box.obstacle().defined()) return;
+  if (open < 0 && !box.obstacle().defined()) return at::empty({0}, at::kDouble);
   std::vector<bool> inlet(parts.count), outlet(parts.count);
   const auto cells = static_cast<int64_t>(parts.of_cell.size());
   for (int64_t cell = 0; cell < cells && open >= 0; ++cell) {
@@ -60,24 +62,17 @@ void set_closed_parts(const FlowBox& box, const at::Tensor& fluid, FlowFields& f
     if (position(box, cell, open) == 0) inlet[parts.of_cell[cell]] = true;
     if (position(box, cell, open) == box.shape()[open] - 1) outlet[parts.of_cell[cell]] = true;
   }
-  std::vector<int64_t> number(parts.count, -1);
-  int64_t closed = 0;
+  const auto numbers = at::tensor(parts.of_cell, at::kLong).reshape(box.shape());
+  std::vector<at::Tensor> closed;
   for (int64_t p = 0; p < parts.count; ++p) {
     TORCH_CHECK_VALUE(!inlet[p] || outlet[p],
                       "Flow: the obstacle keeps fluid that comes in at the open end from going out at the other; make "
                       "the cells before it solid, or open a way");
-    if (!outlet[p]) number[p] = closed++;
+    const auto cells_of_part = numbers.eq(p);
+    // The pressure of a cell without a free face is known.
+    if (!outlet[p] && cells_of_part.sum().item<int64_t>() > 1) closed.push_back(cells_of_part.to(at::kDouble));
   }
-  if (closed == 0) return;
-  fields.part = at::empty({cells}, at::kLong);
-  fields.cells_of_parts = at::zeros({closed + 1}, at::kDouble);
-  auto* part = fields.part.mutable_data_ptr<int64_t>();
-  auto* count = fields.cells_of_parts.mutable_data_ptr<double>();
-  for (int64_t cell = 0; cell < cells; ++cell) {
-    const int64_t p = parts.of_cell[cell];
-    part[cell] = p < 0 || number[p] < 0 ? closed : number[p];
-    count[part[cell]] += 1;
-  }
+  return closed.empty() ? at::Tensor() : at::stack(closed);
 }
 
 /// The coefficient of each neighbour, low and high along each axis, behind that of the point itself.
@@ -163,7 +158,7 @@ FlowFields make_flow_fields(const FlowBox& box) {
   auto known = fluid.logical_not();
   if (open >= 0) known.narrow(open, box.shape()[open] - 1, 1).fill_(true);
   fields.pressure = pressure_coefficients(box, at::stack(free), known);
-  set_closed_parts(box, fluid, fields);
+  fields.closed_parts = find_closed_parts(box, fluid);
 
   fields.cells = known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
   fields.free = at::stack(free).unsqueeze(0);

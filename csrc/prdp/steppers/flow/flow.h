@@ -11,7 +11,7 @@ struct FlowSettings {
   Length length = 1.0;
   at::Tensor obstacle{};  // bool (*shape), true in solid cells
   at::Tensor force{};     // (d,) or (batch or 1, d, *shape); may get a gradient
-  at::Tensor inflow{};    // for an open axis: (d,) or (batch or 1, d, *shape with one cell along it); may get a gradient
+  at::Tensor inflow{};  // for an open axis: (d,) or (batch or 1, d, *shape with one cell along it); may get a gradient
   Advection advection = Advection::kCentral;
   Diffusion diffusion = Diffusion::kImplicit;
 };
@@ -35,8 +35,8 @@ class Flow : public StepperBase {
   at::Tensor project(const at::Tensor& u) const;
   /// The pressure of the step from u, (batch, 1, *shape).
   at::Tensor pressure(const at::Tensor& u) const;
-  /// div u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last cells before an
-  /// open end, whose high faces take what mass conservation gives.
+  /// div u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last cells before
+  /// an open end, whose high faces take what mass conservation gives.
   at::Tensor divergence(const at::Tensor& u) const;
 
  private:

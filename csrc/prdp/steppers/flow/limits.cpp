@@ -1,5 +1,7 @@
 #include "prdp/steppers/flow/limits.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include <cmath>
 
 #include "prdp/operators/operator.h"
@@ -15,8 +17,8 @@ namespace {
 /// where diffusion is implicit. Up to 1 waves grow slowly at most.
 double largest_courant_number(const FlowEquation& e) {
   if (e.advection == Advection::kUpwind || e.diffusion == Diffusion::kExplicit) return 1.0;
-  return std::max(1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() /
-                                 static_cast<double>(e.box->dim())));
+  return std::max(
+      1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
 }
 
 }  // namespace
@@ -27,8 +29,8 @@ RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const auto fine = courant.le(largest_courant_number(equation));
   if (fine.all().item<bool>()) return {};
   const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);
-  return {fine.logical_not(), diverged.masked_fill(courant.isfinite().logical_not(),
-                                                   static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
+  return {fine.logical_not(),
+          diverged.masked_fill(courant.isfinite().logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
 }
 
 void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,

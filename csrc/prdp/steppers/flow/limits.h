@@ -1,6 +1,6 @@
 #pragma once
-#include "prdp/steppers/flow/equation.h"
 #include "prdp/solvers/solver.h"
+#include "prdp/steppers/flow/equation.h"
 
 namespace prdp {
 

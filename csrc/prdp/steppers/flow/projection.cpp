@@ -6,8 +6,14 @@ namespace prdp {
 
 namespace {
 
-FlowSystem pressure_system(const FlowBox& box, const at::Tensor& u, SolveOptions options) {
-  return {stencil_of(box, box.fields(u.options()).pressure), std::move(options), box.has_closed_parts()};
+/// -div grad of the pressure, and its null space.
+OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
+  const auto& fields = box.fields(u.options());
+  auto a = stencil_of(box, fields.pressure);
+  if (!fields.closed_parts.defined()) return a;
+  a.kind = "singular_" + a.kind;
+  a.tensors.insert(a.tensors.end(), {fields.closed_parts, fields.closed_parts});
+  return a;
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }
@@ -38,7 +44,7 @@ at::Tensor flow_gradient(const FlowBox& box, const at::Tensor& p) {
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
-  const auto phi = solve(box, pressure_system(box, u, options), -flow_divergence(box, u), info);
+  const auto phi = solve(pressure_operator(box, u), -flow_divergence(box, u), options, info);
   return {u - flow_gradient(box, phi), phi};
 }
 
@@ -46,7 +52,7 @@ at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const So
                        CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
   const auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
-  const auto b_bar = solve_vjp(box, pressure_system(box, cotangent, options), phi_bar, {}, info).b;
+  const auto b_bar = solve_vjp(pressure_operator(box, cotangent), phi_bar, {}, options, info).b;
   return cotangent + differences(box, masked(b_bar, fields.cells));
 }
 

@@ -14,20 +14,13 @@ class CombinedInfo {
   SolveInfo info_;
 };
 
-/// A symmetric system of a flow: all its right-hand sides are solved by one matrix.
-struct FlowSystem {
-  OperatorSpec a;
-  SolveOptions options;
-  bool singular = false;  // a constant of each closed part of the fluid is in its null space
-};
-
-/// A u = b, differentiable in b and the coefficients.
-at::Tensor solve(const FlowBox& box, const FlowSystem& system, const at::Tensor& b, CombinedInfo& info);
-/// The cotangent of b from that of u, by one adjoint solve; and that of the coefficients where `u` is given.
+/// A u = b, differentiable in b and the tensors of A.
+at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info);
+/// The cotangent of b from that of u, by one adjoint solve; and that of the first tensor of A where `u` is given.
 struct SystemVjp {
   at::Tensor b, coefficients;
 };
-SystemVjp solve_vjp(const FlowBox& box, const FlowSystem& system, const at::Tensor& cotangent, const at::Tensor& u,
-                    CombinedInfo& info);
+SystemVjp solve_vjp(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
+                    const SolveOptions& options, CombinedInfo& info);
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/step.h"
 
+#include <ATen/core/grad_mode.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <limits>
@@ -65,6 +66,40 @@ std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Ten
   return gradients({step.u}, {cotangent}, inputs, needed, /*create_graph=*/true);
 }
 
+/// The gradients of u, ν, force and inflow from the cotangents of the velocity with its boundary values, of its change,
+/// and of ν in the diffusion.
+std::vector<at::Tensor> explicit_vjp_recorded(const FlowEquation& equation, const at::Tensor& u,
+                                              const at::Tensor& refused, const at::Tensor& velocity_bar,
+                                              const DiffuseVjp& back, at::IntArrayRef needed) {
+  const at::AutoGradMode record(true);
+  std::vector<at::Tensor> inputs{u.detach().requires_grad_()};
+  const auto given = equation.tensors();
+  for (size_t i = 0; i < given.size(); ++i)
+    inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
+  const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
+  const auto part = explicit_part(e, inputs[0], refused);
+  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, back.change, back.nu}, inputs, needed,
+                   /*create_graph=*/false);
+}
+
+/// The same by loops.
+std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& refused,
+                                     const at::Tensor& velocity_bar, const DiffuseVjp& back, at::IntArrayRef needed) {
+  const auto e = equation.for_state(u);
+  const auto velocity = cleared(with_boundary_values(e, u), refused);
+  auto found = tendency_vjp(e, velocity, back.change * e.dt);
+  add_to(found.nu, back.nu);
+  auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
+  add_to(of_boundary.inflow, found.inflow);
+  std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
+  const auto given = equation.tensors();
+  for (size_t i = 0; i < all.size(); ++i) {
+    if (!needed[i]) all[i] = at::Tensor();
+    else if (i > 0) all[i] = all[i].reshape(given[i - 1].sizes()).to(given[i - 1].options());
+  }
+  return all;
+}
+
 }  // namespace
 
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
@@ -86,32 +121,21 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
 std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
   if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
-  std::vector<at::Tensor> inputs{input_of(u, true)};
-  const auto given = equation.tensors();
-  for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
-  FlowEquation e;
-  ExplicitPart part;
-  at::Tensor refused;
-  {
-    const at::AutoGradMode record(true);
-    e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
-    refused = find_refused(e, with_boundary_values(e, u)).mask;
-    part = explicit_part(e, inputs[0], refused);
-  }
+  const auto e = equation.for_state(u);
+  const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
   const auto& box = *e.box;
   CombinedInfo adjoint;
   const auto velocity_bar = project_vjp(box, cleared(cotangent, refused), options, adjoint);
   const auto& free = box.fields(u.options()).free;
   DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
   if (is_implicit(e)) {
-    const auto constant = e.with_tensors({e.nu.detach(), {}, {}});
     CombinedInfo again;
-    const auto diffused = needed[1] ? diffuse(constant, part.change.detach(), options, again) : at::Tensor();
-    back = diffuse_vjp(constant, back.change, diffused, options, adjoint);
+    const auto diffused = needed[1] ? diffuse(e, explicit_part(e, u, refused).change, options, again) : at::Tensor();
+    back = diffuse_vjp(e, back.change, diffused, options, adjoint);
   }
   info = adjoint.info();
-  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, back.change, back.nu}, inputs, needed,
-                   /*create_graph=*/false);
+  const auto by_loops = tendency_has_loops(u);
+  return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar, back, needed);
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/steps.h"
 
+#include <ATen/core/grad_mode.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
 
@@ -64,7 +65,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
-    ctx->save_for_backward({call->all_states ? out : u, nu, force, inflow, may_have_failed ? info.status : at::Tensor()});
+    ctx->save_for_backward(
+        {call->all_states ? out : u, nu, force, inflow, may_have_failed ? info.status : at::Tensor()});
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {out, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
   }

@@ -1,5 +1,13 @@
 #include "prdp/steppers/flow/tendency.h"
 
+#include <ATen/core/grad_mode.h>
+
+#include <algorithm>
+
+#include "prdp/operators/disguises.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/explicit_loops.h"
+
 namespace prdp {
 
 namespace {
@@ -34,9 +42,10 @@ at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t
   const int64_t c = box.channel_of(along), d = axis + 1, n = box.shape()[axis];
   const auto before = u.edges(c, axis, 0), after = u.edges(c, axis, 1);
   // The velocity through the edges between neighbours.
-  const auto through = axis == along
-                           ? (before + after) * 0.5
-                           : (u.edges(box.channel_of(axis), axis, 1, along, -1) + u.edges(box.channel_of(axis), axis, 1)) * 0.5;
+  const auto through =
+      axis == along
+          ? (before + after) * 0.5
+          : (u.edges(box.channel_of(axis), axis, 1, along, -1) + u.edges(box.channel_of(axis), axis, 1)) * 0.5;
   const auto low = [&](const at::Tensor& t) { return t.narrow(d, 0, n); };
   const auto high = [&](const at::Tensor& t) { return t.narrow(d, 1, n); };
   if (kind == Advection::kCentral)
@@ -52,6 +61,59 @@ at::Tensor laplacian(const FlowBox& box, const Padded& u, int64_t c) {
   return sum;
 }
 
+/// -(u·∇)u + ν Δu in tensor operations.
+at::Tensor advect_and_diffuse_tensors(const FlowEquation& equation, const at::Tensor& ghosts) {
+  const auto& box = *equation.box;
+  const Padded padded(box, ghosts);
+  std::vector<at::Tensor> components;
+  for (int64_t c = 0; c < box.dim(); ++c) {
+    auto sum = laplacian(box, padded, c) * equation.nu;
+    for (int64_t axis = 0; axis < box.dim(); ++axis)
+      sum = sum - advection(box, padded, box.dim() - 1 - c, axis, equation.advection);
+    components.push_back(sum);
+  }
+  return at::stack(components, 1);
+}
+
+/// The order in which the axes get their ghosts: the open one first, so that the others take its ghosts along.
+std::vector<int64_t> axes_of_ghosts(const FlowBox& box) {
+  std::vector<int64_t> axes;
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    axes.insert(axis == box.open_axis() ? axes.begin() : axes.end(), axis);
+  return axes;
+}
+
+/// The cotangents of u and of the inflow from that of the field with ghosts, which is overwritten.
+std::pair<at::Tensor, at::Tensor> ghosts_back(const FlowEquation& equation, at::Tensor padded) {
+  const auto& box = *equation.box;
+  const auto& fields = box.fields(padded.options());
+  auto axes = axes_of_ghosts(box);
+  std::reverse(axes.begin(), axes.end());
+  at::Tensor inflow;
+  for (const int64_t axis : axes) {
+    const int64_t d = axis + 2, n = box.shape()[axis];
+    const auto low = padded.narrow(d, 0, 1), high = padded.narrow(d, n + 1, 1);
+    padded = padded.narrow(d, 1, n);
+    auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
+    switch (box.boundary(axis)) {
+      case FlowBoundary::kPeriodic:
+        last.add_(low);
+        first.add_(high);
+        break;
+      case FlowBoundary::kWall:
+        first.sub_(low);
+        last.add_(fields.high_sign[axis] * high);
+        break;
+      case FlowBoundary::kOpen:
+        inflow = at::sum_to(2 * low, equation.inflow.sizes());
+        first.sub_(low);
+        last.add_(high);
+        break;
+    }
+  }
+  return {padded, inflow};
+}
+
 }  // namespace
 
 at::Tensor with_boundary_values(const FlowEquation& equation, const at::Tensor& u) {
@@ -60,15 +122,17 @@ at::Tensor with_boundary_values(const FlowEquation& equation, const at::Tensor& 
   return fields.inlet.defined() ? inside + fields.inlet * equation.inflow : inside;
 }
 
+BoundaryVjp boundary_values_vjp(const FlowEquation& equation, const at::Tensor& cotangent) {
+  const auto& fields = equation.box->fields(cotangent.options());
+  return {fields.free.defined() ? cotangent * fields.free : cotangent,
+          fields.inlet.defined() ? at::sum_to(cotangent * fields.inlet, equation.inflow.sizes()) : at::Tensor()};
+}
+
 at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
   const auto& box = *equation.box;
   const auto& fields = box.fields(u.options());
   auto padded = u;
-  // The open axis first: the other axes then take its ghosts along.
-  std::vector<int64_t> axes;
-  for (int64_t axis = 0; axis < box.dim(); ++axis)
-    axes.insert(axis == box.open_axis() ? axes.begin() : axes.end(), axis);
-  for (const int64_t axis : axes) {
+  for (const int64_t axis : axes_of_ghosts(box)) {
     const int64_t d = axis + 2, n = box.shape()[axis];
     const auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
     switch (box.boundary(axis)) {
@@ -80,23 +144,31 @@ at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
   return padded;
 }
 
+bool tendency_has_loops(const at::Tensor& u) { return u.is_cpu() && is_plain(u) && !at::GradMode::is_enabled(); }
+
 at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u) {
-  const auto& box = *equation.box;
-  const auto& fields = box.fields(u.options());
-  const auto ghosts = with_ghosts(equation, u);
-  const Padded padded(box, ghosts);
-  std::vector<at::Tensor> components;
-  for (int64_t c = 0; c < box.dim(); ++c) {
-    auto viscous = laplacian(box, padded, c);
-    if (fields.friction.defined()) viscous = viscous - fields.friction.select(1, c) * u.select(1, c);
-    auto sum = viscous * equation.nu;
-    for (int64_t axis = 0; axis < box.dim(); ++axis)
-      sum = sum - advection(box, padded, box.dim() - 1 - c, axis, equation.advection);
-    components.push_back(sum);
-  }
-  auto all = at::stack(components, 1);
+  const auto& fields = equation.box->fields(u.options());
+  const auto padded = with_ghosts(equation, u);
+  auto all = tendency_has_loops(u) ? advect_and_diffuse(equation, padded.contiguous())
+                                   : advect_and_diffuse_tensors(equation, padded);
+  if (fields.friction.defined()) all = all - equation.nu * fields.friction * u;
   if (equation.force.defined()) all = all + equation.force;
   return fields.free.defined() ? all * fields.free : all;
+}
+
+TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent) {
+  const auto& fields = equation.box->fields(u.options());
+  const auto g = fields.free.defined() ? cotangent * fields.free : cotangent;
+  auto [padded_bar, nu_bar] = advect_and_diffuse_vjp(equation, with_ghosts(equation, u).contiguous(), g);
+  TendencyVjp found{{}, nu_bar, {}, {}};
+  if (equation.force.defined()) found.force = at::sum_to(g, equation.force.sizes());
+  std::tie(found.u, found.inflow) = ghosts_back(equation, padded_bar);
+  if (fields.friction.defined()) {
+    const auto held = fields.friction * g;
+    found.u = found.u - equation.nu * held;
+    found.nu = found.nu - (held * u).sum();
+  }
+  return found;
 }
 
 at::Tensor courant_numbers(const FlowEquation& equation, const at::Tensor& u) {
