@@ -21,6 +21,7 @@ def check_operator(A, example):
     - every tensor that requires grad is among the tensors of the operator;
     - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
+    - A does not map the constant to zero, unless that is its `nullspace`;
     - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction.
 
     Returns:
@@ -41,7 +42,13 @@ def check_operator(A, example):
     generator = torch.Generator().manual_seed(0)
     v, w = (_noise(example, generator) for _ in range(2))
     with torch.no_grad():
-        wrong = [*_products(A, v, w), *_captures(A, v), *_diagonal(A, v), *_gradients(A, v, w, generator)]
+        wrong = [
+            *_products(A, v, w),
+            *_null_space(A, v),
+            *_captures(A, v),
+            *_diagonal(A, v),
+            *_gradients(A, v, w, generator),
+        ]
     if wrong:
         raise ValueError(f"{who}: {type(A).__name__}: " + "; ".join(wrong))
     return True
@@ -76,6 +83,15 @@ def _products(A, v, w):
         other[0] = w[0]
         if (_norm(A.apply(other) - av)[1:] > rounding * scale[1:]).any():
             yield "samples influence each other: A v changes in a sample whose v did not"
+
+
+def _null_space(A, v):
+    if A.kind.startswith("singular_"):
+        return
+    constant = torch.ones_like(v)
+    left = _norm(A.apply(constant)) / _norm(constant)
+    if (left <= 1e3 * torch.finfo(v.dtype).eps * _norm(A.apply(v)) / _norm(v)).any():
+        yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
 
 
 def _captures(A, v):

@@ -196,9 +196,11 @@ def unsuited():
     burgers = operators.Burgers(field((8,)), 1e-3, 1e-2)
     function = operators.Function(lambda v: v, lambda v: v)
     chebyshev = "Chebyshev: the spectrum is known of Heat and Poisson operators alone"
-    multigrid = 'preconditioner "multigrid" is for Heat, Poisson, Burgers, NavierStokes, and Stencil .* not for this'
+    multigrid = (
+        'preconditioner "multigrid" is for Heat, Poisson, Burgers, Diffusion, NavierStokes, and Stencil .* not for this'
+    )
     flow = operators.NavierStokes(field((8, 8), channels=2), 1e-3, 1e-2)
-    cycles = "the method Multigrid is for Heat, Poisson, Burgers, and Stencil"
+    cycles = "the method Multigrid is for Heat, Poisson, Burgers, Diffusion, and Stencil"
     return [
         (burgers, prdp.Chebyshev(1), chebyshev),
         (function, prdp.Chebyshev(5), chebyshev),

@@ -57,7 +57,7 @@ void check_multigrid(const Operator& a, const OperatorSpec& spec, const Solver& 
   const bool alone = solver.method == Method::kMultigrid;
   TORCH_CHECK_VALUE(alone ? a.has_coarse_grids() : a.has_multigrid_preconditioner(), role_of(spec), ": ",
                     alone ? "the method Multigrid" : "preconditioner \"multigrid\"",
-                    " is for Heat, Poisson, Burgers,", alone ? "" : " NavierStokes,",
+                    " is for Heat, Poisson, Burgers, Diffusion,", alone ? "" : " NavierStokes,",
                     " and Stencil with neighbours at most one cell away, not for this ",
                     operator_kind(spec.kind).title);
 }

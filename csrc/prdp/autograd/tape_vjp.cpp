@@ -4,7 +4,7 @@
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/threads/share_samples.h"
+#include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {

@@ -1,6 +1,7 @@
 #include "prdp/operators/kinds.h"
 
 #include "prdp/operators/burgers_operator.h"
+#include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/laplacian_operator.h"
 #include "prdp/operators/matrix_operator.h"
@@ -17,6 +18,7 @@ std::unique_ptr<Operator> make(const OperatorSpec& spec) {
   return std::make_unique<T>(spec);
 }
 
+constexpr const char* kDiffusion = "Diffusion";
 constexpr const char* kStencil = "Stencil";
 constexpr const char* kMatrix = "Matrix";
 constexpr const char* kFunction = "Function";
@@ -34,10 +36,12 @@ const std::vector<OperatorKind> kKinds{
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
     {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
     {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, /*has_pressure=*/true},
+    {"diffusion", kDiffusion, make<DiffusionOperator>, Axes{kLikeState, kLikeState}},
     {"stencil", kStencil, make<StencilOperator>, Axes{kLikeState}},
     {"dense", kMatrix, make<DenseOperator>, Axes{3}},
     {"function", kFunction, make<FunctionOperator>, std::nullopt},
     {"csr", kMatrix, make<CsrOperator>, Axes{2, 2, 2}},
+    {"singular_diffusion", kDiffusion, singular<DiffusionOperator, kDiffusion>, Axes{kLikeState, kLikeState, 0, 0}},
     {"singular_stencil", kStencil, singular<StencilOperator, kStencil>, Axes{kLikeState, 0, 0}},
     {"singular_dense", kMatrix, singular<DenseOperator, kMatrix>, Axes{3, 0, 0}},
     {"singular_csr", kMatrix, singular<CsrOperator, kMatrix>, Axes{2, 2, 2, 0, 0}},

@@ -3,7 +3,7 @@
 #include <ATen/EmptyTensor.h>
 
 #include "prdp/solvers/methods.h"
-#include "prdp/threads/share_samples.h"
+#include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/solve_samples.h"
 
 namespace prdp {

@@ -1,0 +1,231 @@
+#include "prdp/operators/diffusion_operator.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <cmath>
+
+#include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+/// t without its last, and without its first entries along an axis of the grid.
+at::Tensor below(const at::Tensor& t, int64_t axis) { return t.narrow(axis, 0, t.size(axis) - 1); }
+at::Tensor above(const at::Tensor& t, int64_t axis) { return t.narrow(axis, 1, t.size(axis) - 1); }
+at::Tensor first(const at::Tensor& t, int64_t axis) { return t.narrow(axis, 0, 1); }
+at::Tensor last(const at::Tensor& t, int64_t axis) { return t.narrow(axis, t.size(axis) - 1, 1); }
+
+/// t with so many zeros before and behind it along an axis.
+at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int64_t behind) {
+  std::vector<int64_t> pad(2 * (t.dim() - axis), 0);
+  pad[pad.size() - 2] = before;
+  pad[pad.size() - 1] = behind;
+  return at::constant_pad_nd(t, pad);
+}
+
+/// Summed over the samples where these share one.
+at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
+  if (tensor.dim() == 0) return sum.sum();
+  return tensor.size(0) == 1 && sum.size(0) != 1 ? sum.sum(0, /*keepdim=*/true) : sum;
+}
+
+}  // namespace
+
+OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<std::array<Side, 2>>& sides,
+                       const std::vector<double>& lengths, FaceMean faces) {
+  TORCH_CHECK_VALUE(kappa.dim() >= 2 && kappa.dim() <= 4,
+                    "Diffusion: kappa must have shape (batch or 1, *shape) with 1 to 3 axes in shape, got ",
+                    kappa.sizes());
+  const auto dim = static_cast<size_t>(kappa.dim() - 1);
+  TORCH_CHECK_VALUE(sides.size() == 1 || sides.size() == dim, "Diffusion: boundary must be one for all axes or ", dim,
+                    ", one for each, got ", sides.size());
+  TORCH_CHECK_VALUE(lengths.size() == 1 || lengths.size() == dim, "Diffusion: length must be one number or ", dim,
+                    ", one for each axis, got ", lengths.size());
+  OperatorSpec spec{"diffusion", kappa.sizes().slice(1).vec(), {}, {kappa.unsqueeze(1), shift}};
+  for (size_t d = 0; d < dim; ++d)
+    for (const auto side : sides[sides.size() == 1 ? 0 : d]) spec.parameters.push_back(static_cast<double>(side));
+  for (size_t d = 0; d < dim; ++d) spec.parameters.push_back(lengths[lengths.size() == 1 ? 0 : d]);
+  spec.parameters.push_back(static_cast<double>(faces));
+  if (shift.dim() > 0) spec.tensors[1] = shift.unsqueeze(1);
+  [[maybe_unused]] const DiffusionOperator checks_the_rest(spec);
+  bool held = shift.dim() > 0 || shift.item<double>() != 0.0;
+  for (const auto& axis : sides)
+    for (const auto side : axis) held = held || side == Side::kZero;
+  if (held) return spec;
+  spec.kind = "singular_diffusion";
+  for (int side = 0; side < 2; ++side) spec.tensors.push_back(at::empty({0}, kappa.options()));
+  return spec;
+}
+
+DiffusionOperator::DiffusionOperator(const OperatorSpec& spec) : shape_(spec.shape) {
+  TORCH_CHECK_VALUE(spec.tensors.size() == 2, "Diffusion: takes two tensors, kappa and shift");
+  kappa_ = spec.tensors[0];
+  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa_.dim() == dim() + 2 && kappa_.sym_sizes().slice(2) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_)),
+                    "Diffusion: kappa must have shape (batch or 1, *shape), got ", kappa_.sym_sizes());
+  TORCH_CHECK_TYPE(kappa_.scalar_type() == at::kFloat || kappa_.scalar_type() == at::kDouble,
+                   "Diffusion: kappa must be float32 or float64, got ", kappa_.scalar_type());
+  shift_ = spec.tensors[1].to(kappa_.scalar_type());
+  TORCH_CHECK_VALUE(shift_.dim() == 0 || (shift_.dim() == kappa_.dim() &&
+                                          shift_.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2)),
+                    "Diffusion: shift must be a number or have the shape of kappa, got ", shift_.sym_sizes());
+  const auto axes = static_cast<size_t>(dim());
+  TORCH_CHECK_VALUE(spec.parameters.size() == 3 * axes + 1, "Diffusion: expected ", 3 * axes + 1, " parameters, got ",
+                    spec.parameters.size());
+  for (size_t d = 0; d < axes; ++d) {
+    sides_.push_back({static_cast<Side>(static_cast<int>(spec.parameters[2 * d])),
+                      static_cast<Side>(static_cast<int>(spec.parameters[2 * d + 1]))});
+    TORCH_CHECK_VALUE((sides_[d][0] == Side::kPeriodic) == (sides_[d][1] == Side::kPeriodic),
+                      "Diffusion: both sides of an axis are periodic or none is");
+    lengths_.push_back(spec.parameters[2 * axes + d]);
+    TORCH_CHECK_VALUE(std::isfinite(lengths_[d]) && lengths_[d] > 0.0, "Diffusion: length must be > 0, got ",
+                      lengths_[d]);
+  }
+  mean_ = static_cast<FaceMean>(static_cast<int>(spec.parameters.back()));
+}
+
+void DiffusionOperator::check_vector(const at::Tensor& b) const {
+  TORCH_CHECK_VALUE(b.dim() == dim() + 2 && b.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2) && b.sym_size(1) != 0,
+                    "Diffusion: expected (batch, channel, *shape) with the shape of kappa, ",
+                    kappa_.sym_sizes().slice(2), ", got ", b.sym_sizes());
+  for (const auto& [name, t] : {std::pair("kappa", kappa_), std::pair("shift", shift_)})
+    TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
+                      " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));
+  TORCH_CHECK_TYPE(b.scalar_type() == kappa_.scalar_type(), "Diffusion: kappa is ", kappa_.scalar_type(),
+                   " but the vector is ", b.scalar_type());
+  for (const auto& t : {kappa_, shift_})
+    TORCH_CHECK_VALUE(t.device() == b.device() || (t.dim() == 0 && t.is_cpu()), "Diffusion: its tensors are on ",
+                      t.device(), " but the vector is on ", b.device());
+}
+
+void DiffusionOperator::check_parameters() const {
+  const auto wrong = kappa_.le(0);
+  if (!wrong.any().item<bool>()) return;
+  const auto index = first_true(wrong);
+  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ", kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
+                    " in sample ", index[0]);
+}
+
+double DiffusionOperator::per_cell2(int64_t axis) const {
+  const double per_cell = static_cast<double>(shape_[axis]) / lengths_[axis];
+  return per_cell * per_cell;
+}
+
+at::Tensor DiffusionOperator::mean(const at::Tensor& a, const at::Tensor& b) const {
+  return mean_ == FaceMean::kHarmonic ? 2.0 / (1.0 / a + 1.0 / b) : 0.5 * (a + b);
+}
+
+std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis) const {
+  const int64_t d = 2 + axis;
+  const double scale = per_cell2(axis);
+  const auto inner = scale * mean(above(kappa_, d), below(kappa_, d));
+  const auto outer = [&](const at::Tensor& cells, Side side) {
+    return side == Side::kZero ? 2.0 * scale * cells : at::zeros_like(cells);
+  };
+  const auto around = is_periodic(axis) ? scale * mean(first(kappa_, d), last(kappa_, d)) : at::Tensor();
+  const auto low = around.defined() ? around : outer(first(kappa_, d), sides_[axis][0]);
+  const auto high = around.defined() ? around : outer(last(kappa_, d), sides_[axis][1]);
+  return {at::cat({low, inner}, d), at::cat({inner, high}, d)};
+}
+
+at::Tensor DiffusionOperator::apply(const at::Tensor& v) const {
+  auto sum = shift_ * v;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const int64_t d = v.dim() - dim() + axis;
+    const auto [lower, upper] = faces(axis);
+    const auto nothing = at::zeros_like(first(v, d));
+    const auto before = is_periodic(axis) ? at::roll(v, 1, d) : at::cat({nothing, below(v, d)}, d);
+    const auto after = is_periodic(axis) ? at::roll(v, -1, d) : at::cat({above(v, d), nothing}, d);
+    sum = sum + lower * (v - before) + upper * (v - after);
+  }
+  return sum;
+}
+
+std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  at::Tensor kappa_bar;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const int64_t d = 2 + axis;
+    const double scale = per_cell2(axis);
+    // ∂ mean(a, b)/∂a
+    const auto derivative = [&](const at::Tensor& a, const at::Tensor& b) {
+      return mean_ == FaceMean::kHarmonic ? 2.0 * (b / (a + b)).square() : at::full_like(a, 0.5);
+    };
+    const auto couple = [&](const at::Tensor& du, const at::Tensor& dl) {
+      return scale * (du * dl).sum(1, /*keepdim=*/true);
+    };
+    const auto inner = couple(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
+    const auto lower = below(kappa_, d), upper = above(kappa_, d);
+    // Fields that are zero but at the low, or the high end of the axis.
+    const auto at_first = [&](const at::Tensor& t) { return padded(t, d, 0, shape_[axis] - t.size(d)); };
+    const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
+    add_to(kappa_bar, at_last(inner * derivative(upper, lower)));
+    add_to(kappa_bar, at_first(inner * derivative(lower, upper)));
+    if (is_periodic(axis)) {
+      const auto around = couple(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
+      add_to(kappa_bar, at_first(around * derivative(first(kappa_, d), last(kappa_, d))));
+      add_to(kappa_bar, at_last(around * derivative(last(kappa_, d), first(kappa_, d))));
+    }
+    if (sides_[axis][0] == Side::kZero) add_to(kappa_bar, at_first(2.0 * couple(first(u, d), first(lambda, d))));
+    if (sides_[axis][1] == Side::kZero) add_to(kappa_bar, at_last(2.0 * couple(last(u, d), last(lambda, d))));
+  }
+  return {like(kappa_, kappa_bar), like(shift_, (lambda * u).sum(1, /*keepdim=*/true))};
+}
+
+at::Tensor DiffusionOperator::coefficients() const {
+  auto diagonal = shift_.expand_as(shift_.dim() == 0 ? kappa_ : shift_);
+  std::vector<at::Tensor> all{at::Tensor()};
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    for (const auto& face : faces(axis)) {
+      diagonal = diagonal + face;
+      all.push_back(-face);
+    }
+  all[0] = diagonal;
+  for (auto& field : all) field = field.expand_as(diagonal);
+  return at::cat(all, 1);
+}
+
+OperatorSpec DiffusionOperator::as_stencil() const {
+  OperatorSpec spec{"stencil", shape_, {}, {coefficients()}};
+  for (int64_t axis = 0; axis < dim(); ++axis) spec.parameters.push_back(is_periodic(axis));
+  spec.parameters.insert(spec.parameters.end(), dim(), 0.0);
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    for (const double cells : {-1.0, 1.0})
+      for (int64_t d = 0; d < dim(); ++d) spec.parameters.push_back(d == axis ? cells : 0.0);
+  return spec;
+}
+
+at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()).norm(); }
+
+at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b) const {
+  return StencilOperator(as_stencil()).solve_directly(b);
+}
+
+std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
+  for (const auto& t : {kappa_, shift_}) {
+    if (t.dim() == 0) continue;
+    const auto of_sample = nonfinite(t.select(0, t.size(0) == 1 ? 0 : sample).select(0, 0));
+    if (of_sample.any().item<bool>()) return first_true(of_sample);
+  }
+  return {};
+}
+
+std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) const {
+  auto chosen = std::make_unique<DiffusionOperator>(*this);
+  for (auto* t : {&chosen->kappa_, &chosen->shift_})
+    if (t->dim() > 0 && t->size(0) > 1) *t = t->index_select(0, index);
+  return chosen;
+}
+
+std::vector<int64_t> DiffusionOperator::vector_shape() const {
+  std::vector<int64_t> shape{1};
+  shape.insert(shape.end(), shape_.begin(), shape_.end());
+  return shape;
+}
+
+std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
+  const at::NoGradGuard no_grad;
+  return StencilOperator(as_stencil()).kernels(b, /*transposed=*/false);
+}
+
+}  // namespace prdp

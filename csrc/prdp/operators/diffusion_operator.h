@@ -1,0 +1,67 @@
+#pragma once
+#include <array>
+
+#include "prdp/grid/grid.h"
+#include "prdp/operators/operator.h"
+
+namespace prdp {
+
+/// What holds at one side of the box: u = 0 on it, half a cell from the nearest centre; no flux through it; or the
+/// other side follows, for both sides of an axis.
+enum class Side { kZero, kFlux, kPeriodic };
+/// How the coefficient on a face is made of those of its two cells.
+enum class FaceMean { kHarmonic, kArithmetic };
+
+/// A u = shift·u - ∇·(κ ∇u) on the cells of a box in finite volumes, the same for every channel of u (batch, channel,
+/// *shape), for linear_solve. It is symmetric; where nothing holds u, it knows that it is singular.
+///
+/// kappa: (batch or 1, *shape) with 1 to 3 axes in shape, the values in the centres of the cells, > 0. shift: a
+/// 0-dimensional tensor or one like kappa. Both get gradients, which for kappa are formed from differences of u and not
+/// from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each axis, or one
+/// pair for all. lengths: of the box, for each axis or one for all. Raises ValueError if these do not fit together.
+OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
+                       const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
+                       const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic);
+
+/// The operator of kind "diffusion". Parameters: the two sides of each axis, the lengths, the mean on faces. Tensors:
+/// kappa and shift with an axis of one channel, or a 0-dimensional shift.
+class DiffusionOperator final : public Operator {
+ public:
+  explicit DiffusionOperator(const OperatorSpec& spec);
+
+  void check_vector(const at::Tensor& b) const override;
+  /// Raises ValueError unless kappa > 0.
+  void check_parameters() const override;
+  at::Tensor apply(const at::Tensor& v) const override;
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
+  at::Tensor diagonal() const override { return coefficients().narrow(1, 0, 1); }
+  at::Tensor norm() const override;
+  at::Tensor solve_directly(const at::Tensor& b) const override;
+  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
+  std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  std::vector<int64_t> first_nonfinite(int64_t sample) const override;
+  std::unique_ptr<Operator> select(const at::Tensor& index) const override;
+  std::vector<int64_t> vector_shape() const override;
+  bool has_coarse_grids() const override { return true; }
+  std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+
+ private:
+  int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
+  bool is_periodic(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic; }
+  double per_cell2(int64_t axis) const;  // 1/h²
+  /// Coefficients of the faces below and above each cell along an axis, times 1/h²; of a side with u = 0 twice that of
+  /// its cell, as it is half as far away.
+  std::array<at::Tensor, 2> faces(int64_t axis) const;
+  at::Tensor mean(const at::Tensor& a, const at::Tensor& b) const;
+  /// The same operator as a stencil: the diagonal, and for each axis what couples a cell to those below and above.
+  at::Tensor coefficients() const;
+  OperatorSpec as_stencil() const;
+
+  std::vector<int64_t> shape_;
+  std::vector<std::array<Side, 2>> sides_;
+  std::vector<double> lengths_;
+  FaceMean mean_;
+  at::Tensor kappa_, shift_;
+};
+
+}  // namespace prdp

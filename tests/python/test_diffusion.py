@@ -1,0 +1,185 @@
+"""operators.Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch.operators import Diffusion, Stencil
+
+F64 = torch.float64
+SIDES = ["zero", "flux", "periodic"]
+
+
+def rand(*shape, seed=0, dtype=F64):
+    return 0.3 + torch.rand(shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def matrix(kappa, shift, sides, lengths, faces="harmonic"):
+    """The matrix on one sample, cell by cell."""
+    kappa = np.asarray(kappa)
+    shape, n = kappa.shape, kappa.size
+    a = np.zeros((n, n))
+    index = np.arange(n).reshape(shape)
+    for cell in itertools.product(*map(range, shape)):
+        i = index[cell]
+        a[i, i] += shift if np.isscalar(shift) else shift[cell]
+        for axis, (low, high) in enumerate(sides):
+            h2 = (lengths[axis] / shape[axis]) ** 2
+            for step, side in ((-1, low), (1, high)):
+                other = list(cell)
+                other[axis] += step
+                if not 0 <= other[axis] < shape[axis]:
+                    if side != "periodic":
+                        a[i, i] += 2 * kappa[cell] / h2 if side == "zero" else 0.0
+                        continue
+                    other[axis] %= shape[axis]
+                x, y = kappa[cell], kappa[tuple(other)]
+                t = (2 * x * y / (x + y) if faces == "harmonic" else (x + y) / 2) / h2
+                a[i, i] += t
+                a[i, index[tuple(other)]] -= t
+    return a
+
+
+CASES = [
+    ((5,), [("zero", "flux")], (1.0,)),
+    ((4, 3), [("flux", "zero"), ("periodic",) * 2], (2.0, 0.5)),
+    ((2, 1), [("periodic",) * 2, ("zero", "zero")], (1.0, 1.0)),
+    ((3, 2, 4), [("zero", "zero"), ("flux", "flux"), ("periodic",) * 2], (1.0, 3.0, 2.0)),
+]
+
+
+@pytest.mark.parametrize("faces", ["harmonic", "arithmetic"])
+@pytest.mark.parametrize("shape, sides, lengths", CASES, ids=str)
+def test_products_diagonal_and_matrix(shape, sides, lengths, faces):
+    kappa, shift = rand(2, *shape), rand(2, *shape, seed=1)
+    a = Diffusion(kappa, shift, boundary=sides, length=lengths, faces=faces)
+    dense = np.stack([matrix(kappa[i], shift[i].numpy(), sides, lengths, faces) for i in range(2)])
+    v = rand(2, 3, *shape, seed=2)
+    expected = np.einsum("bij,bcj->bci", dense, v.flatten(2).numpy())
+    np.testing.assert_allclose(a.apply(v).flatten(2), expected, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(a.apply(v.requires_grad_()).detach().flatten(2), expected, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(a.dense(), dense, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(a.diagonal().flatten(1), np.einsum("bii->bi", dense), rtol=1e-12)
+    assert prdp.check_operator(a, v.detach())
+
+
+@pytest.mark.parametrize("faces", ["harmonic", "arithmetic"])
+@pytest.mark.parametrize("shape, sides, lengths", CASES, ids=str)
+def test_gradients(shape, sides, lengths, faces):
+    b = rand(2, 2, *shape, seed=3)
+
+    def solve(kappa, shift, b, solver, backward="implicit"):
+        a = Diffusion(kappa, shift, boundary=sides, length=lengths, faces=faces)
+        return prdp.linear_solve(a, b, solver, backward)[0]
+
+    for kappa, shift in ((rand(2, *shape), rand(2, *shape, seed=1)), (rand(1, *shape), torch.tensor(2.0, dtype=F64))):
+        inputs = [t.requires_grad_() for t in (kappa, shift, b.clone())]
+        for solver in (prdp.CG(80, rtol=1e-13), prdp.Direct(), prdp.CG(40, rtol=1e-13, preconditioner="multigrid")):
+            assert torch.autograd.gradcheck(lambda *t, s=solver: solve(*t, s), inputs)
+        assert torch.autograd.gradcheck(lambda *t: solve(*t, prdp.CG(3, rtol=0.0), "unrolled"), inputs)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_gradient_keeps_its_digits_on_a_fine_grid(dtype):
+    n = 2048
+    kappa64 = 1 + 0.5 * torch.sin(6 * torch.linspace(0, 1, n, dtype=F64))[None]
+    gradients = []
+    for of in (dtype, F64):
+        kappa = kappa64.to(of).requires_grad_()
+        b = torch.ones(1, 1, n, dtype=of)
+        u, _ = prdp.linear_solve(Diffusion(kappa), b, prdp.Direct(rtol=1e-3))
+        u.square().sum().backward()
+        gradients.append(kappa.grad.double())
+    error = (gradients[0] - gradients[1]).norm() / gradients[1].norm()
+    assert error < (2e-3 if dtype == torch.float32 else 1e-12)
+
+
+def test_without_a_hold_the_mean_is_free():
+    kappa = rand(1, 8, 8).requires_grad_()
+    for boundary in ("flux", "periodic", ["flux", "periodic"]):
+        a = Diffusion(kappa, boundary=boundary)
+        b = rand(2, 1, 8, 8, seed=4)
+        _, info = prdp.linear_solve(a, b, prdp.CG(200, rtol=1e-10), on_failure="return")
+        assert (info.status == prdp.SolveStatus.INCONSISTENT).all()
+        b = b - b.mean((-2, -1), keepdim=True)
+        for solver in (prdp.CG(200, rtol=1e-11), prdp.Direct(), prdp.CG(30, rtol=1e-11, preconditioner="multigrid")):
+            u, info = prdp.linear_solve(a, b, solver)
+            assert info.solved.all() and u.mean((-2, -1)).abs().max() < 1e-14
+            (g,) = torch.autograd.grad(u.sum() + u.square().sum(), kappa)
+            assert g.isfinite().all() and g.abs().max() < 1e3
+
+
+def test_values_and_fluxes_at_the_sides():
+    """A straight line, and a layered medium whose flux the harmonic mean makes exact."""
+    n = 10
+    kappa = torch.ones(1, n, 3, dtype=F64)
+    kappa[:, n // 2 :] = 100.0
+    a = Diffusion(kappa, boundary=["zero", "flux"])
+    b = a.boundary_rhs(values=[(1.0, 3.0), (0.0, 0.0)])
+    u, _ = prdp.linear_solve(a, b, prdp.Direct())
+    flux = 2.0 / (0.5 / 1 + 0.5 / 100)
+    x = (torch.arange(n, dtype=F64) + 0.5) / n
+    expected = torch.where(x < 0.5, 1 + flux * x, 3 - flux / 100 * (1 - x))
+    torch.testing.assert_close(u[0, 0], expected[:, None].expand(n, 3), rtol=1e-10, atol=1e-10)
+
+    a = Diffusion(torch.full((1, n), 2.0, dtype=F64), boundary=[("zero", "flux")], length=4.0)
+    inflow = torch.tensor(0.5, dtype=F64, requires_grad=True)
+    u, _ = prdp.linear_solve(a, a.boundary_rhs(values=1.0, fluxes=inflow), prdp.Direct())
+    torch.testing.assert_close(u[0, 0], 1 + 0.25 * 4 * x, rtol=1e-10, atol=1e-10)
+    (slope,) = torch.autograd.grad(u[0, 0, -1], inflow)
+    torch.testing.assert_close(slope, 0.5 * 4 * x[-1], rtol=1e-10, atol=1e-10)
+
+
+def test_it_is_second_order_and_a_step_of_diffusion():
+    errors = []
+    for n in (16, 32):
+        x = (torch.arange(n, dtype=F64) + 0.5) / n
+        b = torch.sin(torch.pi * x)
+        u, _ = prdp.linear_solve(
+            Diffusion(torch.ones(1, n, dtype=F64), shift=10.0), b.view(1, 1, n), prdp.CG(99, 1e-12)
+        )
+        errors.append((u[0, 0] - b / (10 + torch.pi**2)).abs().max())
+    assert 3.7 < errors[0] / errors[1] < 4.3
+
+
+def test_arguments_are_checked():
+    kappa = rand(1, 4, 4)
+    for arguments, message in (
+        ({"boundary": "neumann"}, r"boundary must be 'zero', 'flux' or 'periodic'"),
+        ({"boundary": [("periodic", "zero"), "zero"]}, "both sides of an axis are periodic or none is"),
+        ({"boundary": ["zero"]}, "for each of 2 axes"),
+        ({"faces": "upwind"}, "faces must be 'harmonic' or 'arithmetic'"),
+        ({"shift": torch.ones(3)}, "shift must be a number or have the shape of kappa"),
+        ({"length": 0.0}, "length"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Diffusion(kappa, **arguments)
+    with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1"):
+        prdp.linear_solve(Diffusion(-torch.ones(1, 4, 4)), torch.ones(1, 1, 4, 4), prdp.CG(3))
+    with pytest.raises(ValueError, match=r"Diffusion: expected \(batch, channel, \*shape\)"):
+        prdp.linear_solve(Diffusion(kappa), torch.ones(1, 1, 4, 5, dtype=F64), prdp.CG(3))
+    bad = kappa.clone()
+    bad[0, 1, 2] = torch.nan
+    with pytest.raises(torch.linalg.LinAlgError, match="NONFINITE_OPERATOR"):
+        prdp.linear_solve(Diffusion(bad), torch.ones(1, 1, 4, 4, dtype=F64), prdp.CG(3))
+
+
+@pytest.mark.parametrize("boundary", SIDES)
+def test_it_is_the_stencil_with_its_coefficients(boundary):
+    kappa = rand(1, 6, 7)
+    a = Diffusion(kappa, shift=1.0, boundary=boundary)
+    v = rand(1, 2, 6, 7, seed=5)
+    dense = matrix(kappa[0], 1.0, [(boundary,) * 2] * 2, (1.0, 1.0))
+    index = torch.arange(42).reshape(6, 7)
+    offsets = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
+    fields = [torch.tensor(dense[index.flatten(), index.roll([-o for o in offset], (0, 1)).flatten()]).reshape(6, 7)
+              for offset in offsets]  # fmt: skip
+    stencil = Stencil(torch.stack(fields)[None], offsets, "periodic" if boundary == "periodic" else "zero")
+    b = rand(1, 2, 6, 7, seed=6)
+    for solver in (prdp.CG(99, 1e-12), prdp.Direct(), prdp.Jacobi(9, 0.0)):
+        ours, theirs = (prdp.linear_solve(x, b, solver, on_failure="return")[0] for x in (a, stencil))
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(a.apply(v), stencil.apply(v), rtol=1e-12, atol=1e-10)

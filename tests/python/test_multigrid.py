@@ -1,0 +1,211 @@
+"""Multigrid as a preconditioner and as a method: iterations, dense truth, both derivatives, threads, failures."""
+
+import numpy as np
+import pytest
+import torch
+from helpers import field, statuses
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+F64 = torch.float64
+MULTIGRID = {"preconditioner": "multigrid"}
+METHODS = {
+    "cg": lambda k, rtol: prdp.CG(k, rtol=rtol, **MULTIGRID),
+    "gmres": lambda k, rtol: prdp.GMRES(k, rtol=rtol, restart=20, **MULTIGRID),
+    "bicgstab": lambda k, rtol: prdp.BiCGStab(k, rtol=rtol, **MULTIGRID),
+    "cycles": lambda k, rtol: prdp.Multigrid(k, rtol=rtol),
+}
+
+
+def diffusion(kappa, shift=0.0, boundary="zero", winds=None, weights=None, **options):
+    """-∇·(κ ∇u) + shift u (+ upwind winds·∇u) for κ on a unit box, as a `Stencil`."""
+    dim, n = kappa.dim(), kappa.shape
+    offsets, fields = [(0,) * dim], [torch.full_like(kappa, shift)]
+    for axis in range(dim):
+        h = 1 / n[axis] if boundary == "periodic" else 1 / (n[axis] + 1)
+        for step in (-1, 1):
+            there = kappa.roll(-step, axis)
+            if boundary == "zero":
+                there.select(axis, -1 if step > 0 else 0).copy_(kappa.select(axis, -1 if step > 0 else 0))
+            face = 2 * kappa * there / (kappa + there) / h**2 * (weights[axis] if weights else 1.0)
+            if winds is not None:
+                face = face + (-step * winds[axis]).clamp_min(0) / h
+            offsets.append(tuple(step if d == axis else 0 for d in range(dim)))
+            fields.append(-face)
+            fields[0] = fields[0] + face
+    return operators.Stencil(torch.stack(fields)[None], offsets, boundary, **options)
+
+
+def blobs(shape, contrast, seed=1):
+    g = np.random.default_rng(seed)
+    y = np.meshgrid(*[np.arange(n) / n for n in shape], indexing="ij")
+    s = np.zeros(shape)
+    for _ in range(12):
+        k = g.integers(-6, 7, len(shape))
+        phase = 2 * np.pi * sum(a * b for a, b in zip(k, y, strict=True)) + 6 * g.random()
+        s = s + g.standard_normal() * np.sin(phase)
+    s = (s - s.min()) / (s.max() - s.min())
+    return torch.tensor(contrast**s)
+
+
+def noise(shape, seed=0, dtype=F64):
+    return torch.randn(1, 1, *shape, dtype=F64, generator=torch.Generator().manual_seed(seed)).to(dtype)
+
+
+# Operator, grid, and the most iterations to 1e-6 and 1e-10.
+EASY = {
+    **{f"poisson {n}": (lambda s: operators.Poisson(s), (n, n), 6, 10) for n in (31, 64, 127, 500)},
+    "poisson 200x37": (lambda s: operators.Poisson(s), (200, 37), 6, 10),
+    "poisson 1d": (lambda s: operators.Poisson(s), (1000,), 4, 6),
+    "poisson 3d": (lambda s: operators.Poisson(s), (37, 20, 48), 7, 11),
+    "heat": (lambda s: operators.Heat(s, 1.0, 1.0), (255, 255), 6, 10),
+    "periodic": (lambda s: diffusion(torch.ones(s).double(), 1.0, "periodic"), (63, 64), 6, 10),
+    "periodic 3d odd": (lambda s: diffusion(torch.ones(s).double(), 1.0, "periodic"), (33, 33, 33), 7, 12),
+    "contrast 1e2": (lambda s: diffusion(blobs(s, 1e2)), (255, 255), 7, 12),
+    "contrast 1e4": (lambda s: diffusion(blobs(s, 1e4)), (255, 255), 8, 13),
+    "anisotropy": (lambda s: diffusion(torch.ones(s).double(), weights=(1.0, 1e3)), (255, 255), 7, 12),
+    "anisotropy 3d": (lambda s: diffusion(torch.ones(s).double(), weights=(1.0, 1.0, 1e3)), (24, 24, 24), 6, 9),
+}
+
+
+@pytest.mark.parametrize("case", EASY)
+def test_the_number_of_iterations_does_not_grow_with_the_grid(case):
+    make, shape, *most = EASY[case]
+    a, b = make(shape), noise(shape)
+    for rtol, limit in zip((1e-6, 1e-10), most, strict=True):
+        _, info = prdp.linear_solve(a, b, prdp.CG(limit, rtol=rtol, **MULTIGRID))
+        assert info.solved.all(), info
+    _, info = prdp.linear_solve(a, b, prdp.Multigrid(3 * most[0], rtol=1e-6))
+    assert info.solved.all(), info
+
+
+def windy(shape, peclet, shift=100.0):
+    y, x = np.meshgrid(*[np.arange(n) / n for n in shape], indexing="ij")
+    speed = peclet * shape[0]
+    winds = [torch.tensor(speed * np.cos(2 * np.pi * x)), torch.tensor(speed * np.sin(2 * np.pi * y))]
+    return diffusion(torch.ones(shape).double(), shift, "periodic", winds=winds)
+
+
+@pytest.mark.parametrize("peclet, most", [(0.1, 8), (1.0, 9), (10.0, 19), (100.0, 46)])
+def test_winds(peclet, most):
+    shape = (128, 128)
+    _, info = prdp.linear_solve(windy(shape, peclet), noise(shape), prdp.GMRES(1, rtol=1e-6, restart=most, **MULTIGRID))
+    assert info.solved.all(), info
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["heat", "stencil", "winds", "burgers"])
+def test_solutions_and_gradients_equal_those_of_lapack(kind, method, transposed):
+    if method == "cg" and kind in ("winds", "burgers"):
+        return
+    shape, channels = (9, 7), 2 if kind == "burgers" else 1
+    a = {
+        "heat": lambda: operators.Heat(shape, torch.tensor(0.3, dtype=F64), 1.0),
+        "stencil": lambda: diffusion(blobs(shape, 1e3), 1.0),
+        "winds": lambda: windy(shape, 2.0),
+        "burgers": lambda: operators.Burgers(field(shape, channels=2, batch=2), torch.tensor(0.01, dtype=F64), 0.1),
+    }[kind]()
+    tensors = [t.requires_grad_() for t in a.tensors]
+    b = field(shape, channels=channels, batch=2).requires_grad_()
+    found, exact = [], []
+    for results, solver in ((found, METHODS[method](90, 1e-13)), (exact, prdp.Direct())):
+        u, info = prdp.linear_solve(a, b, solver)
+        assert info.solved.all()
+        results += [u, *torch.autograd.grad(u.square().sum() + u[..., 0].sum(), [b, *tensors])]
+    for ours, theirs in zip(found, exact, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-8, atol=1e-8 * theirs.abs().max().item())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_unrolled_gradients_of_b(method):
+    a = windy((6, 5), 2.0) if method != "cg" else diffusion(blobs((6, 5), 10.0))
+    solver = METHODS[method](2, 0.0)
+    solve = lambda b: prdp.linear_solve(a, b, solver, "unrolled", on_failure="return")[0]  # noqa: E731
+    assert torch.autograd.gradcheck(solve, noise((6, 5)).requires_grad_())
+
+
+def test_truncated_cycles_are_a_linear_map_whose_transpose_is_as_many_cycles():
+    a = windy((33, 40), 5.0)
+    b, cotangent = noise((33, 40)).requires_grad_(), noise((33, 40), seed=1)
+    for backward in ("implicit", "unrolled"):
+        u, _ = prdp.linear_solve(a, b, prdp.Multigrid(2, rtol=0.0), backward)
+        (b_bar,) = torch.autograd.grad((u * cotangent).sum(), b)
+        torch.testing.assert_close((b_bar * b).sum(), (cotangent * u).sum(), rtol=1e-11, atol=0.0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_every_bit_is_the_same_on_any_number_of_threads(dtype):
+    a = diffusion(blobs((200, 210), 1e3).to(dtype))
+    b = noise((200, 210), dtype=dtype).requires_grad_()
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            for solver in (
+                prdp.CG(4, rtol=0.0, **MULTIGRID),
+                prdp.CG(9, rtol=0.0),
+                prdp.GMRES(4, rtol=0.0),
+                prdp.Jacobi(9, 0.0),
+            ):
+                u, _ = prdp.linear_solve(a, b, solver, on_failure="return")
+                results.append((threads, u.detach(), torch.autograd.grad(u.sum(), b)[0]))
+    finally:
+        torch.set_num_threads(before)
+    for i, (_, u, g) in enumerate(results):
+        assert torch.equal(u, results[i % 4][1]) and torch.equal(g, results[i % 4][2])
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e12, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_scale_of_the_operator_changes_nothing(dtype, scale):
+    factor = 2.0 ** round(np.log2(scale))
+    plain = diffusion(blobs((40, 30), 10.0).to(dtype))
+    scaled = operators.Stencil(plain.tensors[0] * factor, plain.offsets)
+    b = noise((40, 30), dtype=dtype)
+    for solver in (prdp.CG(4, rtol=1e-4, **MULTIGRID), prdp.Multigrid(9, rtol=1e-4)):
+        u, info = prdp.linear_solve(plain, b, solver)
+        v, again = prdp.linear_solve(scaled, b * factor, solver)
+        assert torch.equal(u, v) and torch.equal(info.residual, again.residual)
+
+
+def test_a_batch_solves_each_sample_as_alone_and_a_bad_one_fails_alone():
+    kappa = torch.stack([blobs((20, 21), 100.0, seed) for seed in range(3)])
+    a = operators.Diffusion(kappa)
+    b = noise((20, 21)).expand(3, -1, -1, -1)
+    solver = prdp.CG(9, rtol=1e-6, **MULTIGRID)
+    u, _ = prdp.linear_solve(a, b, solver)
+    for i in range(3):
+        alone, _ = prdp.linear_solve(operators.Diffusion(kappa[i : i + 1]), b[i : i + 1], solver)
+        assert torch.equal(u[i : i + 1], alone)
+    bad = kappa.clone()
+    bad[1, 3, 4] = torch.inf
+    v, info = prdp.linear_solve(operators.Diffusion(bad), b, solver, on_failure="return")
+    assert statuses(info) == ["CONVERGED", "NONFINITE_OPERATOR", "CONVERGED"]
+    assert torch.equal(v[0], u[0]) and torch.equal(v[2], u[2]) and v[1].abs().max() == 0
+
+
+def test_what_it_cannot_do_is_said():
+    b = noise((8, 8))
+    far = operators.Stencil(torch.ones(1, 2, 8, 8, dtype=F64), [(0, 0), (0, 2)])
+    matrix = operators.Matrix(torch.eye(64, dtype=F64))
+    for a, of_a in ((far, b), (matrix, b.reshape(1, 64))):
+        for solver in (prdp.CG(3, **MULTIGRID), prdp.Multigrid(3)):
+            with pytest.raises(ValueError, match=r"is for Heat, Poisson, Burgers, .* and Stencil with neighbours"):
+                prdp.linear_solve(a, of_a, solver)
+    hollow = diffusion(torch.ones(8, 8, dtype=F64))
+    hollow.tensors[0][0, 0, 3, 3] = 0.0
+    _, info = prdp.linear_solve(hollow, b, prdp.Multigrid(3), on_failure="return")
+    assert statuses(info) == ["ZERO_DIAGONAL"]
+    with pytest.raises(ValueError, match="smoothing"):
+        prdp.Multigrid(3, smoothing=0)
+
+
+def test_steps_and_rollouts_take_it():
+    step = prdp.Heat((40, 40), 1.0, 0.01, solver=prdp.Multigrid(20, rtol=1e-10))
+    exact = prdp.Heat((40, 40), 1.0, 0.01, solver=prdp.Direct())
+    u = field((40, 40), channels=1, batch=2).requires_grad_()
+    results = [torch.autograd.grad(s.rollout(u, 3).square().sum(), u)[0] for s in (step, exact)]
+    torch.testing.assert_close(*results, rtol=1e-7, atol=1e-9)
+    assert step.info.solved.all()

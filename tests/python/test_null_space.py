@@ -1,0 +1,171 @@
+"""Singular operators of one's own whose null space is named."""
+
+import numpy as np
+import pytest
+import torch
+from helpers import field, statuses
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+F64 = torch.float64
+
+
+def periodic_stencil(shape=(5, 6), nullspace="constant", dtype=F64, wind=0.0):
+    """-∇·(κ ∇u) on a periodic grid, whose rows and columns sum to zero; with `wind`, not symmetric."""
+    kappa = 0.5 + torch.rand(shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
+    dim, fields, offsets = len(shape), [], []
+    centre = torch.zeros(shape, dtype=dtype)
+    for axis in range(dim):
+        for step in (-1, 1):
+            face = (kappa + kappa.roll(-step, axis)) / 2 - step * wind * (shape[axis] > 2)
+            offsets.append(tuple(step if d == axis else 0 for d in range(dim)))
+            fields.append(-face)
+            centre += face
+    stencil = torch.stack([centre, *fields])[None]
+    return operators.Stencil(stencil, [(0,) * dim, *offsets], boundary="periodic", nullspace=nullspace)
+
+
+def graph_laplacian(dtype=F64):
+    a = torch.rand(7, 7, dtype=dtype, generator=torch.Generator().manual_seed(2))
+    a = a + a.T
+    return torch.diag(a.sum(1)) - a
+
+
+SYMMETRIC = {
+    "stencil": lambda: (periodic_stencil(), (3, 2, 5, 6)),
+    "matrix": lambda: (operators.Matrix(graph_laplacian(), nullspace="constant"), (3, 7)),
+    "csr": lambda: (operators.Matrix(graph_laplacian().to_sparse_csr(), nullspace=torch.ones(1, 7, dtype=F64)), (3, 7)),
+    "function": lambda: (
+        operators.Function(lambda v: 2 * v - v.roll(1, -1) - v.roll(-1, -1), symmetric=True, nullspace="constant"),
+        (3, 1, 9),
+    ),
+}
+SOLVERS = {
+    "cg": prdp.CG(200, rtol=1e-11),
+    "sd": prdp.SteepestDescent(20000, rtol=1e-10),
+    "gmres": prdp.GMRES(40, rtol=1e-11, restart=40),
+    "bicgstab": prdp.BiCGStab(200, rtol=1e-10),
+    "direct": prdp.Direct(),
+}
+
+
+def dense_of(a, shape):
+    """A as a matrix on one sample, from products with unit vectors."""
+    n = int(np.prod(shape[1:]))
+    units = torch.eye(n, dtype=F64).reshape(n, *shape[1:])
+    return a.apply(units).reshape(n, n).T.numpy()
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("kind", SYMMETRIC)
+def test_solution_and_gradient_are_those_of_the_pseudo_inverse(kind, solver):
+    a, shape = SYMMETRIC[kind]()
+    generator = torch.Generator().manual_seed(3)
+    b, cotangent = (torch.randn(shape, dtype=F64, generator=generator) for _ in range(2))
+    b = a_range(a, b, shape).requires_grad_()
+    u, info = prdp.linear_solve(a, b, SOLVERS[solver])
+    assert (info.status > 0).all()
+    u.backward(cotangent)  # has a mean, which no u changes
+    inverse = np.linalg.pinv(dense_of(a, shape), rcond=1e-10)
+    for found, given, m in ((u, b, inverse), (b.grad, cotangent, inverse.T)):
+        expected = given.detach().flatten(1).numpy() @ m.T
+        np.testing.assert_allclose(found.detach().flatten(1), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def a_range(a, b, shape):
+    m = dense_of(a, shape)
+    return torch.tensor(b.flatten(1).numpy() @ (m @ np.linalg.pinv(m, rcond=1e-10)).T).reshape(shape)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("kind", SYMMETRIC)
+def test_a_right_hand_side_outside_the_range_is_told(kind, solver):
+    a, shape = SYMMETRIC[kind]()
+    b = torch.randn(shape, dtype=F64, generator=torch.Generator().manual_seed(4))
+    b[0] = a_range(a, b, shape)[0]
+    u, info = prdp.linear_solve(a, b, SOLVERS[solver], on_failure="return")
+    assert statuses(info)[1:] == ["INCONSISTENT"] * 2 and info.status[0] > 0
+    inverse = np.linalg.pinv(dense_of(a, shape), rcond=1e-10)
+    expected = b.flatten(1).numpy() @ inverse.T
+    np.testing.assert_allclose(u.flatten(1), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_left_and_right_null_spaces_differ():
+    generator = torch.Generator().manual_seed(5)
+    q, p = (torch.linalg.qr(torch.randn(8, 8, dtype=F64, generator=generator))[0] for _ in range(2))
+    values = torch.tensor([3.0, 2.0, 1.5, 1.2, 1.0, 0.8, 0.0, 0.0], dtype=F64)
+    m = q @ torch.diag(values) @ p.T
+    a = operators.Matrix(m, nullspace=p[:, 6:].T, left_nullspace=q[:, 6:].T)
+    b = (m @ torch.randn(8, dtype=F64, generator=generator))[None].requires_grad_()
+    inverse = torch.linalg.pinv(m, rtol=1e-10)
+    for solver in (prdp.GMRES(10, rtol=1e-11, restart=8), prdp.Direct()):
+        u, _ = prdp.linear_solve(a, b, solver)
+        (found,) = torch.autograd.grad(u.square().sum(), b)
+        torch.testing.assert_close(u, b @ inverse.T, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(found, 2 * u @ inverse, rtol=1e-8, atol=1e-8)
+    with pytest.raises(ValueError, match=r"left_nullspace is not in the null space of Aᵀ.*give left_nullspace="):
+        prdp.linear_solve(operators.Matrix(m, nullspace=p[:, 6:].T), b, prdp.Direct())
+
+
+GRADIENT_SOLVERS = [
+    prdp.CG(60, rtol=1e-12),
+    prdp.CG(30, rtol=1e-12, preconditioner="multigrid"),
+    prdp.GMRES(30, rtol=1e-12, preconditioner="multigrid"),
+    prdp.Direct(),
+]
+
+
+@pytest.mark.parametrize("solver", GRADIENT_SOLVERS, ids=repr)
+def test_gradients_for_coefficients(solver):
+    shape = (4, 5)
+
+    def loss(kappa, b):
+        faces = [(kappa + kappa.roll(-step, axis)) / 2 for axis in (0, 1) for step in (-1, 1)]
+        stencil = torch.stack([sum(faces), *(-face for face in faces)])[None]
+        offsets = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
+        a = operators.Stencil(stencil, offsets, boundary="periodic", nullspace="constant")
+        return prdp.linear_solve(a, b - b.mean((-2, -1), keepdim=True), solver)[0]
+
+    kappa = 0.5 + torch.rand(shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    b = field(shape, channels=1, batch=1)
+    assert torch.autograd.gradcheck(loss, (kappa.requires_grad_(), b.requires_grad_()))
+
+
+def test_multigrid_takes_the_iterations_of_a_regular_operator_at_a_tight_tolerance():
+    a = periodic_stencil((255, 255))
+    b = field((255, 255), channels=1, batch=1)
+    _, info = prdp.linear_solve(a, b - b.mean(), prdp.CG(40, rtol=1e-10, preconditioner="multigrid"))
+    assert info.solved.all() and info.iterations.max() <= 10
+
+
+def test_a_vector_that_is_none_is_refused():
+    wrong = torch.linspace(0, 1, 30, dtype=F64).reshape(1, 5, 6)
+    with pytest.raises(ValueError, match=r"Stencil: vector 0 of nullspace is not in the null space of A"):
+        prdp.linear_solve(periodic_stencil(nullspace=wrong), field((5, 6)), prdp.CG(3))
+    regular = operators.Stencil(3 * torch.ones(1, 1, 5, 6, dtype=F64), [(0, 0)], nullspace="constant")
+    with pytest.raises(ValueError, match=r"Stencil: vector 0 of nullspace is not in the null space of A"):
+        prdp.linear_solve(regular, field((5, 6)), prdp.CG(3))
+
+
+def test_arguments_are_checked():
+    m = graph_laplacian()
+    b = torch.ones(1, 7, dtype=F64)
+    with pytest.raises(TypeError, match=r"Matrix: nullspace must be None, 'constant' or a tensor \(k, \*shape\)"):
+        operators.Matrix(m, nullspace="linear")
+    with pytest.raises(ValueError, match="left_nullspace= stands beside nullspace="):
+        operators.Matrix(m, left_nullspace="constant")
+    with pytest.raises(ValueError, match=r"Matrix: a null space must have shape \(k, \*shape\)"):
+        prdp.linear_solve(operators.Matrix(m, nullspace=torch.ones(1, 6, dtype=F64)), b, prdp.CG(3))
+    with pytest.raises(ValueError, match="must hold as many vectors, got 2 and 1"):
+        operators.Matrix(m, nullspace=torch.rand(2, 7, dtype=F64), left_nullspace="constant")
+    twice = torch.ones(2, 7, dtype=F64)
+    with pytest.raises(ValueError, match="vector 1 of a null space is zero, not finite, or depends on those before it"):
+        prdp.linear_solve(operators.Matrix(m, nullspace=twice), b - 1, prdp.CG(3))
+
+
+def test_check_operator_finds_a_constant_that_nobody_named():
+    example = torch.zeros(2, 1, 5, 6, dtype=F64)
+    assert prdp.check_operator(periodic_stencil(), example)
+    with pytest.raises(ValueError, match="A maps the constant to zero, so it is singular: give nullspace='constant'"):
+        prdp.check_operator(periodic_stencil(nullspace=None), example)
