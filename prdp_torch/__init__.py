@@ -15,6 +15,7 @@ _load.load_library()
 from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
+from prdp_torch.flow import Flow  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
@@ -32,6 +33,7 @@ __all__ = [
     "Burgers",
     "Chebyshev",
     "Direct",
+    "Flow",
     "Heat",
     "ImplicitStep",
     "Jacobi",

@@ -10,5 +10,6 @@ PYBIND11_MODULE(_C, m) {
   m.def("sentence", &prdp::sentence, py::arg("what"));
   bind_solvers(m);
   bind_steps(m);
+  bind_flow(m);
   bind_controllers(m);
 }

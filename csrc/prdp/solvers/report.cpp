@@ -2,6 +2,7 @@
 #include <utility>
 
 #include "prdp/solvers/diagnosis.h"
+#include "prdp/solvers/raise_or_warn.h"
 
 namespace prdp {
 
@@ -60,7 +61,6 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 
   constexpr size_t named = 4;
   std::ostringstream text;
-  if (step_now > 0) text << "step " << step_now << " of " << steps_in_all << ": ";
   text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": " << failed.size() << " of " << batch
        << " samples failed";
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
@@ -73,11 +73,19 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     text << ", " << diagnosis(role, a, b, what, i);
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
+  raise_or_warn(text.str(), on_failure);
+}
+
+void raise_or_warn(const std::string& text, OnFailure on_failure) {
+  std::ostringstream whole;
+  if (step_now > 0) whole << "step " << step_now << " of " << steps_in_all << ": ";
+  whole << text;
   if (on_failure == OnFailure::kRaise)
-    text << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
-            "the failed ones have no gradient, and a training goes on";
-  TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, text.str());
-  warning_sink()(text.str());
+    whole
+        << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
+           "the failed ones have no gradient, and a training goes on";
+  TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
+  warning_sink()(whole.str());
 }
 
 void set_warning_sink(WarningSink sink) { warning_sink() = sink; }

@@ -1,0 +1,100 @@
+#include "prdp/steppers/flow/box.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/steppers/flow/fields.h"
+
+namespace prdp {
+
+namespace {
+
+constexpr int64_t kFewest = 3;  // cells of an axis: a cell, and a neighbour on each side
+
+template <class T>
+std::vector<T> per_axis(const std::vector<T>& given, size_t axes, const char* what) {
+  TORCH_CHECK_VALUE(given.size() == 1 || given.size() == axes, "Flow: ", what,
+                    " must be one for all axes or one per axis, ", axes, " here, got ", given.size());
+  return given.size() == 1 ? std::vector<T>(axes, given[0]) : given;
+}
+
+}  // namespace
+
+FlowBoundary flow_boundary_from_name(const std::string& name) {
+  if (name == "periodic") return FlowBoundary::kPeriodic;
+  if (name == "wall") return FlowBoundary::kWall;
+  TORCH_CHECK_VALUE(name == "open", "Flow: boundary must be 'periodic', 'wall' or 'open', got '", name, "'");
+  return FlowBoundary::kOpen;
+}
+
+FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& boundary,
+                 const std::vector<double>& length, at::Tensor obstacle)
+    : shape_(std::move(shape)), obstacle_(std::move(obstacle)) {
+  TORCH_CHECK_VALUE(shape_.size() == 2 || shape_.size() == 3,
+                    "Flow: shape must have 2 or 3 extents, (Ny, Nx) or (Nz, Ny, Nx), got ", at::IntArrayRef(shape_));
+  for (const int64_t n : shape_)
+    TORCH_CHECK_VALUE(n >= kFewest, "Flow: every extent of shape must be >= ", kFewest, ", got ",
+                      at::IntArrayRef(shape_));
+  boundary_ = per_axis(boundary, shape_.size(), "boundary");
+  length_ = per_axis(length, shape_.size(), "length");
+  for (const double side : length_)
+    TORCH_CHECK_VALUE(std::isfinite(side) && side > 0, "Flow: length must be finite and > 0, got ", side);
+  TORCH_CHECK_VALUE(std::count(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen) <= 1,
+                    "Flow: at most one axis may be 'open'");
+  if (obstacle_.defined()) {
+    TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
+                     "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle_.scalar_type());
+    TORCH_CHECK_VALUE(obstacle_.sizes() == at::IntArrayRef(shape_), "Flow: obstacle must have the shape of the grid, ",
+                      at::IntArrayRef(shape_), ", got ", obstacle_.sizes());
+    obstacle_ = obstacle_.detach().to(at::kCPU, /*non_blocking=*/false, /*copy=*/true).contiguous();
+  }
+  fields_ = make_flow_fields(*this);
+}
+
+int64_t FlowBox::open_axis() const {
+  const auto found = std::find(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen);
+  return found == boundary_.end() ? -1 : found - boundary_.begin();
+}
+
+double FlowBox::sum_of_couplings() const {
+  double sum = 0;
+  for (int64_t axis = 0; axis < dim(); ++axis) sum += 2.0 / (dx(axis) * dx(axis));
+  return sum;
+}
+
+void FlowBox::check_velocity(const at::Tensor& u) const {
+  bool fits = u.dim() == dim() + 2 && u.size(1) == dim();
+  for (int64_t axis = 0; fits && axis < dim(); ++axis) fits = u.size(axis + 2) == shape_[axis];
+  if (!fits) {
+    std::ostringstream expected;
+    for (const int64_t n : shape_) expected << ", " << n;
+    TORCH_CHECK_VALUE(false, "Flow: expected u of shape (batch, ", dim(), expected.str(), "), got ", u.sizes());
+  }
+  TORCH_CHECK_TYPE(u.scalar_type() == at::kFloat || u.scalar_type() == at::kDouble,
+                   "Flow: u must be float32 or float64, got ", u.scalar_type());
+}
+
+const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
+  const auto dtype = c10::typeMetaToScalarType(options.dtype());
+  const std::lock_guard lock(mutex_);
+  const auto [entry, is_new] = converted_.try_emplace({dtype, options.device().str()});
+  if (!is_new) return entry->second;
+  auto& found = entry->second = fields_;
+  const at::NoGradGuard no_grad;
+  for (auto* t : {&found.cells, &found.free, &found.inlet, &found.friction, &found.pressure, &found.closed_parts})
+    if (t->defined()) *t = t->to(options.device(), dtype);
+  for (auto* list : {&found.diffusion, &found.high_sign})
+    for (auto& t : *list) t = t.to(options.device(), dtype);
+  return found;
+}
+
+at::Tensor neighbour(const FlowBox& box, const at::Tensor& t, int64_t axis, int64_t cells, double outside) {
+  const int64_t d = t.dim() - box.dim() + axis, n = t.size(d);
+  if (box.boundary(axis) == FlowBoundary::kPeriodic) return at::roll(t, -cells, d);
+  const auto end = at::full_like(t.narrow(d, 0, 1), outside);
+  return cells > 0 ? at::cat({t.narrow(d, 1, n - 1), end}, d) : at::cat({end, t.narrow(d, 0, n - 1)}, d);
+}
+
+}  // namespace prdp

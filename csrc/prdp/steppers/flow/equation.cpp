@@ -1,0 +1,97 @@
+#include "prdp/steppers/flow/equation.h"
+
+#include <cmath>
+
+namespace prdp {
+
+namespace {
+
+/// Raises ValueError or TypeError unless t is (d,) or (batch or 1, *of_sample).
+void check_field(const char* name, const at::Tensor& t, std::vector<int64_t> of_sample) {
+  const int64_t d = of_sample[0];
+  TORCH_CHECK_TYPE(at::isFloatingType(t.scalar_type()), "Flow: ", name, " must hold real numbers, got ",
+                   t.scalar_type());
+  const bool uniform = t.dim() == 1 && t.size(0) == d;
+  const bool field =
+      t.dim() == static_cast<int64_t>(of_sample.size()) + 1 && t.sizes().slice(1) == at::IntArrayRef(of_sample);
+  std::ostringstream expected;
+  for (const int64_t n : of_sample) expected << ", " << n;
+  TORCH_CHECK_VALUE(uniform || field, "Flow: ", name, " must have shape (", d, ",) or (batch or 1", expected.str(),
+                    "), got ", t.sizes());
+}
+
+std::vector<int64_t> shape_of_force(const FlowBox& box) {
+  auto shape = box.shape();
+  shape.insert(shape.begin(), box.dim());
+  return shape;
+}
+
+std::vector<int64_t> shape_of_inflow(const FlowBox& box) {
+  auto shape = shape_of_force(box);
+  shape[1 + box.open_axis()] = 1;
+  return shape;
+}
+
+/// (d,) → (1, d, 1, …).
+at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u) {
+  if (!t.defined()) return t;
+  if (t.dim() == 1) {
+    std::vector<int64_t> sizes(u.dim(), 1);
+    sizes[1] = t.size(0);
+    t = t.reshape(sizes);
+  }
+  return t.to(u.options());
+}
+
+}  // namespace
+
+Advection advection_from_name(const std::string& name) {
+  if (name == "central") return Advection::kCentral;
+  TORCH_CHECK_VALUE(name == "upwind", "Flow: advection must be 'central' or 'upwind', got '", name, "'");
+  return Advection::kUpwind;
+}
+
+Diffusion diffusion_from_name(const std::string& name) {
+  if (name == "implicit") return Diffusion::kImplicit;
+  TORCH_CHECK_VALUE(name == "explicit", "Flow: diffusion must be 'implicit' or 'explicit', got '", name, "'");
+  return Diffusion::kExplicit;
+}
+
+void FlowEquation::check() const {
+  TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0, "Flow: dt must be finite and > 0, got ", dt);
+  TORCH_CHECK_VALUE(nu.dim() == 0, "Flow: nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
+  const double value = nu.item<double>();
+  TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, "Flow: nu must be finite and >= 0, got ", value);
+  const double limit = value * dt * box->sum_of_couplings();
+  TORCH_CHECK_VALUE(diffusion == Diffusion::kImplicit || limit <= 1 + 1e-6,
+                    "Flow: explicit diffusion needs nu dt Σ 2/dx² <= 1, got ", limit,
+                    "; take a smaller dt or diffusion='implicit'");
+  if (force.defined()) check_field("force", force, shape_of_force(*box));
+  TORCH_CHECK_VALUE(inflow.defined() == (box->open_axis() >= 0),
+                    inflow.defined() ? "Flow: inflow is for an 'open' axis, and boundary has none"
+                                     : "Flow: an 'open' axis needs inflow, the velocity at its low end");
+  if (inflow.defined()) check_field("inflow", inflow, shape_of_inflow(*box));
+}
+
+void FlowEquation::check(const at::Tensor& u) const {
+  box->check_velocity(u);
+  check();
+  for (const auto* t : {&force, &inflow})
+    TORCH_CHECK_VALUE(!t->defined() || t->dim() == 1 || t->size(0) == 1 || t->size(0) == u.size(0),
+                      "Flow: ", t == &force ? "force" : "inflow", " holds ", t->size(0), " samples, u holds ",
+                      u.size(0));
+}
+
+FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
+  return with_tensors({nu.to(u.options()), with_all_axes(force, u), with_all_axes(inflow, u)});
+}
+
+FlowEquation FlowEquation::with_tensors(at::TensorList tensors) const {
+  auto other = *this;
+  other.nu = tensors[0];
+  other.force = tensors[1];
+  other.inflow = tensors[2];
+  return other;
+}
+
+}  // namespace prdp

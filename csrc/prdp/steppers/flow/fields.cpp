@@ -1,0 +1,173 @@
+#include "prdp/steppers/flow/fields.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <deque>
+
+namespace prdp {
+
+namespace {
+
+/// The parts of the fluid that are connected through free faces.
+struct Parts {
+  std::vector<int64_t> of_cell;  // -1 in solid cells
+  int64_t count = 0;
+};
+
+int64_t stride(const FlowBox& box, int64_t axis) {
+  int64_t cells = 1;
+  for (int64_t later = axis + 1; later < box.dim(); ++later) cells *= box.shape()[later];
+  return cells;
+}
+int64_t position(const FlowBox& box, int64_t cell, int64_t axis) {
+  return cell / stride(box, axis) % box.shape()[axis];
+}
+
+/// The neighbour of a cell along an axis, `way` = 1 or -1; -1 beyond an end.
+int64_t cell_beside(const FlowBox& box, int64_t cell, int64_t axis, int64_t way) {
+  const int64_t n = box.shape()[axis], at = position(box, cell, axis), to = at + way;
+  if (to >= 0 && to < n) return cell + way * stride(box, axis);
+  return box.boundary(axis) == FlowBoundary::kPeriodic ? cell - way * (n - 1) * stride(box, axis) : -1;
+}
+
+Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
+  const auto* is_fluid = fluid.const_data_ptr<bool>();
+  Parts parts{std::vector<int64_t>(fluid.numel(), -1)};
+  for (int64_t first = 0; first < fluid.numel(); ++first) {
+    if (!is_fluid[first] || parts.of_cell[first] >= 0) continue;
+    std::deque<int64_t> queue{first};
+    parts.of_cell[first] = parts.count;
+    for (; !queue.empty(); queue.pop_front())
+      for (int64_t axis = 0; axis < box.dim(); ++axis)
+        for (const int64_t way : {-1, 1}) {
+          const int64_t next = cell_beside(box, queue.front(), axis, way);
+          if (next < 0 || !is_fluid[next] || parts.of_cell[next] >= 0) continue;
+          parts.of_cell[next] = parts.count;
+          queue.push_back(next);
+        }
+    ++parts.count;
+  }
+  return parts;
+}
+
+/// The parts without an open end, as FlowFields has them.
+at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid) {
+  const int64_t open = box.open_axis();
+  const auto parts = find_parts(box, fluid);
+  if (open < 0 && !box.obstacle().defined()) return at::empty({0}, at::kDouble);
+  std::vector<bool> inlet(parts.count), outlet(parts.count);
+  const auto cells = static_cast<int64_t>(parts.of_cell.size());
+  for (int64_t cell = 0; cell < cells && open >= 0; ++cell) {
+    if (parts.of_cell[cell] < 0) continue;
+    if (position(box, cell, open) == 0) inlet[parts.of_cell[cell]] = true;
+    if (position(box, cell, open) == box.shape()[open] - 1) outlet[parts.of_cell[cell]] = true;
+  }
+  const auto numbers = at::tensor(parts.of_cell, at::kLong).reshape(box.shape());
+  std::vector<at::Tensor> closed;
+  for (int64_t p = 0; p < parts.count; ++p) {
+    TORCH_CHECK_VALUE(!inlet[p] || outlet[p],
+                      "Flow: the obstacle keeps fluid that comes in at the open end from going out at the other; make "
+                      "the cells before it solid, or open a way");
+    const auto cells_of_part = numbers.eq(p);
+    // The pressure of a cell without a free face is known.
+    if (!outlet[p] && cells_of_part.sum().item<int64_t>() > 1) closed.push_back(cells_of_part.to(at::kDouble));
+  }
+  return closed.empty() ? at::Tensor() : at::stack(closed);
+}
+
+/// The coefficient of each neighbour, low and high along each axis, behind that of the point itself.
+at::Tensor coefficients(const at::Tensor& diagonal, const std::vector<at::Tensor>& of_neighbours) {
+  std::vector<at::Tensor> all{diagonal};
+  all.insert(all.end(), of_neighbours.begin(), of_neighbours.end());
+  return at::stack(all).unsqueeze(0);
+}
+
+/// -div grad of the pressure: 1 on free faces, 0 on others; identity where the pressure is known.
+at::Tensor pressure_coefficients(const FlowBox& box, const at::Tensor& free, at::Tensor& known) {
+  auto diagonal = at::zeros(box.shape(), at::kDouble);
+  std::vector<at::Tensor> open;
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    const auto low = free[box.channel_of(axis)] / (box.dx(axis) * box.dx(axis));
+    open.push_back(low);
+    open.push_back(neighbour(box, low, axis, 1, 0.0));
+    diagonal = diagonal + open[open.size() - 2] + open.back();
+  }
+  known = known.logical_or(diagonal.eq(0));  // a cell without a free face has no pressure to speak of
+  const auto unknown = known.logical_not().to(at::kDouble);
+  std::vector<at::Tensor> of_neighbours;
+  for (int64_t k = 0; k < 2 * box.dim(); ++k)
+    of_neighbours.push_back(-open[k] * unknown * neighbour(box, unknown, k / 2, k % 2 ? 1 : -1, 0.0));
+  return coefficients(at::where(known, at::full({}, box.sum_of_couplings(), at::kDouble), diagonal), of_neighbours);
+}
+
+/// -Δ of the component along `along`, for values that are zero on all faces which are not free. `inside`: faces inside
+/// an obstacle; its surface, where the velocity is zero, is half a cell from the free faces beside them.
+at::Tensor diffusion_coefficients(const FlowBox& box, int64_t along, const at::Tensor& free, const at::Tensor& inside) {
+  auto diagonal = at::zeros(box.shape(), at::kDouble);
+  std::vector<at::Tensor> of_neighbours;
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    for (const int64_t way : {-1, 1}) {
+      const double coupling = 1.0 / (box.dx(axis) * box.dx(axis));
+      // A wall or an inlet along the face's own axis is a whole cell away, along the others half a cell.
+      const bool outlet = box.boundary(axis) == FlowBoundary::kOpen && way > 0;
+      const double beyond = outlet ? 0.0 : axis == along ? 1.0 : 2.0;
+      const auto weight = neighbour(box, at::ones(box.shape(), at::kDouble), axis, way, beyond);
+      const auto behind = axis == along ? at::zeros_like(weight) : neighbour(box, inside, axis, way, 0.0);
+      diagonal = diagonal + coupling * (weight + behind) * free;
+      of_neighbours.push_back(-coupling * free * neighbour(box, free, axis, way, 0.0));
+    }
+  return coefficients(diagonal, of_neighbours);
+}
+
+bool all_ones(const at::Tensor& mask) { return mask.eq(1).all().item<bool>(); }
+
+}  // namespace
+
+FlowFields make_flow_fields(const FlowBox& box) {
+  const at::NoGradGuard no_grad;
+  const int64_t d = box.dim(), open = box.open_axis();
+  const auto fluid = box.obstacle().defined() ? box.obstacle().logical_not() : at::ones(box.shape(), at::kBool);
+  TORCH_CHECK_VALUE(fluid.any().item<bool>(), "Flow: the obstacle fills the grid; at least one cell must be fluid");
+  const auto is_fluid = fluid.to(at::kDouble);
+  FlowFields fields;
+
+  std::vector<at::Tensor> free(d), inlet(d), inside(d), friction(d);
+  for (int64_t axis = 0; axis < d; ++axis) {
+    const int64_t c = box.channel_of(axis);
+    const auto below = neighbour(box, is_fluid, axis, -1, 0.0);
+    free[c] = is_fluid * below;
+    inside[c] = (1 - is_fluid) * (1 - neighbour(box, is_fluid, axis, -1, 1.0));
+    inlet[c] = at::zeros_like(is_fluid);
+    if (axis == open) inlet[c].narrow(axis, 0, 1).copy_(is_fluid.narrow(axis, 0, 1));
+    friction[c] = at::zeros_like(is_fluid);
+    std::vector<int64_t> ones(d, 1);
+    fields.high_sign.push_back(-at::ones(d, at::kDouble));
+    fields.high_sign.back()[c] = 0.0;  // its own component is zero on the wall
+    ones.insert(ones.begin(), d);
+    fields.high_sign.back() = fields.high_sign.back().reshape(ones);
+  }
+  const bool regular = !box.obstacle().defined();
+  for (int64_t c = 0; c < d; ++c) {
+    const int64_t along = d - 1 - c;
+    for (int64_t axis = 0; axis < d && !regular; ++axis)
+      for (const int64_t way : {-1, 1})
+        if (axis != along)
+          friction[c] += free[c] * neighbour(box, inside[c], axis, way, 0.0) / (box.dx(axis) * box.dx(axis));
+    fields.diffusion.push_back(diffusion_coefficients(box, along, free[c], inside[c]));
+  }
+  auto known = fluid.logical_not();
+  if (open >= 0) known.narrow(open, box.shape()[open] - 1, 1).fill_(true);
+  fields.pressure = pressure_coefficients(box, at::stack(free), known);
+  fields.closed_parts = find_closed_parts(box, fluid);
+
+  fields.cells = known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
+  fields.free = at::stack(free).unsqueeze(0);
+  if (open >= 0) fields.inlet = at::stack(inlet).unsqueeze(0);
+  if (!regular) fields.friction = at::stack(friction).unsqueeze(0);
+  if (all_ones(fields.free)) fields.diffusion.resize(1);  // periodic, no obstacle: all components are alike
+  for (auto* mask : {&fields.cells, &fields.free})
+    if (all_ones(*mask)) *mask = at::Tensor();
+  return fields;
+}
+
+}  // namespace prdp

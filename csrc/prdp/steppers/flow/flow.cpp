@@ -1,0 +1,65 @@
+#include "prdp/steppers/flow/flow.h"
+
+#include "prdp/steppers/flow/projection.h"
+#include "prdp/steppers/flow/steps.h"
+#include "prdp/steppers/flow/tendency.h"
+
+namespace prdp {
+
+namespace {
+
+FlowEquation make_equation(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings s) {
+  auto box = std::make_shared<FlowBox>(std::move(shape), s.boundary, s.length.sides, s.obstacle);
+  return {std::move(box), dt, std::move(nu.tensor), s.force, s.inflow, s.advection, s.diffusion};
+}
+
+SolveOptions without_log(SolveOptions options) {
+  options.adjoint_log = 0;
+  return options;
+}
+
+}  // namespace
+
+at::Tensor flow_project(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
+  equation.check(u);
+  CombinedInfo info;
+  return project(*equation.box, with_boundary_values(equation.for_state(u), u), without_log(options), info).u;
+}
+
+at::Tensor flow_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
+  equation.check(u);
+  return flow_step(equation, u, without_log(options)).potential / equation.dt;
+}
+
+at::Tensor flow_divergence_of_state(const FlowEquation& equation, const at::Tensor& u) {
+  equation.check(u);
+  return flow_divergence(*equation.box, with_boundary_values(equation.for_state(u), u));
+}
+
+Flow::Flow(FlowEquation equation, SolveOptions options)
+    : StepperBase("Flow", std::move(options)), equation_(std::move(equation)) {
+  options_.adjoint_log = *log_;
+  TORCH_CHECK_VALUE(options_.start == Start::kZero, "Flow: start must be 'zero': its solves are for changes");
+  equation_.check();
+}
+
+Flow::Flow(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings settings, Solver solver, Backward backward)
+    : Flow(make_equation(std::move(shape), std::move(nu), dt, std::move(settings)), {std::move(solver), backward}) {}
+
+at::Tensor Flow::operator()(const at::Tensor& u) {
+  auto [next, info] = flow_next(equation_, u, options_);
+  info_ = std::move(info);
+  return next;
+}
+
+at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
+  auto [states, info] = flow_rollout(equation_, u, steps, options_);
+  info_ = std::move(info);
+  return states;
+}
+
+at::Tensor Flow::project(const at::Tensor& u) const { return flow_project(equation_, u, options_); }
+at::Tensor Flow::pressure(const at::Tensor& u) const { return flow_pressure(equation_, u, options_); }
+at::Tensor Flow::divergence(const at::Tensor& u) const { return flow_divergence_of_state(equation_, u); }
+
+}  // namespace prdp

@@ -1,0 +1,56 @@
+#include "prdp/steppers/flow/limits.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <cmath>
+
+#include "prdp/operators/operator.h"
+#include "prdp/solvers/raise_or_warn.h"
+#include "prdp/solvers/status.h"
+#include "prdp/steppers/flow/tendency.h"
+
+namespace prdp {
+
+namespace {
+
+/// The largest Courant number. A step of explicit Euler with central differences lets no wave grow up to √(2 ν dt/dx²)
+/// where diffusion is implicit. Up to 1 waves grow slowly at most.
+double largest_courant_number(const FlowEquation& e) {
+  if (e.advection == Advection::kUpwind || e.diffusion == Diffusion::kExplicit) return 1.0;
+  return std::max(
+      1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
+}
+
+}  // namespace
+
+RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
+  const at::NoGradGuard no_grad;
+  const auto courant = courant_numbers(equation, u);
+  const auto fine = courant.le(largest_courant_number(equation));
+  if (fine.all().item<bool>()) return {};
+  const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);
+  return {fine.logical_not(),
+          diverged.masked_fill(courant.isfinite().logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
+}
+
+void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,
+                    OnFailure on_failure) {
+  if (!refused.mask.defined() || on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
+  const auto courant = courant_numbers(equation, u);
+  std::ostringstream text;
+  const auto failed = refused.mask.nonzero().flatten();
+  text << "Flow: " << failed.size(0) << " of " << u.size(0) << " samples failed";
+  for (int64_t k = 0; k < std::min<int64_t>(failed.size(0), 4); ++k) {
+    const auto i = failed[k].item<int64_t>();
+    const auto status = static_cast<SolveStatus>(refused.status[i].item<int64_t>());
+    text << (k ? "; " : ": ") << "sample " << i << " " << name(status);
+    if (status == SolveStatus::kNonfiniteInput)
+      text << ": the velocity is not finite at index " << at::IntArrayRef(first_true(nonfinite(u[i])));
+    else
+      text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
+           << largest_courant_number(equation) << "; take a smaller dt";
+  }
+  raise_or_warn(text.str(), on_failure);
+}
+
+}  // namespace prdp

@@ -1,0 +1,26 @@
+#pragma once
+#include "prdp/autograd/solve_vjp.h"
+#include "prdp/steppers/flow/equation.h"
+
+namespace prdp {
+
+/// The reports of the solves of a time step as one: the sum of their work, the worst status, the largest residual.
+class CombinedInfo {
+ public:
+  void add(const SolveInfo& info);
+  const SolveInfo& info() const { return info_; }
+
+ private:
+  SolveInfo info_;
+};
+
+/// A u = b, differentiable in b and the tensors of A.
+at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info);
+/// The cotangent of b from that of u, by one adjoint solve; and that of the first tensor of A where `u` is given.
+struct SystemVjp {
+  at::Tensor b, coefficients;
+};
+SystemVjp solve_vjp(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
+                    const SolveOptions& options, CombinedInfo& info);
+
+}  // namespace prdp

@@ -1,0 +1,141 @@
+#include "prdp/steppers/flow/step.h"
+
+#include <ATen/core/grad_mode.h>
+#include <torch/csrc/autograd/autograd.h>
+
+#include <limits>
+
+#include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/diffusion.h"
+#include "prdp/steppers/flow/limits.h"
+#include "prdp/steppers/flow/projection.h"
+#include "prdp/steppers/flow/tendency.h"
+
+namespace prdp {
+
+namespace {
+
+at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
+  return samples.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
+}
+
+/// The change of the velocity by explicit Euler.
+struct ExplicitPart {
+  at::Tensor velocity, change;
+};
+ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& u, const at::Tensor& refused) {
+  const auto velocity = cleared(with_boundary_values(e, u), refused);
+  return {velocity, tendency(e, velocity) * e.dt};
+}
+
+bool is_implicit(const FlowEquation& e) { return e.diffusion == Diffusion::kImplicit; }
+
+/// Tensors to differentiate for. Where autograd records, they stay connected to what they came from.
+at::Tensor input_of(const at::Tensor& t, bool needed) {
+  if (!t.defined() || !needed) return t;
+  return at::GradMode::is_enabled() && t.requires_grad() ? t.alias() : t.detach().requires_grad_();
+}
+
+/// grad() of torch, for the inputs that are needed.
+std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<at::Tensor> cotangents,
+                                  const std::vector<at::Tensor>& inputs, at::IntArrayRef needed, bool create_graph) {
+  std::vector<at::Tensor> of, bars, wanted;
+  for (size_t i = 0; i < outputs.size(); ++i)
+    if (outputs[i].defined() && outputs[i].requires_grad() && cotangents[i].defined()) {
+      of.push_back(outputs[i]);
+      bars.push_back(cotangents[i]);
+    }
+  for (size_t i = 0; i < inputs.size(); ++i)
+    if (needed[i]) wanted.push_back(inputs[i]);
+  std::vector<at::Tensor> all(inputs.size());
+  if (of.empty() || wanted.empty()) return all;
+  const auto found = torch::autograd::grad(of, wanted, bars, create_graph, create_graph, /*allow_unused=*/true);
+  for (size_t i = 0, next = 0; i < inputs.size(); ++i)
+    if (needed[i]) all[i] = found[next++];
+  return all;
+}
+
+/// The same by differentiating the step as it is written; for derivatives of derivatives.
+std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
+                                     SolveOptions options, at::IntArrayRef needed) {
+  options.adjoint_log = 0;
+  const auto given = equation.tensors();
+  std::vector<at::Tensor> inputs{input_of(u, needed[0])};
+  for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
+  const auto step = flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, false);
+  return gradients({step.u}, {cotangent}, inputs, needed, /*create_graph=*/true);
+}
+
+/// The gradients of u, ν, force and inflow from the cotangents of the velocity with its boundary values, of its change,
+/// and of ν in the diffusion.
+std::vector<at::Tensor> explicit_vjp_recorded(const FlowEquation& equation, const at::Tensor& u,
+                                              const at::Tensor& refused, const at::Tensor& velocity_bar,
+                                              const DiffuseVjp& back, at::IntArrayRef needed) {
+  const at::AutoGradMode record(true);
+  std::vector<at::Tensor> inputs{u.detach().requires_grad_()};
+  const auto given = equation.tensors();
+  for (size_t i = 0; i < given.size(); ++i)
+    inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
+  const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
+  const auto part = explicit_part(e, inputs[0], refused);
+  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, back.change, back.nu}, inputs, needed,
+                   /*create_graph=*/false);
+}
+
+/// The same by loops.
+std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& refused,
+                                     const at::Tensor& velocity_bar, const DiffuseVjp& back, at::IntArrayRef needed) {
+  const auto e = equation.for_state(u);
+  const auto velocity = cleared(with_boundary_values(e, u), refused);
+  auto found = tendency_vjp(e, velocity, back.change * e.dt);
+  add_to(found.nu, back.nu);
+  auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
+  add_to(of_boundary.inflow, found.inflow);
+  std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
+  const auto given = equation.tensors();
+  for (size_t i = 0; i < all.size(); ++i) {
+    if (!needed[i]) all[i] = at::Tensor();
+    else if (i > 0) all[i] = all[i].reshape(given[i - 1].sizes()).to(given[i - 1].options());
+  }
+  return all;
+}
+
+}  // namespace
+
+FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
+  const auto e = equation.for_state(u);
+  const auto refused = find_refused(e, with_boundary_values(e, u).detach());
+  if (reported) report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
+  const auto [velocity, change] = explicit_part(e, u, refused.mask);
+  CombinedInfo info;
+  const auto diffused = is_implicit(e) ? diffuse(e, change, options, info) : change;
+  const auto [next, potential] = project(*e.box, velocity + diffused, options, info);
+  FlowStep step{cleared(next, refused.mask), potential, info.info()};
+  if (refused.mask.defined()) {
+    step.info.status = at::where(refused.mask, refused.status, step.info.status);
+    step.info.residual = step.info.residual.masked_fill(refused.mask, std::numeric_limits<double>::infinity());
+  }
+  return step;
+}
+
+std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
+                                      const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
+  if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
+  const auto e = equation.for_state(u);
+  const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
+  const auto& box = *e.box;
+  CombinedInfo adjoint;
+  const auto velocity_bar = project_vjp(box, cleared(cotangent, refused), options, adjoint);
+  const auto& free = box.fields(u.options()).free;
+  DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
+  if (is_implicit(e)) {
+    CombinedInfo again;
+    const auto diffused = needed[1] ? diffuse(e, explicit_part(e, u, refused).change, options, again) : at::Tensor();
+    back = diffuse_vjp(e, back.change, diffused, options, adjoint);
+  }
+  info = adjoint.info();
+  const auto by_loops = tendency_has_loops(u);
+  return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar, back, needed);
+}
+
+}  // namespace prdp

@@ -1,0 +1,24 @@
+#pragma once
+#include "prdp/steppers/flow/solves.h"
+
+namespace prdp {
+
+/// One time step (Chorin 1968): advect, diffuse, project. `potential` is dt times its pressure, (batch, 1, *shape).
+struct FlowStep {
+  at::Tensor u, potential;
+  SolveInfo info;
+};
+
+/// Written in differentiable pieces. Samples whose step is too long for the explicit part, or whose state is not
+/// finite, fail as options.on_failure says: then u is zero and carries no gradient. If not `reported`, nothing is said
+/// about these.
+FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options,
+                   bool reported = true);
+
+/// The gradients of u, ν, force and inflow from the cotangent of the next state, in implicit mode: undefined where
+/// `needed` holds 0. Needs the state u alone. Where autograd records, they are differentiable. `info`: the report of
+/// the adjoint solves.
+std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
+                                      const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info);
+
+}  // namespace prdp

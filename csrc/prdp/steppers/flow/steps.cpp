@@ -1,0 +1,192 @@
+#include "prdp/steppers/flow/steps.h"
+
+#include <ATen/core/grad_mode.h>
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/custom_class.h>
+
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/detach_failed.h"
+#include "prdp/operators/autocast.h"
+#include "prdp/operators/disguises.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/threads/interruption.h"
+
+namespace prdp {
+
+namespace {
+
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+/// What travels from the forward to the backward pass beside tensors.
+struct Call : torch::CustomClassHolder {
+  FlowEquation equation;
+  int64_t steps;
+  bool all_states;
+  SolveOptions options;
+};
+
+/// Functions of autograd take no undefined tensors: an empty one stands for none.
+at::Tensor or_empty(const at::Tensor& t, const at::Tensor& u) { return t.defined() ? t : at::empty({0}, u.options()); }
+at::Tensor or_undefined(const at::Tensor& t) { return t.numel() == 0 ? at::Tensor() : t; }
+
+/// The states u, …, and the reports of the steps.
+SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps, bool all_states,
+                const SolveOptions& options) {
+  if (!all_states) {
+    auto step = flow_step(equation, u, options);
+    return {step.u, step.info};
+  }
+  auto sizes = u.sizes().vec();
+  sizes.insert(sizes.begin() + 1, steps + 1);
+  auto states = at::empty(sizes, u.options());
+  states.select(1, 0).copy_(u);
+  Reports reports;
+  auto state = u;
+  for (int64_t s = 0; s < steps; ++s) {
+    const FailuresOfStep here(s + 1, steps);
+    interruption::Watch::local().spend(u.numel());
+    auto step = flow_step(equation, state, options);
+    state = step.u;
+    states.select(1, s + 1).copy_(state);
+    reports.push(step.info);
+  }
+  return {states, reports.joined(u)};
+}
+
+class FlowSteps : public torch::autograd::Function<FlowSteps> {
+ public:
+  static variable_list forward(AutogradContext* ctx, const at::Tensor& u, const at::Tensor& nu, const at::Tensor& force,
+                               const at::Tensor& inflow, const c10::intrusive_ptr<Call>& call) {
+    const at::AutoDispatchBelowADInplaceOrView below;
+    const auto equation = call->equation.with_tensors({nu, or_undefined(force), or_undefined(inflow)});
+    const auto [out, info] = run(equation, u, call->steps, call->all_states, call->options);
+    ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
+    ctx->set_materialize_grads(false);
+    const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
+    ctx->save_for_backward(
+        {call->all_states ? out : u, nu, force, inflow, may_have_failed ? info.status : at::Tensor()});
+    ctx->saved_data["call"] = c10::IValue::make_capsule(call);
+    return {out, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+  }
+
+  static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
+    const auto saved = ctx->get_saved_variables();
+    const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
+    variable_list out(5);
+    if (!grads[0].defined()) return out;
+    const auto equation = call->equation.with_tensors({saved[1], or_undefined(saved[2]), or_undefined(saved[3])});
+    std::vector<int64_t> needed(4);
+    for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
+    const auto of_cotangent = [&](const at::Tensor& cotangent) {
+      return call->all_states ? back_through_all(equation, saved[0], saved[4], cotangent, *call, needed)
+                              : back(equation, saved[0], saved[4], cotangent, *call, needed);
+    };
+    const WithoutAutocast full_precision;
+    const auto found =
+        is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], of_cotangent) : of_cotangent(grads[0]);
+    std::copy(found.begin(), found.end(), out.begin());
+    return out;
+  }
+
+ private:
+  static std::vector<at::Tensor> back(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& status,
+                                      const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
+    SolveInfo info;
+    auto found = flow_step_vjp(equation, u, without_lost_of(cotangent, status, call), call.options, needed, info);
+    if (call.options.adjoint_log != 0 && info.status.defined()) adjoint_log::write(call.options.adjoint_log, info);
+    return found;
+  }
+
+  static std::vector<at::Tensor> back_through_all(const FlowEquation& equation, const at::Tensor& states,
+                                                  const at::Tensor& status, const at::Tensor& cotangent,
+                                                  const Call& call, at::IntArrayRef needed) {
+    std::vector<at::Tensor> sums(needed.size());
+    auto bar = cotangent.select(1, call.steps);
+    Reports reports;
+    for (int64_t s = call.steps - 1; s >= 0; --s) {
+      const FailuresOfStep here(s + 1, call.steps);
+      interruption::Watch::local().spend(bar.numel());
+      const auto status_of_step = status.defined() ? status.select(1, s) : status;
+      std::vector<int64_t> wanted = needed.vec();
+      wanted[0] = needed[0] || s > 0;
+      SolveInfo info;
+      const auto found = flow_step_vjp(equation, states.select(1, s), without_lost_of(bar, status_of_step, call),
+                                       call.options, wanted, info);
+      bar = cotangent.select(1, s);
+      add_to(bar, found[0]);
+      for (size_t i = 1; i < sums.size(); ++i) add_to(sums[i], found[i]);
+      if (info.status.defined()) reports.push(info);
+    }
+    reports.reverse();
+    if (call.options.adjoint_log != 0 && !at::GradMode::is_enabled())
+      adjoint_log::write(call.options.adjoint_log, reports.joined(cotangent));
+    if (needed[0]) sums[0] = bar;
+    return sums;
+  }
+
+  static at::Tensor without_lost_of(const at::Tensor& cotangent, const at::Tensor& status, const Call& call) {
+    return status.defined() ? without_lost(cotangent, status, call.options.on_failure) : cotangent;
+  }
+};
+
+SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t steps, bool all_states,
+                   const SolveOptions& options) {
+  options.check("Flow");
+  equation.check(u);
+  const WithoutAutocast full_precision;
+  bool differentiable = at::GradMode::is_enabled() && u.requires_grad();
+  for (const auto& t : equation.tensors())
+    differentiable = differentiable || (at::GradMode::is_enabled() && t.defined() && t.requires_grad());
+  if (!differentiable || options.backward == Backward::kNone) {
+    const at::NoGradGuard no_grad;
+    return run(equation, u.detach(), steps, all_states, options);
+  }
+  auto call = c10::make_intrusive<Call>();
+  call->equation = equation.with_tensors({at::Tensor(), at::Tensor(), at::Tensor()});
+  call->steps = steps;
+  call->all_states = all_states;
+  call->options = options;
+  const auto out = FlowSteps::apply(u, equation.nu, or_empty(equation.force, u), or_empty(equation.inflow, u), call);
+  return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
+}
+
+/// A step whose solves have nodes of their own.
+SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
+  auto step = flow_step(equation, u, options);
+  if (options.on_failure == OnFailure::kZeroGrad) step.u = detach_failed(step.u, step.info.status);
+  return {step.u, step.info};
+}
+
+SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
+  options.check("Flow");
+  equation.check(u);
+  std::vector<at::Tensor> states{u};
+  Reports reports;
+  for (int64_t s = 0; s < steps; ++s) {
+    const FailuresOfStep here(s + 1, steps);
+    auto [next, info] = unrolled_step(equation, states.back(), options);
+    states.push_back(std::move(next));
+    reports.push(info);
+  }
+  return {at::stack(states, 1), reports.joined(u)};
+}
+
+}  // namespace
+
+SolveResult flow_next(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
+  if (options.backward != Backward::kUnrolled) return record(equation, u, 1, false, options);
+  options.check("Flow");
+  equation.check(u);
+  return unrolled_step(equation, u, options);
+}
+
+SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
+                         const SolveOptions& options) {
+  TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
+  if (options.backward == Backward::kUnrolled) return unrolled(equation, u, steps, options);
+  return record(equation, u, steps, true, options);
+}
+
+}  // namespace prdp

@@ -1,0 +1,185 @@
+#include "prdp/steppers/flow/tendency.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <algorithm>
+
+#include "prdp/operators/disguises.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/explicit_loops.h"
+
+namespace prdp {
+
+namespace {
+
+/// Views of a component of a field with ghosts, the grid's size along all axes but those that say otherwise.
+class Padded {
+ public:
+  Padded(const FlowBox& box, const at::Tensor& all) : box_(box), all_(all) {}
+  /// Channel c, at the neighbour one `way` along an axis.
+  at::Tensor at(int64_t c, int64_t axis, int64_t way) const {
+    auto view = all_.select(1, c);
+    for (int64_t a = 0; a < box_.dim(); ++a) view = view.narrow(a + 1, 1 + (a == axis ? way : 0), box_.shape()[a]);
+    return view;
+  }
+  /// The N + 1 values along `axis` that begin at the ghost (0) or at the first cell (1), at the neighbour one `way`
+  /// along the axis `other`.
+  at::Tensor edges(int64_t c, int64_t axis, int64_t begin, int64_t other = -1, int64_t way = 0) const {
+    auto view = all_.select(1, c);
+    for (int64_t a = 0; a < box_.dim(); ++a)
+      view = a == axis ? view.narrow(a + 1, begin, box_.shape()[a] + 1)
+                       : view.narrow(a + 1, 1 + (a == other ? way : 0), box_.shape()[a]);
+    return view;
+  }
+
+ private:
+  const FlowBox& box_;
+  const at::Tensor& all_;
+};
+
+/// (u·∇) of the component along `along`: its derivative along `axis`, times the velocity along that axis.
+at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t axis, Advection kind) {
+  const int64_t c = box.channel_of(along), d = axis + 1, n = box.shape()[axis];
+  const auto before = u.edges(c, axis, 0), after = u.edges(c, axis, 1);
+  // The velocity through the edges between neighbours.
+  const auto through =
+      axis == along
+          ? (before + after) * 0.5
+          : (u.edges(box.channel_of(axis), axis, 1, along, -1) + u.edges(box.channel_of(axis), axis, 1)) * 0.5;
+  const auto low = [&](const at::Tensor& t) { return t.narrow(d, 0, n); };
+  const auto high = [&](const at::Tensor& t) { return t.narrow(d, 1, n); };
+  if (kind == Advection::kCentral)
+    return (high(through) * high(after) - low(through) * low(before)) * (0.5 / box.dx(axis));
+  const auto jump = after - before, size = through.abs();
+  return (low((through + size) * jump) + high((through - size) * jump)) * (0.5 / box.dx(axis));
+}
+
+at::Tensor laplacian(const FlowBox& box, const Padded& u, int64_t c) {
+  at::Tensor sum = u.at(c, 0, 0) * -box.sum_of_couplings();
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    sum = sum.add(u.at(c, axis, -1) + u.at(c, axis, 1), 1.0 / (box.dx(axis) * box.dx(axis)));
+  return sum;
+}
+
+/// -(u·∇)u + ν Δu in tensor operations.
+at::Tensor advect_and_diffuse_tensors(const FlowEquation& equation, const at::Tensor& ghosts) {
+  const auto& box = *equation.box;
+  const Padded padded(box, ghosts);
+  std::vector<at::Tensor> components;
+  for (int64_t c = 0; c < box.dim(); ++c) {
+    auto sum = laplacian(box, padded, c) * equation.nu;
+    for (int64_t axis = 0; axis < box.dim(); ++axis)
+      sum = sum - advection(box, padded, box.dim() - 1 - c, axis, equation.advection);
+    components.push_back(sum);
+  }
+  return at::stack(components, 1);
+}
+
+/// The order in which the axes get their ghosts: the open one first, so that the others take its ghosts along.
+std::vector<int64_t> axes_of_ghosts(const FlowBox& box) {
+  std::vector<int64_t> axes;
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    axes.insert(axis == box.open_axis() ? axes.begin() : axes.end(), axis);
+  return axes;
+}
+
+/// The cotangents of u and of the inflow from that of the field with ghosts, which is overwritten.
+std::pair<at::Tensor, at::Tensor> ghosts_back(const FlowEquation& equation, at::Tensor padded) {
+  const auto& box = *equation.box;
+  const auto& fields = box.fields(padded.options());
+  auto axes = axes_of_ghosts(box);
+  std::reverse(axes.begin(), axes.end());
+  at::Tensor inflow;
+  for (const int64_t axis : axes) {
+    const int64_t d = axis + 2, n = box.shape()[axis];
+    const auto low = padded.narrow(d, 0, 1), high = padded.narrow(d, n + 1, 1);
+    padded = padded.narrow(d, 1, n);
+    auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
+    switch (box.boundary(axis)) {
+      case FlowBoundary::kPeriodic:
+        last.add_(low);
+        first.add_(high);
+        break;
+      case FlowBoundary::kWall:
+        first.sub_(low);
+        last.add_(fields.high_sign[axis] * high);
+        break;
+      case FlowBoundary::kOpen:
+        inflow = at::sum_to(2 * low, equation.inflow.sizes());
+        first.sub_(low);
+        last.add_(high);
+        break;
+    }
+  }
+  return {padded, inflow};
+}
+
+}  // namespace
+
+at::Tensor with_boundary_values(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& fields = equation.box->fields(u.options());
+  const auto inside = fields.free.defined() ? u * fields.free : u;
+  return fields.inlet.defined() ? inside + fields.inlet * equation.inflow : inside;
+}
+
+BoundaryVjp boundary_values_vjp(const FlowEquation& equation, const at::Tensor& cotangent) {
+  const auto& fields = equation.box->fields(cotangent.options());
+  return {fields.free.defined() ? cotangent * fields.free : cotangent,
+          fields.inlet.defined() ? at::sum_to(cotangent * fields.inlet, equation.inflow.sizes()) : at::Tensor()};
+}
+
+at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& box = *equation.box;
+  const auto& fields = box.fields(u.options());
+  auto padded = u;
+  for (const int64_t axis : axes_of_ghosts(box)) {
+    const int64_t d = axis + 2, n = box.shape()[axis];
+    const auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
+    switch (box.boundary(axis)) {
+      case FlowBoundary::kPeriodic: padded = at::cat({last, padded, first}, d); break;
+      case FlowBoundary::kWall: padded = at::cat({-first, padded, fields.high_sign[axis] * last}, d); break;
+      case FlowBoundary::kOpen: padded = at::cat({2 * equation.inflow - first, padded, last}, d); break;
+    }
+  }
+  return padded;
+}
+
+bool tendency_has_loops(const at::Tensor& u) { return u.is_cpu() && is_plain(u) && !at::GradMode::is_enabled(); }
+
+at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u) {
+  const auto& fields = equation.box->fields(u.options());
+  const auto padded = with_ghosts(equation, u);
+  auto all = tendency_has_loops(u) ? advect_and_diffuse(equation, padded.contiguous())
+                                   : advect_and_diffuse_tensors(equation, padded);
+  if (fields.friction.defined()) all = all - equation.nu * fields.friction * u;
+  if (equation.force.defined()) all = all + equation.force;
+  return fields.free.defined() ? all * fields.free : all;
+}
+
+TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent) {
+  const auto& fields = equation.box->fields(u.options());
+  const auto g = fields.free.defined() ? cotangent * fields.free : cotangent;
+  auto [padded_bar, nu_bar] = advect_and_diffuse_vjp(equation, with_ghosts(equation, u).contiguous(), g);
+  TendencyVjp found{{}, nu_bar, {}, {}};
+  if (equation.force.defined()) found.force = at::sum_to(g, equation.force.sizes());
+  std::tie(found.u, found.inflow) = ghosts_back(equation, padded_bar);
+  if (fields.friction.defined()) {
+    const auto held = fields.friction * g;
+    found.u = found.u - equation.nu * held;
+    found.nu = found.nu - (held * u).sum();
+  }
+  return found;
+}
+
+at::Tensor courant_numbers(const FlowEquation& equation, const at::Tensor& u) {
+  const at::NoGradGuard no_grad;
+  const auto& box = *equation.box;
+  at::Tensor sum;
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    const auto of_axis = u.select(1, box.channel_of(axis)).abs() * (equation.dt / box.dx(axis));
+    sum = sum.defined() ? sum + of_axis : of_axis;
+  }
+  return sum.flatten(1).amax(1);
+}
+
+}  // namespace prdp

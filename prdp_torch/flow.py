@@ -1,0 +1,151 @@
+"""`Flow`: incompressible flow by projection."""
+
+import torch
+
+from prdp_torch import _C, _check, operators
+from prdp_torch.solvers import CG
+from prdp_torch.stepper import Stepper
+
+
+class Flow(Stepper):
+    """Make one time step of incompressible flow, u_t + (u·∇)u + ∇p = nu Δu + force with ∇·u = 0, in 2D or 3D.
+
+    The state u is (batch, d, *shape). The grid is staggered: channel 0 is the velocity along x, the last axis, and each
+    component lies on the low face of its own axis. One step advects by explicit Euler, diffuses, and then projects the
+    velocity onto the ones without divergence. The projection solves an equation for the pressure.
+
+    Args:
+        shape: the cells, (Ny, Nx) or (Nz, Ny, Nx), at least 3 per axis.
+        nu: viscosity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of the module,
+            and another tensor a buffer. The same holds for `force` and `inflow`.
+        dt: time step > 0. The advection needs dt Σ |u|/dx <= 1; a longer step raises an error.
+        boundary: one for all axes, or one per axis in the order of `shape`.
+            "periodic".
+            "wall": no slip at both ends. The low face of the first cell lies on the wall.
+            "open": `inflow` at the low end; at the high end pressure zero and no normal gradient. At most one axis.
+        length: the side of the domain, one number or one per axis in the order of `shape`; dx = length/N.
+        obstacle: bool (*shape), True in solid cells. Their faces carry no velocity.
+        force: acceleration, (d,) or (batch or 1, d, *shape).
+        inflow: velocity at the low end of the open axis, (d,), or (batch or 1, d, *shape) with extent 1 along it.
+        advection: "central" is of second order and conserves the energy; it needs about dt <= 2 nu/|u|². "upwind" is of
+            first order and stable without viscosity.
+        diffusion: "implicit" solves with `solver`, and "explicit" needs nu dt Σ 2/dx² <= 1.
+        solver: for the pressure and the implicit diffusion, both symmetric. CG(100) with multigrid by default.
+        backward and the other options: as in `Stepper`, but `start` must be "zero".
+
+    `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
+    Each step stores one state for the backward pass, and computes the rest again.
+
+    Raises:
+        ValueError, TypeError: an argument is wrong. This is checked before any work.
+        torch.linalg.LinAlgError: a sample failed; a step that is too long has status DIVERGED.
+
+    Examples:
+        >>> flow = prdp.Flow((64, 64), nu=1e-3, dt=1e-2)
+        >>> states = flow.rollout(flow.project(u0), 50)  # (batch, 2, 64, 64) -> (batch, 51, 2, 64, 64)
+        >>> channel = prdp.Flow((24, 96), nu=1e-2, dt=1e-2, boundary=("wall", "open"), length=(1, 4), inflow=profile)
+
+    Source: Harlow and Welch (1965) for the grid, Chorin (1968) for the step.
+    """
+
+    def __init__(
+        self,
+        shape,
+        nu,
+        dt,
+        boundary="periodic",
+        length=1.0,
+        obstacle=None,
+        force=None,
+        inflow=None,
+        advection="central",
+        diffusion="implicit",
+        solver=None,
+        backward="implicit",
+        **options,
+    ):
+        solver = CG(max_iter=100, preconditioner="multigrid") if solver is None else solver
+        super().__init__(solver, backward, **options)
+        if self.start != "zero":
+            raise ValueError(f"Flow: start must be 'zero': its solves are for changes, got {self.start!r}")
+        self.shape = tuple(_check.shape("Flow", shape))
+        self.dt = _check.real("Flow", "dt", dt)
+        self.boundary, self.length = boundary, length
+        self.advection = _check.string("Flow", "advection", advection)
+        self.diffusion = _check.string("Flow", "diffusion", diffusion)
+        self._keep_tensor("nu", nu if isinstance(nu, torch.Tensor) else _check.real("Flow", "nu", nu))
+        self._keep_tensor("force", force)
+        self._keep_tensor("inflow", inflow)
+        self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
+        self._box = None
+        self._equation().check()
+
+    def _keep_tensor(self, name, value):
+        if isinstance(value, torch.nn.Parameter):
+            self.register_parameter(name, value)
+        elif isinstance(value, torch.Tensor):
+            self.register_buffer(name, _check.dense("Flow", name, value))
+        elif value is None or isinstance(value, float):
+            setattr(self, name, value)
+        else:
+            self.register_buffer(name, _of_numbers(name, value))
+
+    def forward(self, u):
+        _check.dense("Flow", "u", u)
+        log = self._adjoint_log.number
+        u_next, *report = self._equation().step(u, self._options_kept(), self._max_iter, log)
+        self._keep(report, self._adjoint_log)
+        return u_next
+
+    def rollout(self, u, steps):
+        """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
+
+        It is a single node of autograd, whose backward pass needs the states alone. `info` and `adjoint_info` then hold
+        tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1."""
+        _check.dense("Flow", "u", u)
+        steps = _check.whole("rollout", "steps", steps)
+        log = self._adjoint_log.number
+        states, *report = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
+        self._keep(report, self._adjoint_log)
+        return states
+
+    def project(self, u):
+        """Return the velocity nearest to u that has the boundary values and no divergence."""
+        return self._equation().project(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
+
+    def pressure(self, u):
+        """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
+        unless an axis is open."""
+        return self._equation().pressure(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
+
+    def divergence(self, u):
+        """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
+        cells before an open end, whose high faces take what mass conservation gives."""
+        return self._equation().divergence(_check.dense("Flow", "u", u))
+
+    def _equation(self):
+        if self._box is None:
+            self._box = self._make_box()
+        nu = operators.real_tensor("Flow", "nu", self.nu)
+        return _C.FlowEquation(self._box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
+
+    def _make_box(self):
+        names = [self.boundary] if isinstance(self.boundary, str) else self.boundary
+        if not isinstance(names, (tuple, list)):
+            raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
+        names = [_check.string("Flow", "boundary", name) for name in names]
+        lengths = self.length if isinstance(self.length, (tuple, list)) else [self.length]
+        lengths = [_check.real("Flow", "length", side) for side in lengths]
+        return _C.FlowBox(list(self.shape), names, lengths, self.obstacle)
+
+    def __getstate__(self):
+        return {**super().__getstate__(), "_box": None}  # of the compiled library; made again where it is needed
+
+    def extra_repr(self):
+        return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
+
+
+def _of_numbers(name, value):
+    if not isinstance(value, (tuple, list)):
+        raise TypeError(f"Flow: {name} must be a tensor or a tuple of numbers, got {value!r}")
+    return torch.tensor([_check.real("Flow", f"every entry of {name}", v) for v in value], dtype=torch.float64)

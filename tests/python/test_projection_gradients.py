@@ -1,0 +1,133 @@
+"""Gradients of `Flow` against finite differences in float64."""
+
+import pytest
+import torch
+from flows import random_velocity
+from torch.autograd import gradcheck, gradgradcheck
+
+import prdp_torch as prdp
+
+EXACT = prdp.CG(200, rtol=1e-13, preconditioner="multigrid")
+CASES = {
+    "periodic": {"shape": (5, 4)},
+    "walls": {"shape": (4, 5), "boundary": "wall"},
+    "open": {"shape": (4, 6), "boundary": ("wall", "open")},
+    "obstacle": {"shape": (5, 7), "boundary": ("wall", "open"), "obstacle": [(2, 2), (2, 3), (3, 3)]},
+    "holes": {"shape": (6, 6), "obstacle": [(1, 1), (3, 3), (3, 4), (2, 4), (4, 4), (3, 5)]},
+    "3d": {"shape": (3, 3, 4), "boundary": ("periodic", "wall", "open"), "obstacle": [(1, 1, 1)]},
+}
+
+
+def make(name, nu, force, inflow, **options):
+    case = dict(CASES[name])
+    shape = case.pop("shape")
+    if "obstacle" in case:
+        solid = torch.zeros(shape, dtype=torch.bool)
+        for cell in case["obstacle"]:
+            solid[cell] = True
+        case["obstacle"] = solid
+    inflow = inflow if "open" in case.get("boundary", "") else None
+    options = {"solver": EXACT, "adjoint_rtol": 1e-13, **options}
+    return prdp.Flow(shape, nu, 0.02, force=force, inflow=inflow, **case, **options)
+
+
+def inputs(name, batch=2):
+    shape = CASES[name]["shape"]
+    d = len(shape)
+    generator = torch.Generator().manual_seed(1)
+    inflow = 1 + 0.1 * torch.randn(batch, d, *shape[:-1], 1, generator=generator, dtype=torch.float64)
+    force = torch.randn(1, d, *shape, generator=generator, dtype=torch.float64)
+    nu = torch.tensor(0.3, dtype=torch.float64)
+    return [t.requires_grad_() for t in (random_velocity(shape, batch), nu, force, inflow)]
+
+
+def used(name, all_inputs):
+    return all_inputs if "open" in CASES[name].get("boundary", "") else all_inputs[:3]
+
+
+@pytest.mark.parametrize("advection", ["central", "upwind"])
+@pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_has_the_gradients_of_finite_differences(name, diffusion, advection):
+    def step(u, nu, force, inflow=None):
+        if diffusion == "explicit":
+            nu = 0.05 * nu
+        return make(name, nu, force, inflow, diffusion=diffusion, advection=advection)(u)
+
+    assert gradcheck(step, used(name, inputs(name)))
+
+
+@pytest.mark.parametrize("name", ["walls", "obstacle"])
+def test_a_rollout_has_them_too(name):
+    def states(u, nu, force, inflow=None):
+        return make(name, nu, force, inflow).rollout(u, 3)
+
+    assert gradcheck(states, used(name, inputs(name)))
+
+
+@pytest.mark.parametrize("name", ["periodic", "obstacle"])
+def test_project_and_pressure_have_them_too(name):
+    def both(u, nu, force, inflow=None):
+        flow = make(name, nu, force, inflow)
+        return flow.project(u), flow.pressure(u), flow.divergence(u)
+
+    assert gradcheck(both, used(name, inputs(name)))
+
+
+def test_second_derivatives():
+    def states(u, nu, force):
+        return make("walls", nu, force, None).rollout(u, 2)
+
+    assert gradgradcheck(states, inputs("walls", batch=1)[:3])
+
+
+def test_unrolled_gradients_are_those_of_the_iterations_that_ran():
+    few = prdp.CG(2, rtol=0.0, preconditioner="diagonal")
+
+    def step(u, nu, force):
+        return make("walls", nu, force, None, solver=few, backward="unrolled", adjoint_rtol=None)(u)
+
+    assert gradcheck(step, inputs("walls", batch=1)[:3])
+
+
+def test_a_rollout_equals_its_steps_to_the_last_bit():
+    u, nu, force, inflow = inputs("obstacle")
+    flow = make("obstacle", nu, force, inflow)
+    states = flow.rollout(u, 4)
+    weights = random_velocity(CASES["obstacle"]["shape"], seed=3)
+    found = torch.autograd.grad((states[:, -1] * weights).sum(), (u, nu, force, inflow))
+    assert flow.info.iterations.shape == flow.adjoint_info.iterations.shape == (2, 4)
+    v = u
+    for k in range(4):
+        v = flow(v)
+        assert torch.equal(v, states[:, k + 1])
+    expected = torch.autograd.grad((v * weights).sum(), (u, nu, force, inflow))
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-14)
+
+
+def test_no_gradient_where_none_is_asked_for():
+    u, nu, force, _ = inputs("periodic")
+    assert not make("periodic", nu, force, None, backward="none")(u).requires_grad
+
+
+def test_gradients_stay_finite_over_many_steps():
+    flow = prdp.Flow((16, 16), 1e-3, 0.05, length=6.28, solver=prdp.CG(100, rtol=1e-6, preconditioner="multigrid"))
+    u = flow.project(0.1 * random_velocity((16, 16), dtype=torch.float32)).requires_grad_()
+    (flow.rollout(u, 1000)[:, -1] ** 2).sum().backward()
+    assert u.grad.isfinite().all()
+    assert flow.converged
+
+
+def test_the_backward_pass_keeps_one_state_per_step():
+    flow = prdp.Flow((32, 32), 0.1, 1e-3)
+    u = flow.project(random_velocity((32, 32), dtype=torch.float32)).requires_grad_()
+    kept = {}
+
+    def pack(t):
+        kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
+        return t
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+        flow.rollout(u, 20)
+    assert sum(kept.values()) < 22 * u.nbytes
