@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-PEERS = ("torch", "jax", "lineax", "scipy", "phiflow", "jax-cfd", "exponax", "torch-fem")
+PEERS = ("torch", "jax", "lineax", "scipy", "pyamg", "phiflow", "jax-cfd", "exponax", "torch-fem")
 
 
 def use_one_thread():

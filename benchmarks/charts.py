@@ -7,9 +7,9 @@ from matplotlib.ticker import NullFormatter
 
 # One colour a method, whoever runs it; Okabe and Ito's, which colour-blind readers can tell apart.
 COLOURS = {"Jacobi": "#0072B2", "Chebyshev": "#009E73", "steepest descent": "#CC79A7", "CG": "#E69F00",
-           "GMRES": "#D55E00", "Stokes": "#56B4E9", "direct": "#222222", "LU": "#999999",
+           "GMRES": "#D55E00", "multigrid": "#56B4E9", "Multigrid": "#0072B2", "direct": "#222222", "LU": "#999999",
            "diagonal": "#009E73", "Function": "#CC79A7", "CSR": "#D55E00"}  # fmt: skip
-MARKS = {"torch eager": "s", "torch.compile": "P", "JAX jit": "^", "lineax": "v", "SciPy": "D"}
+MARKS = {"torch eager": "s", "torch.compile": "P", "JAX jit": "^", "lineax": "v", "SciPy": "D", "pyamg": "v"}
 
 
 def colour(label):
@@ -87,6 +87,26 @@ def size(series):
     left.set(xlabel="unknowns of one sample (batch 1)", ylabel="ns per unknown and product with A")
     right.set(xlabel="samples in the batch")
     right.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def large(points):
+    """Seconds, with the setup and of one more solve, and the true residual, over the unknowns of one sample."""
+    figure = Figure(figsize=(11.5, 4.8), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for label in dict.fromkeys(p["solver"] for p in points):
+        line = [p for p in points if p["solver"] == label]
+        mark = MARKS.get(library(label), "o")
+        style = {"color": colour(label), "marker": mark, "lw": 1.4, "ms": 5, "label": label}
+        for axes, what in zip(panels, ("seconds", "again", "residual"), strict=True):
+            axes.plot([p["unknowns"] for p in line], [max(p[what], 1e-12) for p in line], **style)
+    titles = ("first solve, with its setup: seconds", "one more with the same κ: seconds", "‖b - A u‖ / ‖b‖ in float64")
+    for axes, title in zip(panels, titles, strict=True):
+        axes.set(xscale="log", yscale="log", xlabel="unknowns of one sample", title=title)
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+    )
     return figure
 
 

@@ -37,7 +37,13 @@ def methods(problem):
         } | exact
     if problem.kappa is not None:
         scaled = lambda k: prdp.CG(k, rtol=0.0, preconditioner="diagonal")  # noqa: E731
-        return {"CG": (problem.solver, budgets(problem.k)), "CG, diagonal": (scaled, budgets(problem.k))} | exact
+        cycles = lambda k: prdp.CG(k, rtol=0.0, preconditioner="multigrid")  # noqa: E731
+        few = budgets(problem.k)
+        return {
+            "CG": (problem.solver, few),
+            "CG, diagonal": (scaled, few),
+            "CG, multigrid": (cycles, [1, 2, 4, 8]),
+        } | exact
     if problem.name.startswith("burgers"):
         jacobi = {"Jacobi": (lambda k: prdp.Jacobi(k, rtol=0.0), budgets(2 * problem.k))}
         return {"GMRES(2)": (problem.solver, budgets(problem.k))} | jacobi | exact

@@ -31,7 +31,16 @@ app = typer.Typer(
 )
 console = Console(highlight=False, markup=False, emoji=False)  # paths and titles are printed as they are
 
-SUITES = ("accuracy", "diffusion", "size", "roofline", "change_of_k", "training", "memory")  # modules of benchmarks/
+SUITES = (
+    "accuracy",
+    "diffusion",
+    "size",
+    "large",
+    "roofline",
+    "change_of_k",
+    "training",
+    "memory",
+)  # modules of benchmarks/
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 COUNT = {"min": 1, "max": _C.MOST_COUNTED}
