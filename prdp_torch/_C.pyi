@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'join_adjoint_logs', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'join_adjoint_logs', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -26,13 +26,37 @@ class SolveOptions:
     """
     The options of a solve but for max_iter and the log.
     """
-    def __init__(self, arg0: str, arg1: typing.SupportsFloat | typing.SupportsIndex, arg2: typing.SupportsInt | typing.SupportsIndex, arg3: str, arg4: typing.SupportsInt | typing.SupportsIndex | None, arg5: typing.SupportsFloat | typing.SupportsIndex | None, arg6: str, arg7: typing.SupportsInt | typing.SupportsIndex, arg8: bool) -> None:
+    def __init__(self, arg0: str, arg1: typing.SupportsFloat | typing.SupportsIndex, arg2: typing.SupportsInt | typing.SupportsIndex, arg3: str, arg4: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], arg5: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], arg6: collections.abc.Sequence[torch.Tensor], arg7: bool, arg8: str, arg9: typing.SupportsInt | typing.SupportsIndex | None, arg10: typing.SupportsFloat | typing.SupportsIndex | None, arg11: str, arg12: typing.SupportsInt | typing.SupportsIndex, arg13: bool) -> None:
         ...
 class Equation:
     """
     An equation but for its tensors.
     """
     def __init__(self, arg0: str, arg1: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], arg2: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], arg3: typing.SupportsInt | typing.SupportsIndex) -> None:
+        ...
+class FlowBox:
+    """
+    The grid of a flow, its boundary and its obstacle.
+    """
+    def __init__(self, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], boundary: collections.abc.Sequence[str], length: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], obstacle: torch.Tensor | None) -> None:
+        ...
+class FlowEquation:
+    """
+    A flow and how it is stepped.
+    """
+    def __init__(self, box: FlowBox, dt: typing.SupportsFloat | typing.SupportsIndex, nu: torch.Tensor, force: torch.Tensor | None, inflow: torch.Tensor | None, advection: str, diffusion: str) -> None:
+        ...
+    def check(self) -> None:
+        ...
+    def divergence(self, u: torch.Tensor) -> torch.Tensor:
+        ...
+    def pressure(self, u: torch.Tensor, options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex) -> torch.Tensor:
+        ...
+    def project(self, u: torch.Tensor, options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex) -> torch.Tensor:
+        ...
+    def rollout(self, u: torch.Tensor, steps: typing.SupportsInt | typing.SupportsIndex, options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex, adjoint_log: typing.SupportsInt | typing.SupportsIndex) -> tuple:
+        ...
+    def step(self, u: torch.Tensor, options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex, adjoint_log: typing.SupportsInt | typing.SupportsIndex) -> tuple:
         ...
 class Controller:
     def _load(self, max_iter: typing.SupportsInt | typing.SupportsIndex, checkpoint: typing.SupportsFloat | typing.SupportsIndex, history: collections.abc.Sequence[tuple[typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex, bool, typing.SupportsFloat | typing.SupportsIndex | None, typing.SupportsFloat | typing.SupportsIndex | None]]) -> None:
@@ -88,7 +112,7 @@ def check_operator(kind: str, shape: collections.abc.Sequence[typing.SupportsInt
     ...
 def check_options(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex, backward: str, adjoint_max_iter: typing.SupportsInt | typing.SupportsIndex | None, adjoint_rtol: typing.SupportsFloat | typing.SupportsIndex | None, on_failure: str, checkpoint_every: typing.SupportsInt | typing.SupportsIndex, start: str = 'zero') -> None:
     ...
-def check_solver(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex) -> None:
+def check_solver(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex, preconditioner: str = '') -> None:
     ...
 def check_start(start: str) -> None:
     ...
@@ -114,7 +138,7 @@ def read_adjoint_log(log: typing.SupportsInt | typing.SupportsIndex) -> tuple | 
     ...
 def sentence(what: str) -> str:
     ...
-def solve_with_tensors(b: torch.Tensor, tensors: collections.abc.Sequence[torch.Tensor], kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], transposed: bool, solver: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex = 10, x0: torch.Tensor | None = None) -> tuple[torch.Tensor, tuple]:
+def solve_with_tensors(b: torch.Tensor, tensors: collections.abc.Sequence[torch.Tensor], kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], transposed: bool, solver: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex = 10, x0: torch.Tensor | None = None, preconditioner: str = '') -> tuple[torch.Tensor, tuple]:
     """
     The plain-tensor solver behind linear_solve, without derivatives: the oracle of the CPU loops.
     """

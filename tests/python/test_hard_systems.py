@@ -1,0 +1,114 @@
+"""Singular, nearly singular and rescaled systems: what a solve reports is true, whatever the method, mode and dtype."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+METHODS = {
+    "jacobi": lambda k: prdp.Jacobi(k),
+    "steepest_descent": lambda k: prdp.SteepestDescent(k),
+    "cg": lambda k: prdp.CG(k),
+    "cg diagonal": lambda k: prdp.CG(k, preconditioner="diagonal"),
+    "cg multigrid": lambda k: prdp.CG(k, preconditioner="multigrid"),
+    "bicgstab": lambda k: prdp.BiCGStab(k),
+    "bicgstab multigrid": lambda k: prdp.BiCGStab(k, preconditioner="multigrid"),
+    "gmres": lambda k: prdp.GMRES(k, restart=5),
+    "gmres multigrid": lambda k: prdp.GMRES(k, restart=5, preconditioner="multigrid"),
+    "cycles": lambda k: prdp.Multigrid(k),
+    "direct": lambda k: prdp.Direct(),
+}
+
+
+@st.composite
+def systems(draw):
+    """Coefficients (float64) of a stencil of nearest neighbours in 1D or 2D, its boundary and a right-hand side."""
+    seed = draw(st.integers(0, 2**20))
+    generator = np.random.default_rng(seed)
+    shape = draw(st.sampled_from([(5,), (12,), (3, 4), (6, 5)]))
+    boundary = draw(st.sampled_from(["zero", "periodic"]))
+    dim = len(shape)
+    offsets = [(0,) * dim] + [tuple(s * (d == a) for d in range(dim)) for a in range(dim) for s in (-1, 1)]
+    kind = draw(st.sampled_from(["laplacian", "almost", "winds", "random", "indefinite", "symmetric"]))
+    fields = generator.standard_normal((len(offsets), *shape))
+    if kind in ("laplacian", "almost", "winds", "symmetric"):
+        kappa = np.exp(generator.standard_normal(shape))
+        for a in range(dim):
+            for j, s in enumerate((-1, 1)):
+                there = np.roll(kappa, -s, a)
+                fields[1 + 2 * a + j] = -2 * kappa * there / (kappa + there)
+        if kind == "winds":
+            fields[1::2] *= 1 + generator.random((dim, *shape))
+        fields[0] = -fields[1:].sum(0)
+        fields[0] += {"almost": 10.0 ** -draw(st.integers(3, 14)), "symmetric": 1.0}.get(kind, 0.0)
+    if kind == "indefinite":
+        fields[1:] = 0.0
+    b = generator.standard_normal((1, 1, *shape))
+    if draw(st.booleans()):
+        b -= b.mean()
+    return fields, offsets, boundary, b, seed
+
+
+def matrix(a):
+    n = math.prod(a.shape)
+    return a.apply(torch.eye(n, dtype=torch.float64).reshape(n, 1, *a.shape)).reshape(n, n).T
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", METHODS)
+@settings(deadline=None, max_examples=25)
+@given(system=systems(), exponent=st.sampled_from([-90, -40, 0, 40, 90]), k=st.sampled_from([1, 4, 60]))
+def test_the_report_is_true_and_no_iterate_is_worse_than_zero_in_silence(method, dtype, system, exponent, k):
+    fields, offsets, boundary, b, _ = system
+    scale = 2.0**exponent
+    coefficients = torch.tensor(fields).to(dtype)
+    a = operators.Stencil(coefficients[None] * scale, offsets, boundary)
+    exact = operators.Stencil(coefficients.double()[None], offsets, boundary)  # of the order of one
+    rhs = torch.tensor(b).to(dtype).requires_grad_()
+    u, info = prdp.linear_solve(a, rhs, METHODS[method](k), on_failure="return")
+    status = prdp.SolveStatus(int(info.status))
+    assert u.isfinite().all()
+    left = rhs.detach().double() - exact.apply(u.detach().double() * scale)
+    relative = float(left.norm() / rhs.detach().double().norm())
+    norm = float(exact.apply(torch.ones_like(left)).abs().max() + 4 * coefficients.abs().max())
+    rounding = 20 * torch.finfo(dtype).eps * (1 + norm * float(u.detach().double().norm()) * scale)
+    usable = status > 0 or status in (prdp.SolveStatus.MAX_ITER, prdp.SolveStatus.STAGNATED)
+    if usable:
+        assert abs(float(info.residual) - relative) <= rounding + 1e-3 * relative
+    if status in (prdp.SolveStatus.CONVERGED, prdp.SolveStatus.CONVERGED_BREAKDOWN):
+        assert relative <= 1.01e-5 + rounding
+    if usable and relative > 1 + rounding:
+        m = matrix(exact)
+        definite = torch.equal(m, m.T) and torch.linalg.eigvalsh(m).sign().unique().numel() == 1
+        assert method.startswith(("cg", "steepest")) and definite, f"{status.name}, {relative}"
+    if status > 0:
+        cotangent = torch.ones_like(u)
+        (b_bar,) = torch.autograd.grad(u, rhs, cotangent)
+        assert b_bar.isfinite().all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 33, 100])
+def test_direct_on_a_singular_ring_breaks_down(size):
+    coefficients = torch.tensor([2.0, -1.0, -1.0]).view(1, 3, 1).repeat(1, 1, size)
+    a = operators.Stencil(coefficients, [(0,), (-1,), (1,)], boundary="periodic")
+    b = torch.randn(1, 1, size, generator=torch.Generator().manual_seed(0)) + 1
+    u, info = prdp.linear_solve(a, b, prdp.Direct(), on_failure="return")
+    assert prdp.SolveStatus(int(info.status)).name == "BREAKDOWN"
+    assert u.abs().max() <= 1e6 and info.residual <= 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_direct_on_singular_matrices_breaks_down(dtype):
+    square = torch.stack([torch.stack(torch.ones(6, dtype=dtype).split(1))[:, 0] for _ in range(6)])
+    grid = torch.arange(1.0, 10.0, dtype=dtype).reshape(3, 3)
+    for m in (grid, square):
+        u, info = prdp.linear_solve(
+            m, torch.arange(1.0, len(m) + 1, dtype=dtype).flip(0) ** 2, prdp.Direct(), on_failure="return"
+        )
+        assert prdp.SolveStatus(int(info.status)).name == "BREAKDOWN" and info.residual <= 1 and u.isfinite().all()
