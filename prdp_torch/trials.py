@@ -31,7 +31,7 @@ class Solve:
     status: str
     """The worst of the samples, a name of `SolveStatus`."""
     solved: bool
-    """Whether all samples met the tolerance, or came as near as their dtype allows."""
+    """Whether all samples met the tolerance."""
 
 
 @dataclass
@@ -164,7 +164,7 @@ def _solve(info, seconds):
         int(info.operator_applications.max()),
         median(seconds),
         worst,
-        bool(info.solved.all()),
+        bool((info.status > 0).all()),
     )
 
 

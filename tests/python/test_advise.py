@@ -185,7 +185,7 @@ def test_gradients_of_parameters_count_though_the_state_has_none():
 
 
 def made_up(name, rtol, seconds, iterations=10):
-    solve = Solve(iterations, iterations + 1, seconds / 2, "CONVERGED")
+    solve = Solve(iterations, iterations + 1, seconds / 2, "CONVERGED", True)
     solver = {"CG": prdp.CG(1), "Direct": prdp.Direct(1)}[name]
     return Row(solver, torch.float64, rtol, solve, solve)
 
@@ -276,7 +276,7 @@ def test_the_gain_of_a_start_is_counted():
     for step, u, verdict in cases:
         solves = [prdp.linear_solve(heat.operator(u), step.rhs(u), solver, x0=x0) for x0 in (None, u)]
         zero, state = (int(info.operator_applications) for _, info in solves)
-        row = Row(solver, u.dtype, 1e-5, Solve(zero, zero, 1.0, "CONVERGED"), None)
+        row = Row(solver, u.dtype, 1e-5, Solve(zero, zero, 1.0, "CONVERGED", True), None)
         words = f"takes {state} products to 1e-5 in place of {zero}: {verdict}."
         assert (state < zero) == ("pass" in verdict)
         text = module._start_gain(row, measure_with_start(step, u, row))

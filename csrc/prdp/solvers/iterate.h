@@ -326,9 +326,11 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   auto worse = worse_than_zero(space, states);
   if (any(worse)) {
     if constexpr (kDescendsEnergy<Method>) {
+      const auto before = states;
       const auto falls = energy_falls(space, method, states);
       for (size_t i = 0; i < states.size(); ++i) {
         if (worse[i] && !falls[i]) states[i].status = SolveStatus::kDiverged;
+        if (!worse[i]) states[i].applications = before[i].applications;  // a batch is looked at as a whole
         worse[i] = false;
       }
     } else if constexpr (kIsExact<Method>) {

@@ -167,6 +167,7 @@ class SampleSpace {
   Scalar step_length(Scalar num, Scalar den, Scalar a2, Scalar b2) {
     if (num < kNegligible) return 0;
     if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
+    if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
     if (std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2)) {
       broken_ = true;
       return 0;
