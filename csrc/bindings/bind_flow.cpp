@@ -24,8 +24,8 @@ FlowEquation make_equation(std::shared_ptr<const FlowBox> box, double dt, at::Te
           std::move(nu),
           force.value_or(at::Tensor()),
           inflow.value_or(at::Tensor()),
-          advection_from_name(advection),
-          diffusion_from_name(diffusion)};
+          flow_advection_from_name(advection),
+          flow_diffusion_from_name(diffusion)};
 }
 
 SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {

@@ -352,7 +352,7 @@ def test_arguments_are_checked():
     allowed = "allowed: None, 'diagonal', 'multigrid', or an operator$"
     with pytest.raises(ValueError, match=f"CG: unknown preconditioner 'stokes'; {allowed}"):
         prdp.CG(3, preconditioner="stokes")
-    with pytest.raises(TypeError, match="GMRES: preconditioner must be a name or an operator of .*, got 3"):
+    with pytest.raises(TypeError, match=r"GMRES: preconditioner must be a name or an operator of .*, got 3"):
         prdp.GMRES(3, preconditioner=3)
     with pytest.raises(ValueError, match=r"its diagonal, which Jacobi and preconditioner=.diagonal. divide by"):
         prdp.linear_solve(operators.Function(lambda v: 2 * v), field((4,)), cg(3))

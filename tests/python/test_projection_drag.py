@@ -35,7 +35,7 @@ def test_the_drag_in_a_periodic_box_is_the_force_on_the_fluid():
 @pytest.mark.parametrize("reynolds, literature", [(20, 2.05), (40, 1.52)])
 def test_the_drag_of_a_cylinder(reynolds, literature):
     """Dennis and Chang (1970) have an unbounded plane. Here the neighbours above and below are 16 diameters away and
-    the inflow 8, and a cylinder of 8 cells has steps: both add some 10 %."""
+    the inflow 8, which adds some 10 %; at distances of 40 and 18 it is 2.12 and 1.60."""
     cells, height, width = 8, 16, 16
     shape, h = (height * cells, width * cells), 1 / cells
     y, x = torch.meshgrid(*((torch.arange(n) + 0.5) * h for n in shape), indexing="ij")

@@ -24,7 +24,7 @@ struct FlowFields {
   at::Tensor free;                    // (1, d, *shape): faces whose velocity is unknown
   at::Tensor inlet;                   // (1, d, *shape): faces that carry the inflow; undefined if there are none
   at::Tensor friction;                // (1, d, *shape): 1/dx² for each neighbour inside an obstacle; or undefined
-  at::Tensor pressure;                // (1, 2 d + 1, *shape): coefficients of -div grad
+  at::Tensor pressure;                // (1, 2 d + 1, *shape): coefficients of -dx² div grad
   std::vector<at::Tensor> diffusion;  // (1, 2 d + 1, *shape) for each component: -Δ; a single one if all are the same
   std::vector<at::Tensor> high_sign;  // per axis, (d, 1, …): the ghost beyond its high wall is so many times the last
   /// (parts, *shape): 1 in the cells of each closed part of the fluid, where the pressure has no level; empty for one

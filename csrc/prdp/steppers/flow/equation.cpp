@@ -45,16 +45,16 @@ at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u) {
 
 }  // namespace
 
-Advection advection_from_name(const std::string& name) {
-  if (name == "central") return Advection::kCentral;
+FlowAdvection flow_advection_from_name(const std::string& name) {
+  if (name == "central") return FlowAdvection::kCentral;
   TORCH_CHECK_VALUE(name == "upwind", "Flow: advection must be 'central' or 'upwind', got '", name, "'");
-  return Advection::kUpwind;
+  return FlowAdvection::kUpwind;
 }
 
-Diffusion diffusion_from_name(const std::string& name) {
-  if (name == "implicit") return Diffusion::kImplicit;
+FlowDiffusion flow_diffusion_from_name(const std::string& name) {
+  if (name == "implicit") return FlowDiffusion::kImplicit;
   TORCH_CHECK_VALUE(name == "explicit", "Flow: diffusion must be 'implicit' or 'explicit', got '", name, "'");
-  return Diffusion::kExplicit;
+  return FlowDiffusion::kExplicit;
 }
 
 void FlowEquation::check() const {
@@ -63,7 +63,7 @@ void FlowEquation::check() const {
   const double value = nu.item<double>();
   TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0, "Flow: nu must be finite and >= 0, got ", value);
   const double limit = value * dt * box->sum_of_couplings();
-  TORCH_CHECK_VALUE(diffusion == Diffusion::kImplicit || limit <= 1 + 1e-6,
+  TORCH_CHECK_VALUE(diffusion == FlowDiffusion::kImplicit || limit <= 1 + 1e-6,
                     "Flow: explicit diffusion needs nu dt Σ 2/dx² <= 1, got ", limit,
                     "; take a smaller dt or diffusion='implicit'");
   if (force.defined()) check_field("force", force, shape_of_force(*box));

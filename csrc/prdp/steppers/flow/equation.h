@@ -5,14 +5,14 @@
 
 namespace prdp {
 
-enum class Advection {
+enum class FlowAdvection {
   kCentral,  // second order; the skew-symmetric form, which conserves the energy
   kUpwind,   // first order, monotone
 };
-enum class Diffusion { kImplicit, kExplicit };
+enum class FlowDiffusion { kImplicit, kExplicit };
 /// Raise ValueError for names that do not exist.
-Advection advection_from_name(const std::string& name);
-Diffusion diffusion_from_name(const std::string& name);
+FlowAdvection flow_advection_from_name(const std::string& name);
+FlowDiffusion flow_diffusion_from_name(const std::string& name);
 
 /// u_t + (u·∇)u + ∇p = ν Δu + f with ∇·u = 0 in a box, and how a time step treats it.
 struct FlowEquation {
@@ -21,8 +21,8 @@ struct FlowEquation {
   at::Tensor nu;          // 0-dimensional
   at::Tensor force = {};  // (d,) or (batch or 1, d, *shape); undefined: none
   at::Tensor inflow = {}; // (d,) or (batch or 1, d, *shape with one cell along the open axis)
-  Advection advection = Advection::kCentral;
-  Diffusion diffusion = Diffusion::kImplicit;
+  FlowAdvection advection = FlowAdvection::kCentral;
+  FlowDiffusion diffusion = FlowDiffusion::kImplicit;
 
   /// Raises ValueError or TypeError for what is out of range or does not fit the box.
   void check() const;

@@ -46,12 +46,12 @@ struct Term {
 
 /// out += the term, of a row.
 template <class T>
-void add_row(const Term<T>& t, Advection kind, const T* c, const T* w, T* out, int64_t n) {
+void add_row(const Term<T>& t, FlowAdvection kind, const T* c, const T* w, T* out, int64_t n) {
   const T q = t.half_dx / 2;
   for (int64_t i = 0; i < n; ++i) {
     const T low = t.low(c, w, i), high = t.high(c, w, i);
     const T before = c[i - t.sb], here = c[i], after = c[i + t.sb];
-    const T carried = kind == Advection::kCentral
+    const T carried = kind == FlowAdvection::kCentral
                           ? high * after - low * before
                           : (low + std::abs(low)) * (here - before) + (high - std::abs(high)) * (after - here);
     out[i] += t.diffusion * (before - 2 * here + after) - q * carried;
@@ -65,7 +65,7 @@ void add_shifted(const T* from, T* to, int64_t n) {
 
 /// The same back: adds the cotangents of a row of c and w. `work`: five rows.
 template <class T>
-T add_row_back(const Term<T>& t, Advection kind, const T* c, const T* w, const T* g, T* c_bar, T* w_bar, T* work,
+T add_row_back(const Term<T>& t, FlowAdvection kind, const T* c, const T* w, const T* g, T* c_bar, T* w_bar, T* work,
                int64_t n) {
   T *before_bar = work, *here_bar = work + n, *after_bar = work + 2 * n, *low_bar = work + 3 * n,
     *high_bar = work + 4 * n;
@@ -75,7 +75,7 @@ T add_row_back(const Term<T>& t, Advection kind, const T* c, const T* w, const T
     const T low = t.low(c, w, i), high = t.high(c, w, i), k = -q * g[i], spread = t.diffusion * g[i];
     const T before = c[i - t.sb], here = c[i], after = c[i + t.sb];
     laplacian += g[i] * (before - 2 * here + after);
-    if (kind == Advection::kCentral) {
+    if (kind == FlowAdvection::kCentral) {
       before_bar[i] = spread - k * low;
       here_bar[i] = -2 * spread;
       after_bar[i] = spread + k * high;

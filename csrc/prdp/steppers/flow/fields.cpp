@@ -82,12 +82,13 @@ at::Tensor coefficients(const at::Tensor& diagonal, const std::vector<at::Tensor
   return at::stack(all).unsqueeze(0);
 }
 
-/// -div grad of the pressure: 1 on free faces, 0 on others; identity where the pressure is known.
+/// -div grad of the pressure times dx² of the last axis: 1 on free faces, 0 on others; identity where it is known.
 at::Tensor pressure_coefficients(const FlowBox& box, const at::Tensor& free, at::Tensor& known) {
   auto diagonal = at::zeros(box.shape(), at::kDouble);
   std::vector<at::Tensor> open;
   for (int64_t axis = 0; axis < box.dim(); ++axis) {
-    const auto low = free[box.channel_of(axis)] / (box.dx(axis) * box.dx(axis));
+    const double ratio = box.dx(box.dim() - 1) / box.dx(axis);
+    const auto low = free[box.channel_of(axis)] * (ratio * ratio);
     open.push_back(low);
     open.push_back(neighbour(box, low, axis, 1, 0.0));
     diagonal = diagonal + open[open.size() - 2] + open.back();
@@ -97,7 +98,7 @@ at::Tensor pressure_coefficients(const FlowBox& box, const at::Tensor& free, at:
   std::vector<at::Tensor> of_neighbours;
   for (int64_t k = 0; k < 2 * box.dim(); ++k)
     of_neighbours.push_back(-open[k] * unknown * neighbour(box, unknown, k / 2, k % 2 ? 1 : -1, 0.0));
-  return coefficients(at::where(known, at::full({}, box.sum_of_couplings(), at::kDouble), diagonal), of_neighbours);
+  return coefficients(at::where(known, at::full({}, 4.0, at::kDouble), diagonal), of_neighbours);
 }
 
 /// -Δ of the component along `along`, for values that are zero on all faces which are not free. `inside`: faces inside

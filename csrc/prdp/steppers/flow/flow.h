@@ -12,8 +12,8 @@ struct FlowSettings {
   at::Tensor obstacle{};  // bool (*shape), true in solid cells
   at::Tensor force{};     // (d,) or (batch or 1, d, *shape); may get a gradient
   at::Tensor inflow{};  // for an open axis: (d,) or (batch or 1, d, *shape with one cell along it); may get a gradient
-  Advection advection = Advection::kCentral;
-  Diffusion diffusion = Diffusion::kImplicit;
+  FlowAdvection advection = FlowAdvection::kCentral;
+  FlowDiffusion diffusion = FlowDiffusion::kImplicit;
 };
 
 /// One step of incompressible flow by projection (Chorin 1968) in 2D or 3D: u_t + (u·∇)u + ∇p = ν Δu + f, ∇·u = 0.

@@ -16,7 +16,7 @@ namespace {
 /// The largest Courant number. A step of explicit Euler with central differences lets no wave grow up to √(2 ν dt/dx²)
 /// where diffusion is implicit. Up to 1 waves grow slowly at most.
 double largest_courant_number(const FlowEquation& e) {
-  if (e.advection == Advection::kUpwind || e.diffusion == Diffusion::kExplicit) return 1.0;
+  if (e.advection == FlowAdvection::kUpwind || e.diffusion == FlowDiffusion::kExplicit) return 1.0;
   return std::max(
       1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
 }

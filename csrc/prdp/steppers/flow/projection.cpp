@@ -6,14 +6,23 @@ namespace prdp {
 
 namespace {
 
-/// -div grad of the pressure, and its null space.
+/// The equation of the pressure is multiplied by this: with square cells its coefficients are then whole numbers, and
+/// the sums of its rows are zero to the last bit in any dtype.
+double scale_of(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
+
 OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
-  const auto& fields = box.fields(u.options());
-  auto a = stencil_of(box, fields.pressure);
-  if (!fields.closed_parts.defined()) return a;
-  a.kind = "singular_" + a.kind;
-  a.tensors.insert(a.tensors.end(), {fields.closed_parts, fields.closed_parts});
-  return a;
+  return stencil_of(box, box.fields(u.options()).pressure);
+}
+
+/// Takes off the mean of each closed part of the fluid: differences of pressures have none, but for rounding.
+at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
+  const auto& parts = box.fields(t.options()).closed_parts;
+  if (!parts.defined()) return t;
+  const auto flat = t.flatten(2);
+  if (parts.numel() == 0) return (flat - flat.mean(2, /*keepdim=*/true)).view_as(t);
+  const auto of_parts = parts.flatten(1);
+  const auto means = at::matmul(flat, of_parts.mT()) / of_parts.sum(1);
+  return (flat - at::matmul(means, of_parts)).view_as(t);
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }
@@ -44,16 +53,17 @@ at::Tensor flow_gradient(const FlowBox& box, const at::Tensor& p) {
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
-  const auto phi = solve(pressure_operator(box, u), -flow_divergence(box, u), options, info);
+  const auto b = without_means(box, flow_divergence(box, u) * -scale_of(box));
+  const auto phi = without_means(box, solve(pressure_operator(box, u), b, options, info));
   return {u - flow_gradient(box, phi), phi};
 }
 
 at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const SolveOptions& options,
                        CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
-  const auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
-  const auto b_bar = solve_vjp(pressure_operator(box, cotangent), phi_bar, {}, options, info).b;
-  return cotangent + differences(box, masked(b_bar, fields.cells));
+  const auto phi_bar = without_means(box, flow_divergence(box, masked(cotangent, fields.free)));
+  const auto b_bar = without_means(box, solve_vjp(pressure_operator(box, cotangent), phi_bar, {}, options, info).b);
+  return cotangent + differences(box, masked(b_bar, fields.cells)) * scale_of(box);
 }
 
 }  // namespace prdp

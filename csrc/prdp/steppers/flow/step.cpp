@@ -28,7 +28,7 @@ ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& u, const at:
   return {velocity, tendency(e, velocity) * e.dt};
 }
 
-bool is_implicit(const FlowEquation& e) { return e.diffusion == Diffusion::kImplicit; }
+bool is_implicit(const FlowEquation& e) { return e.diffusion == FlowDiffusion::kImplicit; }
 
 /// Tensors to differentiate for. Where autograd records, they stay connected to what they came from.
 at::Tensor input_of(const at::Tensor& t, bool needed) {

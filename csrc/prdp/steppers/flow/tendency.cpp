@@ -38,7 +38,7 @@ class Padded {
 };
 
 /// (u·∇) of the component along `along`: its derivative along `axis`, times the velocity along that axis.
-at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t axis, Advection kind) {
+at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t axis, FlowAdvection kind) {
   const int64_t c = box.channel_of(along), d = axis + 1, n = box.shape()[axis];
   const auto before = u.edges(c, axis, 0), after = u.edges(c, axis, 1);
   // The velocity through the edges between neighbours.
@@ -48,7 +48,7 @@ at::Tensor advection(const FlowBox& box, const Padded& u, int64_t along, int64_t
           : (u.edges(box.channel_of(axis), axis, 1, along, -1) + u.edges(box.channel_of(axis), axis, 1)) * 0.5;
   const auto low = [&](const at::Tensor& t) { return t.narrow(d, 0, n); };
   const auto high = [&](const at::Tensor& t) { return t.narrow(d, 1, n); };
-  if (kind == Advection::kCentral)
+  if (kind == FlowAdvection::kCentral)
     return (high(through) * high(after) - low(through) * low(before)) * (0.5 / box.dx(axis));
   const auto jump = after - before, size = through.abs();
   return (low((through + size) * jump) + high((through - size) * jump)) * (0.5 / box.dx(axis));
