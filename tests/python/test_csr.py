@@ -63,7 +63,7 @@ for i in range(count):
     try:
         if through_op:  # past Python's checks
             torch.ops.prdp.linear_solve(b, parts, "csr", [], [], draw.random() < 0.5, solver.method, 3, 1e-5, 3,
-                                        *NO_PRECONDITIONER, backward, None, None, "return", 0)
+                                        "", [], [], [], False, backward, None, None, "return", 0)
         else:
             size = (2, n, n) if batched else (n, n)
             matrix = torch.sparse_csr_tensor(*parts, size=size, check_invariants=False)

@@ -84,9 +84,10 @@ def test_the_report_is_true_and_no_iterate_is_worse_than_zero_in_silence(method,
     if status in (prdp.SolveStatus.CONVERGED, prdp.SolveStatus.CONVERGED_BREAKDOWN):
         assert relative <= 1.01e-5 + rounding
     if usable and relative > 1 + rounding:
-        m = matrix(exact)
-        definite = torch.equal(m, m.T) and torch.linalg.eigvalsh(m).sign().unique().numel() == 1
-        assert method.startswith(("cg", "steepest")) and definite, f"{status.name}, {relative}"
+        # The one excuse: CG and steepest descent on an operator that nothing in sight says is not definite.
+        m, r, x = matrix(exact), left.flatten(), u.detach().double().flatten() * scale
+        excused = torch.equal(m, m.T) and (r @ m @ r) * (x @ m @ x) > 0
+        assert method.startswith(("cg", "steepest")) and excused, f"{status.name}, {relative}"
     if status > 0:
         cotangent = torch.ones_like(u)
         (b_bar,) = torch.autograd.grad(u, rhs, cotangent)

@@ -79,7 +79,9 @@ class TapeBack {
         }
         if (op.factor != T(1)) return tape_.add_bar(op.a, op.factor, bar);
         return tape_.move_bar(op.out, op.a);
-      case Kind::kApply: return product_back(op.a, 1, bar);
+      case Kind::kApply:
+        if (values_.projects_products()) values_.project(bar);
+        return product_back(op.a, 1, bar);
       case Kind::kResidual:
         values_.project(bar);
         tape_.add_bar(b_, 1, bar);

@@ -94,6 +94,10 @@ class Kernel {
     null_space_.emplace(std::move(right));
     left_null_space_.emplace(std::move(left));
   }
+  /// Whether A maps a null space that somebody named to zero up to rounding only. Then products are to be projected:
+  /// what is left there would add up in the residuals that a method carries on.
+  bool leaks() const { return leaks_; }
+  void set_leaks() { leaks_ = true; }
 
  protected:
   const WholeVectors<T> vectors_{};
@@ -102,6 +106,7 @@ class Kernel {
   Layout<T> layout_;
   T factor_;
   std::optional<NullSpace<T>> null_space_, left_null_space_;
+  bool leaks_ = false;
 };
 
 template <class T>

@@ -158,6 +158,7 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
           if (!a) return a;
           const auto& layout = a->layout();
           a->set_null_spaces({layout, 0, layout.planes, *right}, {layout, 0, layout.planes, *left});
+          a->set_leaks();
           return a;
         };
         return std::make_shared<const kernels::Kernels>(

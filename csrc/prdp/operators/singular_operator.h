@@ -20,8 +20,9 @@ class SingularOperator final : public Operator {
   /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero.
   void check_null_spaces(const at::Tensor& b) const override;
 
-  at::Tensor apply(const at::Tensor& v) const override { return a_->apply(v); }
-  at::Tensor apply_transpose(const at::Tensor& v) const override { return a_->apply_transpose(v); }
+  /// Without what rounding leaves along the null space, which would add up in the residuals that a method carries on.
+  at::Tensor apply(const at::Tensor& v) const override { return project(a_->apply(v)); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override { return project_solution(a_->apply_transpose(v)); }
   at::Tensor diagonal() const override { return a_->diagonal(); }
   at::Tensor norm() const override { return a_->norm(); }
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }

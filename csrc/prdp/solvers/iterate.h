@@ -286,8 +286,8 @@ auto worse_than_zero(Space& space, const typename Space::States& states) {
 }
 
 /// Whether the iterates of a method for definite operators do what they are made for, for each sample: A is symmetric,
-/// judged by x·A r and r·A x, and x is nearer to the solution than zero in the norm of A, which is (x·b)² > (x·r)² for
-/// a definite A of either sign. One product.
+/// judged by x·A r and r·A x; x·A x and r·A r have the same sign; and x is nearer to the solution than zero in the norm
+/// of A, which is (x·b)² > (x·r)² for a definite A of either sign. One product.
 template <class Space, class Method>
 auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
   const auto& x = method.x;
@@ -296,16 +296,16 @@ auto energy_falls(Space& space, Method& method, const typename Space::States& st
   space.apply(r, ar);
   const auto number = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
   const auto xb = number(x, b), xr = number(x, r), rb = number(r, b), rr = number(r, r), bb = number(b, b);
-  const auto x_ar = number(x, ar), xx = number(x, x), ar2 = number(ar, ar);
+  const auto x_ar = number(x, ar), r_ar = number(r, ar), xx = number(x, x), ar2 = number(ar, ar);
   space.fill_zero(ar);
   size_t i = 0;
   return space.map(states, [&](const SampleState&) {
     const double ax2 = bb[i] - 2 * rb[i] + rr[i];
     const double scale = std::sqrt(rr[i]) * std::sqrt(std::max(ax2, 0.0)) + std::sqrt(xx[i]) * std::sqrt(ar2[i]);
     const bool symmetric = std::abs(rb[i] - rr[i] - x_ar[i]) <= 2e3 * space.epsilon() * scale;
-    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i];
+    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i], definite = r_ar[i] * (xb[i] - xr[i]) > 0;
     ++i;
-    return symmetric && nearer;
+    return symmetric && definite && nearer;
   });
 }
 

@@ -100,13 +100,19 @@ class SampleSpace {
   }
 
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
+    if (system_.a().leaks()) {
+      apply(v, out);
+      return {dot(v, out), dot(out, out)};
+    }
     count(1);
     return system_.a().apply_with_dots(v, out);
   }
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
+    if (system_.a().leaks()) project(out);
   }
+  bool projects_products() const { return system_.a().leaks(); }
   bool is_preconditioned() const { return system_.preconditioner(); }
   bool is_preconditioned_by_diagonal() const { return system_.by_diagonal(); }
   Scalar precondition(const T* v, Vector out) {
