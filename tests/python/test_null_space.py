@@ -169,3 +169,24 @@ def test_check_operator_finds_a_constant_that_nobody_named():
     assert prdp.check_operator(periodic_stencil(), example)
     with pytest.raises(ValueError, match="A maps the constant to zero, so it is singular: give nullspace='constant'"):
         prdp.check_operator(periodic_stencil(nullspace=None), example)
+
+
+@pytest.mark.parametrize("preconditioner", [None, "diagonal", "multigrid"])
+@pytest.mark.parametrize("boundary", ["periodic", "zero"])
+def test_in_float32_more_iterations_than_the_dtype_needs_do_no_harm(boundary, preconditioner):
+    """Coefficients of a 2π box do not sum to zero exactly, and products leave rounding along the constant."""
+    n, h = 64, 2 * torch.pi / 64
+    sides = [torch.ones(n, n) for _ in range(4)]
+    if boundary == "zero":  # no flux
+        for side, axis, end in zip(sides, (1, 1, 0, 0), (0, -1, 0, -1), strict=True):
+            side.select(axis, end).zero_()
+    coefficients = torch.stack([sum(sides), *(-side for side in sides)])[None] / h**2
+    offsets = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+    a = operators.Stencil(coefficients, offsets, boundary, nullspace="constant")
+    b = torch.randn(1, 1, n, n, dtype=F64, generator=torch.Generator().manual_seed(0))
+    b = (b - b.mean()).float()
+    for k in (300, 600):
+        _, info = prdp.linear_solve(a, b, prdp.CG(k, rtol=0.0, preconditioner=preconditioner))
+        assert info.residual.max() < 5e-5
+    _, info = prdp.linear_solve(a, b, prdp.CG(600, rtol=1e-8, preconditioner=preconditioner))
+    assert statuses(info) == ["STAGNATED"] and 0 < info.residual.max() < 5e-5

@@ -76,7 +76,7 @@ bool all_finite(const RawStencil<T>& a) {
 }  // namespace
 
 template <class T>
-std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(RawStencil<T> finest) {
+std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(RawStencil<T> finest, int64_t nullity) {
   std::unique_ptr<Hierarchy> h(new Hierarchy);
   h->symmetric_ = is_symmetric(finest);
   RawStencil<T> a = std::move(finest);
@@ -97,14 +97,14 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(RawStencil<T> finest) {
     if (h->levels_.size() > 1 && !h->symmetric_) h->raw_.push_back(std::move(a));
     a = std::move(coarse);
   }
-  if (!h->invert_coarsest(a)) return nullptr;
+  if (!h->invert_coarsest(a, nullity)) return nullptr;
   if (h->levels_.size() > 1 && !h->symmetric_) h->raw_.push_back(std::move(a));
   h->transposed_.resize(h->rows_.size());
   return h;
 }
 
 template <class T>
-bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a) {
+bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a, int64_t nullity) {
   const auto rows = rows_of(a, false);
   const int64_t n = a.points();
   Eigen::MatrixXd m = Eigen::MatrixXd::Zero(n, n);
@@ -113,7 +113,14 @@ bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a) {
   const Eigen::PartialPivLU<Eigen::MatrixXd> lu(m);
   const auto pivots = lu.matrixLU().diagonal().cwiseAbs();
   Eigen::MatrixXd inverse;
-  if (pivots.minCoeff() > tiny * pivots.maxCoeff()) {
+  if (nullity > 0) {
+    // Rounding of the coefficients may have made the matrix regular; its inverse would be rounding all the same.
+    const Eigen::JacobiSVD<Eigen::MatrixXd> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
+    Eigen::VectorXd values = Eigen::VectorXd::Zero(n);
+    for (int64_t i = 0; i < n - nullity; ++i)
+      if (svd.singularValues()[i] > tiny * svd.singularValues()[0]) values[i] = 1.0 / svd.singularValues()[i];
+    inverse = svd.matrixV() * values.asDiagonal() * svd.matrixU().transpose();
+  } else if (pivots.minCoeff() > tiny * pivots.maxCoeff()) {
     inverse = lu.inverse();
   } else {
     Eigen::CompleteOrthogonalDecomposition<Eigen::MatrixXd> decomposition;

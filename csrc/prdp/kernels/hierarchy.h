@@ -21,8 +21,9 @@ class Hierarchy {
     std::vector<Transfer<T>> transfers;  // to the next level, one axis after the other; empty on the last
   };
 
-  /// Null if a diagonal is zero on some grid, or a number left the range of T.
-  static std::unique_ptr<const Hierarchy> make(RawStencil<T> finest);
+  /// `nullity`: how many vectors A is said to map to zero. Null if a diagonal is zero on some grid, or a number left
+  /// the range of T.
+  static std::unique_ptr<const Hierarchy> make(RawStencil<T> finest, int64_t nullity);
 
   const std::vector<Level>& levels() const { return levels_; }
   /// A, or Aᵀ, on level `l` >= 1.
@@ -33,7 +34,7 @@ class Hierarchy {
 
  private:
   Hierarchy() = default;
-  bool invert_coarsest(const RawStencil<T>& a);
+  bool invert_coarsest(const RawStencil<T>& a, int64_t nullity);
 
   bool symmetric_ = true;
   std::vector<Level> levels_;

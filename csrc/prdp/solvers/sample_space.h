@@ -96,7 +96,10 @@ class SampleSpace {
   Scalar xpby_with_square(const T* x, Scalar beta, Vector y) { return vectors_.xpby_with_square(x, beta, y, length()); }
   Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
   Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
-    return vectors_.descend(alpha, p, q, x, r, length());
+    const Scalar rr = vectors_.descend(alpha, p, q, x, r, length());
+    if (!system_.a().leaks()) return rr;
+    project(r);  // no product takes away what rounding leaves there
+    return dot(r, r);
   }
 
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
@@ -117,8 +120,9 @@ class SampleSpace {
   bool is_preconditioned_by_diagonal() const { return system_.by_diagonal(); }
   Scalar precondition(const T* v, Vector out) {
     const Scalar product = system_.preconditioner()->apply(v, out);
-    if (!system_.by_diagonal()) project_solution(out);  // cycles leave rounding there, which they would amplify
-    return product;
+    if (system_.by_diagonal() || !system_.a().null_space()) return product;
+    project_solution(out);  // cycles leave rounding there, which they would amplify
+    return dot(v, out);
   }
   /// The transpose of this without a diagonal; v is overwritten.
   void precondition_transpose(Vector v, Vector out) {
