@@ -60,8 +60,9 @@ def test_a07_jacobi_diverges_where_steepest_descent_converges(rtol):
 
 
 def test_a07_is_no_divergence_while_the_residual_merely_grows():
-    _, info = solve("A07", prdp.Jacobi(10, rtol=0.0))
-    assert statuses(info) == ["MAX_ITER"] and info.residual.item() > 100
+    """But none of its iterates is better than zero, which is handed out."""
+    u, info = solve("A07", prdp.Jacobi(10, rtol=0.0))
+    assert statuses(info) == ["MAX_ITER"] and info.residual.item() == 1.0 and not u.any()
 
 
 def test_a09_jacobi_never_converges_on_the_periodic_laplacian():
@@ -119,7 +120,7 @@ def test_c01_finite_rows_equal_their_solo_runs(dtype):
 
 def test_d05_jacobi_may_grow_eight_hundredfold_and_be_exact_at_the_eighth_sweep():
     _, after_one = solve("D05", prdp.Jacobi(1, rtol=0.0))
-    assert after_one.residual.item() > 100
+    assert after_one.residual.item() == 1.0 and after_one.iterations.item() == 0  # zero is better
     u, info = solve("D05", prdp.Jacobi(50))
     assert info.iterations.tolist() == [8] and statuses(info) == ["CONVERGED"]
     np.testing.assert_allclose(u, F["D05__u"], rtol=1e-12)
@@ -153,9 +154,9 @@ def test_overflow_is_said_and_a_finite_iterate_handed_out(solver):
     assert torch.isfinite(u).all()
     assert info.status[1] > 0
     np.testing.assert_allclose(u[1], torch.ones(2), rtol=1e-6)
-    assert statuses(info)[0] in ("OVERFLOW", "CONVERGED", "MAX_ITER")
+    assert statuses(info)[0] in ("OVERFLOW", "CONVERGED", "CONVERGED_BREAKDOWN", "MAX_ITER")
     residual = (1.0 - (a.double() @ u[0].double())).norm() / 2**0.5
-    assert info.residual[0].item() == pytest.approx(float(residual), rel=1e-3)
+    assert info.residual[0].item() == pytest.approx(float(residual), rel=1e-3, abs=1e-6)
 
 
 def test_a_solution_beyond_the_dtype_overflows():
