@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-import prdp_torch as prdp
 from benchmarks.mosaic import case as cases_
 from benchmarks.mosaic import charts, differences, fields, optimise, reference, runner, solvers, tables, tasks
 from benchmarks.mosaic.solvers.ours_conduction import Ours as Volumes
@@ -131,7 +130,6 @@ def test_conduction_reaches_the_closed_forms_and_its_gradient_the_differences():
     assert differences.compare(volumes.forward, rho, np.full_like(rho, np.nan), directions=5) == {"finite": False}
 
 
-@pytest.mark.skipif(not hasattr(prdp, "Flow"), reason="this prdp_torch has no Flow")
 def test_this_library_runs_the_tasks():
     flow = solvers.load(solvers.FLOWS, "ours")
     exact = forward.run(flow, {"field": "taylor_green", "n": 32, "nu": 0.05, "dt": 0.01, "steps": 10})

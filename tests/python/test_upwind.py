@@ -166,7 +166,7 @@ def test_burgers_rows_sum_to_one_with_no_positive_entry_off_the_diagonal():
 def test_constant_pressure_is_the_null_space_of_navier_stokes():
     a = operators.NavierStokes(field((4, 5), channels=2), 1e-3, 0.1)
     p = torch.zeros(2, 3, 4, 5, dtype=torch.float64)
-    p[:, 2] = 1.7
+    p[:, 2] = 1.5  # whose products with 1/dx are exact
     assert not a.apply(p).any() and not a.apply_transpose(p).any()
     assert (torch.linalg.matrix_rank(a.dense()) == 3 * 20 - 1).all()
 

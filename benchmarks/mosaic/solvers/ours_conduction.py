@@ -26,9 +26,10 @@ class Ours:
         return self._with_gradient(rho, lambda k, t: ((t - torch.as_tensor(observed)) ** 2).sum())
 
     def forward(self, rho):
+        """NaN where a step of the differences has left the conductivities that are positive."""
         with torch.no_grad():
             k = self._conductivity(rho)
-            return self._compliance(k, self._solve(k)).item()
+            return self._compliance(k, self._solve(k)).item() if bool((k > 0).all()) else float("nan")
 
     def _with_gradient(self, rho, value_of):
         rho = torch.as_tensor(rho).clone().requires_grad_()
