@@ -126,7 +126,7 @@ class Flow(Stepper):
     def _equation(self):
         if self._box is None:
             self._box = self._make_box()
-        nu = operators.real_tensor("Flow", "nu", self.nu)
+        nu = operators.base.real_tensor("Flow", "nu", self.nu)
         return _C.FlowEquation(self._box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
 
     def _make_box(self):

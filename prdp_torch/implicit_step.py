@@ -36,7 +36,7 @@ class ImplicitStep(Stepper):
         super().__init__(solver, backward, **options)
         who = type(self).__name__
         if isinstance(operator, (operators.Operator, torch.Tensor)):
-            operator = ConstantOperator(operators.as_operator(who, "operator", operator))
+            operator = ConstantOperator(operators.matrix.as_operator(who, "operator", operator))
         if not callable(operator):
             raise TypeError(f"{who}: operator must be a function of u or an operator, got {operator!r}")
         if rhs is not None and not callable(rhs):

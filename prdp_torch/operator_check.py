@@ -36,7 +36,7 @@ def check_operator(A, example):
         True
     """
     who = "check_operator"
-    A = operators.as_operator(who, "A", A)
+    A = operators.matrix.as_operator(who, "A", A)
     if _check.dense(who, "example", example).dim() < 2:
         raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
     generator = torch.Generator().manual_seed(0)

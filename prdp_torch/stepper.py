@@ -139,7 +139,7 @@ class Stepper(torch.nn.Module):
         compiling = torch.compiler.is_compiling()
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
-        a = operators.as_operator(who, "operator(u)", self.operator(u))
+        a = operators.matrix.as_operator(who, "operator(u)", self.operator(u))
         b = self.rhs(u)
         if not compiling:
             _check.dense(who, "rhs(u)", b)

@@ -104,7 +104,7 @@ class EquationStepper(Stepper):
             return [nu]
         number, tensor = self._number
         if nu != number:
-            tensor = operators.real_tensor(type(self).__name__, "nu", nu)
+            tensor = operators.base.real_tensor(type(self).__name__, "nu", nu)
             self._number = nu, tensor
         return [tensor]
 

@@ -204,7 +204,7 @@ def _check_direct(trial, sample, seconds):
 
 
 def _operator(step, sample):
-    return operators.as_operator("advise", "operator(u)", step.operator(sample))
+    return operators.matrix.as_operator("advise", "operator(u)", step.operator(sample))
 
 
 def _symmetric(trial, sample, v):

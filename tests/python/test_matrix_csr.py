@@ -83,7 +83,7 @@ def test_no_gradient_is_ever_dense():
 
 
 def test_a_csr_tensor_with_a_gradient_warns_once(monkeypatch):
-    monkeypatch.setattr(operators, "_warned_of_csr_gradient", False)
+    monkeypatch.setattr(operators.matrix, "_warned_of_csr_gradient", False)
     m, b = dense(entries()).to_sparse_csr().requires_grad_(), right_hand_side()
     with torch.no_grad():
         prdp.linear_solve(m, b, prdp.Jacobi(2))

@@ -1,0 +1,95 @@
+"""The base of all operators, and what several of them need."""
+
+import math
+
+import torch
+
+from prdp_torch import _C, _check
+
+
+class Operator:
+    """The base of all operators. `kind`, `shape`, `parameters` and `tensors` describe it to the compiled library."""
+
+    kind: str
+
+    def __init__(self, shape, parameters, tensors, null_spaces=()):
+        self.shape = shape
+        self.parameters = parameters
+        self.tensors = [full_precision(t) for t in (*tensors, *null_spaces)]
+        if null_spaces:
+            self.kind = "singular_" + self.kind
+        if not torch.compiler.is_compiling():
+            _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
+
+    def __repr__(self):
+        tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
+        return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
+
+    def apply(self, v):
+        """Return A v, with gradients. v has the shape of a right-hand side."""
+        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
+
+    def apply_transpose(self, v):
+        """Return Aᵀ v, with gradients."""
+        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
+
+    def diagonal(self):
+        """Return the diagonal of A, in a shape that broadcasts against a batch of vectors."""
+        return torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
+
+    def dense(self, dtype=torch.float64):
+        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n: ValueError if
+        it would not fit into the memory of the machine."""
+        self._check_dense_fits(dtype)
+        return torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
+
+    def _unknowns(self):
+        """The length of a vector, in all its channels."""
+        return math.prod(self.shape)
+
+    def _check_dense_fits(self, dtype):
+        axes = _C.batched_axes(self.kind)
+        if axes is None:  # a Function, whose vectors may be of any length
+            return
+        axes = [len(self.shape) + 2 if n < 0 else n for n in axes]
+        batch = max((t.shape[0] for t, n in zip(self.tensors, axes, strict=True) if t.dim() == n > 0), default=1)
+        n, there = self._unknowns(), _C.physical_memory()
+        needed = 2 * batch * n * n * dtype.itemsize  # the columns, and the matrix
+        if needed > there:
+            raise ValueError(
+                f"{type(self).__name__}: dense() of {n} unknowns would take {needed / 1e9:.3g} GB, and this machine "
+                f"has {there / 1e9:.3g} GB; apply() needs no matrix"
+            )
+
+
+def real_tensor(who, name, value):
+    """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
+    if isinstance(value, torch.Tensor):
+        return value
+    return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+
+
+def full_precision(t):
+    """float32 for float16 and bfloat16 under torch.autocast, as the solves take them there."""
+    low = t.dtype in (torch.float16, torch.bfloat16) and torch.is_autocast_enabled(t.device.type)
+    return t.float() if low else t
+
+
+def null_spaces_of(who, right, left, like):
+    """The two bases for the compiled library, an empty one for "constant"; none without a null space."""
+    if right is None and left is None:
+        return ()
+    if right is None:
+        raise ValueError(f"{who}: left_nullspace= stands beside nullspace=, which is missing")
+    return tuple(
+        _basis(who, *named, like)
+        for named in (("nullspace", right), ("left_nullspace", right if left is None else left))
+    )
+
+
+def _basis(who, name, value, like):
+    if isinstance(value, str) and value == "constant":
+        return torch.empty(0) if like is None else like.new_empty(0)
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{who}: {name} must be None, 'constant' or a tensor (k, *shape), got {value!r:.80}")
+    return _check.dense(who, name, value).detach()

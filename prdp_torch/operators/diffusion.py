@@ -1,0 +1,113 @@
+"""Diffusion by finite volumes."""
+
+import torch
+
+from prdp_torch import _check
+from prdp_torch.operators.base import Operator, real_tensor
+
+
+class Diffusion(Operator):
+    """Diffusion on the cells of a box by finite volumes: A u = shift·u - ∇·(κ ∇u), the same for every channel of u.
+
+    It is symmetric. Where neither a side nor the shift holds u, A is singular; the constant is then its `nullspace`
+    (see `Stencil`). Values and fluxes at the sides that are not zero belong to b: `boundary_rhs` makes that part.
+
+    Args:
+        kappa: (batch, *shape), or (1, *shape) for all samples alike, κ > 0 in the centres of the cells; shape has 1 to
+            3 axes. Gets a gradient, which is formed from fluxes: in float32 it keeps digits that the gradient of a
+            `Stencil`'s coefficients loses.
+        shift: a number, or a tensor like kappa, which gets a gradient. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by
+            implicit Euler, with b = u/dt.
+        boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes) or "periodic":
+            one for all sides, one for each axis, or a pair (low, high) for each axis.
+        length: the side of the box, one number or one for each axis in the order of `shape`.
+        faces: how κ on a face is made of its two cells: "harmonic", which is exact for layers, or "arithmetic".
+
+    Raises:
+        ValueError, TypeError: the arguments do not fit together. This is checked before any work.
+
+    Examples:
+        >>> A = prdp.operators.Diffusion(torch.rand(1, 64, 64) + 0.1, boundary=["zero", "flux"])
+        >>> u, info = prdp.linear_solve(A, torch.ones(1, 1, 64, 64), prdp.CG(20, preconditioner="multigrid"))
+    """
+
+    kind = "diffusion"
+
+    def __init__(self, kappa, shift=0.0, boundary="zero", length=1.0, faces="harmonic"):
+        dim = _check.dense("Diffusion", "kappa", kappa).dim() - 1
+        if not 1 <= dim <= 3:
+            raise ValueError(
+                "Diffusion: kappa must have shape (batch or 1, *shape) with 1 to 3 axes in shape, got "
+                f"{tuple(kappa.shape)}"
+            )
+        if faces not in ("harmonic", "arithmetic"):
+            raise ValueError(f"Diffusion: faces must be 'harmonic' or 'arithmetic', got {faces!r}")
+        self.boundary = _sides(boundary, dim)
+        self.length = _check.lengths("Diffusion", length, dim) or [1.0] * dim
+        self.kappa = kappa
+        if isinstance(shift, torch.Tensor) and shift.dim() > 0:
+            if shift.dim() != kappa.dim():
+                raise ValueError(
+                    f"Diffusion: shift must be a number or have the shape of kappa, {tuple(kappa.shape)}, got "
+                    f"{tuple(shift.shape)}"
+                )
+            shift, is_held = shift.unsqueeze(1), True
+        else:
+            is_held = isinstance(shift, torch.Tensor) or shift != 0
+            shift = real_tensor("Diffusion", "shift", shift)
+        is_held = is_held or any("zero" in sides for sides in self.boundary)
+        codes = [float(("zero", "flux", "periodic").index(side)) for sides in self.boundary for side in sides]
+        parameters = [*codes, *self.length, float(faces == "arithmetic")]
+        null_spaces = () if is_held else (kappa.new_empty(0).detach(),) * 2
+        super().__init__(list(kappa.shape[1:]), parameters, [kappa.unsqueeze(1), shift], null_spaces)
+
+    def boundary_rhs(self, values=0.0, fluxes=0.0):
+        """The part of b that given values and fluxes at the sides make, (batch or 1, 1, *shape), with gradients.
+
+        Args:
+            values: u on the sides that are "zero".
+            fluxes: what flows in, κ ∂u/∂n with the normal n pointing outwards, on the sides that are "flux".
+                Each is one number for all sides, or a pair (low, high) for each axis; a number, or a tensor that
+                broadcasts to (batch or 1, *side), where side is shape without the axis.
+        """
+        dim = len(self.shape)
+        values, fluxes = (_of_sides(name, given, dim) for name, given in (("values", values), ("fluxes", fluxes)))
+        b = torch.zeros_like(self.kappa)
+        for axis, sides in enumerate(self.boundary):
+            h = self.length[axis] / self.shape[axis]
+            for end, side in enumerate(sides):
+                if side == "periodic":
+                    continue
+                at_side = self.kappa.select(axis + 1, -end)
+                given = (values if side == "zero" else fluxes)[axis][end]
+                added = 2 * at_side * given / h**2 if side == "zero" else torch.ones_like(at_side) * given / h
+                if added.shape[0] != b.shape[0]:
+                    b = b.expand(added.shape[0], *b.shape[1:])
+                place = torch.zeros(self.shape[axis], dtype=b.dtype, device=b.device)
+                place[-end] = 1.0
+                b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (dim - axis - 1))
+        return b.unsqueeze(1)
+
+
+def _sides(boundary, dim):
+    """The pair (low, high) of each axis."""
+    axes = [boundary] * dim if isinstance(boundary, str) else list(boundary)
+    pairs = [(of_axis,) * 2 if isinstance(of_axis, str) else tuple(of_axis) for of_axis in axes]
+    known = {"zero", "flux", "periodic"}
+    if len(pairs) != dim or any(len(pair) != 2 or not set(pair) <= known for pair in pairs):
+        raise ValueError(
+            "Diffusion: boundary must be 'zero', 'flux' or 'periodic': one for all sides, or one, or a pair "
+            f"(low, high), for each of {dim} axes, got {boundary!r}"
+        )
+    if any(pair.count("periodic") == 1 for pair in pairs):
+        raise ValueError(f"Diffusion: boundary: both sides of an axis are periodic or none is, got {boundary!r}")
+    return pairs
+
+
+def _of_sides(name, given, dim):
+    """A value for each side: (low, high) for each axis."""
+    if isinstance(given, (int, float, torch.Tensor)):
+        return [(given, given)] * dim
+    if len(given) != dim or any(len(pair) != 2 for pair in given):
+        raise ValueError(f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes")
+    return given

@@ -1,0 +1,76 @@
+"""Products given by Python functions."""
+
+import torch
+
+from prdp_torch import _C, _check, batching
+from prdp_torch.operators.base import Operator, null_spaces_of
+
+
+class Function(Operator):
+    """An operator of your own, given by a function for its product with a batch of vectors (batch, ...).
+
+    Args:
+        matvec: `matvec(v, *tensors)` returns A v as a new tensor with the shape and dtype of v. It is made of torch
+            operations and linear in v. Samples may differ only through `tensors`.
+        transpose: the same for Aᵀ v. None takes torch's own derivative of matvec.
+        tensors: what A is made of, a tuple of tensors or a single one. They get gradients. A tensor that requires
+            grad and reaches matvec in another way is refused.
+        diagonal: `diagonal(*tensors)` returns the diagonal of A in a shape that broadcasts against the vectors.
+            `Jacobi` and `preconditioner="diagonal"` need it.
+        symmetric: whether A = Aᵀ. Then matvec is used for both.
+        nullspace, left_nullspace: as for `Stencil`; a vector has the shape of a channel of b (batch, channel, *shape),
+            or of b without its batch axis if b has two axes.
+
+    `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
+    the functions with each other. A `Function` cannot be created inside `torch.compile`.
+    """
+
+    kind = "function"
+
+    def __init__(
+        self,
+        matvec,
+        transpose=None,
+        tensors=(),
+        diagonal=None,
+        symmetric=False,
+        nullspace=None,
+        left_nullspace=None,
+    ):
+        for name, function in (("matvec", matvec), ("transpose", transpose), ("diagonal", diagonal)):
+            if not callable(function) and (name == "matvec" or function is not None):
+                raise TypeError(f"Function: {name} must be callable, got {function!r}")
+        if symmetric and transpose is not None:
+            raise ValueError("Function: with symmetric=True matvec is its own transpose; give only one of the two")
+        if isinstance(tensors, torch.Tensor):
+            tensors = (tensors,)
+        if not isinstance(tensors, (tuple, list)):
+            raise TypeError(f"Function: tensors must be a tuple of tensors, got {tensors!r}")
+        tensors = [_check.dense("Function", "every tensor", t) for t in tensors]
+        self._made_of = matvec, transpose, diagonal, symmetric
+        product = _returning_a_tensor("matvec", matvec)
+        self._products = _C.RegisteredProducts(
+            product,
+            product if symmetric else _returning_a_tensor("transpose", transpose),
+            None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
+            lambda v, given: batching.transposed(matvec, v, given),
+            lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
+        )
+        self._null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
+        super().__init__([self._products.number], [], tensors, self._null_spaces)
+
+    def __reduce__(self):
+        matvec, transpose, diagonal, symmetric = self._made_of
+        tensors = tuple(self.tensors[: len(self.tensors) - len(self._null_spaces)])
+        return Function, (matvec, transpose, tensors, diagonal, symmetric, *(self._null_spaces or (None, None)))
+
+
+def _tensor(name, value):
+    if isinstance(value, torch.Tensor):
+        return value
+    raise TypeError(f"Function: {name} must return a torch tensor, got {type(value).__name__}")
+
+
+def _returning_a_tensor(name, function):
+    """A product as the compiled library calls it."""
+    return None if function is None else lambda v, given: _tensor(name, function(v, *given))

@@ -1,0 +1,101 @@
+"""Matrices, and what else is taken for an operator."""
+
+import warnings
+
+import torch
+
+from prdp_torch import _check
+from prdp_torch.operators.base import Operator, null_spaces_of
+
+
+class Matrix(Operator):
+    """A matrix: a tensor (n, n) or (batch, n, n), dense or sparse CSR. A sparse one gets gradients on its pattern; if
+    you need them, use `Matrix.csr`, because torch may make the gradient of a CSR tensor dense.
+
+    `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n)."""
+
+    def __init__(self, matrix, nullspace=None, left_nullspace=None):
+        if not isinstance(matrix, torch.Tensor):
+            raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
+        if matrix.layout == torch.sparse_csr:
+            _warn_of_csr_gradient(matrix)
+            self.kind = "csr"
+            with torch._C._DisableFuncTorch():  # torch.func does not know sparse tensors
+                tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
+        elif matrix.layout == torch.strided:
+            self.kind = "dense"
+            tensors = [matrix]
+        else:
+            raise ValueError(f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}")
+        if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
+            raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
+        if self.kind == "csr" and tensors[0].shape[-1] != matrix.shape[-1] + 1:
+            raise ValueError(
+                f"linear_solve: a CSR matrix of {matrix.shape[-1]} rows needs a crow of one more, got "
+                f"{tensors[0].shape[-1]}"
+            )
+        super().__init__([], [], tensors, null_spaces_of("Matrix", nullspace, left_nullspace, tensors[-1]))
+
+    def _unknowns(self):
+        return self.tensors[0].shape[-1] - (self.kind == "csr")
+
+    @classmethod
+    def csr(cls, crow, col, values, size, nullspace=None, left_nullspace=None):
+        """A sparse matrix by its compressed rows, as `torch.sparse_csr_tensor` takes them.
+
+        Args:
+            crow: (n + 1,) whole numbers, where each row starts in col and values.
+            col: (nnz,) whole numbers, the column of each stored entry.
+            values: (nnz,), or (batch, nnz) for a matrix per sample on one pattern; float32 or float64. The
+                gradient arrives here, in this shape.
+            size: (n, n) or n; (batch, n, n) with values (batch, nnz).
+            nullspace, left_nullspace: "constant" or vectors (k, n), as for `Stencil`.
+
+        Raises TypeError or ValueError where the shapes do not fit each other.
+        """
+        for name, tensor in (("crow", crow), ("col", col)):
+            if _check.dense("Matrix.csr", name, tensor).dtype not in (torch.int32, torch.int64):
+                raise TypeError(f"Matrix.csr: {name} must hold whole numbers (int32 or int64), got {tensor.dtype}")
+        if _check.dense("Matrix.csr", "values", values).dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"Matrix.csr: values must be float32 or float64, got {values.dtype}")
+        if not isinstance(size, (tuple, list)):
+            size = (_check.whole("Matrix.csr", "size", size),) * 2
+        size = tuple(_check.whole("Matrix.csr", "every extent of size", n) for n in size)
+        n, batch = size[-1], values.shape[:-1]
+        if values.dim() not in (1, 2) or len(size) not in (2, 3) or size[-2] != n or size[:-2] not in ((), batch):
+            raise ValueError(
+                "Matrix.csr: size must be (n, n), or (batch, n, n) with values of shape (batch, nnz), "
+                f"got {size} with values of shape {tuple(values.shape)}"
+            )
+        for name, tensor, length in (("crow", crow, n + 1), ("col", col, values.shape[-1])):
+            if tensor.shape not in ((length,), (*batch, length)):
+                raise ValueError(f"Matrix.csr: {name} must have shape ({length},), got {tuple(tensor.shape)}")
+        made = cls.__new__(cls)
+        made.kind = "csr"
+        pattern = [index.expand(*batch, -1) for index in (crow, col)]
+        null_spaces = null_spaces_of("Matrix.csr", nullspace, left_nullspace, values)
+        Operator.__init__(made, [], [], [*pattern, values], null_spaces)
+        return made
+
+
+_warned_of_csr_gradient = False
+
+
+def _warn_of_csr_gradient(matrix):
+    global _warned_of_csr_gradient
+    if matrix.requires_grad and torch.is_grad_enabled() and not _warned_of_csr_gradient:
+        _warned_of_csr_gradient = True
+        warnings.warn(
+            "linear_solve: the gradient of a sparse CSR tensor passes through torch, which may make it dense; "
+            "operators.Matrix.csr(crow, col, values, size) takes it to the values directly",
+            stacklevel=4,
+        )
+
+
+def as_operator(who, name, value):
+    """An operator as it is, a tensor as a `Matrix`; TypeError for all else."""
+    if isinstance(value, Operator):
+        return value
+    if isinstance(value, torch.Tensor):
+        return Matrix(value)
+    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}")
