@@ -36,7 +36,9 @@ def error_against_cost(found):
             points = [point for summary in found.values() if (point := _ratios(summary, label, cost))]
             if label == "converged":
                 points = points[:1]
-            axes.scatter(*zip(*points, strict=True), color=colour, marker=marker, s=36, label=title, alpha=0.8, lw=0)
+            axes.scatter([], [], color=colour, marker=marker, s=36, label=title)
+            for *point, is_claimed in points:
+                axes.scatter(*point, **_marker(colour, marker, is_claimed), alpha=0.8)
         axes.set(xscale="log", yscale="log")
         axes.axhspan(0.0, 1.1, color="#e8f4e8", zorder=0, lw=0)
         axes.grid(alpha=0.3, lw=0.4)
@@ -46,7 +48,8 @@ def error_against_cost(found):
     panels[0].set(xlabel="products with A, converged = 1", ylabel="error, converged = 1")
     panels[1].set(xlabel="seconds, converged = 1")
     panels[0].legend(frameon=False, fontsize=8)
-    figure.suptitle(f"{len(found)} scenes: error against work. Green: at most a tenth above the converged error")
+    title = f"{len(found)} scenes: error against work. Green: at most a tenth above the converged error"
+    figure.suptitle(f"{title}. Hollow: fails or warns")
     return figure
 
 
@@ -55,20 +58,30 @@ def _ratios(summary, label, cost):
     row = next(row for row in summary["rows"] if row["label"] == label)
     if row["diverged"]:
         return None
-    return row[cost] / base[cost], row["metric"] / base["metric"]
+    return row[cost] / base[cost], row["metric"] / base["metric"], _claims(row)
+
+
+def _claims(row):
+    return row["as_good"] and not row["warnings"]
+
+
+def _marker(colour, marker, is_claimed):
+    """Hollow where the row claims nothing."""
+    return {"marker": marker, "s": 36, "facecolors": colour if is_claimed else "none", "edgecolors": colour}
 
 
 def time_against_products(found):
-    """What is saved of the products, and of the seconds with network and optimiser: one point a scene."""
+    """What is saved of the products, and of the seconds with network and optimiser: one point per scene, hollow where
+    the row fails or warns."""
     figure = Figure(figsize=(6.2, 4.6), layout="constrained")
     axes = figure.subplots()
     for label in ("prdp", "auto"):
         title, colour, marker = ROWS[label]
+        axes.scatter([], [], color=colour, marker=marker, s=36, label=title)
         for name, summary in found.items():
             row, base = next(row for row in summary["rows"] if row["label"] == label), summary["rows"][0]
             saved = [100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds")]
-            axes.scatter(*saved, color=colour, marker=marker, s=36, label=title)
-            title = None  # once in the legend
+            axes.scatter(*saved, **_marker(colour, marker, _claims(row)))
             if label == "auto":  # those below zero are named to the right, out of the way of the others
                 place = {"xytext": (0, 6), "rotation": 60} if saved[1] > -3 else {"xytext": (7, -3)}
                 axes.annotate(name, saved, **place, textcoords="offset points", fontsize=8)
@@ -76,6 +89,7 @@ def time_against_products(found):
     axes.set(xlabel="products saved, %", ylabel="time saved, %", xlim=(0, 100), ylim=(None, 100))
     axes.axhline(0, color="#888888", lw=1)
     axes.grid(alpha=0.3, lw=0.4)
+    axes.scatter([], [], **_marker("#444444", "o", False), label="fails or warns")
     axes.legend(frameon=False, loc="upper left")
     return figure
 

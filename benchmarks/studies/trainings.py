@@ -126,5 +126,13 @@ class Study:
 
 
 def saved(rows, converged, count):
-    """The share of a cost that is saved, for a table."""
+    """The share of a cost that is saved, for a table: none is claimed by rows that end worse than the converged ones,
+    as `prdp compare` judges it, or whose controllers warn."""
+    errors, goal = ([r["error"] for r in these] for these in (rows, converged))
+    spread_of_goal = np.std(goal, ddof=1) if len(goal) > 1 else 0.0
+    if np.mean(errors) > np.mean(goal) + max(spread_of_goal, 0.1 * np.mean(goal)):
+        return "fails"
+    warns = sum(r["warning"] is not None for r in rows)
+    if warns:
+        return f"{warns} of {len(rows)} warn"
     return f"{100 * (1 - np.mean([r[count] for r in rows]) / np.mean([r[count] for r in converged])):.0f} %"

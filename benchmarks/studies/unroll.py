@@ -149,7 +149,9 @@ def table(rows):
             for gradient in (*GRADIENTS, *UNCLIPPED):
                 chosen = _of(rows, name, steps, gradient)
                 if chosen:
-                    errors = [spread([row["errors"][n] for row in chosen]) for n in (steps, *BEYOND)]
+                    # "errors" is rounded to four digits; a spread of them would be computed from rounded numbers
+                    exact = [(row["trained"], *row["beyond"]) for row in chosen]
+                    errors = [spread(values) for values in zip(*exact, strict=True)]
                     costs = [np.mean([row[f"{kind}_products"] for row in chosen]) for kind in ("forward", "adjoint")]
                     costs.append(min(row["seconds"] for row in chosen))
                     cells = [*errors, *(f"{cost:,.0f}" for cost in costs)]

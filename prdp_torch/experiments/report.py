@@ -49,7 +49,7 @@ def columns(scene):
             "saved",
             "products saved",
             "saved: share of the converged run's products, given only if the error is at most one standard deviation, "
-            "or a tenth, above that of the converged run.",
+            "or a tenth, above that of the converged run and the controller does not warn.",
         ),
         Column("s", "seconds of training"),
     ]
@@ -80,7 +80,9 @@ def cells(scene, entry):
 
 
 def _saving(entry, name):
-    return f"{100 * entry[name]:.1f} %" if entry["as_good"] else "fails"
+    if not entry["as_good"]:
+        return "fails"
+    return "warns" if entry["warning"] else f"{100 * entry[name]:.1f} %"
 
 
 def in_terminal(scene):
@@ -135,6 +137,8 @@ def _verdict(scene, base, entry):
         ending = f"reaches {reach} after {entry['intervals']:.0f} {scene.unit}s"
         if not base["reaches_target"]:
             return f"{name} {ending}; {against} does not."
+        if entry["warning"]:
+            return f"{name} {ending}, {against} after {base['intervals']:.0f}; its controller warns."
         return f"{name} {ending}, {against} after {base['intervals']:.0f}, {_savings(entry)}."
     spread = f" ± {base['metric_std']:.1e}" if base["metric_std"] else ""
     ending = f"{name} ends at an error of {entry['metric']:.2e}, {against} at {base['metric']:.2e}{spread}"

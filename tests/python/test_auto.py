@@ -89,6 +89,8 @@ def test_a_comparison_judges_savings_only_of_rows_that_end_as_well(untuned):
     assert shown["prdp"][saved] == shown["constant_10"][saved] == "fails" and shown["prdp"][0] == "PRDP !"
     assert shown["auto"][saved] == f"{100 * table['auto']['products_saved']:.1f} %"
     assert table["auto"]["products_saved"] > 0.6
+    warned = table["auto"] | {"warning": "the solves stop too far off", "warnings": 1}
+    assert report.cells(scene, warned)[saved] == "warns"
 
 
 def test_a_failure_is_named_and_no_headline(untuned):

@@ -1,10 +1,12 @@
 """The tables of results in README.md and docs are those of the records in docs/results."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from benchmarks.studies.trainings import saved
 from docs import flow_tables, performance_tables, result_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -28,6 +30,48 @@ def test_the_tables_of_flows_are_those_of_the_records():
     text = flow_tables.PAGE.read_text()
     assert flow_tables.TABLE.search(text)
     assert text == flow_tables.with_tables(text), "run: python -m docs.flow_tables"
+
+
+def a_row(**changes):
+    row = {"as_good": True, "warnings": 0, "warning": None, "seeds": 3, "diverged": 0, "kind": "prdp", "seconds": 5.0}
+    row |= {"products_saved": 0.5, "metric": 0.1, "metric_std": 0.0, "reaches_target": None, "error": 0.1, "budget": 5}
+    return row | changes
+
+
+def test_a_row_that_fails_or_warns_claims_no_saving():
+    assert [result_tables.claim(row, 0.5) for row in (a_row(), a_row(warnings=1), a_row(as_good=False))] == [
+        "50 %", "warns", "fails",
+    ]  # fmt: skip
+    assert result_tables.claim(a_row(as_good=False, warnings=3), 0.5) == "fails"
+    base = a_row(seconds=10.0)
+    times = [a_row(), a_row(seconds=9.0), a_row(seconds=11.0), a_row(seconds=15.0), a_row(as_good=False)]
+    assert [result_tables._time_saved(row, base) for row in times] == ["50 %", "none", "none", "−50 %", "fails"]
+
+
+def test_an_error_says_how_many_of_its_seeds_warn():
+    assert result_tables.error(a_row(warnings=1, seeds=10)) == "1.00e-01, 1 of 10 warn"
+    assert result_tables.error(a_row(warnings=1, seeds=1)) == "1.00e-01, warns"
+
+
+def test_a_study_claims_no_saving_of_trainings_that_fail_or_warn():
+    converged = [a_row(budget=10) for _ in range(3)]
+    assert saved([a_row() for _ in range(3)], converged, "budget") == "50 %"
+    assert saved([a_row(error=0.12) for _ in range(3)], converged, "budget") == "fails"
+    assert saved([a_row(), a_row(), a_row(warning="too far off")], converged, "budget") == "1 of 3 warn"
+
+
+@pytest.mark.parametrize("page", result_tables.PAGES, ids=lambda page: page.name)
+def test_no_line_of_a_table_claims_what_it_warns_of(page):
+    """Of the tables with one way of choosing K per line; those with more have a cell for each."""
+    for found in result_tables.TABLE.finditer(page.read_text()):
+        if found[2] in ("time and products", "the study of widths"):
+            continue
+        for line in found[0].splitlines():
+            if re.search(r"\bwarns?\b|\bfails\b|not reached|diverged", line):
+                cells = [cell.strip() for cell in line.split("|")]
+                if found[2] == "the scenes beside the paper":
+                    del cells[6]  # what the paper saves
+                assert not [cell for cell in cells if re.fullmatch(r"−?[\d.]+ %", cell)], line
 
 
 @pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)
