@@ -1,4 +1,5 @@
-"""`python -m benchmarks.refinement_charts`: the pictures of docs/refinement.md, from the records in docs/results."""
+"""`python -m benchmarks.refinement_charts`: the pictures of docs/refinement_records.md and docs/study_time.md,
+from the records in docs/results."""
 
 import json
 from pathlib import Path

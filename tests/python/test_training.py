@@ -107,7 +107,7 @@ def test_the_metric_applies_the_network_as_often_as_the_scene_says(tmp_path):
 
 
 def test_heat_1d_shows_what_the_paper_shows():
-    """One seed; docs/results.md has ten. K = 10 is as good as 25, K = 3 far worse, PRDP saves 75 %."""
+    """One seed; docs/reproduction.md has ten. K = 10 is as good as 25, K = 3 far worse, PRDP saves 75 %."""
     scene = scenes.load("heat_1d")
     final, budget = {}, {}
     for refinement in (
