@@ -1,5 +1,6 @@
-"""What the first call with a new K costs, after calls with others: a compiled graph is for one K."""
+"""What the first call with a new K costs, after calls with others: a graph compiled for one K is compiled again."""
 
+import importlib
 import importlib.util
 import time
 
@@ -22,6 +23,8 @@ def run(report, quick=False):
         paper = next(label for label in ours.methods(problem))
         mine = [entry for entry in ours.entries(problem, ("implicit",)) if entry.label == paper]
         others = [entry for entry in peers.entries(problem) if entry.same_as is not None]
+        if importlib.util.find_spec("jax"):
+            others.append(importlib.import_module("benchmarks.peers.jax_loops").entry_for_any(problem))
         for entry in mine + others:
             report(f"change of K: {problem.title}, {entry.label}")
             found += first_calls(problem, entry)

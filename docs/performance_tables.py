@@ -137,22 +137,24 @@ def threads():
     return page_tables.markdown(["batch", *PROBLEMS.values()], body)
 
 
+COMPARED = {"ours": "", "torch.compile": "torch.compile", "JAX": "JAX jit,", "JAX, K traced": "JAX jit with K traced"}
+
+
 def change_of_k():
     """The median of the calls with a new K, the first of each and the one after it."""
     found, body = record("change_of_k"), []
+    labels = list(dict.fromkeys(row["label"] for row in found))
+    columns = {who: begins for who, begins in COMPARED.items() if any(label.startswith(begins) for label in labels)}
     for problem in dict.fromkeys(row["problem"] for row in found):
-        labels = list(dict.fromkeys(row["label"] for row in found if row["problem"] == problem))
         cells = []
-        for begins in ("", "torch.compile", "JAX jit"):
-            label = next((name for name in labels if name.startswith(begins)), None)
-            calls = [row for row in found if (row["problem"], row["label"]) == (problem, label)][1:]  # the first loads
-            cells += [_with_unit(median(row[f"{which}_seconds"] for row in calls)) if calls else "–"
-                      for which in ("first", "later")]  # fmt: skip
+        for begins in columns.values():
+            of_problem = [row for row in found if row["problem"] == problem and row["label"].startswith(begins)]
+            calls = [row for row in of_problem if row["label"] == of_problem[0]["label"]][1:]  # the first one warms up
+            for which in ("first_seconds", "later_seconds"):
+                cells.append(_with_unit(median(row[which] for row in calls)) if calls else "–")
         body.append([problem, *cells])
-    of_each = ("first call", "later")
-    return page_tables.markdown(
-        ["", *(f"{who}: {what}" for who in ("ours", "torch.compile", "JAX") for what in of_each)], body
-    )
+    head = ["", *(f"{who}: {what}" for who in columns for what in ("first call", "later"))]
+    return page_tables.markdown(head, body)
 
 
 def _with_unit(seconds):

@@ -1,4 +1,4 @@
-"""JAX, jitted: the same iterations over stencils, K a constant of the compilation, implicit derivative."""
+"""JAX, jitted: the same iterations over stencils, implicit derivative; K is a constant, or an argument."""
 
 from functools import partial
 
@@ -119,6 +119,22 @@ def compiled(stencil, loop, k, *extra):
     return jax.jit(solve), jax.jit(both)
 
 
+def compiled_for_any(stencil, loop, *extra):
+    """(forward, both) of arrays and K, jitted: the bound of the loop is traced, so that a new K compiles nothing."""
+
+    @jax.custom_vjp
+    def solve(b, k):
+        return loop(stencil, False, b, k, *extra)
+
+    solve.defvjp(lambda b, k: (solve(b, k), k), lambda k, g: (loop(stencil, True, g, k, *extra), None))
+
+    def both(b, g, k):
+        u, pull = jax.vjp(lambda b: solve(b, k), b)
+        return u, pull(g)[0]
+
+    return jax.jit(solve), jax.jit(both)
+
+
 def diffusion_calls(problem, solve):
     """(forward, both), jitted, of a solve(stencil, b) that is not differentiated itself."""
     b, g, kappa = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g, problem.kappa))
@@ -174,3 +190,21 @@ def entries(problem):
     yield ours.Entry(
         f"JAX jit, GMRES({m})", "implicit", [problem.k], partial(prepare, loop=gmres, extra=(m,)), same_as=f"GMRES({m})"
     )
+
+
+def entry_for_any(problem):
+    """The same iterations with K as an argument, for heat, Burgers and Navier-Stokes."""
+    stencil = stencils.make(problem, Backend, jnp.asarray)
+    b, g = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g))
+    if problem.name.startswith("heat"):
+        method, loop, extra = "Jacobi", jacobi, ()
+    else:
+        m = problem.solver(1).restart
+        method, loop, extra = f"GMRES({m})", gmres, (m,)
+    forward, both = compiled_for_any(stencil, loop, *extra)
+
+    def prepare(k):
+        bound = jnp.asarray(k)
+        return lambda: forward(b, bound).block_until_ready(), lambda: jax.block_until_ready(both(b, g, bound))
+
+    return ours.Entry(f"JAX jit with K traced, {method}", "implicit", [problem.k], prepare, same_as=method)

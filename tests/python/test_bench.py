@@ -96,6 +96,22 @@ def test_the_gradient_for_a_field_is_that_of_differences():
     torch.testing.assert_close((of_kappa * direction).sum(), (losses[0] - losses[1]) / (2 * h), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["heat_1d", "burgers_1d"])
+def test_jax_with_k_as_an_argument_runs_the_same_iterations_and_compiles_once(name):
+    pytest.importorskip("jax")
+    from benchmarks.change_of_k import first_calls
+    from benchmarks.peers import jax_loops
+
+    problem = SMALL[name]()
+    constant = next(entry for entry in jax_loops.entries(problem) if entry.same_as)
+    traced = jax_loops.entry_for_any(problem)
+    for k in (3, 4):
+        (u, gradient), (same_u, same_gradient) = (entry.prepare(k)[1]() for entry in (constant, traced))
+        assert np.allclose(u, same_u, rtol=1e-5) and np.allclose(gradient, same_gradient, rtol=1e-5)
+    first, *later = first_calls(problem, jax_loops.entry_for_any(problem))
+    assert min(row["first_seconds"] for row in later) < first["first_seconds"] / 5
+
+
 def test_readings_are_taken_in_turn():
     order = []
     seconds = measure.interleaved({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, 0.0)
