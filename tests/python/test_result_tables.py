@@ -74,6 +74,25 @@ def test_no_line_of_a_table_claims_what_it_warns_of(page):
                 assert not [cell for cell in cells if re.fullmatch(r"−?[\d.]+ %", cell)], line
 
 
+def test_the_seconds_of_the_first_pages_are_those_of_the_records():
+    def seconds(scene, label, record=result_tables.rows):
+        return result_tables._seconds(record(scene)[label])
+
+    b, d = "refinement_burgers_2d", "refinement_diffusion_inverse"
+    trained = f"{seconds(b, 'auto')} s instead of {seconds(b, 'converged')} s"
+    found = f"{seconds(d, 'auto')} s instead of {seconds(d, 'converged')} s"
+    exact = f"{seconds('diffusion_inverse', 'direct')} s with `Direct`"
+    first, results, readme = ((DOCS / name).read_text() for name in ("index.md", "results.md", "../README.md"))
+    assert all(said in first for said in (trained, found, exact))
+    assert f"{seconds(b, 'converged')} to {seconds(b, 'auto')} s" in results
+    assert f"{seconds(b, 'converged')} s with converged solves, {seconds(b, 'auto')} s with `auto`" in readme
+    updates = {
+        row["scene"]: row["update_seconds"] for row in performance_tables.record("training")
+    }  # the last K of each
+    for text in (first, results, readme):
+        assert f"about {640 * updates['burgers_2d']:.0f} s" in text
+
+
 @pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)
 def test_a_record_says_where_it_comes_from(path):
     record = json.loads(path.read_text())
