@@ -26,4 +26,4 @@ for epoch in range(60):
         print(
             f"epoch {epoch:2d}  validation error {error:.3f}  tolerance {controller.rtol:.1e}  iterations {taken:.1f}"
         )
-print(controller.warning or "The solves were accurate enough.")
+print(controller.warning or "The controller warns of nothing.")
