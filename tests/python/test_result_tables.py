@@ -19,6 +19,12 @@ def test_the_tables_are_those_of_the_records(page):
     assert text == result_tables.with_tables(text), "run: python -m docs.result_tables"
 
 
+def test_every_table_and_every_study_is_on_one_page():
+    shown = [found[2] for page in result_tables.PAGES for found in result_tables.TABLE.finditer(page.read_text())]
+    studies = {f"the study of {path.stem}" for path in (DOCS / "results" / "studies").glob("*.json")}
+    assert len(shown) == len(set(shown)) and {*result_tables.TABLES, *studies} <= set(shown)
+
+
 def test_the_tables_of_speed_are_those_of_the_records():
     text = performance_tables.PAGE.read_text()
     assert len(performance_tables.TABLE.findall(text)) == len(performance_tables.TABLES)
