@@ -234,6 +234,7 @@ def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_fail
         _check.whole(who, "max_iter", solver.max_iter),
         _check.real(who, "rtol", solver.rtol),
         _check.whole(who, "restart", solver.restart),
+        flat_preconditioner(solver.preconditioner)[0],
         _check.string(who, "backward", backward),
         _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),

@@ -180,8 +180,9 @@ class Stepper(torch.nn.Module):
     @max_iter.setter
     def max_iter(self, k):
         who = type(self).__name__
-        _C.check_solver(who, self.method, _check.whole(who, "max_iter", k), self.rtol, self.restart)
-        self._max_iter = int(k)
+        k = _check.whole(who, "max_iter", k)
+        _C.check_solver(who, self.method, k, self.rtol, self.restart, flat_preconditioner(self.preconditioner)[0])
+        self._max_iter = k
 
     @property
     def start(self):

@@ -151,27 +151,26 @@ void bind_solvers(py::module_& m) {
             .check(who.c_str());
       },
       py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
-      py::arg("preconditioner") = "");
+      py::arg("preconditioner"));
   m.def(
       "check_options",
-      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart, std::string backward,
-         std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol, std::string on_failure,
-         int64_t checkpoint_every, std::string start) {
-        const auto of_method = method_from_name(method);
-        SolveOptions{{of_method, max_iter, rtol, restart,
-                      of_method == Method::kMultigrid ? Preconditioner::multigrid() : Preconditioner()},
-                     backward_from_name(backward),
-                     adjoint_max_iter,
-                     adjoint_rtol,
-                     on_failure_from_name(on_failure),
-                     /*adjoint_log=*/0,
-                     checkpoint_every,
-                     start_from_name(start)}
+      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
+         std::string preconditioner, std::string backward, std::optional<int64_t> adjoint_max_iter,
+         std::optional<double> adjoint_rtol, std::string on_failure, int64_t checkpoint_every, std::string start) {
+        SolveOptions{
+            {method_from_name(method), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))},
+            backward_from_name(backward),
+            adjoint_max_iter,
+            adjoint_rtol,
+            on_failure_from_name(on_failure),
+            /*adjoint_log=*/0,
+            checkpoint_every,
+            start_from_name(start)}
             .check(who.c_str());
       },
-      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"), py::arg("backward"),
-      py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"), py::arg("on_failure"), py::arg("checkpoint_every"),
-      py::arg("start") = "zero");
+      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
+      py::arg("preconditioner"), py::arg("backward"), py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"),
+      py::arg("on_failure"), py::arg("checkpoint_every"), py::arg("start") = "zero");
 
   m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
   py::class_<KeptLog>(m, "AdjointLog").def(py::init<>()).def_property_readonly("number", [](const KeptLog& kept) {

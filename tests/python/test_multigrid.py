@@ -209,3 +209,14 @@ def test_steps_and_rollouts_take_it():
     results = [torch.autograd.grad(s.rollout(u, 3).square().sum(), u)[0] for s in (step, exact)]
     torch.testing.assert_close(*results, rtol=1e-7, atol=1e-9)
     assert step.info.solved.all()
+
+
+def test_a_controller_sets_the_number_of_cycles():
+    step = prdp.Heat((15, 15), 1e-2, 1.0, prdp.Multigrid(1, 0.0))
+    u = field((15, 15), 2)
+    for k in (1, 2, 5):
+        step.max_iter = k
+        step(u)
+        assert step.info.iterations.tolist() == [k, k]
+    with pytest.raises(ValueError, match="max_iter must be >= 0, got -1"):
+        step.max_iter = -1
