@@ -6,10 +6,9 @@
 
 #include "prdp/solvers/bicgstab.h"
 #include "prdp/solvers/conjugate_gradient.h"
-#include "prdp/solvers/direct.h"
+#include "prdp/solvers/correction.h"
 #include "prdp/solvers/gmres.h"
 #include "prdp/solvers/jacobi.h"
-#include "prdp/solvers/multigrid.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
@@ -39,7 +38,6 @@ struct MethodTraits {
   bool takes_preconditioner = false;  // and then keeps two vectors more
   double nanoseconds;         // of a core per unknown and iteration, or vector of a cycle
   bool divides_by_diagonal = false;  // refuses an operator with a zero on it
-  bool is_multigrid = false;  // needs multigrid for its preconditioner
   bool is_direct = false;  // takes the operator's exact method, and no start
   /// From zero, u is a polynomial of A, fixed by the number of iterations, times b. Then u is smooth in A and
   /// linear in b, and the transposed map is as many iterations with Aᵀ.
@@ -61,64 +59,81 @@ struct MethodRow : MethodTraits {
 };
 
 /// In the order of the enumerators.
-inline constexpr std::tuple kMethods{MethodRow<JacobiMethod>{{.method = Method::kJacobi,
-                                                              .name = "jacobi",
-                                                              .label = "Jacobi",
-                                                              .made_for = MadeFor::kDominant,
-                                                              .vectors = 4,
-                                                              .nanoseconds = 0.1,
-                                                              .divides_by_diagonal = true,
-                                                              .is_polynomial = true}},
-                                     MethodRow<ChebyshevMethod>{{.method = Method::kChebyshev,
-                                                                 .name = "chebyshev",
-                                                                 .label = "Chebyshev",
-                                                                 .made_for = MadeFor::kKnownSpectrum,
-                                                                 .vectors = 4,
-                                                                 .nanoseconds = 0.1,
-                                                                 .is_polynomial = true,
-                                                                 .has_tape = false}},
-                                     MethodRow<SteepestDescentMethod>{{.method = Method::kSteepestDescent,
-                                                                       .name = "steepest_descent",
-                                                                       .label = "SteepestDescent",
-                                                                       .made_for = MadeFor::kDefinite,
-                                                                       .vectors = 4,
-                                                                       .nanoseconds = 0.3}},
-                                     MethodRow<ConjugateGradientMethod>{{.method = Method::kConjugateGradient,
-                                                                         .name = "cg",
-                                                                         .label = "CG",
-                                                                         .made_for = MadeFor::kDefinite,
-                                                                         .vectors = 4,
-                                                                         .takes_preconditioner = true,
-                                                                         .nanoseconds = 0.3,
-                                                                         .ends_at_unknowns = true}},
-                                     MethodRow<BiCGStabMethod>{{.method = Method::kBiCGStab,
-                                                                .name = "bicgstab",
-                                                                .label = "BiCGStab",
-                                                                .products = 2,
-                                                                .vectors = 6,
-                                                                .takes_preconditioner = true,
-                                                                .nanoseconds = 0.8}},
-                                     MethodRow<GmresMethod>{{.method = Method::kGmres,
-                                                             .name = "gmres",
-                                                             .label = "GMRES",
-                                                             .counts = Counts::kCycles,
-                                                             .vectors = 4,
-                                                             .takes_preconditioner = true,
-                                                             .nanoseconds = 0.8}},
-                                     MethodRow<MultigridMethod>{{.method = Method::kMultigrid,
-                                                                 .name = "multigrid",
-                                                                 .label = "Multigrid",
-                                                                 .vectors = 3,
-                                                                 .nanoseconds = 4.0,
-                                                                 .is_multigrid = true,
-                                                                 .is_polynomial = true}},
-                                     MethodRow<DirectMethod>{{.method = Method::kDirect,
-                                                              .name = "direct",
-                                                              .label = "Direct",
-                                                              .vectors = 4,
-                                                              .nanoseconds = 0.3,
-                                                              .is_direct = true,
-                                                              .has_tape = false}}};
+inline constexpr std::tuple kMethods{
+    MethodRow<JacobiMethod>{{
+        .method = Method::kJacobi,
+        .name = "jacobi",
+        .label = "Jacobi",
+        .made_for = MadeFor::kDominant,
+        .vectors = 4,
+        .nanoseconds = 0.1,
+        .divides_by_diagonal = true,
+        .is_polynomial = true,
+    }},
+    MethodRow<ChebyshevMethod>{{
+        .method = Method::kChebyshev,
+        .name = "chebyshev",
+        .label = "Chebyshev",
+        .made_for = MadeFor::kKnownSpectrum,
+        .vectors = 4,
+        .nanoseconds = 0.1,
+        .is_polynomial = true,
+        .has_tape = false,
+    }},
+    MethodRow<SteepestDescentMethod>{{
+        .method = Method::kSteepestDescent,
+        .name = "steepest_descent",
+        .label = "SteepestDescent",
+        .made_for = MadeFor::kDefinite,
+        .vectors = 4,
+        .nanoseconds = 0.3,
+    }},
+    MethodRow<ConjugateGradientMethod>{{
+        .method = Method::kConjugateGradient,
+        .name = "cg",
+        .label = "CG",
+        .made_for = MadeFor::kDefinite,
+        .vectors = 4,
+        .takes_preconditioner = true,
+        .nanoseconds = 0.3,
+        .ends_at_unknowns = true,
+    }},
+    MethodRow<BiCGStabMethod>{{
+        .method = Method::kBiCGStab,
+        .name = "bicgstab",
+        .label = "BiCGStab",
+        .products = 2,
+        .vectors = 6,
+        .takes_preconditioner = true,
+        .nanoseconds = 0.8,
+    }},
+    MethodRow<GmresMethod>{{
+        .method = Method::kGmres,
+        .name = "gmres",
+        .label = "GMRES",
+        .counts = Counts::kCycles,
+        .vectors = 4,
+        .takes_preconditioner = true,
+        .nanoseconds = 0.8,
+    }},
+    MethodRow<MultigridMethod>{{
+        .method = Method::kMultigrid,
+        .name = "multigrid",
+        .label = "Multigrid",
+        .vectors = 3,
+        .nanoseconds = 4.0,
+        .is_polynomial = true,
+    }},
+    MethodRow<DirectMethod>{{
+        .method = Method::kDirect,
+        .name = "direct",
+        .label = "Direct",
+        .vectors = 4,
+        .nanoseconds = 0.3,
+        .is_direct = true,
+        .has_tape = false,
+    }},
+};
 
 inline constexpr auto kTraits =
     std::apply([](const auto&... row) { return std::array<MethodTraits, sizeof...(row)>{row...}; }, kMethods);

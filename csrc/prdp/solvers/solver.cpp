@@ -76,7 +76,7 @@ std::string Preconditioner::title() const { return is_operator() ? operator_kind
 void Solver::check(const char* who) const {
   check_budget(who, "", max_iter, rtol);
   TORCH_CHECK_VALUE(restart >= 1, who, ": restart must be >= 1, got ", restart);
-  if (traits(method).is_multigrid) {
+  if (method == Method::kMultigrid) {
     TORCH_CHECK_VALUE(preconditioner.is_multigrid(), who, ": the method multigrid needs Preconditioner::multigrid()");
   } else {
     TORCH_CHECK_VALUE(!preconditioner || traits(method).takes_preconditioner, who, ": the method ",

@@ -6,13 +6,11 @@
 
 namespace prdp {
 
-/// u ← u + A⁻¹(b - A u) by an exact method: the first iteration solves, those after it refine.
-template <FactorisedSpace Space>
-class DirectMethod {
+/// x ← x + B(b - A x). No products of vectors with each other.
+template <class Space, class B>
+class CorrectionMethod {
  public:
-  static constexpr bool kIsExact = true;
-
-  explicit DirectMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
+  explicit CorrectionMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
 
   void start() {
     space_.fill_zero(x);
@@ -22,7 +20,7 @@ class DirectMethod {
   }
   void step() {
     if (!ready_) space_.residual(x, r_);
-    space_.solve_directly(r_, d_);
+    B::apply(space_, r_, d_);
     space_.add(d_, x);
     ready_ = false;
   }
@@ -44,6 +42,24 @@ class DirectMethod {
   typename Space::Vector r_, d_;  // residual; its correction
   typename Space::Scalar residual2_{};
   bool ready_ = false;  // r_ and residual2_ belong to x
+};
+
+struct VCycle {
+  static void apply(auto& space, auto& r, auto& d) { space.precondition(r, d); }
+};
+template <VectorSpace Space>
+struct MultigridMethod : CorrectionMethod<Space, VCycle> {
+  using CorrectionMethod<Space, VCycle>::CorrectionMethod;
+};
+
+struct ExactSolve {
+  static void apply(auto& space, auto& r, auto& d) { space.solve_directly(r, d); }
+};
+/// The first iteration solves, those after it refine.
+template <FactorisedSpace Space>
+struct DirectMethod : CorrectionMethod<Space, ExactSolve> {
+  using CorrectionMethod<Space, ExactSolve>::CorrectionMethod;
+  static constexpr bool kIsExact = true;
 };
 
 }  // namespace prdp
