@@ -238,15 +238,7 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
 SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
   check(equation, u, steps * equation.picard_steps, options);
   options.adjoint_log = 0;  // it would hold the first step's alone
-  std::vector<at::Tensor> states{u};
-  Reports reports;
-  for (int64_t s = 0; s < steps; ++s) {
-    const FailuresOfStep here(s + 1, steps);
-    auto [next, info] = step(equation, states.back(), options);
-    states.push_back(std::move(next));
-    reports.push(info);
-  }
-  return {at::stack(states, 1), reports.joined(u)};
+  return step_by_step(u, steps, [&](const at::Tensor& state) { return step(equation, state, options); });
 }
 
 template <class... Options>

@@ -18,6 +18,21 @@ class Reports {
   std::vector<at::Tensor> iterations_, residual_, status_, applications_, floor_;
 };
 
+/// The states u, …, (batch, steps + 1, …), where `next` returns the one after a state with its report. Autograd sees
+/// each step by itself.
+template <class Next>
+SolveResult step_by_step(const at::Tensor& u, int64_t steps, const Next& next) {
+  std::vector<at::Tensor> states{u};
+  Reports reports;
+  for (int64_t s = 0; s < steps; ++s) {
+    const FailuresOfStep here(s + 1, steps);
+    auto [state, info] = next(states.back());
+    states.push_back(std::move(state));
+    reports.push(info);
+  }
+  return {at::stack(states, 1), reports.joined(u)};
+}
+
 /// What the solves of a rollout store for their derivative; undefined if it is not needed.
 struct KeptSolves {
   at::Tensor solutions, iterations, status, residual;  // (batch, solves (+ 1), …)

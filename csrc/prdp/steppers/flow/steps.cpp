@@ -162,15 +162,7 @@ SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, con
 SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
-  std::vector<at::Tensor> states{u};
-  Reports reports;
-  for (int64_t s = 0; s < steps; ++s) {
-    const FailuresOfStep here(s + 1, steps);
-    auto [next, info] = unrolled_step(equation, states.back(), options);
-    states.push_back(std::move(next));
-    reports.push(info);
-  }
-  return {at::stack(states, 1), reports.joined(u)};
+  return step_by_step(u, steps, [&](const at::Tensor& state) { return unrolled_step(equation, state, options); });
 }
 
 }  // namespace
