@@ -69,6 +69,13 @@ def rhs(shape, dtype=torch.float64):
     return torch.randn(3, *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(4)).to(dtype)
 
 
+def in_plain_tensors(a, b, solver):
+    return _C.solve_with_tensors(
+        b, a.tensors, a.kind, a.shape, a.parameters, False, solver.method, solver.max_iter, solver.rtol, solver.restart,
+        preconditioner="diagonal",
+    )  # fmt: skip
+
+
 def textbook_cg(a, b, iterations):
     """Saad, Iterative methods for sparse linear systems, algorithm 9.1, with M the diagonal."""
     x, r = np.zeros_like(b), b.copy()
@@ -119,19 +126,7 @@ def test_it_solves_in_the_loops_and_in_plain_tensors(name, solver, dtype):
     rtol = 1e-5 if dtype == torch.float32 else 1e-11
     method = solver(60, rtol)
     u, info = prdp.linear_solve(a, b, method)
-    v, report = _C.solve_with_tensors(
-        b,
-        a.tensors,
-        a.kind,
-        a.shape,
-        a.parameters,
-        False,
-        method.method,
-        60,
-        rtol,
-        method.restart,
-        preconditioner="diagonal",
-    )
+    v, report = in_plain_tensors(a, b, method)
     assert statuses(info) == ["CONVERGED"] * 3 and bool((info.residual <= rtol).all())
     assert bool((report[2] == 1).all()) and bool(((report[0] - info.iterations).abs() <= 1).all())
     for found in (u, v):
@@ -148,19 +143,7 @@ def test_plain_tensors_take_the_same_iterations(name, solver):
     for k in (0, 1, 3):
         method = solver(k)
         u, info = prdp.linear_solve(a, b, method)
-        v, report = _C.solve_with_tensors(
-            b,
-            a.tensors,
-            a.kind,
-            a.shape,
-            a.parameters,
-            False,
-            method.method,
-            k,
-            0.0,
-            method.restart,
-            preconditioner="diagonal",
-        )
+        v, report = in_plain_tensors(a, b, method)
         torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10 * float(u.abs().max()))
         torch.testing.assert_close(info.operator_applications, report[3])
 
@@ -225,19 +208,7 @@ def test_a_diagonal_matrix_takes_one_iteration_however_its_entries_spread(solver
     b, status = torch.ones(1, 4, dtype=dtype), "CONVERGED" if solver is cg else "CONVERGED_BREAKDOWN"
     if plain:
         a = operators.Matrix(d.diag())
-        u, report = _C.solve_with_tensors(
-            b,
-            a.tensors,
-            a.kind,
-            a.shape,
-            a.parameters,
-            False,
-            solver(1).method,
-            1,
-            1e-5,
-            3,
-            preconditioner="diagonal",
-        )
+        u, report = in_plain_tensors(a, b, solver(1, 1e-5))
         assert prdp.SolveStatus(report[2].item()).name == status
     else:
         u, info = prdp.linear_solve(d.diag(), b, solver(1, 1e-5))
