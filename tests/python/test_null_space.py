@@ -190,3 +190,17 @@ def test_in_float32_more_iterations_than_the_dtype_needs_do_no_harm(boundary, pr
         assert info.residual.max() < 5e-5
     _, info = prdp.linear_solve(a, b, prdp.CG(600, rtol=1e-8, preconditioner=preconditioner))
     assert statuses(info) == ["STAGNATED"] and 0 < info.residual.max() < 5e-5
+
+
+def test_functions_stay_at_the_floor_as_stencils_do():
+    def matvec(v):
+        return 4 * v - sum(v.roll(step, axis) for step in (-1, 1) for axis in (-1, -2))
+
+    b = torch.randn(2, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    b = b - b.mean((-1, -2), keepdim=True)
+    a = operators.Function(matvec, symmetric=True, nullspace="constant")
+    for k in (200, 600):
+        u, info = prdp.linear_solve(a, b, prdp.CG(k, rtol=0.0))
+        left = (b - matvec(u)).double()
+        assert statuses(info) == ["MAX_ITER"] * 2
+        assert (left.flatten(1).norm(dim=1) < 5e-5 * b.double().flatten(1).norm(dim=1)).all()

@@ -33,7 +33,7 @@ class NullSpace {
     return static_cast<T>(std::sqrt(part2));
   }
 
-  int64_t first() const { return first_; }
+  int64_t count() const { return std::ssize(basis_); }
   /// The basis as contiguous vectors of one field.
   std::vector<std::vector<double>> contiguous() const {
     std::vector<std::vector<double>> all;

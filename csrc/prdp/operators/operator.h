@@ -50,6 +50,9 @@ class Operator {
   /// which no product changes; v itself if A is regular. Differentiable.
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
   virtual at::Tensor project_solution(const at::Tensor& v) const { return project(v); }
+  /// Whether rounding leaves parts along the null spaces in what methods carry on, which no product takes away; as of
+  /// operators whose null space somebody named.
+  virtual bool leaks() const { return false; }
   /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
   /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;

@@ -33,17 +33,17 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
 }  // namespace
 
 SingularOperator::SingularOperator(std::unique_ptr<Operator> a, at::Tensor right, at::Tensor left, const char* title)
-    : a_(std::move(a)), right_(right.detach()), left_(left.detach()), title_(title) {
-  const auto count = [&](const at::Tensor& basis) { return is_constant(basis) ? c10::SymInt(1) : basis.sym_size(0); };
-  TORCH_CHECK_VALUE(count(right_) == count(left_), title_,
-                    ": nullspace and left_nullspace must hold as many vectors, got ", count(right_), " and ",
-                    count(left_));
+    : a_(std::move(a)), right_{right.detach(), {}}, left_{left.detach(), {}}, title_(title) {
+  TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
+                    ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
+                    left_.count());
 }
 
 void SingularOperator::check_vector(const at::Tensor& b) const {
   a_->check_vector(b);
-  for (const auto& basis : {right_, left_}) {
-    if (is_constant(basis)) continue;
+  for (const auto* side : {&right_, &left_}) {
+    if (side->is_constant()) continue;
+    const auto& basis = side->given;
     const auto channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
     TORCH_CHECK_VALUE(basis.dim() >= 2 && basis.sym_sizes().slice(1) == channel, title_,
                       ": a null space must have shape (k, *shape) with the shape of a channel, ", channel, ", got ",
@@ -53,35 +53,38 @@ void SingularOperator::check_vector(const at::Tensor& b) const {
   }
 }
 
-at::Tensor SingularOperator::orthonormal(const at::Tensor& basis, const at::Tensor& v) const {
-  if (is_constant(basis)) {
+at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v) const {
+  if (basis.is_constant()) {
     const auto n = by_channel(v).sym_size(-1);
     return at::full_symint({1, n}, 1.0 / std::sqrt(static_cast<double>(n.expect_int())), v.options());
   }
-  return orthonormalised(basis.flatten(1).to(at::kDouble), title_).to(v.scalar_type());
+  if (!basis.orthonormal.defined()) basis.orthonormal = orthonormalised(basis.given.flatten(1).to(at::kDouble), title_);
+  return basis.orthonormal.to(v.scalar_type());
 }
 
-at::Tensor SingularOperator::without(const at::Tensor& basis, const at::Tensor& v) const {
+at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) const {
   const auto channels = by_channel(v);
-  if (is_constant(basis)) return (channels - channels.mean({-1}, /*keepdim=*/true)).reshape_as(v);
+  if (basis.is_constant()) return (channels - channels.mean({-1}, /*keepdim=*/true)).reshape_as(v);
   const auto q = orthonormal(basis, v.detach());
   return (channels - at::matmul(at::matmul(channels, q.mT()), q)).reshape_as(v);
 }
 
-void SingularOperator::check_is_mapped_to_zero(const at::Tensor& basis, const at::Tensor& b, bool transposed) const {
-  const at::NoGradGuard no_grad;
-  const auto product = [&](const at::Tensor& v) { return apply_on_loops(*a_, v, transposed); };
-  // How large products can be: that of a vector which changes its sign from point to point.
-  const auto alternating = 1.0 - 2.0 * at::arange(by_channel(b).size(-1), b.options()).remainder(2.0);
-  const auto largest = [](const at::Tensor& v) { return v.abs().amax().item<double>(); };
-  const auto as_vector = [&](const at::Tensor& q) { return q.expand_as(by_channel(b)).reshape_as(b); };
-  const double magnitude = largest(product(as_vector(alternating)));
+namespace {
+
+double largest(const at::Tensor& v) { return v.abs().amax().item<double>(); }
+/// A vector like b with q, (n,), in each channel.
+at::Tensor as_vector(const at::Tensor& q, const at::Tensor& b) { return q.expand_as(by_channel(b)).reshape_as(b); }
+
+}  // namespace
+
+void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude,
+                                               bool transposed) const {
   const auto q = orthonormal(basis, b);
   const double rounding = 200.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
                                                                  : std::numeric_limits<double>::epsilon());
   for (int64_t k = 0; k < q.size(0); ++k) {
     const auto v = q[k] / q[k].abs().amax();
-    const double left = largest(product(as_vector(v)));
+    const double left = largest(apply_on_loops(*a_, as_vector(v, b), transposed));
     if (!std::isfinite(left) || !std::isfinite(magnitude)) return;  // said of each sample by its status
     TORCH_CHECK_VALUE(left <= rounding * magnitude, title_, ": vector ", k, " of ",
                       transposed ? "left_nullspace" : "nullspace", " is not in the null space of ",
@@ -92,8 +95,12 @@ void SingularOperator::check_is_mapped_to_zero(const at::Tensor& basis, const at
 
 void SingularOperator::check_null_spaces(const at::Tensor& b) const {
   if (b.numel() == 0) return;
-  check_is_mapped_to_zero(right_, b, /*transposed=*/false);
-  check_is_mapped_to_zero(left_, b, /*transposed=*/true);
+  const at::NoGradGuard no_grad;
+  // How large products can be: that of a vector which changes its sign from point to point.
+  const auto alternating = 1.0 - 2.0 * at::arange(by_channel(b).size(-1), b.options()).remainder(2.0);
+  const double magnitude = largest(apply_on_loops(*a_, as_vector(alternating, b), /*transpose=*/false));
+  check_is_mapped_to_zero(right_, b, magnitude, /*transposed=*/false);
+  check_is_mapped_to_zero(left_, b, magnitude, /*transposed=*/true);
 }
 
 namespace {
@@ -136,13 +143,13 @@ std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda,
 
 std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
   auto chosen = a_->select(index);
-  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), right_, left_, title_) : nullptr;
+  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), right_.given, left_.given, title_) : nullptr;
 }
 
 std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {
   const auto regular = a_->kernels(b, transposed);
   if (!regular) return nullptr;
-  const auto rows_of = [&](const at::Tensor& basis) {
+  const auto rows_of = [&](const Basis& basis) {
     const auto q = orthonormal(basis, b.detach()).to(at::kDouble).contiguous();
     std::vector<std::vector<double>> rows;
     for (int64_t k = 0; k < q.size(0); ++k)

@@ -27,6 +27,7 @@ class SingularOperator final : public Operator {
   at::Tensor norm() const override { return a_->norm(); }
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
   at::Tensor project_solution(const at::Tensor& v) const override { return without(right_, v); }
+  bool leaks() const override { return true; }
   at::Tensor solve_directly(const at::Tensor& b) const override;
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
@@ -37,14 +38,22 @@ class SingularOperator final : public Operator {
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
-  bool is_constant(const at::Tensor& basis) const { return basis.sym_numel() == 0; }
+  struct Basis {
+    at::Tensor given;  // (k, *shape), or empty for the constant vector
+    mutable at::Tensor orthonormal;  // (k, n) in double, once it has been asked for
+
+    bool is_constant() const { return given.sym_numel() == 0; }
+    c10::SymInt count() const { return is_constant() ? c10::SymInt(1) : given.sym_size(0); }
+  };
+
   /// An orthonormal basis (k, n) in the dtype of v, with n the unknowns of a channel.
-  at::Tensor orthonormal(const at::Tensor& basis, const at::Tensor& v) const;
-  at::Tensor without(const at::Tensor& basis, const at::Tensor& v) const;
-  void check_is_mapped_to_zero(const at::Tensor& basis, const at::Tensor& b, bool transposed) const;
+  at::Tensor orthonormal(const Basis& basis, const at::Tensor& v) const;
+  at::Tensor without(const Basis& basis, const at::Tensor& v) const;
+  /// `magnitude`: how large an entry of a product can be.
+  void check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude, bool transposed) const;
 
   std::unique_ptr<Operator> a_;
-  at::Tensor right_, left_;
+  Basis right_, left_;
   const char* title_;
 };
 

@@ -58,7 +58,8 @@ class TensorSpace {
   Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     x = keep_frozen(x + alpha * p, x);
-    r = keep_frozen(r - alpha * q, r);
+    const auto left = r - alpha * q;
+    r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
     return dot(r, r);
   }
 
