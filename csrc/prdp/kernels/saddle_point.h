@@ -20,7 +20,8 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
       : a_(a),
         transpose_(transpose),
         sweeps_(kSweepsPerSmoothing * smoothing),
-        laplacian_(laplacian_of(a.parameters())) {
+        spacing_(a.parameters()),
+        laplacian_(laplacian_of(a.parameters(), spacing_)) {
     cycle_ = Multigrid<T>::make(*laplacian_, nullptr, smoothing);
     memory_.prepare(kVectors, a.length(), a.layout().halo);
   }
@@ -52,13 +53,19 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
   enum Vector { kInput, kOutput, kScaled, kX, kY, kVectors };
   static constexpr int64_t kSweepsPerSmoothing = 2;
 
+  /// 1/dy² and 1/dx², 0 for an axis of one cell, and the larger of them.
+  struct Spacing {
+    explicit Spacing(const UpwindParameters<T>& p)
+        : y(p.ny > 1 ? std::pow(static_cast<double>(p.ny) / p.length_y, 2) : 0.0),
+          x(p.nx > 1 ? std::pow(static_cast<double>(p.nx) / p.length_x, 2) : 0.0),
+          largest(std::max(x, y)) {}
+    double y, x, largest;
+  };
+
   /// -L on the pressure, times the square of the smaller spacing.
-  static std::unique_ptr<Stencil<T>> laplacian_of(const UpwindParameters<T>& p) {
-    const double y = p.ny > 1 ? std::pow(static_cast<double>(p.ny) / p.length_y, 2) : 0.0;
-    const double x = p.nx > 1 ? std::pow(static_cast<double>(p.nx) / p.length_x, 2) : 0.0;
-    const double largest = std::max(x, y);
-    const T along[] = {static_cast<T>(2 * (x + y) / largest), static_cast<T>(-x / largest),
-                       static_cast<T>(-x / largest), static_cast<T>(-y / largest), static_cast<T>(-y / largest)};
+  static std::unique_ptr<Stencil<T>> laplacian_of(const UpwindParameters<T>& p, const Spacing& of) {
+    const T y = static_cast<T>(-of.y / of.largest), x = static_cast<T>(-of.x / of.largest);
+    const T along[] = {static_cast<T>(2 * (of.x + of.y) / of.largest), x, x, y, y};
     auto rows = std::make_shared<StencilRows<T>>(p.pattern(2));
     for (int64_t j = 0; j < p.ny; ++j)
       for (int64_t k = 0; k < 5; ++k) std::fill_n(rows->coefficient(j, k), p.nx, along[k]);
@@ -74,15 +81,13 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
   /// p = Ŝ⁻¹ r
   void solve_schur(const T* r, T* p) {
     const auto& of = a_.parameters();
-    const double y = of.ny > 1 ? static_cast<double>(of.ny) / of.length_y : 0.0;
-    const double x = of.nx > 1 ? static_cast<double>(of.nx) / of.length_x : 0.0;
-    const double largest = std::pow(std::max(x, y), 2), factor = static_cast<double>(a_.factor());
+    const double factor = static_cast<double>(a_.factor());
     if (cycle_) cycle_->apply(r, p);
     else vectors_.fill_zero(p, plane());
-    vectors_.scale(static_cast<T>(1.0 / (of.dt * largest * factor)), p, p, plane());
+    vectors_.scale(static_cast<T>(1.0 / (of.dt * spacing_.largest * factor)), p, p, plane());
     vectors_.axpy(static_cast<T>(of.nu / factor), r, p, plane());
   }
-  /// u = Ĉ⁻¹ r; r is overwritten.
+  /// u = Ĉ⁻¹ r
   void solve_velocity(const NavierStokes<T>& a, const T* r, T* u) {
     for (int64_t channel = 0; channel < 2; ++channel) {
       const Stencil<T> c(a.velocity(channel), 1, T(1));
@@ -98,6 +103,7 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
   const NavierStokes<T>& a_;
   const NavierStokes<T>* transpose_;
   int64_t sweeps_;
+  Spacing spacing_;
   std::unique_ptr<Stencil<T>> laplacian_;
   std::unique_ptr<Multigrid<T>> cycle_;
   Workspace<T> memory_;

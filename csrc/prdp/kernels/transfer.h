@@ -28,7 +28,6 @@ class Transfer {
   /// For the points of `grid`.
   Transfer(const StencilGrid& grid, int axis, const AxisTransfer<T>& weights, bool symmetric);
 
-  int axis() const { return axis_; }
   /// The grid of the coarse points.
   const StencilGrid& coarse() const { return coarse_; }
   int64_t bytes() const;

@@ -10,15 +10,6 @@
 /// Scaling, finiteness and memory of the vectors of one sample.
 namespace prdp::kernels {
 
-/// A singular operator that knows its null space: the kernel's project() takes it off a vector.
-template <class Kernel>
-inline constexpr bool kHasNullSpace = requires(const Kernel& a, typename Kernel::Scalar* v) { a.project(v); };
-
-/// Whether the spectrum of I - D⁻¹A is known; there it is symmetric, so that norms of Jacobi's residuals
-/// are a convex sequence on a logarithmic scale.
-template <class Kernel>
-inline constexpr bool kHasSpectrum = requires(const Kernel& kernel) { kernel.radius(); };
-
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
