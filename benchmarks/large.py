@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 import prdp_torch as prdp
+from benchmarks import volumes
 from prdp_torch import _C
 from prdp_torch.operators import Diffusion
 
@@ -95,29 +96,12 @@ def ours(solver):
 
 def assembled(kappa):
     """The matrix of `Diffusion`, float64."""
-    import scipy.sparse as sp
+    import scipy.sparse
 
     k = kappa[0].numpy()
-    side = len(k)
-    index = np.arange(side * side).reshape(side, side)
-    diagonal = np.zeros((side, side))
-    rows, columns, values = [], [], []
-    for axis in (0, 1):
-        low, high = (slice(None, -1), slice(None)), (slice(1, None), slice(None))
-        low, high = (low, high) if axis == 0 else (low[::-1], high[::-1])
-        face = 2 * k[low] * k[high] / (k[low] + k[high]) * side**2
-        diagonal[low] += face
-        diagonal[high] += face
-        for end in (0, -1):
-            at = (end, slice(None)) if axis == 0 else (slice(None), end)
-            diagonal[at] += 2 * k[at] * side**2
-        for of, to in ((low, high), (high, low)):
-            rows.append(index[of].ravel())
-            columns.append(index[to].ravel())
-            values.append(-face.ravel())
-    rows, columns, values = (np.concatenate(part) for part in (rows, columns, values))
-    off = sp.coo_array((values, (rows, columns)), shape=(side**2, side**2))
-    return (off + sp.diags_array(diagonal.ravel())).tocsr()
+    cells = np.arange(k.size).reshape(k.shape)
+    held = np.concatenate([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
+    return len(k) ** 2 * scipy.sparse.csr_matrix(volumes.entries(k.ravel(), volumes.neighbours(cells), held))
 
 
 def scipy_lu(kappa, b):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import prdp_torch as prdp
+from benchmarks import volumes
 from prdp_torch.operators import Diffusion, Stencil
 
 F64 = torch.float64
@@ -203,3 +204,14 @@ def test_it_is_the_stencil_with_its_coefficients(boundary):
         ours, theirs = (prdp.linear_solve(x, b, solver, on_failure="return")[0] for x in (a, stencil))
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(a.apply(v), stencil.apply(v), rtol=1e-12, atol=1e-10)
+
+
+@pytest.mark.parametrize("shape", [(5,), (4, 4), (3, 3, 3)])
+def test_the_benchmarks_hand_the_same_matrix_to_their_rivals(shape):
+    kappa = torch.rand(1, *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
+    cells = np.arange(kappa.numel()).reshape(shape)
+    held = np.concatenate([np.take(cells, end, axis).ravel() for axis in range(len(shape)) for end in (0, -1)])
+    values, places = volumes.entries(kappa.flatten().numpy(), volumes.neighbours(cells), held)
+    found = np.zeros((cells.size, cells.size))
+    np.add.at(found, places, shape[0] ** 2 * values)
+    np.testing.assert_allclose(found, Diffusion(kappa).dense(), rtol=1e-13, atol=1e-12)

@@ -1,8 +1,9 @@
 """SciPy: the same finite volumes, a sparse LU factorisation, and the adjoint by hand."""
 
 import numpy as np
-import scipy.sparse
 import scipy.sparse.linalg
+
+from benchmarks import volumes
 
 
 class Volumes:
@@ -11,9 +12,7 @@ class Volumes:
     def __init__(self, plate):
         self.plate = plate
         cells = np.arange(plate.ny * plate.nx).reshape(plate.ny, plate.nx)
-        self.pairs = np.concatenate(
-            [np.stack([a.ravel(), b.ravel()]) for a, b in ((cells[:, :-1], cells[:, 1:]), (cells[:-1], cells[1:]))], 1
-        )
+        self.pairs = volumes.neighbours(cells)
         self.left, self.right = cells[:, 0], cells[:, -1]
         self.b = np.zeros(cells.size)
         self.b[self.right] = plate.flux * plate.h
@@ -42,14 +41,7 @@ class Volumes:
         return float((q * h * (t[self.right] + q * h / (2 * k[self.right]))).sum())
 
     def _factorised(self, rho):
-        k = self.plate.conductivity(rho).ravel()
-        i, j = self.pairs
-        weight = 2 * k[i] * k[j] / (k[i] + k[j])
-        diagonal = np.zeros(k.size)
-        for cells, added in ((i, weight), (j, weight), (self.left, 2 * k[self.left])):
-            np.add.at(diagonal, cells, added)
-        entries = (np.concatenate([-weight, -weight, diagonal]),
-                   (np.concatenate([i, j, np.arange(k.size)]), np.concatenate([j, i, np.arange(k.size)])))  # fmt: skip
+        entries = volumes.entries(self.plate.conductivity(rho).ravel(), self.pairs, self.left)
         return scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(entries), permc_spec="MMD_AT_PLUS_A")
 
     def _of_conductivity(self, k, t, adjoint):
