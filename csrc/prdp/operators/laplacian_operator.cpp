@@ -1,8 +1,12 @@
 #include "prdp/operators/laplacian_operator.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include <cmath>
 
 #include "prdp/kernels/laplacian.h"
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/disguises.h"
 
 namespace prdp {
 
@@ -57,7 +61,9 @@ at::Tensor HeatOperator::apply(const at::Tensor& v) const { return v - (step_.nu
 
 std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, u - ν Δt L u⟩/∂ν = -Δt ⟨λ, L u⟩
-  const auto derivative = (lambda * laplacian(u, grid_)).sum() * -step_.dt;
+  const bool by_loops = !at::GradMode::is_enabled() && is_plain(u) && is_plain(lambda) && !has_tangent(u);
+  const auto lu = by_loops ? apply_on_loops(PoissonOperator(grid_), u, /*transposed=*/false) : laplacian(u, grid_);
+  const auto derivative = (lambda * lu).sum() * -step_.dt;
   return {derivative.to(step_.nu.options())};
 }
 

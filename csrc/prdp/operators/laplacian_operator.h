@@ -38,6 +38,7 @@ class LaplacianOperator : public Operator {
 class PoissonOperator final : public LaplacianOperator {
  public:
   explicit PoissonOperator(const OperatorSpec& spec);
+  explicit PoissonOperator(Grid grid) : LaplacianOperator(std::move(grid)) {}
   at::Tensor apply(const at::Tensor& v) const override { return laplacian(v, grid_); }
   std::unique_ptr<Operator> select(const at::Tensor&) const override {
     return std::make_unique<PoissonOperator>(*this);
