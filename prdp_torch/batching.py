@@ -26,7 +26,7 @@ def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
     if isinstance(rest[-1], torch.Tensor):  # x0, the last argument where there is one
         rest = *rest[:-1], in_batch(rest[-1], in_dims[-1])
     results = op(in_batch(b, in_dims[0]), folded, kind, shape, *rest)
-    return [t.unflatten(0, (size, -1)) for t in results], [0] * len(results)
+    return [t.unflatten(0, (size, samples)) for t in results], [0] * len(results)
 
 
 def _fold(tensors, mapped, kind, axes, size, batch):
@@ -60,8 +60,28 @@ def _one_by_one(op, info, in_dims, arguments):
         return argument if dim is None else argument.select(dim, i)
 
     results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
-    stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
+    if results:
+        stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
+    else:
+        stacked = _no_entries(op, in_dims, arguments)
     return stacked, tree_map(lambda _: 0, stacked)
+
+
+def _no_entries(op, in_dims, arguments):
+    """What one after the other gives where the mapped axis is empty: tensors without memory tell its shapes."""
+    devices = []
+
+    def without_memory(argument, dim):
+        if isinstance(dim, (list, tuple)):
+            return [without_memory(*pair) for pair in zip(argument, dim, strict=True)]
+        if not isinstance(argument, torch.Tensor):
+            return argument
+        devices.append(argument.device)
+        shape = [n for axis, n in enumerate(argument.shape) if axis != dim]
+        return argument.new_empty(shape, device="meta")
+
+    one = op(*without_memory(arguments, in_dims))
+    return tree_map(lambda t: t.new_empty((0, *t.shape), device=devices[0]), one)
 
 
 def _loop(op):

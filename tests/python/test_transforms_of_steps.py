@@ -224,3 +224,27 @@ def test_a_bad_viscosity_is_refused_under_vmap_too():
     u = field((5,))
     with pytest.raises(ValueError, match="nu must be finite and >= 0"):
         vmap(lambda nu: heat(nu, "implicit")(u))(torch.tensor([0.1, -0.1], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_vmap_over_an_axis_without_entries(backward):
+    """As torch's own operations: the shapes of the entries with a zero in front."""
+    none, nus = torch.randn(0, 4, 1, 6), torch.rand(0)
+    state, matrices = torch.randn(4, 1, 6), torch.randn(0, 6, 6)
+
+    def step(u, nu):
+        return prdp.Heat((6,), nu, 1.0, prdp.CG(3), backward)(u)
+
+    def loss(u, nu):
+        return step(u, nu).sum()
+
+    def solve(a, b):
+        return prdp.linear_solve(a, b, prdp.CG(3), backward=backward)[0]
+
+    assert vmap(lambda u: step(u, 1e-3))(none).shape == (0, 4, 1, 6)
+    assert vmap(lambda nu: step(state, nu))(nus).shape == (0, 4, 1, 6)
+    assert vmap(grad(lambda nu: loss(state, nu)))(nus).shape == (0,)
+    assert [g.shape for g in vmap(grad(loss, (0, 1)))(none, nus)] == [(0, 4, 1, 6), (0,)]
+    assert vmap(solve)(matrices, none[:, :, 0]).shape == (0, 4, 6)
+    scaled = vmap(lambda k, b: solve(prdp.operators.Function(lambda v, k: k * v, tensors=(k,)), b))
+    assert scaled(matrices[:, 0], none[:, :, 0]).shape == (0, 4, 6)
