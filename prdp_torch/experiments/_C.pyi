@@ -4,7 +4,7 @@ import os
 import pathlib
 import torch
 import typing
-__all__: list[str] = ['Checkpoint', 'Compare', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'without_mean_pressure', 'write_training', 'write_whole']
+__all__: list[str] = ['Checkpoint', 'Compare', 'DARCY_SOURCE', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'without_mean_pressure', 'write_training', 'write_whole']
 class Saved:
     """
     The named tensors of a file, each of which is asked for and checked.
@@ -204,6 +204,9 @@ class Scene:
     def prdp(self) -> dict:
         ...
     @property
+    def preconditioner(self) -> str:
+        ...
+    @property
     def restart(self) -> int:
         ...
     @property
@@ -323,7 +326,7 @@ def refuse_finished(record: os.PathLike | str | bytes, intervals: typing.Support
     ...
 def relative_error(theta: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
     ...
-def roughness(theta: torch.Tensor, lengths: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex] = []) -> torch.Tensor:
+def roughness(theta: torch.Tensor, physics: Physics) -> torch.Tensor:
     ...
 def scene_keys() -> list:
     ...
@@ -339,4 +342,5 @@ def write_training(path: os.PathLike | str | bytes, object: str, weights: str) -
     ...
 def write_whole(path: os.PathLike | str | bytes, content: str) -> None:
     ...
+DARCY_SOURCE: float = 10.0
 MOST_COUNTED: int = 1000000000

@@ -49,8 +49,10 @@ def make_stepper(scene, direct=False, max_iter=None):
         "on_failure": scene.on_failure,
         "start": scene.start,
     }
-    if physics.equation == "diffusion":
+    if scene.task == "field":
         return field_task.make_stepper(scene, **options)
+    if physics.equation == "darcy":
+        return field_task.make_darcy_step(scene, **options)
     if physics.equation == "poisson":
         return steppers.Poisson(physics.shape, length=physics.length, **options)
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
@@ -59,4 +61,6 @@ def make_stepper(scene, direct=False, max_iter=None):
 
 def _solver(scene, max_iter):
     extra = {"restart": scene.restart} if scene.method == "gmres" else {}
+    if scene.preconditioner and scene.method != "multigrid":
+        extra["preconditioner"] = scene.preconditioner
     return _SOLVERS[scene.method](max_iter=max_iter, rtol=scene.rtol, **extra)

@@ -38,11 +38,11 @@ class Trajectories:
 
 def collect(scene, rows, folder, on_data=None):
     """Follow the validation samples with the networks of converged training and of PRDP, whose weights lie
-    beside their records in `folder`. None for a task without a network, or if there are no weights at all.
+    beside their records in `folder`. None for a task without a network or without time, or if there are no weights.
 
     on_data: called while the reference is made with (steps of a sample done, all of them).
     """
-    if not scene.trains_network:
+    if not scene.trains_network or scene.physics.equation == "darcy":
         return None
     rows = [row for row in rows if row.kind in ("converged", "prdp")]
     networks = {row.label: _networks(scene, row, folder) for row in rows}

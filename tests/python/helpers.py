@@ -33,6 +33,11 @@ SMALL_FIELD = (
     ("updates = 150\nupdates = 150", "updates = 30\nupdates = 30"),
     ("initial = 10", "initial = 2"),
 )
+SMALL_DARCY = (
+    ("shape = [64, 64]", "shape = [10, 12]"),
+    ("\nstates = 4", "\nstates = 3"),
+    ("updates = 150\nupdates = 150", "updates = 30\nupdates = 30"),
+)
 
 
 def golden(name):
@@ -158,6 +163,11 @@ def tiny(tmp_path, *changes, name="tiny"):
 def small_field(tmp_path, *changes, name="small"):
     """The path of a small copy of the scene diffusion_inverse, with replacements."""
     return written(tmp_path, *SMALL_FIELD, *changes, scene="diffusion_inverse", name=name)
+
+
+def small_darcy(tmp_path, *changes, name="small"):
+    """The path of a small copy of the scene darcy_inverse, with replacements."""
+    return written(tmp_path, *SMALL_DARCY, *changes, scene="darcy_inverse", name=name)
 
 
 def reseal(path, state):

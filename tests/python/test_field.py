@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import assert_refused, small_field
+from helpers import assert_refused, small_darcy, small_field
 
 from prdp_torch import operators
 from prdp_torch.experiments import _C, compare, field_task, scenes
@@ -51,11 +51,14 @@ def test_the_stencil_is_the_sum_of_its_fluxes(shape):
     )
 
 
-def test_the_roughness_is_the_mean_square_of_the_gradient():
+def test_the_roughness_is_the_mean_square_of_the_gradient(tmp_path):
     theta = random_kappa(4, 6)
     t = theta.numpy()
     slopes = [n * (np.roll(t, -1, axis) - t) for axis, n in enumerate(t.shape)]
-    np.testing.assert_allclose(_C.roughness(theta), (slopes[0] ** 2 + slopes[1] ** 2).mean(), rtol=1e-14)
+    periodic, box = scenes.load(small_field(tmp_path)).physics, scenes.load(small_darcy(tmp_path)).physics
+    np.testing.assert_allclose(_C.roughness(theta, periodic), (slopes[0] ** 2 + slopes[1] ** 2).mean(), rtol=1e-14)
+    inner = (slopes[0][:-1] ** 2).mean() + (slopes[1][:, :-1] ** 2).mean()
+    np.testing.assert_allclose(_C.roughness(theta, box), inner, rtol=1e-14)
 
 
 def test_the_snapshots_are_states_of_the_field_with_noise(tmp_path):
@@ -81,22 +84,38 @@ def test_the_snapshots_are_states_of_the_field_with_noise(tmp_path):
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.2
 
 
+def test_the_pressures_of_a_darcy_flow_solve_its_equation(tmp_path):
+    scene = scenes.load(small_darcy(tmp_path, DOUBLE, ("noise = 0.005", "noise = 0.0")))
+    problem = _C.make_field_problem(scene, 0)
+    a = operators.Diffusion(problem.reference[None], length=scene.physics.length).dense()
+    assert problem.start.shape == (3, 1, 10, 12) and problem.snapshots.shape == (3, 1, 1, 10, 12)
+    expected = np.linalg.solve(a.numpy(), problem.start.flatten(1).numpy().T).T
+    np.testing.assert_allclose(problem.snapshots.flatten(1), expected, rtol=1e-9, atol=1e-12)
+    # The sources are series in the centres of the cells, where whole waves sum to nothing.
+    np.testing.assert_allclose(problem.start.sum((-1, -2)), 0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("backward", ["implicit", "unrolled"])
-def test_the_gradient_of_the_loss(tmp_path, backward):
-    """Against finite differences, through the assembly, the rollout and the snapshots, of nearly exact solves."""
+@pytest.mark.parametrize("equation", ["diffusion", "darcy"])
+def test_the_gradient_of_the_loss(tmp_path, backward, equation):
+    """Against finite differences, through the assembly, the solves and what is observed, of nearly exact solves."""
     changes = [("shape = [10, 12]", "shape = [3, 4]"), ('"implicit"', f'"{backward}"')]
-    scene = scenes.load(small_field(tmp_path, DOUBLE, EXACT, *changes))
+    if equation == "darcy":
+        changes.append(('preconditioner = "multigrid"\nmax_iter = 20', "max_iter = 200"))
+    make = {"diffusion": small_field, "darcy": small_darcy}[equation]
+    scene = scenes.load(make(tmp_path, DOUBLE, EXACT, *changes))
     problem = _C.make_field_problem(scene, 0)
     stepper = scenes.make_stepper(scene)
 
     def loss(theta):
-        return field_task.misfit(scene, stepper, problem, theta) + 1e-3 * _C.roughness(theta)
+        return field_task.misfit(scene, stepper, problem, theta) + 1e-3 * _C.roughness(theta, scene.physics)
 
     theta = (problem.theta + random_kappa(3, 4)).requires_grad_()
     assert torch.autograd.gradcheck(loss, theta, eps=1e-5, atol=1e-8, rtol=1e-6)
     loss(theta).backward()
     assert stepper.converged
-    assert backward == "unrolled" or stepper.adjoint_info.iterations.shape == (3, 6)
+    solves = (3, 6) if equation == "diffusion" else (3,)
+    assert backward == "unrolled" or stepper.adjoint_info.iterations.shape == solves
 
 
 def in_cpp(tmp_path, path, *arguments):
@@ -117,8 +136,9 @@ def in_cpp(tmp_path, path, *arguments):
     ],
     ids=["auto", "constant", "direct", "prdp"],
 )
-def test_both_languages_train_alike(tmp_path, arguments, refinement):
-    path = small_field(tmp_path)
+@pytest.mark.parametrize("make", [small_field, small_darcy])
+def test_both_languages_train_alike(tmp_path, arguments, refinement, make):
+    path = make(tmp_path)
     scene = scenes.load(path)
     cpp, python = in_cpp(tmp_path, path, *arguments), train(scene, refinement(scene))
     assert set(cpp) == set(python) and all(len(cpp[key]) == len(python[key]) for key in cpp if key != "warning")

@@ -31,7 +31,7 @@ def applies(words, content):
     chosen = {content["task"], content["physics"]["equation"], content["solver"]["method"]}
     chosen |= {content.get("network", {}).get("kind")}
     chosen |= {*content.get("data", {}), *content["training"]}
-    for part in filter(None, words.split(", ")):
+    for part in filter(None, re.split(", (?=only|not)", words)):
         relation, names = part.split("`", 1)[0].strip(), set(re.findall("`(.*?)`", part))
         assert relation in ("only for", "not for", "not with"), part
         if bool(names & chosen) != (relation == "only for"):
@@ -121,6 +121,7 @@ def test_the_defaults_are_those_of_a_scene_without_the_keys():
         ("physics", "length"): f"{scene.physics.length[0]:g}",
         ("solver", "on_failure"): f"`{scene.on_failure}`",
         ("solver", "start"): f"`{scene.start}`",
+        ("solver", "preconditioner"): f"`{scene.preconditioner or 'none'}`",
         ("data", "file"): scene.data.file or "none",
         ("data", "fresh"): f"`{str(scene.data.fresh).lower()}`",
         ("network", "zero_output"): f"`{str(scene.network.zero_output).lower()}`",

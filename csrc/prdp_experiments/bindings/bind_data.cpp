@@ -1,6 +1,7 @@
 #include <pybind11/functional.h>
 
 #include "prdp_experiments/bindings/bindings.h"
+#include "prdp_experiments/data/darcy.h"
 #include "prdp_experiments/data/data.h"
 #include "prdp_experiments/data/field_problem.h"
 #include "prdp_experiments/data/fresh_data.h"
@@ -44,6 +45,7 @@ void bind_data(py::module_& m) {
         return std::make_pair(stencil.coefficients, stencil.offsets);
       },
       py::arg("kappa"), py::arg("dt"), py::arg("lengths") = std::vector<double>());
+  m.attr("DARCY_SOURCE") = kDarcySource;
   m.def("observed", &observed, py::arg("states"), py::arg("scene"));
-  m.def("roughness", &roughness, py::arg("theta"), py::arg("lengths") = std::vector<double>());
+  m.def("roughness", &roughness, py::arg("theta"), py::arg("physics"));
 }

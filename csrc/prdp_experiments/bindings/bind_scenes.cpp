@@ -78,6 +78,7 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("method", [](const Scene& s) { return name(s.solver.method); })
       .def_property_readonly("max_iter", [](const Scene& s) { return s.solver.max_iter.expect_int(); })
       .def_property_readonly("rtol", [](const Scene& s) { return s.solver.rtol; })
+      .def_property_readonly("preconditioner", [](const Scene& s) { return s.solver.preconditioner.spec().kind; })
       .def_property_readonly("restart", [](const Scene& s) { return s.solver.restart; })
       .def_property(
           "backward", [](const Scene& s) { return name(s.backward); }, &Scene::set_backward)

@@ -5,6 +5,7 @@
 
 #include <numbers>
 
+#include "prdp_experiments/data/darcy.h"
 #include "prdp_experiments/data/data_cache.h"
 #include "prdp_experiments/data/flow_data.h"
 
@@ -18,12 +19,14 @@ at::Tensor shuffled(int64_t samples, at::Generator& generator) {
 
 namespace {
 
-/// The unknowns' places on an axis, as parts of its length: i/N where it is periodic, else between the boundary points,
-/// (i + 1)/(N + 1).
+/// The unknowns' places on an axis, as parts of its length: i/N where it is periodic, (i + 1/2)/N in the centres of
+/// cells, else between the boundary points, (i + 1)/(N + 1).
 at::Tensor unknowns_on_axis(const Scene::Physics& physics, int64_t axis) {
-  const int64_t n = physics.shape[axis], first = physics.periodic() ? 0 : 1;
-  const double dx = 1.0 / static_cast<double>(n + first);
-  return at::arange(first, n + first, at::TensorOptions().dtype(at::kDouble)) * dx;
+  const int64_t n = physics.shape[axis];
+  const bool between_points = !physics.periodic() && !physics.is_darcy();
+  const double first = physics.is_darcy() ? 0.5 : between_points ? 1.0 : 0.0;
+  const double dx = 1.0 / static_cast<double>(n + between_points);
+  return (at::arange(n, at::TensorOptions().dtype(at::kDouble)) + first) * dx;
 }
 
 }  // namespace
@@ -75,9 +78,26 @@ at::Tensor starts(const Scene& scene, int64_t samples) {
 
 constexpr int64_t kSamplesAtOnce = 100;  // between two reports
 
+/// The pressures of log κ, log κ itself, and so on in turn: what a network makes of pressures, and the solver of that.
+at::Tensor in_turn(const Scene& scene, const at::Tensor& log_kappa, int64_t steps, const OnSteps& on_steps) {
+  auto solve = darcy_step(scene.physics, SolveOptions{scene.reference_solver()});
+  std::vector<at::Tensor> pressures;
+  for (const auto& part : log_kappa.split(kSamplesAtOnce)) {
+    pressures.push_back(solve(part));
+    TORCH_CHECK(solve.converged(), "data: a reference solve stopped at a residual of ",
+                solve.info()->residual.max().item<double>());
+    on_steps(steps * part.size(0));
+  }
+  const auto p = at::cat(pressures);
+  std::vector<at::Tensor> states;
+  for (int64_t i = 0; i <= steps; ++i) states.push_back(i % 2 == 0 ? p : log_kappa);
+  return at::stack(states, 1).to(scene.dtype);
+}
+
 /// The states of `steps` steps of the converged equation: (samples, steps + 1, channels, *shape).
 at::Tensor follow(const Scene& scene, at::Tensor u, int64_t steps, const OnSteps& on_steps) {
   const at::NoGradGuard no_grad;
+  if (scene.physics.is_darcy()) return in_turn(scene, u, steps, on_steps);
   if (scene.task == Scene::Task::kCorrector) return follow_flow(scene, u, steps, on_steps).to(scene.dtype);
   auto reference = scene.stepper(scene.reference_solver());
   std::vector<at::Tensor> parts;

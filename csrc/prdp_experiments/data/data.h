@@ -20,7 +20,8 @@ at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
 using OnProgress = std::function<void(int64_t, int64_t)>;
 
 /// The samples of a scene: initial states, and the states after converged steps from them, each
-/// (samples, channels, *shape). Training samples make two steps, validation samples data.valid_steps.
+/// (samples, channels, *shape). Training samples make two steps, validation samples data.valid_steps. Of "darcy" the
+/// states are pressures and log κ in turn.
 struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
   at::Tensor train_first;  // after one step; only for the task "corrector"

@@ -2,15 +2,16 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/steppers/implicit_step.h"
+#include "prdp_experiments/data/darcy.h"
 #include "prdp_experiments/data/data.h"
 
 namespace prdp {
 
 namespace {
 
-/// 1/dx of a periodic axis.
+/// 1/dx of an axis of cells.
 double per_length(const at::Tensor& field, const std::vector<double>& lengths, int64_t axis) {
   return static_cast<double>(field.size(axis)) / (lengths.empty() ? 1.0 : lengths[axis]);
 }
@@ -38,6 +39,31 @@ DiffusionStencil diffusion_stencil(const at::Tensor& kappa, double dt, const std
   return stencil;
 }
 
+FieldModel::FieldModel(const Scene& scene, at::Tensor start, SolveOptions options)
+    : pressure(scene.physics.is_darcy() ? at::zeros_like(start) : at::Tensor()),
+      scene_(scene),
+      start_(std::move(start)),
+      step_([this](const at::Tensor&) { return assembled_; },
+            scene.physics.is_darcy() ? ImplicitStep::RhsAt([this](const at::Tensor&) { return start_; }) : nullptr,
+            std::move(options)) {}
+
+at::Tensor FieldModel::operator()(const at::Tensor& kappa) {
+  const auto& physics = scene_.physics;
+  at::Tensor states;
+  if (physics.is_darcy()) {
+    assembled_ = darcy_operator(kappa.unsqueeze(0), physics);
+    states = step_(pressure);
+    pressure = states.detach();
+    states = states.unsqueeze(1);
+  } else {
+    const auto [coefficients, offsets] = diffusion_stencil(kappa, physics.dt, physics.lengths);
+    assembled_ = stencil(coefficients, offsets, {Boundary::kPeriodic});
+    states = step_.rollout(start_, scene_.field.steps);
+  }
+  if (scene_.on_failure == OnFailure::kZeroGrad) states = detach_failed(states, step_.info()->status);
+  return observed(states, scene_);
+}
+
 FieldProblem make_field_problem(const Scene& scene, int64_t seed) {
   const at::NoGradGuard no_grad;
   const auto& f = scene.field;
@@ -48,11 +74,11 @@ FieldProblem make_field_problem(const Scene& scene, int64_t seed) {
   const auto theta = at::full_like(pattern, f.mean).log();
   const auto reference = (theta + f.contrast * pattern).exp();
 
-  const auto [coefficients, offsets] = diffusion_stencil(reference, scene.physics.dt, scene.physics.lengths);
-  ImplicitStep exact(stencil(coefficients, offsets, {Boundary::kPeriodic}), nullptr, scene.reference_solver());
-  const auto states = observed(exact.rollout(start, f.steps), scene);
-  TORCH_CHECK(exact.converged(), "data: a reference solve stopped at a residual of ",
-              exact.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
+  FieldModel exact(scene, start, SolveOptions{scene.reference_solver()});
+  const auto states = exact(reference);
+  TORCH_CHECK(exact.stepper().converged(), "data: a reference solve stopped at a residual of ",
+              exact.stepper().info()->residual.max().item<double>(),
+              scene.physics.is_darcy() ? "" : "; the scene's dt is too long for it");
   auto generator = make_generator(seed);
   const auto noise = at::randn(states.sizes(), generator, states.options());
   const auto snapshots = states + f.noise * states.square().mean().sqrt() * noise;
@@ -60,16 +86,19 @@ FieldProblem make_field_problem(const Scene& scene, int64_t seed) {
 }
 
 at::Tensor observed(const at::Tensor& states, const Scene& scene) {
+  if (scene.physics.is_darcy()) return states;
   return states.slice(1, scene.field.every, std::nullopt, scene.field.every);
 }
 
-at::Tensor roughness(const at::Tensor& theta, const std::vector<double>& lengths) {
-  at::Tensor squares;
+at::Tensor roughness(const at::Tensor& theta, const Scene::Physics& physics) {
+  at::Tensor sum;
   for (int64_t axis = 0; axis < theta.dim(); ++axis) {
-    const auto slope = (theta.roll(-1, axis) - theta) * per_length(theta, lengths, axis);
-    squares = squares.defined() ? squares + slope.square() : slope.square();
+    const auto after = physics.periodic() ? theta.roll(-1, axis) : theta.slice(axis, 1);
+    const auto here = physics.periodic() ? theta : theta.slice(axis, 0, -1);
+    const auto mean = ((after - here) * per_length(theta, physics.lengths, axis)).square().mean();
+    sum = sum.defined() ? sum + mean : mean;
   }
-  return squares.mean();
+  return sum;
 }
 
 }  // namespace prdp

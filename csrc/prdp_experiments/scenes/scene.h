@@ -21,10 +21,12 @@ struct Scene {
   struct Physics {
     std::string equation;
     std::vector<int64_t> shape;
-    double nu = 0.0, dt = 0.0;  // length²/time, time; poisson has neither, diffusion no nu
+    double nu = 0.0, dt = 0.0;  // length²/time, time; poisson and darcy have neither, diffusion no nu
     std::vector<double> lengths{};  // the sides of the domain, as a Grid takes them: empty where all are 1
 
     bool periodic() const;  // of the grid
+    /// -∇·(κ ∇p) = f on the cells of a box, p = 0 on its sides: no time, and no unknowns on a boundary's neighbours.
+    bool is_darcy() const { return equation == "darcy"; }
     /// The side of the domain along an axis of `shape`.
     double length(int64_t axis) const { return lengths.empty() ? 1.0 : lengths[axis]; }
     /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
@@ -35,7 +37,7 @@ struct Scene {
   };
   struct Data {
     int64_t modes = 0, train = 0, valid = 0, seed = 0;
-    int64_t valid_steps = 0;  // validation horizon in time steps
+    int64_t valid_steps = 1;  // validation horizon in time steps
     // For a corrector: the grid of the reference solution, and the K of the converged solves behind the metric.
     std::vector<int64_t> reference_shape{};
     int64_t valid_max_iter = 0;
@@ -46,10 +48,10 @@ struct Scene {
   };
   struct Network {
     std::string python{};  // "module:Class" of the Python trainer, in place of all the rest
-    std::string kind;             // "mlp" or "resnet"
+    std::string kind;  // "mlp" or "resnet"
     std::vector<int64_t> hidden;  // mlp
     int64_t blocks = 0, width = 0;  // resnet
-    bool zero_output = false;       // whether the last layer starts at zero
+    bool zero_output = false;  // whether the last layer starts at zero
   };
   struct Training {
     std::string loss;  // "nmse" or "mse"
@@ -57,7 +59,7 @@ struct Scene {
     double decay = 1.0;  // factor of the learning rate over decay_steps updates, applied smoothly
     int64_t decay_steps = 1;
     std::optional<int64_t> cosine_updates;  // in place of decay: a cosine down to a tenth over this many updates
-    int64_t batch = 0;      // samples per update; 0 without a network
+    int64_t batch = 0;  // samples per update; 0 without a network
     int64_t intervals = 0;  // epochs, or updates without a network; the controller acts once per interval
   };
   struct Parameters {
@@ -67,8 +69,8 @@ struct Scene {
     // κ = mean·exp(contrast·g), where g is a random Fourier series with this many modes, scaled to max |g| = 1.
     double mean = 0.0, contrast = 0.0;
     int64_t modes = 0;
-    int64_t states = 0, state_modes = 0;  // number and modes of the initial states, also random Fourier series
-    int64_t steps = 0, every = 0;         // time steps of each state, and time steps between snapshots
+    int64_t states = 0, state_modes = 0;  // of the initial states, or sources of darcy: also random Fourier series
+    int64_t steps = 1, every = 1;  // time steps of each state, and time steps between snapshots
     double noise = 0.0;  // its standard deviation, relative to the root mean square of the snapshots
     double smoothing = 0.0;  // weight of the mean of |∇θ|² in the loss; length²
     int64_t seed = 0;

@@ -29,6 +29,10 @@ Task task_from_name(const std::string& name) {
   if (name == "field") return Task::kField;
   return name == "emulator" ? Task::kEmulator : Task::kParameters;
 }
+Preconditioner preconditioner_from_name(const std::string& name) {
+  if (name == "none") return {};
+  return name == "multigrid" ? Preconditioner::multigrid() : Preconditioner::diagonal();
+}
 at::ScalarType dtype_from_name(const std::string& name) { return name == "float32" ? at::kFloat : at::kDouble; }
 
 /// A corrector has a gradient of its own, the other tasks have the solver's alone.
@@ -38,11 +42,13 @@ template <class Section>
 void read_physics(Section& s, Scene& scene) {
   auto& p = scene.physics;
   const When grid{!field(scene).holds && !corrector(scene).holds, "only for `emulator` and `parameters`"};
-  const Choices equations{{"poisson", grid},
-                          {"heat", grid},
-                          {"burgers", grid},
-                          {"navier_stokes", corrector(scene)},
-                          {"diffusion", field(scene)}};
+  const Choices equations{
+      {"poisson", grid},
+      {"heat", grid},
+      {"burgers", grid},
+      {"navier_stokes", corrector(scene)},
+      {"diffusion", field(scene)},
+      {"darcy", {field(scene).holds || scene.task == Task::kEmulator, "only for `field` and `emulator`"}}};
   s.choice(p.equation, equations, {"equation", "the equation"});
   s.wholes(p.shape, 1, {"shape", "unknowns per axis, in 1 to 3 axes: `[N]`, `[Ny, Nx]` or `[Nz, Ny, Nx]`"});
   s.check(!p.shape.empty() && p.shape.size() <= 3, "shape", "expected 1 to 3 extents");
@@ -54,19 +60,28 @@ void read_physics(Section& s, Scene& scene) {
            .means = "side of the domain, one number or one per axis in the order of `shape`",
            .unit = "length",
            .optional = true});
-  const When has_nu{p.equation != "poisson" && p.equation != "diffusion", "not for `poisson` and `diffusion`"};
-  const When has_dt{p.equation != "poisson", "not for `poisson`"};
+  const When has_nu{p.equation != "poisson" && p.equation != "diffusion" && !p.is_darcy(),
+                    "not for `poisson`, `diffusion` and `darcy`"};
+  const When has_dt{p.equation != "poisson" && !p.is_darcy(), "not for `poisson` and `darcy`"};
   s.at_least(p.nu, 0.0, {"nu", "viscosity or diffusivity", "length²/time", has_nu});
   s.above(p.dt, 0.0, {"dt", "time step", "time", has_dt});
 }
 
 template <class Section>
 void read_solver(Section& s, Scene& scene) {
-  const When spectrum{!scene.physics.periodic(), "only for `heat` and `poisson`"};
+  const When spectrum{!scene.physics.periodic() && !scene.physics.is_darcy(), "only for `heat` and `poisson`"};
+  const When coarse_grids{!corrector(scene).holds, "not for `navier_stokes`"};
   Choices methods;
   for (const auto& method : kTraits)
-    methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum : When{});
+    methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum
+                                             : method.method == Method::kMultigrid      ? coarse_grids
+                                                                                        : When{});
   s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
+  const When takes_one{traits(scene.solver.method).takes_preconditioner, "only for `cg`, `bicgstab` and `gmres`"};
+  std::string preconditioner = scene.solver.method == Method::kMultigrid ? "multigrid" : "none";
+  s.choice(preconditioner, {"none", "diagonal", "multigrid"},
+           {.name = "preconditioner", .means = "the preconditioner", .when = takes_one, .optional = true});
+  scene.solver.preconditioner = preconditioner_from_name(preconditioner);
   s.count(scene.solver.max_iter, 1,
           {"max_iter", "K of the converged solver, K_ε in the paper", "iterations (`gmres`: cycles)"});
   s.at_least(scene.solver.rtol, 0.0, {"rtol", "relative residual at which a solve stops; 0 runs exactly K iterations"});
@@ -82,9 +97,11 @@ void read_solver(Section& s, Scene& scene) {
 template <class Section>
 void read_data(Section& s, Scene& scene) {
   auto& d = scene.data;
+  const When in_time{!scene.physics.is_darcy(), "not for `darcy`"};
   s.text(d.file, {.name = "file",
                   .means = "HDF5 or `.npz` file of trajectories, in place of random initial states",
                   .unit = "path relative to the scene file",
+                  .when = in_time,
                   .optional = true});
   const When random{d.file.empty(), "not with `file`"};
   const When emulator{scene.task == Task::kEmulator, "only for `emulator`"};
@@ -94,7 +111,8 @@ void read_data(Section& s, Scene& scene) {
   auto finer = scene.physics.shape;
   for (auto& n : finer) n = 2 * n + 1;
   s.check(!flow.holds || d.reference_shape == finer, "reference_shape", "expected 2 N + 1 for each N of physics.shape");
-  s.whole(d.modes, 1, {"modes", "sine and cosine modes of the random initial states", "", emulator && random});
+  s.whole(d.modes, 1,
+          {"modes", "sine and cosine modes of the random initial states; of `darcy` of log κ", "", emulator && random});
   s.whole(d.seed, 0, {"seed", "seed of the data; every training of the scene uses the same data", "", random});
   s.count(d.valid_max_iter, 1,
           {"valid_max_iter", "K of the converged solves behind the validation metric", "iterations", corrector(scene)});
@@ -106,7 +124,7 @@ void read_data(Section& s, Scene& scene) {
   s.whole(d.valid, 1, {"valid", "validation samples"});
   s.whole(d.valid_steps, 1,
           {"valid_steps", "validation horizon: how many steps the network makes before its error is measured",
-           "time steps"});
+           "time steps", in_time});
 }
 
 template <class Section>
@@ -158,18 +176,19 @@ void read_parameters(Section& s, Scene& scene) {
 template <class Section>
 void read_field(Section& s, Scene& scene) {
   auto& f = scene.field;
+  const When in_time{!scene.physics.is_darcy(), "not for `darcy`"};
   s.above(f.mean, 0.0, {"mean", "geometric mean of κ, and the field to start from", "length²/time"});
   s.at_least(f.contrast, 0.0, {"contrast", "largest |log(κ/mean)| of the field to be found"});
   s.whole(f.modes, 1, {"modes", "sine and cosine modes of log κ"});
-  s.whole(f.states, 1, {"states", "initial states"});
-  s.whole(f.state_modes, 1, {"state_modes", "sine and cosine modes of the initial states"});
-  s.count(f.steps, 1, {"steps", "how far each state is followed", "time steps"});
-  s.whole(f.every, 1, {"every", "time between snapshots, at most `steps`", "time steps"});
+  s.whole(f.states, 1, {"states", "initial states; of `darcy` sources, each with a pressure of its own"});
+  s.whole(f.state_modes, 1, {"state_modes", "sine and cosine modes of the initial states or sources"});
+  s.count(f.steps, 1, {"steps", "how far each state is followed", "time steps", in_time});
+  s.whole(f.every, 1, {"every", "time between snapshots, at most `steps`", "time steps", in_time});
   s.check(f.every <= f.steps, "every", "must be <= steps, for there to be a snapshot");
   s.at_least(f.noise, 0.0,
              {"noise", "standard deviation of the noise, relative to the root mean square of the snapshots"});
   s.at_least(f.smoothing, 0.0, {"smoothing", "weight of the mean of |∇ log κ|² in the loss", "length²"});
-  s.whole(f.seed, 0, {"seed", "seed of the field and of the initial states"});
+  s.whole(f.seed, 0, {"seed", "seed of the field and of the initial states or sources"});
 }
 
 template <class Section>

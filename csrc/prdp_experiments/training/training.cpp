@@ -26,6 +26,7 @@
 #include "prdp_experiments/training/fused_adam.h"
 #include "prdp_experiments/training/loss.h"
 #include "prdp_experiments/training/progress.h"
+#include "prdp_experiments/training/scene_step.h"
 #include "prdp_experiments/training/state.h"
 
 namespace prdp::train {
@@ -245,7 +246,7 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   return network;
 }
 
-using Steppers = std::vector<Stepper>;
+using Steppers = std::vector<SceneStep>;
 
 /// What training a network is about: the loss of a batch, and the metric.
 struct Objective {
@@ -267,7 +268,7 @@ Objective emulator(const Scene& scene, Steppers& steppers, const Dataset& data, 
 }
 
 Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data, torch::nn::AnyModule& network) {
-  const auto corrected = [&](Stepper& stepper, const at::Tensor& u) {
+  const auto corrected = [&](const SceneStep& stepper, const at::Tensor& u) {
     const auto coarse = without_mean_pressure(stepper(u));
     return coarse + network.forward(coarse);
   };
@@ -285,7 +286,7 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
   };
   auto solver = scene.solver;
   solver.max_iter = scene.data.valid_max_iter;
-  const auto metric = [&, corrected, converged = scene.stepper(solver)]() mutable {
+  const auto metric = [&, corrected, converged = scene_step(scene, solver)] {
     auto u = data.valid_start;
     for (int64_t i = 0; i < scene.data.valid_steps; ++i) u = corrected(converged, u);
     return normalised_mse(u.narrow(1, 0, 1), data.valid_end.narrow(1, 0, 1)).item<double>();
@@ -339,7 +340,7 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   return curves;
 }
 
-Curves train_parameters(const Scene& scene, Run& run, Stepper& stepper, const OnInterval& on_interval) {
+Curves train_parameters(const Scene& scene, Run& run, const SceneStep& stepper, const OnInterval& on_interval) {
   const auto problem = make_parameter_problem(scene);
   auto theta = problem.start.clone().requires_grad_();
   // What a user sees, who does not know θ; before the first solve nothing is explained yet.
@@ -376,9 +377,9 @@ Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, con
     return Run(scene, refinement, seed, checkpoint, {&field.stepper()}).go(field.task(), on_interval);
   }
   Steppers steppers;
-  for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene.stepper(solver));
+  for (int64_t i = 0; i < scene.executions(); ++i) steppers.push_back(scene_step(scene, solver));
   std::vector<StepperBase*> solves;
-  for (auto& stepper : steppers) solves.push_back(&stepper);
+  for (const auto& step : steppers) solves.push_back(step.stepper.get());
   Run run(scene, refinement, seed, checkpoint, solves);
   return scene.task == Scene::Task::kParameters
              ? train_parameters(scene, run, steppers[0], on_interval)
