@@ -5,9 +5,8 @@ tensor that is mapped, such as nu, the entries are solved one after the other.
 """
 
 import torch
-from torch.utils._pytree import tree_map
 
-from prdp_torch import _C
+from prdp_torch import _C, torch_private
 
 
 @torch.library.register_vmap("prdp::linear_solve")
@@ -59,9 +58,15 @@ def _one_by_one(op, info, in_dims, arguments):
             return [pick(*pair, i) for pair in zip(argument, dim, strict=True)]
         return argument if dim is None else argument.select(dim, i)
 
-    results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
-    stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
-    return stacked, tree_map(lambda _: 0, stacked)
+    return _stacked([op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)])
+
+
+def _stacked(results):
+    """Results of several calls, each a tensor or a list of results, stacked; and 0 for each, the mapped axis."""
+    if isinstance(results[0], torch.Tensor):
+        return torch.stack(results), 0
+    parts = [_stacked(part) for part in zip(*results, strict=True)]
+    return [stacked for stacked, _ in parts], [axes for _, axes in parts]
 
 
 def _loop(op):
@@ -97,15 +102,6 @@ def product_rule(matvec, cotangent, u, tensors):
 def outlive_transforms(tensors):
     """Tensors without the wrappers of the transforms that run, which must not leave them; the axes that are
     mapped come first. None in a compiled function, which cannot take the wrappers off."""
-    if not torch._C._are_functorch_transforms_active():
+    if not torch_private.transforms_are_active():
         return tensors
-    return None if torch.compiler.is_compiling() else [_unwrapped(t) for t in tensors]
-
-
-def _unwrapped(t):
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(t):
-        dim = functorch.maybe_get_bdim(t)
-        t = functorch.get_unwrapped(t)
-        t = t.movedim(dim, 0) if dim > 0 else t
-    return t
+    return None if torch.compiler.is_compiling() else [torch_private.unwrapped(t) for t in tensors]

@@ -4,7 +4,7 @@ import copy
 
 import torch
 
-from prdp_torch import operators
+from prdp_torch import operators, torch_private
 from prdp_torch.stepper import Stepper
 
 
@@ -53,7 +53,7 @@ class ImplicitStep(Stepper):
         return u if self.rhs_at is None else self.rhs_at(u)
 
 
-class ConstantOperator(torch.nn.Module):
+class ConstantOperator(torch_private.HearsOfMoves):
     """One operator for all u. Its tensors move, save and train as those of a module do; a number given as
     nu stays one."""
 
@@ -65,17 +65,15 @@ class ConstantOperator(torch.nn.Module):
                 self.register_parameter(f"tensor{i}", tensor)
             elif tensor.dim() > 0 or tensor.requires_grad:
                 self.register_buffer(f"tensor{i}", tensor)
-        self._collect()
+        self.moved()
 
     def forward(self, u):
         return self._operator
 
-    def _apply(self, fn, recurse=True):
-        super()._apply(fn, recurse)
-        self._collect()
-        return self
-
-    def _collect(self):
-        """The tensors as the module has them now."""
-        held = {**self._parameters, **self._buffers}
+    def moved(self):
+        """Take the tensors as the module has them now."""
+        held = {
+            **dict(self.named_parameters(recurse=False, remove_duplicate=False)),
+            **dict(self.named_buffers(recurse=False, remove_duplicate=False)),
+        }
         self._operator.tensors = [held.get(f"tensor{i}", t) for i, t in enumerate(self._operator.tensors)]

@@ -2,7 +2,7 @@
 
 import torch
 
-from prdp_torch import _C, _check, operators
+from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
@@ -166,7 +166,8 @@ class Stepper(torch.nn.Module):
         return self._kept_options.of(*solver, *self._settings(), every, self.start == "state")
 
     def _options(self, log_number):
-        k = self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self)
+        compiling = torch.compiler.is_dynamo_compiling()
+        k = torch_private.number_as_graph_input(self, "_max_iter") if compiling else self._max_iter
         solver = self.method, k, self.rtol, self.restart, *flat_preconditioner(self.preconditioner)
         return *solver, *self._settings(), log_number, checkpoint_number(self.checkpoint_every)
 
@@ -210,11 +211,3 @@ class Stepper(torch.nn.Module):
             else f", preconditioner={self.preconditioner!r}"
         )
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
-
-
-def _as_graph_input(stepper):
-    """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
-    each of them. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole process.
-    """
-    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
-        return stepper._max_iter + 0  # the number is read where it is used first, which must be here

@@ -4,7 +4,7 @@ import warnings
 
 import torch
 
-from prdp_torch import _check
+from prdp_torch import _check, torch_private
 from prdp_torch.operators.base import Operator, null_spaces_of
 
 
@@ -20,7 +20,7 @@ class Matrix(Operator):
         if matrix.layout == torch.sparse_csr:
             _warn_of_csr_gradient(matrix)
             self.kind = "csr"
-            with torch._C._DisableFuncTorch():  # torch.func does not know sparse tensors
+            with torch_private.without_transforms():
                 tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
         elif matrix.layout == torch.strided:
             self.kind = "dense"
