@@ -4,9 +4,11 @@ Where a release of torch changes one of them, `tests/python/test_torch_private.p
 """
 
 from collections.abc import Callable
+from typing import Self
 
 import torch
 from torch import Tensor
+from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, maybe_get_bdim
 
 without_transforms = torch._C._DisableFuncTorch
 """A context in which torch.func leaves tensors alone: it does not know sparse ones, whose parts are read in it."""
@@ -14,15 +16,15 @@ without_transforms = torch._C._DisableFuncTorch
 
 def transforms_are_active() -> bool:
     """Whether a transform of torch.func runs. Its wrappers must not leave it, and nothing public tells."""
-    return torch._C._are_functorch_transforms_active()
+    return bool(torch._C._are_functorch_transforms_active())
 
 
 def unwrapped(t: Tensor) -> Tensor:
     """A tensor without the wrappers of the transforms that run; the axes that are mapped come first. Reports of solves
     outlive the transforms, and torch.func has no public way to take a wrapper off."""
-    while torch._C._functorch.is_functorch_wrapped_tensor(t):
-        dim = torch._C._functorch.maybe_get_bdim(t)
-        t = torch._C._functorch.get_unwrapped(t)
+    while is_functorch_wrapped_tensor(t):
+        dim = maybe_get_bdim(t)
+        t = get_unwrapped(t)
         t = t.movedim(dim, 0) if dim > 0 else t
     return t
 
@@ -32,7 +34,8 @@ def number_as_graph_input(module: torch.nn.Module, name: str) -> int:
     again for each value. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole
     process."""
     with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
-        return getattr(module, name) + 0  # the number is read where it is used first, which must be here
+        number: int = getattr(module, name) + 0  # the number is read where it is used first, which must be here
+    return number
 
 
 class HearsOfMoves(torch.nn.Module):
@@ -42,7 +45,7 @@ class HearsOfMoves(torch.nn.Module):
     def moved(self) -> None:
         """Called when this module has new tensors."""
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True):
-        super()._apply(fn, recurse)
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self.moved()
         return self

@@ -7,7 +7,7 @@ import torch
 from prdp_torch.advice import Update, advise_on, checked_limit, milliseconds
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
-from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.experiments.scenes import make_solver, make_stepper
 from prdp_torch.trials import RUNS, now, random_cotangent, run
 
 
@@ -28,8 +28,9 @@ def advise_scene(scene, seconds=5.0):
         update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
     other = torch.float64 if sample.dtype == torch.float32 else torch.float32
     cotangent = random_cotangent(step, sample)
-    run(step, sample, cotangent)  # to warm up
-    physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
+    solver = make_solver(scene, scene.max_iter)
+    run(step, sample, cotangent, solver)  # to warm up
+    physics = update.physics(run(step, sample, cotangent, solver, RUNS))
     update.notes.append(
         f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
         f"{update.share(physics)}."

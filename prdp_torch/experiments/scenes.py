@@ -44,7 +44,7 @@ def make_stepper(scene, direct=False, max_iter=None):
     """
     physics = scene.physics
     options = {
-        "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
+        "solver": solvers.Direct() if direct else make_solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
         "on_failure": scene.on_failure,
         "start": scene.start,
@@ -57,6 +57,7 @@ def make_stepper(scene, direct=False, max_iter=None):
     return kinds[physics.equation](physics.shape, physics.nu, physics.dt, length=physics.length, **options)
 
 
-def _solver(scene, max_iter):
+def make_solver(scene, max_iter):
+    """Make the solver of a scene with K = max_iter."""
     extra = {"restart": scene.restart} if scene.method == "gmres" else {}
     return _SOLVERS[scene.method](max_iter=max_iter, rtol=scene.rtol, **extra)
