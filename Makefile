@@ -27,6 +27,7 @@ test: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc)
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/ruff check --quiet . && $(BIN)/ruff format --check --quiet .
+	$(BIN)/mypy --no-error-summary && PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
 	find csrc tests benchmarks -name '*.h' -o -name '*.cpp' | xargs $(BIN)/clang-format --dry-run -Werror
 	[ ! -x $(BIN)/clang-tidy ] || $(MAKE) --no-print-directory tidy
 	$(BIN)/ctest --test-dir build --output-on-failure

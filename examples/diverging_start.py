@@ -7,25 +7,28 @@ until all of them converge.
 """
 
 import torch
+from torch import Tensor
 
 import prdp_torch as prdp
+from prdp_torch.types import OnFailure
 
 N, OFFSETS = 16, [(0,), (-1,), (1,), (-2,), (2,)]
 dt = torch.tensor([0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0], dtype=torch.float64) / N**4
 start = torch.randn(len(dt), 1, N, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
-def step(nu, solver, on_failure):
+def step(nu: Tensor, solver: prdp.Solver, on_failure: OnFailure) -> tuple[Tensor, prdp.SolveInfo]:
     ratio = (nu * dt * N**4)[:, None, None]  # nu dt/dx⁴ of each sample
     stencil = torch.cat([1 + 6 * ratio, -4 * ratio, -4 * ratio, ratio, ratio], 1).expand(-1, -1, N)
     return prdp.linear_solve(prdp.operators.Stencil(stencil, OFFSETS, "periodic"), start, solver, on_failure=on_failure)
 
 
-def train(on_failure, updates=150):
+def train(on_failure: OnFailure, updates: int = 150) -> tuple[float, list[int]]:
     """The logarithm of nu over its true value, and how many samples failed in each update."""
     observed, _ = step(torch.tensor(0.04, dtype=torch.float64), prdp.Direct(), "raise")
     theta = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
-    optimiser, failed = torch.optim.Adam([theta], lr=0.1), []
+    optimiser = torch.optim.Adam([theta], lr=0.1)
+    failed: list[int] = []
     for _ in range(updates):
         u, info = step(0.04 * theta.exp(), prdp.Jacobi(max_iter=1000), on_failure)
         error = (u - observed).square().sum((1, 2)) / observed.square().sum((1, 2))

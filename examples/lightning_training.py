@@ -3,8 +3,12 @@
 Needs `pip install lightning`.
 """
 
+from typing import Any
+
 import lightning
 import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset, random_split
 
 import prdp_torch as prdp
 
@@ -14,7 +18,7 @@ SAMPLES, POINTS = 100, 30
 class Emulator(lightning.LightningModule):
     """A network learns one step of the heat equation, through the next step's solve."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.network = torch.nn.Sequential(
             torch.nn.Linear(POINTS, 64), torch.nn.ReLU(), torch.nn.Linear(64, 64), torch.nn.ReLU(),
@@ -23,41 +27,41 @@ class Emulator(lightning.LightningModule):
         self.heat = prdp.Heat(shape=(POINTS,), nu=1e-3, dt=1.0, solver=prdp.Jacobi(max_iter=1))
         self.controller = prdp.PRDPController([self.heat])
 
-    def training_step(self, batch, _):
+    def training_step(self, batch: list[Tensor], _: int) -> Tensor:
         start, end = batch
         return torch.nn.functional.mse_loss(self.heat(self.network(start)), end)
 
-    def validation_step(self, batch, _):
+    def validation_step(self, batch: list[Tensor], _: int) -> None:
         start, end = batch
         error = (self.network(self.network(start)) - end).square().mean() / end.square().mean()
         self.log("error", error, sync_dist=True)  # the mean over all processes
 
-    def on_validation_epoch_end(self):
+    def on_validation_epoch_end(self) -> None:
         if not self.trainer.sanity_checking:
             self.controller.step(self.trainer.callback_metrics["error"])  # sets heat.max_iter
 
-    def on_save_checkpoint(self, checkpoint):
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["controller"] = self.controller.state_dict()
 
-    def on_load_checkpoint(self, checkpoint):
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.controller.load_state_dict(checkpoint["controller"])
 
-    def configure_optimizers(self):
+    def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.Adam(self.parameters(), lr=2e-3)
 
 
-def make_loaders():
+def make_loaders() -> tuple[DataLoader[tuple[Tensor, ...]], DataLoader[tuple[Tensor, ...]]]:
     torch.manual_seed(0)
     x, n = torch.arange(1, POINTS + 1) / (POINTS + 1), torch.arange(1, 6)[:, None]
     waves = torch.cat([torch.sin(2 * torch.pi * n * x), torch.cos(2 * torch.pi * n * x)])
     start = ((2 * torch.rand(SAMPLES, 10) - 1) @ waves)[:, None]
     exact = prdp.Heat(shape=(POINTS,), nu=1e-3, dt=1.0, solver=prdp.Direct())
-    samples = torch.utils.data.TensorDataset(start, exact(exact(start)))
-    train, valid = torch.utils.data.random_split(samples, [SAMPLES - 20, 20])
-    return torch.utils.data.DataLoader(train, batch_size=20), torch.utils.data.DataLoader(valid, batch_size=20)
+    samples = TensorDataset(start, exact(exact(start)))
+    train, valid = random_split(samples, [SAMPLES - 20, 20])
+    return DataLoader(train, batch_size=20), DataLoader(valid, batch_size=20)
 
 
-def fit(epochs, folder, resume_from=None):
+def fit(epochs: int, folder: str, resume_from: str | None = None) -> Emulator:
     """Train up to so many epochs, from the start or from a checkpoint. Returns the trained module."""
     torch.manual_seed(1)
     emulator = Emulator()

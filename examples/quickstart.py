@@ -21,7 +21,7 @@ for epoch in range(60):
         optimiser.step()
     with torch.no_grad():
         error = (network(u0[80:]) - u1[80:]).norm() / u1[80:].norm()
-    if controller.step(error) and epoch % 5 == 0:
+    if controller.step(error) and heat.info and epoch % 5 == 0:
         taken = heat.info.iterations.float().mean()
         print(
             f"epoch {epoch:2d}  validation error {error:.3f}  tolerance {controller.rtol:.1e}  iterations {taken:.1f}"

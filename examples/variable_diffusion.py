@@ -7,11 +7,10 @@ import torch
 import prdp_torch as prdp
 
 n, epochs = map(int, sys.argv[1:]) if sys.argv[1:] else (32, 60)
-dt = 0.02
-OFFSETS = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+dt, OFFSETS = 0.02, [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
 
 
-def diffusion(kappa):
+def diffusion(kappa: torch.Tensor) -> prdp.operators.Stencil:
     """I - dt ∇·(κ ∇) for κ (ny, nx) on a periodic grid, with the mean κ on the faces between cells."""
     east, north = (dt * n**2 * (kappa + kappa.roll(-1, axis)) / 2 for axis in (-1, -2))
     west, south = east.roll(1, -1), north.roll(1, -2)
@@ -26,6 +25,7 @@ u0 = torch.stack([torch.sin(2 * torch.pi * (k * x + j * y)) for k, j in ((1, 0),
 observed = prdp.ImplicitStep(diffusion(true), solver=prdp.CG(max_iter=1000)).rollout(u0, 10)[:, 5::5]
 
 log_kappa = torch.nn.Parameter(torch.full((n, n), 0.02).log())
+operator: prdp.operators.Stencil  # made anew in every update
 step = prdp.ImplicitStep(lambda u: operator, solver=prdp.CG(max_iter=1000))  # a cap; the controller sets rtol
 controller = prdp.ToleranceController([step])
 optimiser = torch.optim.Adam([log_kappa], lr=0.05)

@@ -7,6 +7,7 @@ for the discretisation, the derivatives and what a solve says when it fails.
 """
 
 import importlib
+from typing import TYPE_CHECKING
 
 from prdp_torch import _load
 
@@ -19,11 +20,15 @@ from prdp_torch.flow import Flow  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
-from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Multigrid, SteepestDescent  # noqa: E402
+from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Multigrid, Solver, SteepestDescent  # noqa: E402
 from prdp_torch.stepper import Stepper  # noqa: E402
 from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson  # noqa: E402
 
-__version__ = _C.VERSION
+if TYPE_CHECKING:
+    from prdp_torch import experiments
+    from prdp_torch.experiments.trained import load_trained
+
+__version__: str = _C.VERSION
 
 __all__ = [
     "CG",
@@ -44,6 +49,7 @@ __all__ = [
     "Poisson",
     "SolveInfo",
     "SolveStatus",
+    "Solver",
     "SteepestDescent",
     "Stepper",
     "ToleranceController",
@@ -58,14 +64,16 @@ __all__ = [
 ]
 
 
-def __getattr__(name):
-    """Import what only trainings need when it is first used."""
-    if name == "experiments":
-        return importlib.import_module("prdp_torch.experiments")
-    if name == "load_trained":
-        return importlib.import_module("prdp_torch.experiments.trained").load_trained
-    raise AttributeError(f"module 'prdp_torch' has no attribute '{name}'")
+if not TYPE_CHECKING:  # which would take every misspelt name for one that is found here
+
+    def __getattr__(name):
+        """Import what only trainings need when it is first used."""
+        if name == "experiments":
+            return importlib.import_module("prdp_torch.experiments")
+        if name == "load_trained":
+            return importlib.import_module("prdp_torch.experiments.trained").load_trained
+        raise AttributeError(f"module 'prdp_torch' has no attribute '{name}'")
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})

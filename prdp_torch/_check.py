@@ -3,19 +3,25 @@ the plain type it stands for, or raises TypeError, or ValueError for a number th
 this type cannot hold."""
 
 import numbers
+from collections.abc import Callable
+from typing import TypeVar
 
 import torch
+from torch import Tensor
+
+T = TypeVar("T")
 
 
-def whole(who, name, value):
+def whole(who: str, name: str, value: object) -> int:
     if isinstance(value, numbers.Integral) and not isinstance(value, bool):
-        if abs(value) >= 2**63:
+        number = int(value)
+        if abs(number) >= 2**63:
             raise ValueError(f"{who}: {name} must be less than 2**63, got {value}")
-        return int(value)
+        return number
     raise TypeError(f"{who}: {name} must be a whole number, got {value!r}")
 
 
-def real(who, name, value):
+def real(who: str, name: str, value: object) -> float:
     if isinstance(value, numbers.Real) and not isinstance(value, bool):
         try:
             return float(value)
@@ -24,23 +30,23 @@ def real(who, name, value):
     raise TypeError(f"{who}: {name} must be a real number, got {value!r}")
 
 
-def optional(check, who, name, value):
+def optional(check: Callable[[str, str, object], T], who: str, name: str, value: object) -> T | None:
     return None if value is None else check(who, name, value)
 
 
-def string(who, name, value):
+def string(who: str, name: str, value: object) -> str:
     if isinstance(value, str):
         return value
     raise TypeError(f"{who}: {name} must be a string, got {value!r}")
 
 
-def shape(who, value):
+def shape(who: str, value: object) -> list[int]:
     if isinstance(value, (tuple, list)):
         return [whole(who, "every extent of shape", n) for n in value]
     raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {value!r}")
 
 
-def lengths(who, value, axes):
+def lengths(who: str, value: object, axes: int) -> list[float]:
     """The sides of the domain, one per axis; none where all are 1."""
     if not isinstance(value, (tuple, list)):
         sides = [real(who, "length", value)] * axes
@@ -51,8 +57,8 @@ def lengths(who, value, axes):
     return [] if all(side == 1.0 for side in sides) else sides
 
 
-def dense(who, name, value):
-    if not isinstance(value, torch.Tensor):
+def dense(who: str, name: str, value: object) -> Tensor:
+    if not isinstance(value, Tensor):
         raise TypeError(f"{who}: {name} must be a torch tensor, got {type(value).__name__}")
     if value.layout != torch.strided:
         raise TypeError(f"{who}: {name} must be a dense tensor, got one of layout {value.layout}")

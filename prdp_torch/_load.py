@@ -13,7 +13,7 @@ _BUILT_FOR = Path(__file__).with_name("built_for_torch.txt")
 REBUILD = "'pip install --force-reinstall --no-deps .' in the project's folder"
 
 
-def check_torch():
+def check_torch() -> None:
     """Raise ImportError in plain words where the compiled library is missing or of another torch."""
     if not _BUILT_FOR.exists():
         raise ImportError(
@@ -27,11 +27,11 @@ def check_torch():
         )
 
 
-def _release(version):
+def _release(version: str) -> str:
     return version.partition("+")[0]
 
 
-def load_library():
+def load_library() -> None:
     """Import the compiled library. Raise ImportError in plain words where it does not fit this torch or this Python."""
     check_torch()
     try:

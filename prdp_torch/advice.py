@@ -1,12 +1,14 @@
 """`advise`: measure which solver an equation needs, and whether refining it is worth anything."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check
-from prdp_torch.solvers import GMRES, Direct
+from prdp_torch.solvers import GMRES, Direct, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
@@ -22,9 +24,9 @@ class Advice:
     notes: list[str]
     recommendation: str
 
-    def table(self):
+    def table(self) -> str:
         """The rows as lines of aligned text."""
-        lines = [("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")]
+        lines: list[tuple[str, ...]] = [("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")]
         for row in self.rows:
             costs = ["", ""] * 2
             for i, solve in enumerate(row.solves):
@@ -36,11 +38,11 @@ class Advice:
         cells = ([put(cell, width) for put, cell, width in zip(align, line, widths, strict=True)] for line in lines)
         return "\n".join("  ".join(line).rstrip() for line in cells)
 
-    def words(self):
+    def words(self) -> str:
         """What stands below the table."""
         return "\n".join([*self.notes, "", self.recommendation])
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self.table()}\n\n{self.words()}"
 
 
@@ -51,21 +53,21 @@ class Update:
     network: float = 0.0  # seconds
     forwards: int = 1
     adjoints: int = 1
-    notes: list = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
-    def physics(self, row):
+    def physics(self, row: Row) -> float:
         adjoint = 0.0 if row.adjoint is None else row.adjoint.seconds
         return self.forwards * row.forward.seconds + self.adjoints * adjoint
 
-    def share(self, physics):
+    def share(self, physics: float) -> str:
         whole = physics + self.network
         return f"{_percent(physics / whole)} of an update: {milliseconds(physics)} of {milliseconds(whole)}"
 
-    def fastest(self, rows, rtol):
+    def fastest(self, rows: Sequence[Row], rtol: float) -> Row | None:
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
 
 
-def advise(step, sample, seconds=5.0, dtypes=None):
+def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence[torch.dtype] | None = None) -> Advice:
     """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
 
     Args:
@@ -105,7 +107,7 @@ def advise(step, sample, seconds=5.0, dtypes=None):
     return advise_on(step, sample.detach(), checked_limit(seconds), Update(), others)
 
 
-def _other_dtypes(step, sample, dtypes):
+def _other_dtypes(step: Stepper, sample: Tensor, dtypes: Sequence[torch.dtype] | None) -> list[torch.dtype]:
     """The dtypes to try beside that of the sample, checked."""
     both = torch.float32, torch.float64
     if dtypes is None:
@@ -115,7 +117,9 @@ def _other_dtypes(step, sample, dtypes):
     return [dtype for dtype in both if dtype in dtypes and dtype != sample.dtype]
 
 
-def advise_on(step, sample, seconds, update, other_dtypes):
+def advise_on(
+    step: Stepper, sample: Tensor, seconds: float, update: Update, other_dtypes: Sequence[torch.dtype]
+) -> Advice:
     """Advise on a step that is a part of `update`, an `Update`."""
     rows, refused = measure(step, sample, candidates(step), seconds)
     best = update.fastest(rows, TOLERANCES[-1])
@@ -142,19 +146,19 @@ def advise_on(step, sample, seconds, update, other_dtypes):
     return Advice(rows + others, notes, words)
 
 
-def _start_gain(zero, state):
+def _start_gain(zero: Row, state: Row) -> str:
     products = f"{state.forward.products} products to {_power(zero.rtol)} in place of {zero.forward.products}"
     worth = state.forward.status != "MAX_ITER" and state.forward.products < zero.forward.products
     advice = 'pass start="state"' if worth else "keep the start from zero"
     return f"From the state, the forward solve of {zero.name} takes {products}: {advice}."
 
 
-def _recommend(step, sample, rows, best, update):
+def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, update: Update) -> str:
     """The recommendation where `best` is the fastest solver to the finest tolerance."""
     physics = update.physics(best)
     most = max(solve.iterations for solve in best.solves)
     if isinstance(best.solver, Direct):
-        rough = update.fastest(rows, TOLERANCES[0])
+        rough = update.fastest(rows, TOLERANCES[0]) or best
         least, cheapest = update.physics(rough), f"{rough.name} to {_power(rough.rtol)}"
     else:
         least = update.physics(measure_one_iteration(step, sample, best.solver))
@@ -182,7 +186,7 @@ def _recommend(step, sample, rows, best, update):
     return f"{choice}: it is the fastest to {_power(best.rtol)}, and {reason}. {limit}"
 
 
-def _make_do(rows, twin, update, seconds):
+def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:
     """The recommendation where no solver reaches the finest tolerance in the dtype of the sample."""
     rough, fine = (_power(rtol) for rtol in TOLERANCES)
     if twin is not None:
@@ -196,35 +200,35 @@ def _make_do(rows, twin, update, seconds):
     )
 
 
-def _call(solver, max_iter, rtol):
+def _call(solver: Solver, max_iter: int, rtol: float) -> str:
     extra = f", restart={solver.restart}" if isinstance(solver, GMRES) else ""
     if getattr(solver, "preconditioner", None):
         extra += f", preconditioner={solver.preconditioner!r}"
     return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
 
 
-def checked_limit(seconds):
+def checked_limit(seconds: float) -> float:
     """The limit for each solver, checked."""
     if not 0 < _check.real("advise", "seconds", seconds) < float("inf"):
         raise ValueError(f"advise: seconds must be a number > 0, got {seconds}")
     return float(seconds)
 
 
-def _name(dtype):
+def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def _short(ms):
+def _short(ms: float) -> str:
     return f"{ms:.3g}" if ms < 1000 else f"{ms:.0f}"
 
 
-def milliseconds(seconds):
+def milliseconds(seconds: float) -> str:
     return f"{_short(1e3 * seconds)} ms"
 
 
-def _percent(share):
+def _percent(share: float) -> str:
     return f"{share:.1%}" if share < 0.01 else f"{share:.0%}"
 
 
-def _power(rtol):
+def _power(rtol: float) -> str:
     return f"{rtol:.0e}".replace("e-0", "e-")

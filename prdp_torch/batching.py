@@ -4,17 +4,28 @@ A mapped axis is folded into the batch, as samples do not influence each other. 
 tensor that is mapped, such as nu, the entries are solved one after the other.
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, cast
+
 import torch
-from torch.utils._pytree import tree_map
+from torch import Tensor
 
-from prdp_torch import _C
+from prdp_torch import _C, torch_private
+from prdp_torch.types import Report
 
 
-@torch.library.register_vmap("prdp::linear_solve")
-def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
+class _Map(Protocol):
+    """What torch tells a batching rule beside the mapped axes."""
+
+    batch_size: int
+
+
+def _linear_solve(
+    info: _Map, in_dims: Sequence[Any], b: Tensor, tensors: list[Tensor], kind: str, shape: list[int], *rest: Any
+) -> tuple[Any, Any]:
     size, op = info.batch_size, torch.ops.prdp.linear_solve
 
-    def in_batch(t, dim):
+    def in_batch(t: Tensor, dim: int | None) -> Tensor:
         return (t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)).flatten(0, 1)
 
     samples = b.shape[0 if in_dims[0] is None else int(in_dims[0] == 0)]
@@ -29,7 +40,9 @@ def _linear_solve(info, in_dims, b, tensors, kind, shape, *rest):
     return [t.unflatten(0, (size, samples)) for t in results], [0] * len(results)
 
 
-def _fold(tensors, mapped, kind, axes, size, batch):
+def _fold(
+    tensors: list[Tensor], mapped: list[bool], kind: str, axes: int, size: int, batch: int
+) -> list[Tensor] | None:
     """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
     batched_axes = _C.batched_axes(kind)
     if batched_axes is None:  # a Function: unknown which of its tensors have a batch axis
@@ -51,27 +64,34 @@ def _fold(tensors, mapped, kind, axes, size, batch):
     return folded
 
 
-def _one_by_one(op, info, in_dims, arguments):
+def _one_by_one(
+    op: Callable[..., Any], info: _Map, in_dims: Sequence[Any], arguments: Sequence[Any]
+) -> tuple[Any, Any]:
     """The op for one entry after the other; its results with the mapped axis in front."""
 
-    def pick(argument, dim, i):
+    def pick(argument: Any, dim: Any, i: int) -> Any:
         if isinstance(dim, (list, tuple)):
             return [pick(*pair, i) for pair in zip(argument, dim, strict=True)]
         return argument if dim is None else argument.select(dim, i)
 
-    results = [op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)]
-    if results:
-        stacked = tree_map(lambda *of_entries: torch.stack(of_entries), *results)
-    else:
-        stacked = _no_entries(op, in_dims, arguments)
-    return stacked, tree_map(lambda _: 0, stacked)
+    if info.batch_size == 0:
+        return _no_entries(op, in_dims, arguments)
+    return _stacked([op(*pick(arguments, in_dims, i)) for i in range(info.batch_size)])
 
 
-def _no_entries(op, in_dims, arguments):
+def _stacked(results: Sequence[Any]) -> tuple[Any, Any]:
+    """Results of several calls, each a tensor or a list of results, stacked; and 0 for each, the mapped axis."""
+    if isinstance(results[0], torch.Tensor):
+        return torch.stack(list(results)), 0
+    parts = [_stacked(part) for part in zip(*results, strict=True)]
+    return [stacked for stacked, _ in parts], [axes for _, axes in parts]
+
+
+def _no_entries(op: Callable[..., Any], in_dims: Sequence[Any], arguments: Sequence[Any]) -> tuple[Any, Any]:
     """What one after the other gives where the mapped axis is empty: tensors without memory tell its shapes."""
     devices = []
 
-    def without_memory(argument, dim):
+    def without_memory(argument: Any, dim: Any) -> Any:
         if isinstance(dim, (list, tuple)):
             return [without_memory(*pair) for pair in zip(argument, dim, strict=True)]
         if not isinstance(argument, torch.Tensor):
@@ -80,52 +100,52 @@ def _no_entries(op, in_dims, arguments):
         shape = [n for axis, n in enumerate(argument.shape) if axis != dim]
         return argument.new_empty(shape, device="meta")
 
-    one = op(*without_memory(arguments, in_dims))
-    return tree_map(lambda t: t.new_empty((0, *t.shape), device=devices[0]), one)
+    def empty(one: Any) -> Any:
+        if isinstance(one, torch.Tensor):
+            return one.new_empty((0, *one.shape), device=devices[0])
+        return [empty(part) for part in one]
+
+    _, axes = _stacked([one := op(*without_memory(arguments, in_dims))])
+    return empty(one), axes
 
 
-def _loop(op):
+def _loop(op: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
     """The batching rule of a derivative that sums over the batch: it cannot be folded."""
     return lambda info, in_dims, *arguments: _one_by_one(op, info, in_dims, arguments)
 
 
+torch.library.register_vmap("prdp::linear_solve", _linear_solve)
 torch.library.register_vmap("prdp::unrolled_vjp", _loop(torch.ops.prdp.unrolled_vjp))
 torch.library.register_vmap("prdp::unrolled_jvp", _loop(torch.ops.prdp.unrolled_jvp))
 
 
-def transposed(matvec, v, tensors):
+def transposed(matvec: Callable[..., Tensor], v: Tensor, tensors: list[Tensor]) -> Tensor:
     """Aᵀ v by torch.func: A is linear, so its derivative is the same everywhere."""
-    _, pullback = torch.func.vjp(lambda x: matvec(x, *tensors), torch.zeros_like(v))
-    return pullback(v)[0]
+    pullback = torch.func.vjp(lambda x: matvec(x, *tensors), torch.zeros_like(v))[1]
+    product: Tensor = pullback(v)[0]
+    return product
 
 
-def product_rule(matvec, cotangent, u, tensors):
+def product_rule(matvec: Callable[..., Tensor], cotangent: Tensor, u: Tensor, tensors: list[Tensor]) -> list[Tensor]:
     """∂⟨λ, A u⟩ with respect to each tensor of A by torch.func; zeros for those of whole numbers."""
     real = [i for i, t in enumerate(tensors) if t.is_floating_point()]
 
-    def product(*changed):
+    def product(*changed: Tensor) -> Tensor:
         given = list(tensors)
         for i, t in zip(real, changed, strict=True):
             given[i] = t
         return matvec(u, *given)
 
-    _, pullback = torch.func.vjp(product, *[tensors[i] for i in real])
+    pullback = torch.func.vjp(product, *[tensors[i] for i in real])[1]
     gradients = dict(zip(real, pullback(cotangent), strict=True))
     return [gradients[i] if i in gradients else torch.zeros_like(t) for i, t in enumerate(tensors)]
 
 
-def outlive_transforms(tensors):
-    """Tensors without the wrappers of the transforms that run, which must not leave them; the axes that are
+def outlive_transforms(report: Report) -> Report | None:
+    """A report without the wrappers of the transforms that run, which must not leave them; the axes that are
     mapped come first. None in a compiled function, which cannot take the wrappers off."""
-    if not torch._C._are_functorch_transforms_active():
-        return tensors
-    return None if torch.compiler.is_compiling() else [_unwrapped(t) for t in tensors]
-
-
-def _unwrapped(t):
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(t):
-        dim = functorch.maybe_get_bdim(t)
-        t = functorch.get_unwrapped(t)
-        t = t.movedim(dim, 0) if dim > 0 else t
-    return t
+    if not torch_private.transforms_are_active():
+        return report
+    if torch.compiler.is_compiling():
+        return None
+    return cast(Report, tuple(torch_private.unwrapped(t) for t in report))

@@ -1,12 +1,22 @@
 """Controllers: they choose K or the tolerance of the solves after each training interval."""
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check, processes
+from prdp_torch.solve import SolveInfo
+from prdp_torch.types import Number, Refinable, Steppers
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
+
+    _Compiled = _C.Controller
+else:
+    _Compiled = object  # the controllers have the compiled one as their first base
 
 
 class Record(NamedTuple):
@@ -24,6 +34,30 @@ class Record(NamedTuple):
     """‖b - A u‖ / ‖b‖ where the attached solves ended, the mean over the samples."""
 
 
+class PRDPSettings(TypedDict, total=False):
+    """The settings of a `PRDPController`."""
+
+    tau_step: float
+    tau_stop: float
+    delta: int
+    window: int
+    initial: int
+    increment: int
+    maximum: int | None
+    growth: float
+    adjoint_ratio: float | None
+
+
+class ToleranceSettings(TypedDict, total=False):
+    """The settings of a `ToleranceController`."""
+
+    ratio: float
+    adjoint_ratio: float
+    floor: float
+    adjoint_floor: float
+    maximum: int
+
+
 class ToleranceRecord(NamedTuple):
     """One call of `step` of a `ToleranceController`."""
 
@@ -37,10 +71,18 @@ class ToleranceRecord(NamedTuple):
     """As of a `Record`."""
 
 
-class _Attached:
+class _Attached(_Compiled):
     """What controllers share: they hand K and tolerances on to the steppers, and ask them how the solves went."""
 
-    def _take(self, steppers, process_group):
+    steppers: list[Refinable]
+    process_group: "ProcessGroup | None"
+
+    if TYPE_CHECKING:  # each compiled controller has its own
+
+        @property
+        def settings(self) -> dict[str, Any]: ...
+
+    def _take(self, steppers: Steppers, process_group: "ProcessGroup | None") -> None:
         who = type(self).__name__
         if process_group is not None and processes.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
@@ -54,13 +96,13 @@ class _Attached:
                     raise TypeError(f"{who}: a stepper must have {name}, got {stepper!r}")
         self._push()
 
-    def _push(self):
+    def _push(self) -> None:
         budget = {name: value for name, value in self._budget.items() if value is not None}
         for stepper in self.steppers:
             for name, value in budget.items():
                 setattr(stepper, name, value)
 
-    def _decide(self, metric, converged, error):
+    def _decide(self, metric: float, converged: bool | None, error: float | None) -> bool:
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
             converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
@@ -68,7 +110,9 @@ class _Attached:
         self._push()
         return refined
 
-    def _of_all_processes(self, metric, converged, error):
+    def _of_all_processes(
+        self, metric: float, converged: bool, error: float | None
+    ) -> tuple[float, bool, float | None, float | None]:
         """(metric, converged, residual, error), the same in every process: means, and whether all have converged. The
         residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
         ended = [getattr(stepper, "info", None) for stepper in self.steppers]
@@ -79,7 +123,7 @@ class _Attached:
             numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
             numbers += [converged, error is not None]
             metric, error_sum, agree, known, *of_steppers = processes.sums(
-                [*numbers, *(n for r in residuals for n in (r.sum(), r.numel()))], self.process_group
+                [*numbers, *(n for r in residuals for n in (float(r.sum()), r.numel()))], self.process_group
             )
             metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None
             means = [total / n for total, n in zip(of_steppers[::2], of_steppers[1::2], strict=True) if n]
@@ -87,11 +131,11 @@ class _Attached:
             means = [float(r.mean()) for r in residuals if r.numel()]
         return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error
 
-    def state_dict(self):
+    def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
         return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
 
-    def load_state_dict(self, state):
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict()` exactly. ValueError for anything else."""
         wanted = self.state_dict().keys()
         if not isinstance(state, dict) or state.keys() != wanted:
@@ -104,32 +148,34 @@ class _Attached:
             ) from None
         self._push()
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         if self.process_group is not None:
             raise TypeError(f"{type(self).__name__}: only a controller of the default process group can be copied")
         return _remade, (type(self), self.steppers, self.settings, self.state_dict())
 
 
-def _beyond_rounding(info):
+def _beyond_rounding(info: SolveInfo) -> Tensor:
     """The residuals of a report, with 0 where it is rounding alone."""
     return info.residual.double().masked_fill(info.floor > 0, 0.0)
 
 
-def _remade(kind, steppers, settings, state):
+def _remade(
+    kind: Callable[..., _Attached], steppers: Steppers, settings: dict[str, Any], state: dict[str, Any]
+) -> _Attached:
     """A copy of a controller."""
     controller = kind(steppers, **settings)
     controller.load_state_dict(state)
     return controller
 
 
-def _number(who, name, value):
+def _number(who: str, name: str, value: Number) -> float:
     """A metric as a float; a tensor of one element is one."""
-    if isinstance(value, torch.Tensor) and value.numel() == 1:
+    if isinstance(value, Tensor) and value.numel() == 1:
         return value.item()
     return _check.real(who, name, value)
 
 
-def _checked(who, settings, defaults):
+def _checked(who: str, settings: Mapping[str, object], defaults: dict[str, Any]) -> dict[str, Any]:
     """The settings over the defaults, each of its default's type; a maximum or ratio may be None where its
     default is."""
     whole = {"delta", "window", "initial", "increment", "maximum"}
@@ -181,11 +227,17 @@ class PRDPController(_C.PRDPController, _Attached):
     Source: paper, section 3.
     """
 
-    def __init__(self, steppers=(), *, process_group=None, **settings):
+    def __init__(
+        self,
+        steppers: Steppers = (),
+        *,
+        process_group: "ProcessGroup | None" = None,
+        **settings: Unpack[PRDPSettings],
+    ) -> None:
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
         self._take(steppers, process_group)
 
-    def step(self, metric, converged=None, error=None):
+    def step(self, metric: Number, converged: bool | None = None, error: Number | None = None) -> bool:
         """Decide after an interval. Returns True if K was raised.
 
         Args:
@@ -198,11 +250,11 @@ class PRDPController(_C.PRDPController, _Attached):
         return self._decide(_number("PRDPController", "metric", metric), converged, error)
 
     @property
-    def history(self):
+    def history(self) -> list[Record]:
         """Every call of `step` as a `Record`."""
         return [Record(*row) for row in self._history]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items() if value is not None)
         smoothed = f"{self.history[-1].smoothed:.3e}" if self._history else "none yet"
         return f"PRDPController(max_iter={self.max_iter}, smoothed metric {smoothed}; {settings})"
@@ -241,11 +293,17 @@ class ToleranceController(_C.ToleranceController, _Attached):
     and of optimisation with approximate gradients (Pedregosa, ICML 2016).
     """
 
-    def __init__(self, steppers=(), *, process_group=None, **settings):
+    def __init__(
+        self,
+        steppers: Steppers = (),
+        *,
+        process_group: "ProcessGroup | None" = None,
+        **settings: Unpack[ToleranceSettings],
+    ) -> None:
         super().__init__(**_checked("ToleranceController", settings, _C.TOLERANCE_DEFAULTS))
         self._take(steppers, process_group)
 
-    def step(self, error, converged=None):
+    def step(self, error: Number, converged: bool | None = None) -> bool:
         """Decide after an interval. Returns True if rtol became smaller.
 
         Args:
@@ -258,7 +316,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
         return self._decide(_number("ToleranceController", "error", error), converged, None)
 
     @property
-    def history(self):
+    def history(self) -> list[ToleranceRecord]:
         """Every call of `step` as a `ToleranceRecord`."""
         before = [math.inf, *(smallest for _, smallest, *_ in self._history)]
         return [
@@ -266,7 +324,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
             for earlier, (error, smallest, _, tightened, _, residual) in zip(before, self._history, strict=False)
         ]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items())
         return f"ToleranceController(rtol={self.rtol:.1e}, adjoint_rtol={self.adjoint_rtol:.1e}; {settings})"
 
@@ -277,18 +335,27 @@ class LinearSchedule(_C.LinearSchedule, _Attached):
     It has the interface of `PRDPController` and ignores the metric. `adjoint_ratio` and
     `process_group` have the same meaning."""
 
-    def __init__(self, steppers=(), *, initial, increment, maximum, adjoint_ratio=None, process_group=None):
+    def __init__(
+        self,
+        steppers: Steppers = (),
+        *,
+        initial: int,
+        increment: int,
+        maximum: int,
+        adjoint_ratio: float | None = None,
+        process_group: "ProcessGroup | None" = None,
+    ) -> None:
         settings = {"initial": initial, "increment": increment, "maximum": maximum}
         settings = {name: _check.whole("LinearSchedule", name, value) for name, value in settings.items()}
         adjoint_ratio = _check.optional(_check.real, "LinearSchedule", "adjoint_ratio", adjoint_ratio)
         super().__init__(**settings, adjoint_ratio=adjoint_ratio)
         self._take(steppers, process_group)
 
-    def step(self, metric=0.0, converged=None, error=None):
+    def step(self, metric: Number = 0.0, converged: bool | None = None, error: Number | None = None) -> bool:
         """Advance the schedule. Returns True if K was raised."""
         error = None if error is None else _number("LinearSchedule", "error", error)
         return self._decide(_number("LinearSchedule", "metric", metric), converged, error)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items() if value is not None)
         return f"LinearSchedule(max_iter={self.max_iter}; {settings})"

@@ -7,24 +7,27 @@ has no influence.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _check
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
+from prdp_torch.types import Length
 
 _Y, _X = -2, -1
 
 
-def divergence(u, length=1.0):
+def divergence(u: Tensor, length: Length = 1.0) -> Tensor:
     """∂u₁/∂x + ∂u₂/∂y in the cell centres by forward differences: (batch, 1, Ny, Nx)."""
     u1, u2 = _velocity("divergence", u)
     ly, lx = _sides("divergence", length)
     return _forward(u1, _X, lx) + _forward(u2, _Y, ly)
 
 
-def curl(u, length=1.0):
+def curl(u: Tensor, length: Length = 1.0) -> Tensor:
     """The vorticity ∂u₂/∂x - ∂u₁/∂y at the lower left corner of each cell by backward differences:
     (batch, 1, Ny, Nx)."""
     u1, u2 = _velocity("curl", u)
@@ -32,7 +35,7 @@ def curl(u, length=1.0):
     return _backward(u2, _X, lx) - _backward(u1, _Y, ly)
 
 
-def project(u, length=1.0):
+def project(u: Tensor, length: Length = 1.0) -> Tensor:
     """Remove the divergence of a velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
     This is the nearest field without discrete divergence. The mean velocity and the pressure do not change."""
     u1, u2 = _velocity("project", u)
@@ -47,7 +50,7 @@ def project(u, length=1.0):
     return torch.cat([u1 - _backward(phi, _X, lx), u2 - _backward(phi, _Y, ly), u[:, 2:]], dim=1)
 
 
-def downsample(u):
+def downsample(u: Tensor) -> Tensor:
     """Take every second point along both axes, at the indices 1, 3, …. Ny and Nx must be odd; (Ny, Nx) becomes
     ((Ny - 1)/2, (Nx - 1)/2), for example 97 becomes 48 (paper, appendix C.6)."""
     _velocity("downsample", u)
@@ -56,7 +59,7 @@ def downsample(u):
     return u[..., 1::2, 1::2]
 
 
-def rollout(stepper, u, steps):
+def rollout(stepper: Callable[[Tensor], Tensor], u: Tensor, steps: int) -> Tensor:
     """Repeat a step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
     `stepper` may be any callable, such as a network. For steppers of this library `Stepper.rollout` is called.
@@ -71,7 +74,7 @@ def rollout(stepper, u, steps):
     return torch.stack(states, dim=1)
 
 
-def _velocity(who, u):
+def _velocity(who: str, u: Tensor) -> tuple[Tensor, Tensor]:
     """u₁ and u₂, each (batch, 1, Ny, Nx)."""
     _check.dense(who, "u", u)
     if u.dim() != 4 or u.shape[1] not in (2, 3):
@@ -81,7 +84,7 @@ def _velocity(who, u):
     return u[:, 0:1], u[:, 1:2]
 
 
-def _sides(who, length):
+def _sides(who: str, length: Length) -> list[float]:
     """The sides along y and x."""
     sides = _check.lengths(who, length, 2) or [1.0, 1.0]
     if not all(0.0 < side < math.inf for side in sides):
@@ -89,9 +92,9 @@ def _sides(who, length):
     return sides
 
 
-def _forward(v, axis, length):
+def _forward(v: Tensor, axis: int, length: float) -> Tensor:
     return (v.roll(-1, axis) - v) * (v.shape[axis] / length)
 
 
-def _backward(v, axis, length):
+def _backward(v: Tensor, axis: int, length: float) -> Tensor:
     return (v - v.roll(1, axis)) * (v.shape[axis] / length)

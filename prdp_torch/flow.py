@@ -1,10 +1,18 @@
 """`Flow`: incompressible flow by projection."""
 
-import torch
+from collections.abc import Sequence
+from typing import Any, Literal, TypeAlias, Unpack
 
-from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import CG
+import torch
+from torch import Tensor
+
+from prdp_torch import _C, _check
+from prdp_torch.operators.base import real_tensor
+from prdp_torch.solvers import CG, Solver
 from prdp_torch.stepper import Stepper
+from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
+
+Boundary: TypeAlias = Literal["periodic", "wall", "open"]
 
 
 class Flow(Stepper):
@@ -48,22 +56,33 @@ class Flow(Stepper):
     Source: Harlow and Welch (1965) for the grid, Chorin (1968) for the step.
     """
 
+    shape: tuple[int, ...]
+    dt: float
+    boundary: Boundary | Sequence[Boundary]
+    length: Length
+    advection: str
+    diffusion: str
+    nu: Number
+    force: Tensor | None
+    inflow: Tensor | None
+    obstacle: Tensor | None
+
     def __init__(
         self,
-        shape,
-        nu,
-        dt,
-        boundary="periodic",
-        length=1.0,
-        obstacle=None,
-        force=None,
-        inflow=None,
-        advection="central",
-        diffusion="implicit",
-        solver=None,
-        backward="implicit",
-        **options,
-    ):
+        shape: Shape,
+        nu: Number,
+        dt: float,
+        boundary: Boundary | Sequence[Boundary] = "periodic",
+        length: Length = 1.0,
+        obstacle: Tensor | None = None,
+        force: Tensor | Sequence[float] | None = None,
+        inflow: Tensor | Sequence[float] | None = None,
+        advection: Literal["central", "upwind"] = "central",
+        diffusion: Literal["implicit", "explicit"] = "implicit",
+        solver: Solver | None = None,
+        backward: Backward = "implicit",
+        **options: Unpack[StepOptions],
+    ) -> None:
         solver = CG(max_iter=100, preconditioner="multigrid") if solver is None else solver
         super().__init__(solver, backward, **options)
         if self.start != "zero":
@@ -73,31 +92,31 @@ class Flow(Stepper):
         self.boundary, self.length = boundary, length
         self.advection = _check.string("Flow", "advection", advection)
         self.diffusion = _check.string("Flow", "diffusion", diffusion)
-        self._keep_tensor("nu", nu if isinstance(nu, torch.Tensor) else _check.real("Flow", "nu", nu))
+        self._keep_tensor("nu", nu if isinstance(nu, Tensor) else _check.real("Flow", "nu", nu))
         self._keep_tensor("force", force)
         self._keep_tensor("inflow", inflow)
         self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
-        self._box = None
+        self._box: _C.FlowBox | None = None
         self._equation().check()
 
-    def _keep_tensor(self, name, value):
+    def _keep_tensor(self, name: str, value: Tensor | Sequence[float] | float | None) -> None:
         if isinstance(value, torch.nn.Parameter):
             self.register_parameter(name, value)
-        elif isinstance(value, torch.Tensor):
+        elif isinstance(value, Tensor):
             self.register_buffer(name, _check.dense("Flow", name, value))
         elif value is None or isinstance(value, float):
             setattr(self, name, value)
         else:
             self.register_buffer(name, _of_numbers(name, value))
 
-    def forward(self, u):
+    def forward(self, u: Tensor) -> Tensor:
         _check.dense("Flow", "u", u)
         log = self._adjoint_log.number
-        u_next, *report = self._equation().step(u, self._options_kept(), self._max_iter, log)
-        self._keep(report, self._adjoint_log)
-        return u_next
+        found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
+        self._keep(found[1:], self._adjoint_log)
+        return found[0]
 
-    def rollout(self, u, steps):
+    def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
 
         It is a single node of autograd, whose backward pass needs the states alone. `info` and `adjoint_info` then hold
@@ -105,47 +124,48 @@ class Flow(Stepper):
         _check.dense("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
         log = self._adjoint_log.number
-        states, *report = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
-        self._keep(report, self._adjoint_log)
-        return states
+        found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
+        self._keep(found[1:], self._adjoint_log)
+        return found[0]
 
-    def project(self, u):
+    def project(self, u: Tensor) -> Tensor:
         """Return the velocity nearest to u that has the boundary values and no divergence."""
         return self._equation().project(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
 
-    def pressure(self, u):
+    def pressure(self, u: Tensor) -> Tensor:
         """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
         unless an axis is open."""
         return self._equation().pressure(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
 
-    def divergence(self, u):
+    def divergence(self, u: Tensor) -> Tensor:
         """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
         cells before an open end, whose high faces take what mass conservation gives."""
         return self._equation().divergence(_check.dense("Flow", "u", u))
 
-    def _equation(self):
+    def _equation(self) -> _C.FlowEquation:
         if self._box is None:
             self._box = self._make_box()
-        nu = operators.base.real_tensor("Flow", "nu", self.nu)
+        nu = real_tensor("Flow", "nu", self.nu)
         return _C.FlowEquation(self._box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
 
-    def _make_box(self):
+    def _make_box(self) -> _C.FlowBox:
         names = [self.boundary] if isinstance(self.boundary, str) else self.boundary
         if not isinstance(names, (tuple, list)):
             raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
-        names = [_check.string("Flow", "boundary", name) for name in names]
+        checked_names = [_check.string("Flow", "boundary", name) for name in names]
         lengths = self.length if isinstance(self.length, (tuple, list)) else [self.length]
-        lengths = [_check.real("Flow", "length", side) for side in lengths]
-        return _C.FlowBox(list(self.shape), names, lengths, self.obstacle)
+        checked_lengths = [_check.real("Flow", "length", side) for side in lengths]
+        return _C.FlowBox(list(self.shape), checked_names, checked_lengths, self.obstacle)
 
-    def __getstate__(self):
-        return {**super().__getstate__(), "_box": None}  # of the compiled library; made again where it is needed
+    def __getstate__(self) -> dict[str, Any]:
+        state: dict[str, Any] = super().__getstate__()  # type: ignore[no-untyped-call]
+        return {**state, "_box": None}  # of the compiled library; made again where it is needed
 
-    def extra_repr(self):
+    def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
 
 
-def _of_numbers(name, value):
+def _of_numbers(name: str, value: object) -> Tensor:
     if not isinstance(value, (tuple, list)):
         raise TypeError(f"Flow: {name} must be a tensor or a tuple of numbers, got {value!r}")
     return torch.tensor([_check.real("Flow", f"every entry of {name}", v) for v in value], dtype=torch.float64)

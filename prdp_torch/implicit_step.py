@@ -1,11 +1,17 @@
 """`ImplicitStep`: a step of an equation of your own."""
 
 import copy
+from collections.abc import Callable
+from typing import Unpack
 
 import torch
+from torch import Tensor
 
-from prdp_torch import operators
+from prdp_torch import operators, torch_private
+from prdp_torch.operators.matrix import as_operator
+from prdp_torch.solvers import Solver
 from prdp_torch.stepper import Stepper
+from prdp_torch.types import Backward, StepOptions
 
 
 class ImplicitStep(Stepper):
@@ -32,11 +38,18 @@ class ImplicitStep(Stepper):
         >>> states = step.rollout(u0, 10)  # (batch, 1, 30) -> (batch, 11, 1, 30)
     """
 
-    def __init__(self, operator, rhs=None, solver=None, backward="implicit", **options):
+    def __init__(
+        self,
+        operator: Callable[[Tensor], operators.Operator | Tensor] | operators.Operator | Tensor,
+        rhs: Callable[[Tensor], Tensor] | None = None,
+        solver: Solver = None,  # type: ignore[assignment]  # None is refused
+        backward: Backward = "implicit",
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(solver, backward, **options)
         who = type(self).__name__
-        if isinstance(operator, (operators.Operator, torch.Tensor)):
-            operator = ConstantOperator(operators.matrix.as_operator(who, "operator", operator))
+        if isinstance(operator, (operators.Operator, Tensor)):
+            operator = ConstantOperator(as_operator(who, "operator", operator))
         if not callable(operator):
             raise TypeError(f"{who}: operator must be a function of u or an operator, got {operator!r}")
         if rhs is not None and not callable(rhs):
@@ -44,20 +57,20 @@ class ImplicitStep(Stepper):
         self.operator_at = operator
         self.rhs_at = rhs
 
-    def operator(self, u):
+    def operator(self, u: Tensor) -> operators.Operator | Tensor:
         """A(u) as an operator."""
         return self.operator_at(u)
 
-    def rhs(self, u):
+    def rhs(self, u: Tensor) -> Tensor:
         """b(u), the right-hand side of the step from u."""
         return u if self.rhs_at is None else self.rhs_at(u)
 
 
-class ConstantOperator(torch.nn.Module):
+class ConstantOperator(torch_private.HearsOfMoves):
     """One operator for all u. Its tensors move, save and train as those of a module do; a number given as
     nu stays one."""
 
-    def __init__(self, operator):
+    def __init__(self, operator: operators.Operator) -> None:
         super().__init__()
         self._operator = copy.copy(operator)
         for i, tensor in enumerate(operator.tensors):
@@ -65,17 +78,15 @@ class ConstantOperator(torch.nn.Module):
                 self.register_parameter(f"tensor{i}", tensor)
             elif tensor.dim() > 0 or tensor.requires_grad:
                 self.register_buffer(f"tensor{i}", tensor)
-        self._collect()
+        self.moved()
 
-    def forward(self, u):
+    def forward(self, u: Tensor) -> operators.Operator:
         return self._operator
 
-    def _apply(self, fn, recurse=True):
-        super()._apply(fn, recurse)
-        self._collect()
-        return self
-
-    def _collect(self):
-        """The tensors as the module has them now."""
-        held = {**self._parameters, **self._buffers}
+    def moved(self) -> None:
+        """Take the tensors as the module has them now."""
+        held = {
+            **dict(self.named_parameters(recurse=False, remove_duplicate=False)),
+            **dict(self.named_buffers(recurse=False, remove_duplicate=False)),
+        }
         self._operator.tensors = [held.get(f"tensor{i}", t) for i, t in enumerate(self._operator.tensors)]

@@ -1,13 +1,19 @@
 """`check_operator`: whether an operator's parts agree with each other."""
 
-import torch
+from collections.abc import Iterator
+from typing import Literal
 
-from prdp_torch import _C, _check, operators
+import torch
+from torch import Generator, Tensor
+
+from prdp_torch import _C, _check
+from prdp_torch.operators import Operator
+from prdp_torch.operators.matrix import as_operator
 
 _UNIT_VECTORS = 256
 
 
-def check_operator(A, example):
+def check_operator(A: Operator | Tensor, example: Tensor) -> Literal[True]:
     """Check that the parts of an operator fit each other. It takes any operator; `operators.Function` needs it most.
 
     Args:
@@ -36,10 +42,10 @@ def check_operator(A, example):
         True
     """
     who = "check_operator"
-    A = operators.matrix.as_operator(who, "A", A)
+    A = as_operator(who, "A", A)
     if _check.dense(who, "example", example).dim() < 2:
         raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
-    generator = torch.Generator().manual_seed(0)
+    generator = Generator().manual_seed(0)
     v, w = (_noise(example, generator) for _ in range(2))
     with torch.no_grad():
         wrong = [
@@ -54,20 +60,21 @@ def check_operator(A, example):
     return True
 
 
-def _noise(like, generator):
+def _noise(like: Tensor, generator: Generator) -> Tensor:
     return torch.randn(like.shape, generator=generator, dtype=like.dtype).to(like.device)
 
 
-def _dot(v, w):
+def _dot(v: Tensor, w: Tensor) -> Tensor:
     """One product per sample."""
     return (v * w).flatten(1).sum(1)
 
 
-def _norm(v):
-    return v.flatten(1).norm(dim=1)
+def _norm(v: Tensor) -> Tensor:
+    norm: Tensor = v.flatten(1).norm(dim=1)
+    return norm
 
 
-def _products(A, v, w):
+def _products(A: Operator, v: Tensor, w: Tensor) -> Iterator[str]:
     rounding = 1e3 * torch.finfo(v.dtype).eps
     av, aw, atw = A.apply(v), A.apply(w), A.apply_transpose(w)
     scale = _norm(av) + _norm(aw)
@@ -85,7 +92,7 @@ def _products(A, v, w):
             yield "samples influence each other: A v changes in a sample whose v did not"
 
 
-def _null_space(A, v):
+def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
     if A.kind.startswith("singular_"):
         return
     constant = torch.ones_like(v)
@@ -94,14 +101,14 @@ def _null_space(A, v):
         yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
 
 
-def _captures(A, v):
+def _captures(A: Operator, v: Tensor) -> Iterator[str]:
     tensors = [t.detach() for t in A.tensors]
     with torch.enable_grad():
         if torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False).requires_grad:
             yield "matvec uses a tensor that requires grad but is not among its tensors: no gradient reaches it"
 
 
-def _diagonal(A, v):
+def _diagonal(A: Operator, v: Tensor) -> Iterator[str]:
     try:
         diagonal = A.diagonal()
     except ValueError as error:
@@ -124,7 +131,7 @@ def _diagonal(A, v):
             return
 
 
-def _gradients(A, v, w, generator):
+def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Iterator[str]:
     found = _C.product_rule(w, v, A.tensors, A.kind, A.shape, A.parameters)
     for i, (t, gradient) in enumerate(zip(A.tensors, found, strict=True)):
         if not t.is_floating_point():
@@ -134,9 +141,10 @@ def _gradients(A, v, w, generator):
         step = eps ** (1 / 3) * (largest or 1.0)
         direction = _noise(t, generator)
 
-        def product(s, i=i, t=t, direction=direction):
+        def product(s: float, i: int = i, t: Tensor = t, direction: Tensor = direction) -> Tensor:
             tensors = [t + s * direction if j == i else other for j, other in enumerate(A.tensors)]
-            return torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False)
+            changed: Tensor = torch.ops.prdp.apply(v, tensors, A.kind, A.shape, A.parameters, False)
+            return changed
 
         forward, backward = product(step), product(-step)
         expected = ((w * (forward - backward)).sum() / (2 * step)).item()

@@ -6,19 +6,23 @@ Everything here is about torch.distributed's default group, and does nothing whe
 import contextlib
 import os
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 import torch
-from torch import distributed
+from torch import Tensor, distributed
+
+T = TypeVar("T")
 
 
-def count(group=None):
+def count(group: "distributed.ProcessGroup | None" = None) -> int:
     """How many processes there are; 1 where torch.distributed is not initialised."""
     if not distributed.is_available() or not distributed.is_initialized():
         return 1
     return distributed.get_world_size(group)
 
 
-def rank(who, group):
+def rank(who: str, group: object) -> int:
     """This process's number in a group, negative where it does not belong to it. TypeError for what is no group."""
     if distributed.is_available() and group == distributed.GroupMember.NON_GROUP_MEMBER:
         return -1
@@ -27,12 +31,12 @@ def rank(who, group):
     return distributed.get_rank(group)
 
 
-def is_first():
+def is_first() -> bool:
     """Whether this process is the one that writes files."""
     return count() == 1 or distributed.get_rank() == 0
 
 
-def sums(values, group=None):
+def sums(values: Iterable[float], group: "distributed.ProcessGroup | None" = None) -> list[float]:
     """The sums over the processes of each of these numbers, to the same bit in all of them."""
     if count(group) == 1:
         return list(values)
@@ -43,7 +47,7 @@ def sums(values, group=None):
     return [sum(column) for column in zip(*(t.tolist() for t in of_all), strict=True)]
 
 
-def mean(values, samples):
+def mean(values: Iterable[float], samples: int) -> list[float]:
     """The mean of each of these numbers over the processes, which speak for that many samples each."""
     if count() == 1:
         return list(values)
@@ -51,12 +55,12 @@ def mean(values, samples):
     return [total / weight for total in totals]
 
 
-def share(samples):
+def share(samples: Tensor) -> Tensor:
     """This process's part of a tensor of samples or of their numbers."""
     return samples if count() == 1 else samples.tensor_split(count())[distributed.get_rank()]
 
 
-def check_batches(samples, batch):
+def check_batches(samples: int, batch: int) -> None:
     """Raise ValueError unless every process gets a sample of every batch."""
     smallest = samples % batch or min(samples, batch)
     if smallest < count():
@@ -66,23 +70,25 @@ def check_batches(samples, batch):
 class _Loss(torch.nn.Module):
     """What DistributedDataParallel calls: the loss of a share of a batch, with the network's parameters."""
 
-    def __init__(self, network, loss):
+    def __init__(self, network: torch.nn.Module, loss: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
         self.network = network
         self.loss = loss
 
-    def forward(self, batch):
+    def forward(self, batch: Tensor) -> Tensor:
         return self.loss(batch)
 
 
-def shared_loss(network, loss):
+def shared_loss(
+    network: torch.nn.Module, loss: Callable[[Tensor], Tensor]
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """From `loss`, of the numbers of a batch's samples, to that of this process's share of them: (its value, its
     part of the whole loss, for the backward pass). The gradients of the parts are then those of the batch's loss."""
     if count() == 1:
-        return lambda batch: (loss(batch),) * 2
+        return lambda batch: (whole := loss(batch), whole)
     parallel = torch.nn.parallel.DistributedDataParallel(_Loss(network, loss))
 
-    def of_share(batch):
+    def of_share(batch: Tensor) -> tuple[Tensor, Tensor]:
         mine = share(batch)
         value = parallel(mine)
         return value, value * (len(mine) * count() / len(batch))  # DistributedDataParallel divides by the count
@@ -90,32 +96,36 @@ def shared_loss(network, loss):
     return of_share
 
 
-def from_first(make):
+def from_first(make: Callable[[], T]) -> T:
     """What `make()` returns in the first process, in all of them. It is not called in the others."""
     if count() == 1:
         return make()
-    box = [make() if is_first() else None]
+    box: list[Any] = [make() if is_first() else None]
     distributed.broadcast_object_list(box, src=0)
-    return box[0]
+    made: T = box[0]
+    return made
 
 
-def first_before_others(make):
+def first_before_others(make: Callable[[], T]) -> T:
     """`make()` of every process, called in the first one before the others: they find the files it has written."""
     if count() == 1:
         return make()
-    made = make() if is_first() else None
+    if is_first():
+        made = make()
+        distributed.barrier()
+        return made
     distributed.barrier()
-    return made if is_first() else make()
+    return make()
 
 
-def launched():
+def launched() -> int:
     """How many processes torchrun, or who else sets its variables, has started this one among."""
     names = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
     return int(os.environ["WORLD_SIZE"]) if all(name in os.environ for name in names) else 1
 
 
 @contextlib.contextmanager
-def joined():
+def joined() -> Iterator[None]:
     """Join the others that torchrun has started, and leave them in the end. Only the first one prints meanwhile.
 
     RuntimeError, in one sentence, where another process has ended before its time.
@@ -142,6 +152,6 @@ def joined():
             distributed.destroy_process_group()
 
 
-def _is_of_a_connection(error):
+def _is_of_a_connection(error: RuntimeError) -> bool:
     """Whether gloo, which has no class of errors of its own, says that it has lost another process."""
     return any(words in str(error) for words in ("gloo", "Connection closed", "Connection reset", "Broken pipe"))

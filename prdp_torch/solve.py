@@ -2,22 +2,40 @@
 
 from collections import Counter
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check, operators
 from prdp_torch.solvers import (
     Kept,
+    Solver,
     check_options,
     checkpoint_number,
     flat_preconditioner,
     solve_options,
     tensors_of,
 )
+from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Solution
 
-SolveStatus = IntEnum("SolveStatus", _C.SOLVE_STATUSES)
-SolveStatus.__doc__ = """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
+_STATUSES: dict[str, int] = _C.SOLVE_STATUSES
+
+
+class SolveStatus(IntEnum):
+    """Why a solve stopped, one value per sample; positive: solved (docs/stability.md)."""
+
+    CONVERGED_BREAKDOWN = _STATUSES["CONVERGED_BREAKDOWN"]
+    CONVERGED = _STATUSES["CONVERGED"]
+    MAX_ITER = _STATUSES["MAX_ITER"]
+    STAGNATED = _STATUSES["STAGNATED"]
+    DIVERGED = _STATUSES["DIVERGED"]
+    OVERFLOW = _STATUSES["OVERFLOW"]
+    BREAKDOWN = _STATUSES["BREAKDOWN"]
+    ZERO_DIAGONAL = _STATUSES["ZERO_DIAGONAL"]
+    INCONSISTENT = _STATUSES["INCONSISTENT"]
+    NONFINITE_INPUT = _STATUSES["NONFINITE_INPUT"]
+    NONFINITE_OPERATOR = _STATUSES["NONFINITE_OPERATOR"]
 
 
 _last_options = Kept(solve_options)
@@ -26,28 +44,28 @@ _last_options = Kept(solve_options)
 class AdjointLog:
     """Where a backward pass leaves the report of its adjoint solve: nobody is there to return it to."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._kept = _C.AdjointLog()  # closes the log with it
-        self.number = self._kept.number
+        self.number: int = self._kept.number
 
-    def read(self):
+    def read(self) -> "SolveInfo | None":
         entry = _C.read_adjoint_log(self.number)
         return None if entry is None else SolveInfo(*entry)
 
-    def __deepcopy__(self, memo):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "AdjointLog":
         return AdjointLog()
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         return AdjointLog, ()
 
 
-class AdjointLogs(list):
+class AdjointLogs(list[AdjointLog]):
     """The logs of a row of steps, one each; read as (batch, steps)."""
 
-    def __init__(self, steps=0):
+    def __init__(self, steps: int = 0) -> None:
         super().__init__(AdjointLog() for _ in range(steps))
 
-    def read(self):
+    def read(self) -> "SolveInfo | None":
         entry = _C.join_adjoint_logs([log.number for log in self])
         return None if entry is None else SolveInfo(*entry)
 
@@ -56,20 +74,20 @@ class SolveInfo(NamedTuple):
     """The report of a solve, with one value per sample: tensors of shape (batch,). The report of a rollout has one
     value per sample and step: (batch, steps)."""
 
-    iterations: torch.Tensor
+    iterations: Tensor
     """Iterations that produced the returned u (int64)."""
-    residual: torch.Tensor
+    residual: Tensor
     """‖b - A u‖ / ‖b‖, recomputed from the returned u (dtype of u)."""
-    status: torch.Tensor
+    status: Tensor
     """Why the solve stopped (int64). `SolveStatus(int(info.status[0])).name` is its name."""
-    operator_applications: torch.Tensor
+    operator_applications: Tensor
     """Number of products with A (int64)."""
-    floor: torch.Tensor
+    floor: Tensor
     """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖; 0 elsewhere.
     Such a sample is STAGNATED, and u is as accurate as the dtype allows. For a smaller residual take float64."""
     log: AdjointLog | AdjointLogs | None = None
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         found = Counter(SolveStatus(s).name for s in self.status.flatten().tolist())
         statuses = ", ".join(f"{count} {name}" for name, count in found.items())
         ranges = ", ".join(
@@ -80,17 +98,17 @@ class SolveInfo(NamedTuple):
         return f"SolveInfo({statuses}; {ranges})"
 
     @property
-    def failed(self):
+    def failed(self) -> Tensor:
         """Which samples failed (bool): their status is below STAGNATED."""
         return self.status < SolveStatus.STAGNATED
 
     @property
-    def solved(self):
+    def solved(self) -> Tensor:
         """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows."""
         return (self.status > 0) | (self.floor > 0)
 
     @property
-    def adjoint(self):
+    def adjoint(self) -> "SolveInfo | None":
         """The report of the adjoint solve, or None before `backward()`.
 
         Unrolled mode has no adjoint solve. Its report then has the iterations and the status of the solve itself,
@@ -98,7 +116,7 @@ class SolveInfo(NamedTuple):
         return None if self.log is None else self.log.read()
 
 
-def detach_failed(u, info):
+def detach_failed(u: Tensor, info: SolveInfo) -> Tensor:
     """Return u with its failed samples as constants, so that no gradient passes through them.
 
     A solve with on_failure="zero_grad" passes no gradient through a failed sample itself. Use this function if the
@@ -118,20 +136,21 @@ def detach_failed(u, info):
     Examples:
         >>> loss = (network(prdp.detach_failed(step(u), step.info)) - reference).square().mean()
     """
-    return torch.ops.prdp.detach_failed(u, info.status)
+    constant: Tensor = torch.ops.prdp.detach_failed(u, info.status)
+    return constant
 
 
 def linear_solve(
-    A,
-    b,
-    solver,
-    backward="implicit",
-    adjoint_max_iter=None,
-    adjoint_rtol=None,
-    on_failure="raise",
-    checkpoint_every=None,
-    x0=None,
-):
+    A: operators.Operator | Tensor,
+    b: Tensor,
+    solver: Solver,
+    backward: Backward = "implicit",
+    adjoint_max_iter: int | None = None,
+    adjoint_rtol: float | None = None,
+    on_failure: OnFailure = "raise",
+    checkpoint_every: CheckpointEvery = None,
+    x0: Tensor | None = None,
+) -> tuple[Tensor, SolveInfo]:
     """Solve A u = b, with gradients for A and b.
 
     Args:
@@ -175,7 +194,9 @@ def linear_solve(
         A = operators.Matrix(A)
     if not isinstance(A, operators.Operator):
         raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}")
-    compiling, log, found = torch.compiler.is_compiling(), None, None
+    compiling = torch.compiler.is_compiling()
+    log: AdjointLog | None = None
+    found: Solution | None = None
     if not compiling:
         _check.dense("linear_solve", "b", b)
         if x0 is not None:
@@ -187,14 +208,14 @@ def linear_solve(
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
     settings = backward, adjoint_max_iter, adjoint_rtol, on_failure
     every = checkpoint_number(checkpoint_every)
-    if not compiling:
+    if log is not None:
         preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
         options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings, every, False)
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
     if found is None:
-        found = torch.ops.prdp.linear_solve(
+        solution: Solution = torch.ops.prdp.linear_solve(
             rhs,
             A.tensors,
             A.kind,
@@ -211,5 +232,5 @@ def linear_solve(
             every,
             start,
         )
-    u, *report = found
-    return u.squeeze(0) if lone_vector else u, SolveInfo(*report, log)
+        found = solution
+    return found[0].squeeze(0) if lone_vector else found[0], SolveInfo(*found[1:], log)

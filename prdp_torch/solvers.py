@@ -5,13 +5,20 @@ All start from zero unless they are given a start, and stop, sample by sample, a
 Arguments out of range raise ValueError.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check
 from prdp_torch.operators import Operator
+from prdp_torch.types import CheckpointEvery
+
+Preconditioner: TypeAlias = 'Literal["diagonal", "multigrid"] | Operator | Multigrid | None'
+FlatPreconditioner: TypeAlias = tuple[str, list[int], list[float], list[Tensor], bool]
+Made = TypeVar("Made")
 
 
 @dataclass
@@ -32,12 +39,14 @@ class Solver:
 
     max_iter: int
     rtol: float = _C.DEFAULT_RTOL
-    preconditioner: str | Operator | None = field(default=None, kw_only=True)
+    preconditioner: Preconditioner = field(default=None, kw_only=True)
 
-    restart: ClassVar[int] = _C.DEFAULT_RESTART
+    restart: int = field(
+        default=_C.DEFAULT_RESTART, init=False, repr=False, compare=False
+    )  # an argument of GMRES alone
     method: ClassVar[str]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         who = type(self).__name__
         check_preconditioner(who, self.preconditioner)
         if not torch.compiler.is_compiling():
@@ -50,7 +59,7 @@ class Solver:
 PRECONDITIONERS = ("diagonal", "multigrid")
 
 
-def check_preconditioner(who, preconditioner):
+def check_preconditioner(who: str, preconditioner: object) -> None:
     """Raise ValueError or TypeError for what no solver takes."""
     if isinstance(preconditioner, str) and preconditioner not in PRECONDITIONERS:
         names = ", ".join(map(repr, (None, *PRECONDITIONERS)))
@@ -61,7 +70,7 @@ def check_preconditioner(who, preconditioner):
         )
 
 
-def flat_preconditioner(preconditioner):
+def flat_preconditioner(preconditioner: Preconditioner) -> FlatPreconditioner:
     """A preconditioner for the compiled library: kind, shape, parameters, tensors, and whether it is transposed."""
     if isinstance(preconditioner, Operator):
         return preconditioner.kind, preconditioner.shape, preconditioner.parameters, preconditioner.tensors, False
@@ -137,7 +146,7 @@ class GMRES(Solver):
 
     method: ClassVar[str] = "gmres"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not torch.compiler.is_compiling():
             self.restart = _check.whole("GMRES", "restart", self.restart)
         super().__post_init__()
@@ -163,12 +172,12 @@ class Multigrid(Solver):
     """
 
     max_iter: int = 20
-    preconditioner: object = field(init=False, repr=False, compare=False)
+    preconditioner: Preconditioner = field(init=False, repr=False, compare=False)
     smoothing: int = field(default=2, kw_only=True)
 
     method: ClassVar[str] = "multigrid"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.smoothing = _check.whole("Multigrid", "smoothing", self.smoothing)
         if self.smoothing < 1:
             raise ValueError(f"Multigrid: smoothing must be >= 1, got {self.smoothing}")
@@ -186,43 +195,57 @@ class Direct(Solver):
     method: ClassVar[str] = "direct"
 
 
-class Kept:
+class Kept(Generic[Made]):
     """An object of the compiled library, made anew by `make` where the values that it is made of have changed.
     Copies and pickles begin without one."""
 
-    def __init__(self, make):
-        self.make, self._last = make, (None, None)
+    def __init__(self, make: Callable[..., Made]) -> None:
+        self.make = make
+        self._last: tuple[tuple[Any, ...], Made] | None = None
 
-    def of(self, *values):
+    def of(self, *values: Any) -> Made:
         last = self._last
-        if last[0] != values:
+        if last is None or last[0] != values:
             last = self._last = values, self.make(*values)
         return last[1]
 
-    def __deepcopy__(self, memo):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Kept[Made]":
         return Kept(self.make)
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         return Kept, (self.make,)
 
 
-def solve_options(method, rtol, restart, preconditioner, _, backward, *others):
+def solve_options(
+    method: str, rtol: float, restart: int, preconditioner: Preconditioner, _: object, backward: str, *others: Any
+) -> _C.SolveOptions:
     """The options as the compiled library takes them past the dispatcher. The one that is left out tells when the
     tensors of the preconditioner are new."""
     return _C.SolveOptions(method, rtol, restart, *flat_preconditioner(preconditioner), backward, *others)
 
 
-def tensors_of(preconditioner):
+def tensors_of(preconditioner: Preconditioner) -> tuple[int, ...]:
     """What tells whether the tensors of a preconditioner are others than before."""
     return tuple(map(id, preconditioner.tensors)) if isinstance(preconditioner, Operator) else ()
 
 
-def checkpoint_number(checkpoint_every):
+def checkpoint_number(checkpoint_every: CheckpointEvery) -> int:
     """`checkpoint_every` as the compiled library takes it."""
-    return {None: 0, "sqrt": _C.CHECKPOINT_SQRT}.get(checkpoint_every, checkpoint_every)
+    if checkpoint_every is None:
+        return 0
+    return _C.CHECKPOINT_SQRT if checkpoint_every == "sqrt" else checkpoint_every
 
 
-def check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every, start="zero"):
+def check_options(
+    who: str,
+    solver: object,
+    backward: object,
+    adjoint_max_iter: object,
+    adjoint_rtol: object,
+    on_failure: object,
+    checkpoint_every: CheckpointEvery,
+    start: object = "zero",
+) -> None:
     """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
         raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")

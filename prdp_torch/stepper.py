@@ -1,18 +1,25 @@
 """`Stepper`: what all steppers have in common, and the base of those that solve A(u) u_next = b(u)."""
 
-import torch
+from typing import TYPE_CHECKING, cast
 
-from prdp_torch import _C, _check, operators
+import torch
+from torch import Tensor
+
+from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
+from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
     Kept,
+    Preconditioner,
+    Solver,
     check_options,
     checkpoint_number,
     flat_preconditioner,
     solve_options,
     tensors_of,
 )
+from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
 
 
 class Stepper(torch.nn.Module):
@@ -43,16 +50,31 @@ class Stepper(torch.nn.Module):
         ValueError, TypeError: an argument is wrong. This is checked before any work.
     """
 
+    method: str
+    rtol: float
+    restart: int
+    preconditioner: Preconditioner
+    backward: Backward
+    adjoint_max_iter: int | None
+    adjoint_rtol: float | None
+    on_failure: OnFailure
+    checkpoint_every: CheckpointEvery
+    info: SolveInfo | None
+
+    if TYPE_CHECKING:
+
+        def __call__(self, u: Tensor) -> Tensor: ...
+
     def __init__(
         self,
-        solver,
-        backward="implicit",
-        adjoint_max_iter=None,
-        adjoint_rtol=None,
-        on_failure="raise",
-        checkpoint_every=None,
-        start="zero",
-    ):
+        solver: Solver,
+        backward: Backward = "implicit",
+        adjoint_max_iter: int | None = None,
+        adjoint_rtol: float | None = None,
+        on_failure: OnFailure = "raise",
+        checkpoint_every: CheckpointEvery = None,
+        start: Start = "zero",
+    ) -> None:
         super().__init__()
         who = type(self).__name__
         if type(self).operator is Stepper.operator and type(self).forward is Stepper.forward:
@@ -73,26 +95,26 @@ class Stepper(torch.nn.Module):
         self.start = start
         self._max_iter = int(solver.max_iter)
         self._adjoint_log = AdjointLog()
-        self._last_log = self._adjoint_log
+        self._last_log: AdjointLog | AdjointLogs = self._adjoint_log
         self._kept_options = Kept(solve_options)
         self.info = None
 
-    def operator(self, u):
+    def operator(self, u: Tensor) -> operators.Operator | Tensor:
         """A(u), an operator of `prdp_torch.operators`."""
         raise NotImplementedError(f"{type(self).__name__}: operator(u) is not defined")
 
-    def rhs(self, u):
+    def rhs(self, u: Tensor) -> Tensor:
         """b(u), the right-hand side of the step from u."""
         return u
 
-    def forward(self, u):
-        u_next, *report = self._solve(u, self._adjoint_log)
-        self._keep(report, self._adjoint_log)
-        if u_next.requires_grad:
+    def forward(self, u: Tensor) -> Tensor:
+        found = self._solve(u, self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log)
+        if found[0].requires_grad:
             self._last_log = self._adjoint_log
-        return u_next
+        return found[0]
 
-    def rollout(self, u, steps):
+    def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
         `info` and `adjoint_info` then hold tensors of shape (batch, steps). If a step fails, the error gives its
@@ -102,44 +124,45 @@ class Stepper(torch.nn.Module):
             _check.dense(type(self).__name__, "u", u)
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
-        log = self._adjoint_log if compiling else AdjointLogs(steps)
+        logs = AdjointLogs(0 if compiling else steps)
         states, reports = [u], []
         for step in range(steps):
             if compiling:
-                u_next, *report = self._solve(states[-1], self._adjoint_log)
+                found = self._solve(states[-1], self._adjoint_log)
             else:
                 with _C.StepOfRollout(step + 1, steps):
-                    u_next, *report = self._solve(states[-1], log[step])
-            states.append(u_next)
-            reports.append(report)
-        states = torch.stack(states, 1)
+                    found = self._solve(states[-1], logs[step])
+            states.append(found[0])
+            reports.append(found[1:])
         if steps > 0:
             report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=True)]
         else:
             report = [
                 u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)
             ]
-        self._keep(report, log)
+        log = self._adjoint_log if compiling else logs
+        self._keep(cast(Report, tuple(report)), log)
+        all_states = torch.stack(states, 1)
         # A rollout without gradients, such as a validation, leaves the report of the last backward pass.
-        if states.requires_grad:
+        if all_states.requires_grad:
             self._last_log = log
-        return states
+        return all_states
 
-    def _keep(self, report, log):
-        report = outlive_transforms(report)
-        info = None if report is None else SolveInfo(*report, log)
+    def _keep(self, report: Report, log: AdjointLog | AdjointLogs) -> None:
+        kept = outlive_transforms(report)
+        info = None if kept is None else SolveInfo(*kept, log)
         if torch.compiler.is_compiling():
             self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve
             self.__dict__["info"] = info
 
-    def _solve(self, u, log):
+    def _solve(self, u: Tensor, log: AdjointLog) -> Solution:
         """One step: u_next and its report."""
         who = type(self).__name__
         compiling = torch.compiler.is_compiling()
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
-        a = operators.matrix.as_operator(who, "operator(u)", self.operator(u))
+        a = as_operator(who, "operator(u)", self.operator(u))
         b = self.rhs(u)
         if not compiling:
             _check.dense(who, "rhs(u)", b)
@@ -150,72 +173,66 @@ class Stepper(torch.nn.Module):
                 )
         x0 = u if self.start == "state" else None
         if not compiling:
-            found = _C.linear_solve(
+            found: Solution | None = _C.linear_solve(
                 b, a.tensors, a.kind, a.shape, a.parameters, self._options_kept(), self._max_iter, log.number, x0
             )
             if found is not None:
                 return found
-        return torch.ops.prdp.linear_solve(
+        solution: Solution = torch.ops.prdp.linear_solve(
             b, a.tensors, a.kind, a.shape, a.parameters, False, *self._options(log.number), x0
         )
+        return solution
 
-    def _options_kept(self):
+    def _options_kept(self) -> _C.SolveOptions:
         """The options as the compiled library takes them past the dispatcher."""
         solver = self.method, self.rtol, self.restart, self.preconditioner, tensors_of(self.preconditioner)
         every = checkpoint_number(self.checkpoint_every)
         return self._kept_options.of(*solver, *self._settings(), every, self.start == "state")
 
-    def _options(self, log_number):
-        k = self._max_iter if not torch.compiler.is_dynamo_compiling() else _as_graph_input(self)
+    def _options(self, log_number: int) -> tuple[object, ...]:
+        compiling = torch.compiler.is_dynamo_compiling()
+        k = torch_private.number_as_graph_input(self, "_max_iter") if compiling else self._max_iter
         solver = self.method, k, self.rtol, self.restart, *flat_preconditioner(self.preconditioner)
         return *solver, *self._settings(), log_number, checkpoint_number(self.checkpoint_every)
 
-    def _settings(self):
+    def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure]:
         return self.backward, self.adjoint_max_iter, self.adjoint_rtol, self.on_failure
 
     @property
-    def max_iter(self):
+    def max_iter(self) -> int:
         return self._max_iter
 
     @max_iter.setter
-    def max_iter(self, k):
+    def max_iter(self, k: int) -> None:
         who = type(self).__name__
         k = _check.whole(who, "max_iter", k)
         _C.check_solver(who, self.method, k, self.rtol, self.restart, flat_preconditioner(self.preconditioner)[0])
         self._max_iter = k
 
     @property
-    def start(self):
+    def start(self) -> Start:
         return self._start
 
     @start.setter
-    def start(self, start):
+    def start(self, start: Start) -> None:
         _C.check_start(_check.string(type(self).__name__, "start", start))
-        self._start = start
+        self._start: Start = start
 
     @property
-    def adjoint_info(self):
+    def adjoint_info(self) -> SolveInfo | None:
         return self._last_log.read()
 
     @property
-    def converged(self):
+    def converged(self) -> bool:
         """Whether all samples met the tolerance, or came as near as their dtype allows, in the last forward pass and in
         the last backward pass if any."""
         reports = [report for report in (self.info, self.adjoint_info) if report is not None]
         return self.info is not None and all(bool(report.solved.all()) for report in reports)
 
-    def extra_repr(self):
+    def extra_repr(self) -> str:
         by = (
             ""
             if self.preconditioner is None or self.method == "multigrid"
             else f", preconditioner={self.preconditioner!r}"
         )
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
-
-
-def _as_graph_input(stepper):
-    """K inside torch.compile, which otherwise takes a module's plain numbers for constants and compiles again for
-    each of them. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole process.
-    """
-    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
-        return stepper._max_iter + 0  # the number is read where it is used first, which must be here

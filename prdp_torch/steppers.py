@@ -1,12 +1,16 @@
 """Steppers of built-in equations: one time step, or one elliptic solve, as an `nn.Module`."""
 
 from dataclasses import dataclass
+from typing import ClassVar, Unpack
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import Kept
+from prdp_torch.operators.base import real_tensor
+from prdp_torch.solvers import Kept, Solver
 from prdp_torch.stepper import Stepper
+from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
 
 
 @dataclass
@@ -14,8 +18,8 @@ class Equation:
     """A discretised equation as the compiled library takes it, but for its tensors."""
 
     kind: str
-    shape: list
-    parameters: list
+    shape: list[int]
+    parameters: list[float]
     picard_steps: int = 1
 
 
@@ -26,31 +30,45 @@ class EquationStepper(Stepper):
     stays a number.
     """
 
-    def __init__(self, shape, solver, backward, length, nu_and_dt=None, picard_steps=1, **options):
+    kind: ClassVar[str]
+    nu: Number
+    length: Length
+    equation: Equation
+
+    def __init__(
+        self,
+        shape: Shape,
+        solver: Solver,
+        backward: Backward,
+        length: Length,
+        nu_and_dt: tuple[Number, float] | None = None,
+        picard_steps: int = 1,
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(solver, backward, **options)
         who = type(self).__name__
         self._refuse_own_system()
-        shape = _check.shape(who, shape)
+        extents = _check.shape(who, shape)
         self.length = length
-        parameters = _check.lengths(who, length, len(shape))
+        parameters = _check.lengths(who, length, len(extents))
         if nu_and_dt is not None:
             nu, dt = nu_and_dt
             self._keep_nu(nu)
             parameters.insert(0, _check.real(who, "dt", dt))
-        self.equation = Equation(self.kind, shape, parameters, _check.whole(who, "picard_steps", picard_steps))
+        self.equation = Equation(self.kind, extents, parameters, _check.whole(who, "picard_steps", picard_steps))
         self._kept_equation = Kept(_C.Equation)
         torch.ops.prdp.check_equation(*self._equation())
 
-    def _keep_nu(self, nu):
+    def _keep_nu(self, nu: Number) -> None:
         if isinstance(nu, torch.nn.Parameter):
             self.nu = nu
         elif isinstance(nu, torch.Tensor):
             self.register_buffer("nu", nu)
         else:
             self.nu = _check.real(type(self).__name__, "nu", nu)
-        self._number = None, None  # nu as a number, and as the tensor that the library takes
+        self._number: tuple[float, Tensor] | None = None  # nu as a number, and as the tensor that the library takes
 
-    def _refuse_own_system(self):
+    def _refuse_own_system(self) -> None:
         """forward calls the compiled library, not operator(u) and rhs(u) of a subclass."""
         base = next(c for c in type(self).__mro__ if c.__module__ == __name__)
         for name in ("operator", "rhs"):
@@ -60,19 +78,19 @@ class EquationStepper(Stepper):
                     f"build your own with ImplicitStep(operator, rhs, solver)"
                 )
 
-    def forward(self, u):
-        found = None
+    def forward(self, u: Tensor) -> Tensor:
+        found: Solution | None = None
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             log = self._adjoint_log.number
             found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
         if found is None:
-            found = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
-        u_next, *report = found
-        self._keep(report, self._adjoint_log)
-        return u_next
+            solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
+            found = solution
+        self._keep(found[1:], self._adjoint_log)
+        return found[0]
 
-    def rollout(self, u, steps):
+    def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
         Values and gradients equal those of single calls bit for bit. A rollout is faster, because it is one
@@ -82,37 +100,36 @@ class EquationStepper(Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-        states, *report = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
-        self._keep(report, self._adjoint_log)
-        return states
+        found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
+        self._keep(found[1:], self._adjoint_log)
+        return found[0]
 
-    def _equation(self):
+    def _equation(self) -> tuple[list[Tensor], str, list[int], list[float], int]:
         e = self.equation
         return self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps
 
-    def _equation_kept(self):
+    def _equation_kept(self) -> _C.Equation:
         e = self.equation
         return self._kept_equation.of(e.kind, tuple(e.shape), tuple(e.parameters), e.picard_steps)
 
-    def _step_options(self):
+    def _step_options(self) -> tuple[object, ...]:
         return *self._options(self._adjoint_log.number), self.start == "state"
 
-    def _tensors(self):
+    def _tensors(self) -> list[Tensor]:
         """What the operator is made of beside the state: nu as it is now."""
         nu = self.nu
         if isinstance(nu, torch.Tensor):
             return [nu]
-        number, tensor = self._number
-        if nu != number:
-            tensor = operators.base.real_tensor(type(self).__name__, "nu", nu)
-            self._number = nu, tensor
-        return [tensor]
+        if self._number is None or nu != self._number[0]:
+            self._number = nu, real_tensor(type(self).__name__, "nu", nu)
+        return [self._number[1]]
 
-    def rhs(self, u):
+    def rhs(self, u: Tensor) -> Tensor:
         """b(u), the right-hand side of the step from u."""
-        return torch.ops.prdp.rhs(u, self.equation.kind, self.equation.shape, self.equation.parameters)
+        b: Tensor = torch.ops.prdp.rhs(u, self.equation.kind, self.equation.shape, self.equation.parameters)
+        return b
 
-    def extra_repr(self):
+    def extra_repr(self) -> str:
         length = "" if self.length == 1.0 else f"length={self.length}, "
         return f"shape={tuple(self.equation.shape)}, {length}{super().extra_repr()}"
 
@@ -134,13 +151,20 @@ class Poisson(EquationStepper):
 
     kind = "poisson"
 
-    def __init__(self, shape, solver, backward="implicit", length=1.0, **options):
+    def __init__(
+        self,
+        shape: Shape,
+        solver: Solver,
+        backward: Backward = "implicit",
+        length: Length = 1.0,
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(shape, solver, backward, length, **options)
 
-    def _tensors(self):
+    def _tensors(self) -> list[Tensor]:
         return []
 
-    def operator(self, u=None):
+    def operator(self, u: Tensor | None = None) -> operators.Poisson:
         """A(u) as an operator; here the same for every u."""
         return operators.Poisson(self.equation.shape, self.length)
 
@@ -167,10 +191,19 @@ class Heat(EquationStepper):
 
     kind = "heat"
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", length=1.0, **options):
+    def __init__(
+        self,
+        shape: Shape,
+        nu: Number,
+        dt: float,
+        solver: Solver,
+        backward: Backward = "implicit",
+        length: Length = 1.0,
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(shape, solver, backward, length, (nu, dt), **options)
 
-    def operator(self, u=None):
+    def operator(self, u: Tensor | None = None) -> operators.Heat:
         """A(u) as an operator; here the same for every u."""
         e = self.equation
         return operators.Heat(e.shape, self.nu, e.parameters[0], self.length)
@@ -200,10 +233,20 @@ class Burgers(EquationStepper):
 
     kind = "burgers"
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, length=1.0, **options):
+    def __init__(
+        self,
+        shape: Shape,
+        nu: Number,
+        dt: float,
+        solver: Solver,
+        backward: Backward = "implicit",
+        picard_steps: int = 1,
+        length: Length = 1.0,
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
 
-    def operator(self, u):
+    def operator(self, u: Tensor) -> operators.Burgers:
         """A(u) as an operator: the winds are u."""
         return operators.Burgers(u, self.nu, self.equation.parameters[0], self.length)
 
@@ -230,9 +273,19 @@ class NavierStokes(EquationStepper):
 
     kind = "navier_stokes"
 
-    def __init__(self, shape, nu, dt, solver, backward="implicit", picard_steps=1, length=1.0, **options):
+    def __init__(
+        self,
+        shape: Shape,
+        nu: Number,
+        dt: float,
+        solver: Solver,
+        backward: Backward = "implicit",
+        picard_steps: int = 1,
+        length: Length = 1.0,
+        **options: Unpack[StepOptions],
+    ) -> None:
         super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
 
-    def operator(self, u):
+    def operator(self, u: Tensor) -> operators.NavierStokes:
         """A(u) as an operator: the winds are the velocity of u."""
         return operators.NavierStokes(u, self.nu, self.equation.parameters[0], self.length)

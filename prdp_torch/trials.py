@@ -2,15 +2,19 @@
 
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, operators
-from prdp_torch.solve import SolveStatus
+from prdp_torch.operators.matrix import as_operator
+from prdp_torch.solve import SolveInfo, SolveStatus
 from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Solver, SteepestDescent
+from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 
 TOLERANCES = (1e-3, 1e-5)
@@ -46,31 +50,31 @@ class Row:
     """With a random cotangent; None where nothing in the step needs a gradient."""
 
     @property
-    def name(self):
+    def name(self) -> str:
         return name_of(self.solver)
 
     @property
-    def solves(self):
+    def solves(self) -> list[Solve]:
         return [self.forward] if self.adjoint is None else [self.forward, self.adjoint]
 
     @property
-    def solved(self):
+    def solved(self) -> bool:
         return all(solve.solved for solve in self.solves)
 
     @property
-    def status(self):
+    def status(self) -> str:
         """The word solved, or the worse of the two statuses."""
         return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
 
 
-def name_of(solver):
+def name_of(solver: Solver) -> str:
     settings = [str(solver.restart)] if isinstance(solver, GMRES) else []
     if getattr(solver, "preconditioner", None) is not None:
-        settings.append(solver.preconditioner)
+        settings.append(str(solver.preconditioner))
     return type(solver).__name__ + (f"({', '.join(settings)})" if settings else "")
 
 
-def candidates(step):
+def candidates(step: Stepper) -> list[Solver]:
     """The solvers to try on a step."""
     own = [step.restart] if step.method.startswith("gmres") else []
     restarts = sorted({*RESTARTS, *own})
@@ -82,14 +86,15 @@ def candidates(step):
     return [*every, Direct(1)]
 
 
-def measure(step, sample, solvers, seconds):
+def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: float) -> tuple[list[Row], list[str]]:
     """Try the solvers on a step, `seconds` each. Returns the rows of all that the operator allows, and a sentence
     for each of the others. Raises TypeError or ValueError where step and sample do not fit each other."""
     trial = _copy(step)
-    set_solver(trial, GMRES(1, restart=1), 1, 0.0)
+    any_solver = GMRES(1, restart=1)
+    set_solver(trial, any_solver, 1, 0.0)
     trial(sample)  # what does not fit is refused here
     cotangent = random_cotangent(trial, sample)
-    run(trial, sample, cotangent)  # the first backward pass of a process starts its threads
+    run(trial, sample, cotangent, any_solver)  # the first backward pass of a process starts its threads
     symmetric = _symmetric(trial, sample, cotangent)
     rows, refused = [], []
     for solver in solvers:
@@ -108,14 +113,14 @@ def measure(step, sample, solvers, seconds):
     return rows, [sentence for method, sentence in refused if method in tried or sentence == first[method]]
 
 
-def measure_one_iteration(step, sample, solver):
+def measure_one_iteration(step: Stepper, sample: Tensor, solver: Solver) -> Row:
     """The row of a single iteration."""
     trial = _copy(step)
     set_solver(trial, solver, 1, 0.0)
     return run(trial, sample, random_cotangent(trial, sample), solver, RUNS)
 
 
-def measure_with_start(step, sample, row):
+def measure_with_start(step: Stepper, sample: Tensor, row: Row) -> Row:
     """The same solve as `row`, from the state."""
     trial = _copy(step)
     trial.start = "state"
@@ -123,9 +128,10 @@ def measure_with_start(step, sample, row):
     return run(trial, sample, random_cotangent(trial, sample), row.solver, RUNS)
 
 
-def _measure_one(trial, sample, cotangent, solver, seconds):
+def _measure_one(trial: Stepper, sample: Tensor, cotangent: Tensor, solver: Solver, seconds: float) -> list[Row]:
     """K doubles until the tolerance is met or the time is spent; a finer one is not tried after a failure."""
-    rows, k, deadline = [], 1, time.perf_counter() + seconds
+    rows: list[Row] = []
+    k, deadline = 1, time.perf_counter() + seconds
     for rtol in TOLERANCES:
         while True:
             set_solver(trial, solver, k, rtol)
@@ -140,11 +146,19 @@ def _measure_one(trial, sample, cotangent, solver, seconds):
     return rows
 
 
-def run(trial, sample, cotangent, solver=None, max_runs=1, deadline=float("inf")):
+def run(
+    trial: Stepper,
+    sample: Tensor,
+    cotangent: Tensor,
+    solver: Solver,
+    max_runs: int = 1,
+    deadline: float = float("inf"),
+) -> Row:
     """The row of a step and its adjoint as they are set; no run starts after the deadline but the first."""
     u = sample.clone().requires_grad_()
     inputs = [u, *(p for p in trial.parameters() if p.requires_grad)]
-    forward, adjoint = [], []
+    forward: list[float] = []
+    adjoint: list[float] = []
     while not forward or (len(forward) < max_runs and time.perf_counter() < deadline):
         started = now(u)
         u_next = trial(u)
@@ -153,11 +167,12 @@ def run(trial, sample, cotangent, solver=None, max_runs=1, deadline=float("inf")
         if u_next.requires_grad:
             torch.autograd.grad(u_next, inputs, cotangent, allow_unused=True)
             adjoint.append(now(u) - between)
+    assert trial.info is not None
     backward = _solve(trial.adjoint_info, adjoint) if adjoint and trial.adjoint_info is not None else None
     return Row(solver, u.dtype, trial.rtol, _solve(trial.info, forward), backward)
 
 
-def _solve(info, seconds):
+def _solve(info: SolveInfo, seconds: list[float]) -> Solve:
     worst = SolveStatus(int(info.status.min())).name
     return Solve(
         int(info.iterations.max()),
@@ -168,20 +183,20 @@ def _solve(info, seconds):
     )
 
 
-def _copy(step):
+def _copy(step: Stepper) -> Stepper:
     trial = copy.deepcopy(step)
     trial.backward, trial.on_failure = "implicit", "return"
     trial.adjoint_max_iter = trial.adjoint_rtol = trial.checkpoint_every = None
     return trial
 
 
-def set_solver(trial, solver, max_iter, rtol):
+def set_solver(trial: Stepper, solver: Solver, max_iter: int, rtol: float) -> None:
     trial.method, trial.restart, trial.rtol = solver.method, solver.restart, rtol
     trial.preconditioner = solver.preconditioner
     trial.max_iter = max_iter
 
 
-def _check_direct(trial, sample, seconds):
+def _check_direct(trial: Stepper, sample: Tensor, seconds: float) -> None:
     """ValueError where a factorisation would take too much time or memory."""
     a = _operator(trial, sample)
     if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
@@ -203,11 +218,11 @@ def _check_direct(trial, sample, seconds):
         raise ValueError(f"the batch takes some {2 * whole:.2g} s forward and adjoint, more than {seconds:g} s")
 
 
-def _operator(step, sample):
-    return operators.matrix.as_operator("advise", "operator(u)", step.operator(sample))
+def _operator(step: Stepper, sample: Tensor) -> operators.Operator:
+    return as_operator("advise", "operator(u)", step.operator(sample))
 
 
-def _symmetric(trial, sample, v):
+def _symmetric(trial: Stepper, sample: Tensor, v: Tensor) -> bool:
     """Whether A v and Aᵀ v agree to rounding, entry by entry."""
     with torch.no_grad():
         a = _operator(trial, sample)
@@ -215,7 +230,7 @@ def _symmetric(trial, sample, v):
     return float((product - transposed).abs().max()) <= _rounding(product)
 
 
-def random_cotangent(step, sample):
+def random_cotangent(step: Stepper, sample: Tensor) -> Tensor:
     """Random, without the mean of a channel whose constants A maps to zero, such as a pressure."""
     c = torch.randn(sample.shape, generator=torch.Generator().manual_seed(0), dtype=sample.dtype).to(sample.device)
     with torch.no_grad():
@@ -230,11 +245,11 @@ def random_cotangent(step, sample):
     return c
 
 
-def _rounding(v):
+def _rounding(v: Tensor) -> float:
     return 100 * torch.finfo(v.dtype).eps * float(v.abs().max())
 
 
-def now(u):
+def now(u: Tensor) -> float:
     """Seconds, when all work on the device of u is done."""
     if u.is_cuda:
         torch.cuda.synchronize(u.device)

@@ -9,8 +9,9 @@ import math
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 
@@ -23,25 +24,25 @@ _DAMAGED = (
 )  # fmt: skip
 
 
-def is_npz(path):
+def is_npz(path: str | Path) -> bool:
     return Path(path).suffix.lower() == ".npz"
 
 
-def write(path, arrays):
+def write(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write named arrays, whole or not at all. ValueError if the file cannot be written; ImportError if the package
     h5py is missing."""
     content = io.BytesIO()
     if is_npz(path):
-        np.savez(content, **arrays)
+        np.savez(content, **arrays)  # type: ignore[arg-type]  # for all it knows, one is called allow_pickle
     else:
         with _h5py().File(content, "w") as file:
             for name, array in arrays.items():
                 file[name] = array
-    _C.write_whole(path, content.getvalue())
+    _C.write_whole(path, content.getvalue())  # type: ignore[arg-type]  # it takes bytes
 
 
 @contextlib.contextmanager
-def opened(path):
+def opened(path: str | Path) -> Iterator["File"]:
     """The file as an object with `names()` and `array(name)`. ValueError if there is no such file, or none that can be
     read; ImportError if the package h5py is missing."""
     kind = _NpzFile if is_npz(path) else _Hdf5File
@@ -59,13 +60,13 @@ def opened(path):
 class Array(NamedTuple):
     """An array of a file, whose values have not been read."""
 
-    path: str
+    path: str | Path
     name: str
-    shape: tuple
-    dtype: np.dtype
-    rows: object  # a function: how many → an array of the first rows
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    rows: Callable[[int], np.ndarray]  # how many → an array of the first rows
 
-    def read(self, count=None):
+    def read(self, count: int | None = None) -> np.ndarray:
         """The first rows, or all, in float32 or float64."""
         count = self.shape[0] if count is None else count
         needed = count * math.prod(self.shape[1:]) * 8
@@ -80,13 +81,20 @@ class Array(NamedTuple):
         return np.ascontiguousarray(values, wanted)
 
 
-class _File:
+class File:
     """What the two formats share."""
 
-    def __init__(self, path):
+    def __init__(self, path: str | Path) -> None:
         self.path = path
+        self._file: Any = None  # of a library without types, or a zip file
 
-    def array(self, name):
+    def names(self) -> list[str]:
+        raise NotImplementedError
+
+    def _look_at(self, name: str) -> Array:
+        raise NotImplementedError
+
+    def array(self, name: str) -> Array:
         """An `Array` of real numbers. ValueError if it is missing or anything else."""
         if name not in self.names():
             raise ValueError(f"data: '{self.path}' has no '{name}'; it holds: {', '.join(self.names()) or 'nothing'}")
@@ -99,7 +107,7 @@ class _File:
             raise ValueError(f"data: '{self.path}': {name} must be an array, got a single number")
         return array
 
-    def _refuse(self, name, what):
+    def _refuse(self, name: str, what: str) -> NoReturn:
         raise _Refused(f"data: '{self.path}': {name} is {what}; the file must hold the numbers itself")
 
 
@@ -107,20 +115,20 @@ class _Refused(ValueError):
     """An error in words already."""
 
 
-class _Hdf5File(_File):
-    def __enter__(self):
+class _Hdf5File(File):
+    def __enter__(self) -> Self:
         self._file = _h5py().File(self.path, "r")
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         with _words_for(self.path):
             self._file.close()
 
-    def names(self):
+    def names(self) -> list[str]:
         with _words_for(self.path):
             return [_printable(name) for name in self._file]
 
-    def _look_at(self, name):
+    def _look_at(self, name: str) -> Array:
         h5py = _h5py()
         link = self._file.get(name, getlink=True)
         if not isinstance(link, h5py.HardLink):
@@ -135,18 +143,18 @@ class _Hdf5File(_File):
         return Array(self.path, name, tuple(data.shape), data.dtype, lambda count: data[:count])
 
 
-class _NpzFile(_File):
-    def __enter__(self):
+class _NpzFile(File):
+    def __enter__(self) -> Self:
         self._file = zipfile.ZipFile(self.path)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def names(self):
+    def names(self) -> list[str]:
         return [_printable(name.removesuffix(".npy")) for name in self._file.namelist()]
 
-    def _look_at(self, name):
+    def _look_at(self, name: str) -> Array:
         info = self._file.getinfo(f"{name}.npy")
         with self._file.open(info) as entry:
             shape, by_columns, dtype = _npy_header(entry)
@@ -155,7 +163,7 @@ class _NpzFile(_File):
         if dtype.kind == "f" and info.file_size != start + size:
             raise ValueError(f"{name} has {info.file_size - start} bytes, expected {size}")
 
-        def rows(count):
+        def rows(count: int) -> np.ndarray:
             part = math.prod(shape[1:]) * count * dtype.itemsize
             with self._file.open(info) as entry:
                 entry.read(start)
@@ -168,7 +176,7 @@ class _NpzFile(_File):
         return Array(self.path, name, shape, dtype, rows)
 
 
-def _npy_header(entry):
+def _npy_header(entry: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Shape, whether the first index runs fastest, and dtype, which may be anything."""
     version = np.lib.format.read_magic(entry)
     if version not in ((1, 0), (2, 0)):
@@ -181,7 +189,7 @@ def _npy_header(entry):
 
 
 @contextlib.contextmanager
-def _words_for(path):
+def _words_for(path: str | Path) -> Iterator[None]:
     """Turn what the readers of the formats raise for a damaged file into one sentence."""
     try:
         yield
@@ -194,12 +202,12 @@ def _words_for(path):
         ) from None
 
 
-def _printable(what):
+def _printable(what: object) -> str:
     """In one line."""
     return " ".join("".join(c if c.isprintable() else " " for c in str(what)).split())[:200]
 
 
-def _h5py():
+def _h5py() -> Any:
     try:
         import h5py
     except ImportError:

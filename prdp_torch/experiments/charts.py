@@ -1,15 +1,30 @@
 """The pictures of a comparison, each as a matplotlib figure."""
 
+from __future__ import annotations
+
 import io
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from prdp_torch.experiments import _C
+
+if TYPE_CHECKING:
+    from prdp_torch.experiments.compare import Entry, Row
+
+Colour: TypeAlias = str | tuple[float, float, float, float]
+Limits: TypeAlias = list[tuple[float, float]]
+Drawn: TypeAlias = tuple[str, Figure, str]
+"""Name, figure and caption."""
 
 WIDTH = 9.2  # inches, of every picture
 
@@ -25,7 +40,7 @@ FIXED = {
 }
 
 
-def _style(row, rows):
+def _style(row: Row, rows: list[Row]) -> tuple[Colour, str]:
     """Colour and line of a row; constant K run through one colour map, from coarse to fine."""
     if row.kind in FIXED:
         return FIXED[row.kind]
@@ -34,28 +49,28 @@ def _style(row, rows):
     return matplotlib.colormaps["viridis"](0.05 + 0.85 * position), "-"
 
 
-def make_figure(panels=1, height=4.2):
+def make_figure(panels: int = 1, height: float = 4.2) -> tuple[Figure, np.ndarray]:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(1, panels, squeeze=False)[0]
 
 
-def write_png(figure, path, dpi):
+def write_png(figure: Figure, path: Path, dpi: int) -> None:
     """Write a figure as a small file, whole or not at all: without an alpha channel, as it is opaque, and compressed
     with care. ValueError if it cannot be written."""
     image, small = io.BytesIO(), io.BytesIO()
     figure.savefig(image, format="png", dpi=dpi)
     Image.open(image).convert("RGB").save(small, format="png", optimize=True, dpi=(dpi, dpi))
-    _C.write_whole(path, small.getvalue())
+    _C.write_whole(path, small.getvalue())  # type: ignore[arg-type]  # it takes bytes
 
 
-def error_measure(scene):
+def error_measure(scene: _C.Scene) -> tuple[str, str]:
     """What the validation metric measures, and how."""
     if scene.task == "corrector":
         return "x-velocity error", "mean of (‖u₁ − u₁_ref‖ / ‖u₁_ref‖)²"
     return "validation error", "mean of (‖u − u_ref‖ / ‖u_ref‖)²"
 
 
-def _metric_name(scene):
+def _metric_name(scene: _C.Scene) -> str:
     if scene.task == "parameters":
         return "parameter error ‖θ − θ_ref‖ / ‖θ_ref‖"
     if scene.task == "field":
@@ -67,7 +82,9 @@ def _metric_name(scene):
     return f"{error} after {steps} step{'s' if steps > 1 else ''},\n{measure}"
 
 
-def mean_and_band(axes, x, values, label, colour, line, lead=True):
+def mean_and_band(
+    axes: Axes, x: ArrayLike, values: np.ndarray, label: str, colour: Colour, line: str, lead: bool = True
+) -> None:
     """Geometric mean of `values` (seeds, x) as a line, and their spread over the seeds as a band; both end
     where a seed is no longer finite."""
     logs = np.log10(np.maximum(np.where(np.isfinite(values), values, np.nan), 1e-300))
@@ -77,7 +94,7 @@ def mean_and_band(axes, x, values, label, colour, line, lead=True):
         axes.fill_between(x, 10 ** (mean - spread), 10 ** (mean + spread), color=colour, alpha=0.15, lw=0)
 
 
-def metric_over_intervals(scene, rows):
+def metric_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
     """Metric over epochs for every way of choosing K: geometric mean and spread over the seeds."""
     figure, (axes,) = make_figure(height=4.8)
     for row in rows:
@@ -90,7 +107,7 @@ def metric_over_intervals(scene, rows):
     return figure
 
 
-def k_over_intervals(scene, rows):
+def k_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
     """K over epochs, or the iterations that a solve took where K is only a cap: each seed thin, their mean bold."""
     figure, (axes,) = make_figure()
     for row in rows:
@@ -111,7 +128,7 @@ def k_over_intervals(scene, rows):
     return figure
 
 
-def total_iterations(scene, rows, table):
+def total_iterations(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> Figure:
     """Iterations of a whole training as bars, with what incomplete convergence (K ends below the
     converged one) and progressive refinement (K starts lower still) save of the converged run's."""
     chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
@@ -141,7 +158,7 @@ def total_iterations(scene, rows, table):
     return figure
 
 
-def pareto_front(cost, error):
+def pareto_front(cost: np.ndarray, error: np.ndarray) -> list[int]:
     """Indices of the points that no other beats in both, in order of cost."""
     order = np.lexsort((error, cost))
     front, best = [], np.inf
@@ -160,15 +177,15 @@ _COSTS = (
 )
 
 
-def _cost_panels(scene, draw, limits=None):
+def _cost_panels(scene: _C.Scene, draw: Callable[[Axes, str], None], limits: Limits | None = None) -> Figure:
     """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one. With `limits`, (lowest, highest)
     of the y axis from below, the axis is broken between them."""
-    limits = limits or [None]
-    figure = Figure(figsize=(WIDTH, 4.8 if len(limits) == 1 else 6.0), layout="constrained")
-    heights = [1.0, 2.2][-len(limits) :]
-    panels = figure.subplots(len(limits), 2, sharex="col", squeeze=False, height_ratios=heights)
+    ranges: Sequence[tuple[float, float] | None] = limits or [None]
+    figure = Figure(figsize=(WIDTH, 4.8 if len(ranges) == 1 else 6.0), layout="constrained")
+    heights = [1.0, 2.2][-len(ranges) :]
+    panels = figure.subplots(len(ranges), 2, sharex="col", squeeze=False, height_ratios=heights)
     for column, (cost, label) in zip(panels.T, _COSTS, strict=True):
-        for axes, limit in zip(column[::-1], limits, strict=True):
+        for axes, limit in zip(column[::-1], ranges, strict=True):
             draw(axes, cost)
             axes.set(yscale="log", xlim=(0, None), ylim=limit)
             axes.grid(alpha=0.3, which="both", lw=0.4)
@@ -185,17 +202,18 @@ def _cost_panels(scene, draw, limits=None):
     return figure
 
 
-def _break(upper, lower):
+def _break(upper: Axes, lower: Axes) -> None:
     """Two axes as one whose y axis is broken between them."""
     upper.spines["bottom"].set_visible(False)
     lower.spines["top"].set_visible(False)
     upper.tick_params(axis="x", which="both", bottom=False)
-    mark = {"marker": [(-1, -0.6), (1, 0.6)], "ms": 9, "ls": "none", "color": "black", "mew": 1, "clip_on": False}
+    marker = [(-1, -0.6), (1, 0.6)]
+    mark: dict[str, Any] = {"marker": marker, "ms": 9, "ls": "none", "color": "black", "mew": 1, "clip_on": False}
     upper.plot([0, 1], [0, 0], transform=upper.transAxes, **mark)
     lower.plot([0, 1], [1, 1], transform=lower.transAxes, **mark)
 
 
-def _zoom(errors, spreads):
+def _zoom(errors: np.ndarray, spreads: np.ndarray) -> Limits | None:
     """Limits of a y axis on which errors within ten times the best are told apart: those around them, and above a
     break those of the rest. None where all are that close."""
     known = np.isfinite(errors)
@@ -211,12 +229,12 @@ def _zoom(errors, spreads):
     return [(lowest / margin, highest * margin), (max(highest * margin, errors[far].min() / 2), errors[far].max() * 2)]
 
 
-def accuracy_against_cost(scene, rows):
+def accuracy_against_cost(scene: _C.Scene, rows: list[Row]) -> Figure:
     """Final metric against what the training cost, one point a row, with the Pareto front as stairs."""
     error = np.array([row.final().mean() for row in rows])
     spread = np.array([row.final().std(ddof=1) if len(row.curves) > 1 else 0.0 for row in rows])
 
-    def draw(axes, name):
+    def draw(axes: Axes, name: str) -> None:
         cost = np.array([row.total(name).mean() for row in rows])
         for row, x, y in zip(rows, cost, error, strict=True):
             marker = {
@@ -247,10 +265,10 @@ def accuracy_against_cost(scene, rows):
     return _cost_panels(scene, draw, _zoom(error, spread))
 
 
-def error_against_cost(scene, rows):
+def error_against_cost(scene: _C.Scene, rows: list[Row]) -> Figure:
     """The error as the cost of the training grows, one curve a row: means over the seeds."""
 
-    def draw(axes, name):
+    def draw(axes: Axes, name: str) -> None:
         for row in rows:
             colour, line = _style(row, rows)
             cost = np.concatenate([[0.0], np.cumsum(row.stack(name).mean(0))])
@@ -265,7 +283,7 @@ def error_against_cost(scene, rows):
     return _cost_panels(scene, draw)
 
 
-def _k_caption(scene, rows):
+def _k_caption(scene: _C.Scene, rows: list[Row]) -> str:
     """Where K went, in words, from the runs themselves."""
     ends = next(row for row in rows if row.kind == "prdp").last_k()
     each = " (thin: each seed)" if len(ends) > 1 else ""
@@ -274,7 +292,7 @@ def _k_caption(scene, rows):
     return f"K over the training{each}. PRDP ends at K = {ended}, {place} the converged solver's {scene.max_iter}."
 
 
-def all_charts(scene, rows, table):
+def all_charts(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> list[Drawn]:
     """(name, figure, caption) of every chart, in the order of the report."""
     seeds = len(rows[0].curves)
     spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""

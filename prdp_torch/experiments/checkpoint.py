@@ -1,12 +1,19 @@
 """Checkpoints: the state of a running training, so that it can continue after it was killed."""
 
 import json
+import os
 import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import torch
+from torch import Tensor
 
 from prdp_torch import processes
 from prdp_torch.experiments import _C
+
+Found: TypeAlias = list[tuple[Path, bytes, str]]
 
 
 class Checkpoint(_C.Checkpoint):
@@ -17,28 +24,28 @@ class Checkpoint(_C.Checkpoint):
         settings: everything that the training depends on. A file with other settings is ignored.
     """
 
-    def __init__(self, path, **settings):
+    def __init__(self, path: str | os.PathLike[str], **settings: Any) -> None:
         super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
-    def due(self):
+    def due(self) -> bool:
         return processes.is_first() and super().due()
 
-    def remove(self):
+    def remove(self) -> None:
         if processes.is_first():
             super().remove()
 
-    def save(self, tensors, curves, controller):
+    def save(self, tensors: Mapping[str, Tensor], curves: dict[str, Any], controller: dict[str, Any]) -> None:
         """Save named tensors, the curves of `training.train` and the `state_dict` of a controller. ValueError if the
         file cannot be written."""
         if processes.is_first():
-            self.write(_C.pack_state(tensors, curves, **controller))
+            self.write(_C.pack_state(tensors, curves, **controller))  # type: ignore[arg-type]  # it takes bytes
 
-    def found(self):
+    def found(self) -> Found:
         """Return what `restore` takes, the same in all processes: the files that are there, the last one first.
         ValueError if all of them are damaged."""
         return processes.from_first(self.find)
 
-    def restore(self, found, load):
+    def restore(self, found: Found, load: Callable[[_C.Saved], None]) -> bool:  # type: ignore[override]
         """Call load(saved) with the tensors that were saved last, a `_C.Saved`. Where they are damaged, or load raises
         ValueError, warn and go on with those saved before. Return whether there were any. ValueError if all of them
         are refused."""
@@ -48,7 +55,7 @@ class Checkpoint(_C.Checkpoint):
         return there
 
 
-def check_tensors(network):
+def check_tensors(network: torch.nn.Module) -> None:
     """TypeError, naming the entry, for a network whose state_dict holds what a checkpoint cannot keep."""
     for name, value in network.state_dict().items():
         if not isinstance(value, torch.Tensor):
@@ -58,13 +65,13 @@ def check_tensors(network):
             )
 
 
-def state_of(optimiser):
+def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
     """The state of an Adam by names, which `load_optimiser` takes."""
     state = optimiser.state_dict()["state"]
     return {f"optimiser.{i}.{part}": value for i, parts in state.items() for part, value in parts.items()}
 
 
-def load_optimiser(saved, optimiser, updates):
+def load_optimiser(saved: _C.Saved, optimiser: torch.optim.Optimizer, updates: int) -> dict[int, dict[str, Tensor]]:
     """Take the state of an Adam after so many updates from a `_C.Saved`. A parameter may have had no gradient yet."""
     state = {}
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]

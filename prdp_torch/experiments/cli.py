@@ -338,7 +338,7 @@ def _print_table(scene, table):
     console.print(report.notes(scene, kept))
 
 
-def main():
+def main() -> None:
     app()
 
 

@@ -1,17 +1,23 @@
 """`prdp compare`: the converged solver, the exact one, auto, PRDP and a sweep of constant K, over seeds."""
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from prdp_torch import processes
 from prdp_torch.experiments import _C, records
 from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.datasets import OnData
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement
-from prdp_torch.experiments.training import train
+from prdp_torch.experiments.training import Callback, Curves, Interval, train
+
+Entry: TypeAlias = dict[str, Any]
+"""A row of the table: what a way of choosing K reached and what it cost."""
 
 
 @dataclass
@@ -23,59 +29,68 @@ class Row:
     kind: str  # "converged", "constant", "tolerance", "auto", "prdp", "growth", "schedule", "direct"
     refinement: Refinement
     k: int = 0
-    curves: list = field(default_factory=list)
+    curves: list[Curves] = field(default_factory=list)
 
-    def stack(self, name):
+    def stack(self, name: str) -> np.ndarray:
         """(seeds, entries) of a curve. Where that of a lost training ends, its metric is NaN, K stays and nothing more
         is counted."""
-        longest = max(len(c[name]) for c in self.curves)
-        rest = {"metric": lambda values: math.nan, "max_iter": lambda values: values[-1]}.get(name, lambda values: 0)
-        padded = [[*c[name], *[rest(c[name])] * (longest - len(c[name]))] for c in self.curves]
+        curves = self._each(name)
+        longest = max(map(len, curves))
+        padded = []
+        for curve in curves:
+            rest = math.nan if name == "metric" else curve[-1] if name == "max_iter" else 0
+            padded.append([*curve, *[rest] * (longest - len(curve))])
         return np.array(padded, dtype=float)
 
-    def final(self):
-        """Metric at the end, one value a seed."""
-        return self.stack("metric")[:, -1]
+    def _each(self, name: str) -> list[list[float]]:
+        """A curve of each seed."""
+        return [cast(dict[str, list[float]], curves)[name] for curves in self.curves]
 
-    def counted(self, target):
+    def final(self) -> np.ndarray:
+        """Metric at the end, one value a seed."""
+        return np.asarray(self.stack("metric")[:, -1])
+
+    def counted(self, target: float | None) -> np.ndarray:
         """Intervals that count, one value a seed: all, or up to where the metric reaches the target."""
         metric = self.stack("metric")[:, 1:]
         if target is None:
             return np.full(len(metric), metric.shape[1])
         reached = metric <= target
-        return np.where(reached.any(1), reached.argmax(1) + 1, metric.shape[1])
+        counted: np.ndarray = np.where(reached.any(1), reached.argmax(1) + 1, metric.shape[1])
+        return counted
 
-    def total(self, name, target=None):
+    def total(self, name: str, target: float | None = None) -> np.ndarray:
         """Sum of a cost over the intervals that count, one value a seed."""
-        return np.array([sum(c[name][:n]) for c, n in zip(self.curves, self.counted(target), strict=True)])
+        taken = [sum(curve[:n]) for curve, n in zip(self._each(name), self.counted(target), strict=True)]
+        return np.array(taken)
 
-    def diverged(self):
+    def diverged(self) -> int:
         """How many seeds were lost."""
         return sum("diverged" in c for c in self.curves)
 
     @property
-    def capped(self):
+    def capped(self) -> bool:
         """Whether a tolerance ends the solves, and K is only a cap."""
         return self.kind in ("auto", "tolerance")
 
-    def last_k(self):
+    def last_k(self) -> np.ndarray:
         return self.stack("max_iter")[:, -1]
 
-    def taken_per_solve(self):
+    def taken_per_solve(self) -> np.ndarray:
         """Iterations that a solve took in the mean, one row a seed and one column an interval; NaN where none
         was run."""
         solves = self.stack("budget") / np.maximum(1.0, self.stack("max_iter"))
         return self.stack("iterations") / np.where(solves > 0, solves, np.nan)
 
-    def warnings(self):
+    def warnings(self) -> list[str]:
         """What the controllers said in the end, of every seed that has something to say."""
         return [c["warning"] for c in self.curves if "warning" in c]
 
-    def reaches(self, target):
-        return (self.stack("metric") <= target).any(1)
+    def reaches(self, target: float) -> np.ndarray:
+        return np.asarray((self.stack("metric") <= target).any(1))
 
 
-def rows_of(scene):
+def rows_of(scene: _C.Scene) -> list[Row]:
     """The rows of a scene's comparison: converged first, then the exact solver where it is cheap, a looser tolerance
     where the scene names one, auto, PRDP and constant K."""
     converged = scene.max_iter
@@ -101,7 +116,14 @@ def rows_of(scene):
     return rows
 
 
-def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
+def run(
+    scene: _C.Scene,
+    seeds: int,
+    folder: Path,
+    resume: bool = False,
+    progress: Callable[[Row, int, int], None] | None = None,
+    on_data: OnData | None = None,
+) -> list[Row]:
     """Train every row with every seed, writing a record each; with `resume`, finished ones are read and
     unfinished ones go on from their checkpoints.
 
@@ -115,7 +137,7 @@ def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
         for row in rows:
             for seed in range(seeds):
 
-                def show(interval, row=row, seed=seed):
+                def show(interval: Interval, row: Row = row, seed: int = seed) -> None:
                     report(row, seed, interval.number)
 
                 row.curves.append(
@@ -125,7 +147,17 @@ def run(scene, seeds, folder, resume=False, progress=None, on_data=None):
     return rows
 
 
-def run_one(scene, label, refinement, seed, folder, environment, resume=False, callbacks=(), on_data=None):
+def run_one(
+    scene: _C.Scene,
+    label: str,
+    refinement: Refinement,
+    seed: int,
+    folder: Path,
+    environment: dict[str, Any],
+    resume: bool = False,
+    callbacks: Iterable[Callback] = (),
+    on_data: OnData | None = None,
+) -> Curves:
     """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
     the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
     a record of the same settings and another number of intervals, which would be lost."""
@@ -152,7 +184,7 @@ def run_one(scene, label, refinement, seed, folder, environment, resume=False, c
     return curves
 
 
-def _finished(path, scene, checkpoint):
+def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | None:
     """The curves of the record at `path` if it is of this training. ValueError if it is of another length, and no
     checkpoint is left to go on from."""
     record = records.read_training(path)
@@ -167,10 +199,11 @@ def _finished(path, scene, checkpoint):
         if not checkpoint.find():
             _C.refuse_finished(path, intervals, scene.training.intervals)
         return None
-    return record["curves"]
+    curves: Curves = record["curves"]
+    return curves
 
 
-def summarise(scene, rows):
+def summarise(scene: _C.Scene, rows: list[Row]) -> list[Entry]:
     """The table of a comparison: one dict a row, means over seeds; savings against the first row."""
     target = scene.compare.target
     table = [_entry(scene, row, target) for row in rows]
@@ -183,7 +216,7 @@ def summarise(scene, rows):
     return table
 
 
-def _entry(scene, row, target):
+def _entry(scene: _C.Scene, row: Row, target: float | None) -> Entry:
     final = row.final()
     costs = ("budget", "iterations", "operator_applications", "adjoint_applications", "seconds")
     warnings = row.warnings()
@@ -206,11 +239,11 @@ def _entry(scene, row, target):
     }
 
 
-def _as_good(entry, base):
+def _as_good(entry: Entry, base: Entry) -> bool:
     """Whether a row ends as well as the converged one: at its target where both have one to reach, else
     within its spread. A tenth of the error counts as its spread where seeds show less."""
     if entry["diverged"] or not math.isfinite(base["metric"]):
         return not entry["diverged"]
     if entry["reaches_target"] is not None and base["reaches_target"]:
-        return entry["reaches_target"]
-    return entry["metric"] <= base["metric"] + max(base["metric_std"], 0.1 * base["metric"])
+        return bool(entry["reaches_target"])
+    return bool(entry["metric"] <= base["metric"] + max(base["metric_std"], 0.1 * base["metric"]))

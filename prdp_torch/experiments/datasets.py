@@ -1,13 +1,21 @@
 """What a network is trained on: data that the scene makes, a file of trajectories, or your own tensors."""
 
 import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import torch
+from torch import Tensor
 
 from prdp_torch._C import sentence
 from prdp_torch.experiments import _C, pdebench
+
+OnData: TypeAlias = Callable[[int, int], None]
+"""Called with (steps done, all steps)."""
+
+Own: TypeAlias = Any
+"""Trajectories: a tensor, whatever `torch.as_tensor` takes, a dataset, or a pair of them."""
 
 TRAINED_STEPS = 2  # that the loss looks ahead
 
@@ -15,17 +23,17 @@ TRAINED_STEPS = 2  # that the loss looks ahead
 class Data(NamedTuple):
     """Training and validation states; each (samples, channels, *shape)."""
 
-    train_start: torch.Tensor
-    train_first: torch.Tensor
+    train_start: Tensor
+    train_first: Tensor
     """One step later."""
-    train_end: torch.Tensor
+    train_end: Tensor
     """Two steps later."""
-    valid_start: torch.Tensor
-    valid_end: torch.Tensor
+    valid_start: Tensor
+    valid_end: Tensor
     """`data.valid_steps` steps later."""
 
 
-def of_scene(scene, own=None, on_data=None):
+def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) -> "Data | _C.Dataset":
     """The data of a training.
 
     Args:
@@ -38,7 +46,7 @@ def of_scene(scene, own=None, on_data=None):
     Raises ValueError or TypeError, in words, if the trajectories do not fit the scene.
     """
     if own is None and not scene.data.file:
-        return _C.make_dataset(scene, on_data)
+        return _C.make_dataset(scene, on_data)  # type: ignore[arg-type]  # it takes None
     if scene.data.fresh:
         raise ValueError("train: a scene with data.fresh makes its own data in every epoch; it takes no others")
     if own is None:
@@ -55,15 +63,17 @@ def of_scene(scene, own=None, on_data=None):
     return Data(starts, first, end, valid[:, 0].contiguous(), valid[:, scene.data.valid_steps].contiguous())
 
 
-def reference(scene, steps, on_data=None):
+def reference(scene: _C.Scene, steps: int, on_data: OnData | None = None) -> Tensor:
     """Validation trajectories of `steps` steps, or of as many as the scene's file has: (samples, steps + 1,
     channels, *shape)."""
     if not scene.data.file:
-        return _C.validation_trajectories(scene, steps, on_data)
+        return _C.validation_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
     return pdebench.read(path_of(scene), scene)[scene.data.train :, : steps + 1]
 
 
-def export(scene, path, steps=None, on_data=None):
+def export(
+    scene: _C.Scene, path: str | Path, steps: int | None = None, on_data: OnData | None = None
+) -> tuple[int, ...]:
     """Write the trajectories of a scene to a file that `[data] file` reads, HDF5 or .npz. Returns their shape.
 
     Args:
@@ -72,17 +82,17 @@ def export(scene, path, steps=None, on_data=None):
         steps: how many steps each has; by default what the training and the validation metric need.
     """
     steps = max(TRAINED_STEPS, scene.data.valid_steps) if steps is None else steps
-    trajectories = _C.all_trajectories(scene, steps, on_data)
+    trajectories = _C.all_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
     pdebench.write(path, trajectories, scene)
     return tuple(trajectories.shape)
 
 
-def path_of(scene):
+def path_of(scene: _C.Scene) -> Path:
     """The file of a scene's data, which is relative to the scene's own."""
     return Path(scene.path).parent / scene.data.file
 
 
-def fingerprint(scene):
+def fingerprint(scene: _C.Scene) -> str:
     """What tells the file of a scene's data from another one: its size and the bytes at both ends."""
     path = path_of(scene)
     try:
@@ -90,13 +100,14 @@ def fingerprint(scene):
             head = file.read(2**20)
             size = file.seek(0, 2)
             file.seek(max(0, size - 2**20))
-            return _C.fingerprint(head + file.read() + str(size).encode())
+            content = head + file.read() + str(size).encode()
+            return _C.fingerprint(content)  # type: ignore[arg-type]  # it takes bytes
     except OSError as error:
         raise ValueError(f"data: cannot read '{path}': {error.strerror}") from None
 
 
 @contextlib.contextmanager
-def evaluating(network):
+def evaluating(network: object) -> Iterator[None]:
     """A network, or any function, in evaluation mode and without gradients: running means stay as they are. Then every
     module is in its mode again."""
     modes = [(m, m.training) for m in network.modules()] if isinstance(network, torch.nn.Module) else []
@@ -110,7 +121,7 @@ def evaluating(network):
             module.training = mode
 
 
-def check_network(scene, network, states):
+def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     """Raise TypeError or ValueError unless the network takes states of the scene to states, and can be trained."""
     if not isinstance(network, torch.nn.Module):
         raise TypeError(f"train: network must be a torch.nn.Module, got {type(network).__name__}")
@@ -134,7 +145,7 @@ def check_network(scene, network, states):
         raise ValueError(f"train: network must keep the shape of its input, {tuple(states.shape)}, got {got}")
 
 
-def _split(scene, trajectories):
+def _split(scene: _C.Scene, trajectories: Tensor) -> tuple[Tensor, Tensor]:
     """Training and validation trajectories, by the numbers of the scene."""
     train, valid = scene.data.train, scene.data.valid
     if len(trajectories) < train + valid:
@@ -145,27 +156,28 @@ def _split(scene, trajectories):
     return trajectories[:train], trajectories[train : train + valid]
 
 
-def _tensor(scene, name, own):
+def _tensor(scene: _C.Scene, name: str, own: Own) -> Tensor:
     """Trajectories as a tensor of the scene's dtype, checked."""
     if isinstance(own, torch.utils.data.Dataset):
-        items = [own[i] for i in range(len(own))]
-        own = torch.stack([item[0] if isinstance(item, (tuple, list)) and len(item) == 1 else item for item in items])
+        items: list[Any] = [own[i] for i in range(len(own))]  # type: ignore[arg-type]  # it has a length
+        alone = [item[0] if isinstance(item, (tuple, list)) and len(item) == 1 else item for item in items]
+        own = torch.stack(cast(list[Tensor], alone))
     try:
-        own = torch.as_tensor(own)
+        found: Tensor = torch.as_tensor(own)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"train: {name} must be trajectories as a tensor, got {type(own).__name__}") from None
     shape = (scene.physics.channels, *scene.physics.shape)
-    if own.dim() != 2 + len(shape) or own.shape[2:] != shape or own.numel() == 0:
+    if found.dim() != 2 + len(shape) or found.shape[2:] != shape or found.numel() == 0:
         wanted = ", ".join(map(str, shape))
-        raise ValueError(f"train: {name} must have shape (samples, times, {wanted}), got {tuple(own.shape)}")
-    if not own.is_floating_point():
-        raise TypeError(f"train: {name} must hold floating-point numbers, got {own.dtype}")
-    own = own.detach().to("cpu", scene.dtype)
-    pdebench.check_finite(f"train: {name}", own)
-    return own
+        raise ValueError(f"train: {name} must have shape (samples, times, {wanted}), got {tuple(found.shape)}")
+    if not found.is_floating_point():
+        raise TypeError(f"train: {name} must hold floating-point numbers, got {found.dtype}")
+    found = found.detach().to("cpu", scene.dtype)
+    pdebench.check_finite(f"train: {name}", found)
+    return found
 
 
-def _check_times(what, trajectories, steps):
+def _check_times(what: str, trajectories: Tensor, steps: int) -> None:
     if trajectories.shape[1] <= steps:
         raise ValueError(
             f"train: {what} trajectories need {steps + 1} times, for {steps} steps, but the data have "

@@ -1,8 +1,11 @@
 """The tasks "emulator" and "corrector": a network in place of the equation, or on top of a coarse step."""
 
 import math
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 import torch
+from torch import Tensor
 
 from prdp_torch import fields, processes
 from prdp_torch.experiments import _C, datasets
@@ -11,9 +14,14 @@ from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.task import Task
 from prdp_torch.solve import detach_failed
+from prdp_torch.stepper import Stepper
+
+Data: TypeAlias = datasets.Data | _C.Dataset
+Loss: TypeAlias = Callable[[Tensor], Tensor]
+"""Of the numbers of a batch's samples."""
 
 
-def make_task(scene, steppers, seed, network, data):
+def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torch.nn.Module | None, data: Data) -> Task:
     """An interval is an epoch, the metric that of validation."""
     train = _TrainingSamples(scene, data)
     processes.check_batches(train.count, scene.training.batch)
@@ -26,7 +34,7 @@ def make_task(scene, steppers, seed, network, data):
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
-    def updates(first):
+    def updates(first: int) -> Iterator[tuple[float, Tensor | None]]:
         train.begin(first)
         order = torch.randperm(train.count, generator=generator)
         for number, batch in enumerate(order.split(scene.training.batch), first):
@@ -38,11 +46,11 @@ def make_task(scene, steppers, seed, network, data):
             optimiser.step()
             yield float(loss.detach()), processes.share(batch)
 
-    def state():
+    def state() -> dict[str, Tensor]:
         weights = {f"network.{name}": value for name, value in network.state_dict().items()}
         return {**weights, **state_of(optimiser), "shuffling": generator.get_state()}
 
-    def load(saved, updates):
+    def load(saved: _C.Saved, updates: int) -> None:
         trained = load_optimiser(saved, optimiser, updates)
         parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
         finite = {parameters[i].data_ptr() for i in trained}  # a buffer, such as a mask, may hold Inf
@@ -55,7 +63,7 @@ def make_task(scene, steppers, seed, network, data):
         saved.restore("shuffling", generator)
 
     # The metric is a mean of squares, relative to the reference, after so many steps; their errors add up.
-    def of_a_step(metric):
+    def of_a_step(metric: float) -> float:
         return math.sqrt(metric) / scene.data.valid_steps
 
     return Task(updates, _metric(scene, data, network), of_a_step, state, load, train.updates_per_epoch)
@@ -64,26 +72,26 @@ def make_task(scene, steppers, seed, network, data):
 class _TrainingSamples:
     """Start, first and end of the training samples: the same in every epoch, or those of `data.fresh`."""
 
-    def __init__(self, scene, data):
+    def __init__(self, scene: _C.Scene, data: Data) -> None:
         self.count = len(data.train_start)
         self.updates_per_epoch = math.ceil(self.count / scene.training.batch)
-        self._fresh = _C.FreshData(scene, data) if scene.data.fresh else None
+        self._fresh = _C.FreshData(scene, data) if scene.data.fresh and isinstance(data, _C.Dataset) else None
         self._take(data)
 
-    def begin(self, update):
+    def begin(self, update: int) -> None:
         """Take the samples of the epoch that begins with this update."""
         if self._fresh is not None:
             self._take(self._fresh.epoch(update // self.updates_per_epoch))
 
-    def _take(self, data):
+    def _take(self, data: Data) -> None:
         self.start, self.first, self.end = data.train_start, data.train_first, data.train_end
 
 
-def _metric(scene, data, network):
+def _metric(scene: _C.Scene, data: Data, network: torch.nn.Module) -> Callable[[], float]:
     step = propagator(scene, network)
     start, end = processes.share(data.valid_start), processes.share(data.valid_end)
 
-    def metric():
+    def metric() -> float:
         mine = math.nan  # of a process without a sample
         if len(start):
             with datasets.evaluating(network):
@@ -93,32 +101,34 @@ def _metric(scene, data, network):
     return metric
 
 
-def _emulator(scene, steppers, train, network):
+def _emulator(scene: _C.Scene, steppers: list[Stepper], train: _TrainingSamples, network: torch.nn.Module) -> Loss:
     """The loss of a batch: the network in place of the equation."""
     (stepper,) = steppers
 
-    def loss(batch):
+    def loss(batch: Tensor) -> Tensor:
         u2 = stepper(network(train.start[batch]))
         return _C.loss(scene.training.loss, u2, train.end[batch])
 
     return loss
 
 
-def corrected(stepper, network, u):
+def corrected(stepper: Stepper, network: Callable[[Tensor], Tensor], u: Tensor) -> Tensor:
     """Make a step of the task "corrector": a step of the coarse solver from u, with the network on top. The mean of
     its pressure is removed in between."""
     coarse = _C.without_mean_pressure(stepper(u))
     return coarse + network(coarse)
 
 
-def _corrector(scene, steppers, train, network):
+def _corrector(scene: _C.Scene, steppers: list[Stepper], train: _TrainingSamples, network: torch.nn.Module) -> Loss:
     """The loss of a batch: the network on top of a coarse step, twice."""
     first, second = steppers
 
-    def loss(batch):
+    def loss(batch: Tensor) -> Tensor:
         u1 = corrected(first, network, train.start[batch])
         u2 = corrected(second, network, u1)
-        if scene.on_failure == "zero_grad":  # the network's share is no better than the coarse step below it
+        if (
+            scene.on_failure == "zero_grad" and first.info and second.info
+        ):  # the network's share is no better than the coarse step below it
             worst = torch.minimum(first.info.status, second.info.status)
             u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
         kind = scene.training.loss
@@ -127,7 +137,7 @@ def _corrector(scene, steppers, train, network):
     return loss
 
 
-def propagator(scene, network):
+def propagator(scene: _C.Scene, network: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Return a trained network as a function that makes one time step. This is the network itself; for the task
     "corrector" it is a converged step of the coarse solver, corrected by the network."""
     if scene.task == "emulator":
@@ -136,7 +146,7 @@ def propagator(scene, network):
     return lambda u: corrected(converged, network, u)
 
 
-def error(scene, u, reference):
+def error(scene: _C.Scene, u: Tensor, reference: Tensor) -> float:
     """Return the validation error of states u: the mean over the samples of (‖u - reference‖ / ‖reference‖)². For a
     corrector only the velocity along x counts."""
     of = slice(0, 1) if scene.task == "corrector" else slice(None)

@@ -1,11 +1,14 @@
 """The scenes' networks. `MLP` and `ResNet` are twins of those in C++: same names, order and initialisation."""
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from prdp_torch.experiments import own_networks
+from prdp_torch.experiments import _C, own_networks
 
 
 class MLP(torch.nn.Module):
@@ -17,12 +20,12 @@ class MLP(torch.nn.Module):
         hidden: widths of the layers between.
     """
 
-    def __init__(self, unknowns, hidden):
+    def __init__(self, unknowns: int, hidden: Sequence[int]) -> None:
         super().__init__()
         widths = [unknowns, *hidden, unknowns]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(before, after) for before, after in pairwise(widths))
 
-    def forward(self, u):
+    def forward(self, u: Tensor) -> Tensor:
         x = u.flatten(1)
         for i, layer in enumerate(self.layers):
             x = layer(x.relu() if i > 0 else x)
@@ -46,12 +49,16 @@ class ResNet(torch.nn.Module):
     Source: He et al. 2016.
     """
 
-    def __init__(self, dim, channels, blocks, width, periodic):
+    def __init__(self, dim: int, channels: int, blocks: int, width: int, periodic: bool) -> None:
         super().__init__()
         if dim not in (1, 2, 3):
             raise ValueError(f"ResNet: dim must be 1, 2 or 3, got {dim}")
         conv = (torch.nn.Conv1d, torch.nn.Conv2d, torch.nn.Conv3d)[dim - 1]
-        three_wide = {"kernel_size": 3, "padding": 1, "padding_mode": "circular" if periodic else "zeros"}
+        three_wide: dict[str, Any] = {
+            "kernel_size": 3,
+            "padding": 1,
+            "padding_mode": "circular" if periodic else "zeros",
+        }
         self.lift = conv(channels, width, 1)
         self.blocks = torch.nn.ModuleList(
             torch.nn.Sequential(conv(width, width, **three_wide), torch.nn.ReLU(), conv(width, width, **three_wide))
@@ -59,14 +66,15 @@ class ResNet(torch.nn.Module):
         )
         self.project = conv(width, channels, 1)
 
-    def forward(self, u):
-        x = self.lift(u)
+    def forward(self, u: Tensor) -> Tensor:
+        x: Tensor = self.lift(u)
         for block in self.blocks:
             x = (x + block(x)).relu()
-        return self.project(x)
+        projected: Tensor = self.project(x)
+        return projected
 
 
-def make_network(scene, seed, without_memory=False):
+def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> torch.nn.Module:
     """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
     it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is."""
     if scene.network.python:
@@ -74,6 +82,7 @@ def make_network(scene, seed, without_memory=False):
     physics, network = scene.physics, scene.network
     with torch.random.fork_rng(devices=[]), torch.device("meta" if without_memory else "cpu"):
         torch.manual_seed(seed)
+        made: torch.nn.Module
         if network.kind == "mlp":
             made = MLP(physics.channels * math.prod(physics.shape), network.hidden)
         else:

@@ -4,14 +4,16 @@ import contextlib
 import importlib
 import sys
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import torch
 
 from prdp_torch.experiments import _C
 
 
-def make(scene, seed):
+def make(scene: _C.Scene, seed: int) -> torch.nn.Module:
     """Make the network of a scene: `Class()`, with the random numbers of the seed. ValueError, in words, if its module
     cannot be imported or the class is no `torch.nn.Module` that is made without arguments."""
     cls = _class_of(scene)
@@ -23,18 +25,18 @@ def make(scene, seed):
             raise _refused(scene, f"{cls.__name__}() raised {type(error).__name__}: {error}") from error
 
 
-def fingerprint(scene):
+def fingerprint(scene: _C.Scene) -> str:
     """What tells the source of the class from another one."""
-    return _C.fingerprint(_source(scene).read_bytes())
+    return _C.fingerprint(_source(scene).read_bytes())  # type: ignore[arg-type]  # it takes bytes
 
 
-def warn_if_changed(scene, known):
+def warn_if_changed(scene: _C.Scene, known: str | None) -> None:
     """Warn if the source of the class is not that of the training."""
     if fingerprint(scene) != known:
         warnings.warn(f"network: '{_source(scene)}' has changed since the training", stacklevel=3)
 
 
-def _class_of(scene):
+def _class_of(scene: _C.Scene) -> type[torch.nn.Module]:
     name = scene.network.python.partition(":")[2]
     found = getattr(_module(scene), name, None)
     if not isinstance(found, type) or not issubclass(found, torch.nn.Module):
@@ -43,7 +45,7 @@ def _class_of(scene):
     return found
 
 
-def _module(scene):
+def _module(scene: _C.Scene) -> ModuleType:
     """The module, from the folder of the scene or from where Python looks otherwise."""
     name = scene.network.python.partition(":")[0]
     folder = Path(scene.path).resolve().parent
@@ -63,7 +65,7 @@ def _module(scene):
     return module
 
 
-def _source(scene):
+def _source(scene: _C.Scene) -> Path:
     path = getattr(_module(scene), "__file__", None)
     if path is None:
         raise _refused(scene, "its module has no file")
@@ -71,7 +73,7 @@ def _source(scene):
 
 
 @contextlib.contextmanager
-def _first_on_the_path(folder):
+def _first_on_the_path(folder: Path) -> Iterator[None]:
     sys.path.insert(0, str(folder))
     try:
         yield
@@ -79,5 +81,5 @@ def _first_on_the_path(folder):
         sys.path.remove(str(folder))
 
 
-def _refused(scene, what):
+def _refused(scene: _C.Scene, what: str) -> ValueError:
     return ValueError(f"network: '{scene.network.python}' of the scene '{scene.path}': {what}")

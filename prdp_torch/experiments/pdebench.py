@@ -5,15 +5,19 @@ where there are several. `x-coordinate`, `y-coordinate`, `z-coordinate` and `t-c
 the same fields are (samples, times, channels, *shape), and x is the last axis of `shape`.
 """
 
-import torch
+from pathlib import Path
 
-from prdp_torch.experiments import array_files
+import numpy as np
+import torch
+from torch import Tensor
+
+from prdp_torch.experiments import _C, array_files
 
 _AXES = ("x", "y", "z")
 _SPACING = 1e-3  # relative; float32 coordinates are that exact
 
 
-def write(path, trajectories, scene):
+def write(path: str | Path, trajectories: Tensor, scene: _C.Scene) -> None:
     """Write trajectories (samples, times, channels, *shape) of a scene: as .npz if the path ends so, else as HDF5. The
     file is written whole or not at all. Raises ValueError if it cannot be written, and ImportError without the package
     h5py."""
@@ -27,7 +31,7 @@ def write(path, trajectories, scene):
     array_files.write(path, arrays)
 
 
-def read(path, scene):
+def read(path: str | Path, scene: _C.Scene) -> Tensor:
     """Read the first `data.train` + `data.valid` trajectories for a scene: (samples, times, channels, *shape) in the
     scene's dtype.
 
@@ -57,24 +61,24 @@ def read(path, scene):
     return content.contiguous()
 
 
-def check_finite(who, trajectories):
+def check_finite(who: str, trajectories: Tensor) -> None:
     """ValueError for a trajectory with NaN or Inf."""
     bad = (~trajectories.isfinite().flatten(1).all(1)).nonzero().flatten()
     if len(bad):
         raise ValueError(f"{who}: trajectory {int(bad[0])} holds NaN or Inf")
 
 
-def _grid(scene, axis):
+def _grid(scene: _C.Scene, axis: int) -> tuple[float, float]:
     """Place of the first unknown on an axis, and the spacing."""
     n, length = scene.physics.shape[axis], scene.physics.length[axis]
     return (0.0, length / n) if scene.physics.periodic else (length / (n + 1), length / (n + 1))
 
 
-def _points(first, spacing, n):
+def _points(first: float, spacing: float, n: int) -> np.ndarray:
     return (first + spacing * torch.arange(n, dtype=torch.float64)).numpy()
 
 
-def _check_shape(path, scene, tensor):
+def _check_shape(path: str | Path, scene: _C.Scene, tensor: array_files.Array) -> bool:
     """Whether the last axis of a tensor that fits the scene is that of channels."""
     shape, channels = tuple(reversed(scene.physics.shape)), scene.physics.channels
     if tensor.shape[2:] == (*shape, channels):
@@ -88,16 +92,15 @@ def _check_shape(path, scene, tensor):
     )
 
 
-def _check_spacing(path, file, axis, n, wanted, what):
+def _check_spacing(path: str | Path, file: array_files.File, axis: str, n: int, wanted: float, what: str) -> None:
     """The points of an axis must be evenly spaced, as the scene has them. Edges of cells are one more."""
     points = file.array(f"{axis}-coordinate")
     if points.shape not in ((n,), (n + 1,)):
         got = points.shape
         raise ValueError(f"data: '{path}': {axis}-coordinate has shape {got}, but tensor has {n} points there")
-    points = torch.from_numpy(points.read()).double()
+    steps = torch.from_numpy(points.read()).double().diff()
     if n == 1:
         return
-    steps = points.diff()
     spacing = float(steps.mean())
     if not ((steps - spacing).abs() <= 10 * _SPACING * abs(spacing)).all():
         raise ValueError(f"data: '{path}': {axis}-coordinate is not evenly spaced")

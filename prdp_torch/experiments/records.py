@@ -8,7 +8,9 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,7 +19,7 @@ from prdp_torch._C import VERSION
 from prdp_torch.experiments import _C, datasets, own_networks
 
 
-def environment():
+def environment() -> dict[str, Any]:
     """Versions, machine and commit, as far as they can be found out."""
     return {
         "versions": {"prdp_torch": VERSION, "torch": torch.__version__, "python": platform.python_version()},
@@ -32,13 +34,13 @@ def environment():
     }
 
 
-def _program():
+def _program() -> str:
     """As it was called: a command, a script, or python -m and a module."""
     module = getattr(sys.modules["__main__"], "__spec__", None)
     return f"python -m {module.name.removesuffix('.__main__')}" if module else Path(sys.argv[0]).name
 
 
-def _processor():
+def _processor() -> str:
     info = Path("/proc/cpuinfo")
     if info.exists():
         for line in info.read_text().splitlines():
@@ -47,7 +49,7 @@ def _processor():
     return platform.processor() or platform.machine()
 
 
-def _commit():
+def _commit() -> str | None:
     folder = Path(__file__).resolve().parent
     try:
         answer = subprocess.run(
@@ -61,7 +63,7 @@ def _commit():
     return answer.stdout.strip()
 
 
-def identity(scene):
+def identity(scene: _C.Scene) -> dict[str, str]:
     """What a training must agree on to be the same one, however many intervals it goes on for."""
     same = {"scene": scene.name, "text": scene.text, "backward": scene.backward}
     if scene.data.file:
@@ -71,13 +73,13 @@ def identity(scene):
     return same
 
 
-def settings(scene):
+def settings(scene: _C.Scene) -> dict[str, Any]:
     """The scene as it ran."""
     return {**identity(scene), "intervals": scene.training.intervals}
 
 
 @contextlib.contextmanager
-def alone_in(folders):
+def alone_in(folders: Sequence[Path]) -> Iterator[None]:
     """Make the folders, and keep other trainings out of them meanwhile. ValueError if one is there already. Of several
     processes that train together, the first one does so."""
     locks = []
@@ -91,13 +93,13 @@ def alone_in(folders):
             lock.release()
 
 
-def write(path, content):
+def write(path: Path, content: str | dict[str, Any]) -> None:
     """Write JSON (or text) whole or not at all. NaN is null. ValueError if it cannot be written."""
     text = content if isinstance(content, str) else _json(content)
-    _C.write_whole(path, (text + "\n").encode())
+    _C.write_whole(path, text + "\n")
 
 
-def write_training(path, record, network=None):
+def write_training(path: Path, record: dict[str, Any], network: torch.nn.Module | None = None) -> None:
     """Write the record of a training, and the `state_dict` of its network (if it has one) beside it: both, each whole,
     or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier record is
     then still there, with its weights. Of several processes the first one writes."""
@@ -108,29 +110,30 @@ def write_training(path, record, network=None):
         content = io.BytesIO()
         torch.save(network.state_dict(), content)
         weights = content.getvalue()
-        record = {**record, "weights": _C.fingerprint(weights)}
-    _C.write_training(path, _json(record), weights)
+        fingerprint = _C.fingerprint(weights)  # type: ignore[arg-type]  # it takes bytes
+        record = {**record, "weights": fingerprint}
+    _C.write_training(path, _json(record), weights)  # type: ignore[arg-type]  # it takes bytes
 
 
-def read(path):
+def read(path: Path) -> Any:
     """What `write_training` wrote; None where there is no file. ValueError, naming it, for one that is damaged."""
     text = _C.read_record(path)
     return None if text is None else json.loads(text)
 
 
-def read_training(path):
+def read_training(path: Path) -> dict[str, Any] | None:
     """The record of a training, with NaN in its curves where they hold it; None where there is no file. ValueError,
     naming the file and what is wrong, for any other file: every key, type, range and length is checked."""
     text = _C.read_training(path)
     if text is None:
         return None
-    record = json.loads(text)
+    record: dict[str, Any] = json.loads(text)
     for name in ("metric", "error"):
         record["curves"][name] = [math.nan if value is None else value for value in record["curves"][name]]
     return record
 
 
-def scene_of(path, record):
+def scene_of(path: Path, record: dict[str, Any]) -> _C.Scene:
     """The scene of a training as it ran, from its record at `path`. ValueError, naming the record, if it is none."""
     settings = record["settings"]
     try:
@@ -144,12 +147,12 @@ def scene_of(path, record):
     return scene
 
 
-def weights_of(path):
+def weights_of(path: Path) -> Path:
     """Where the weights of a record lie."""
     return path.with_suffix(".pt")
 
 
-def read_weights(path, network, record=None):
+def read_weights(path: Path, network: torch.nn.Module, record: dict[str, Any] | None = None) -> torch.nn.Module | None:
     """Load the weights that belong to the record at `path` into a network of the same make, and return it in
     evaluation mode. None if the record or its weights are not there, ValueError if the weights are not those of the
     record, or of another network."""
@@ -158,7 +161,7 @@ def read_weights(path, network, record=None):
     if content is None:
         return None
     try:
-        saved = _C.Saved(content)
+        saved = _C.Saved(content)  # type: ignore[arg-type]  # it takes bytes
         parameters = dict(network.named_parameters())
         network.load_state_dict(
             {name: saved.take(name, value, finite=name in parameters) for name, value in network.state_dict().items()},
@@ -173,11 +176,11 @@ def read_weights(path, network, record=None):
     return network.eval()
 
 
-def _json(content):
+def _json(content: object) -> str:
     return json.dumps(_null_for_nan(content), indent=1, allow_nan=False)
 
 
-def _null_for_nan(content):
+def _null_for_nan(content: object) -> object:
     if isinstance(content, dict):
         return {name: _null_for_nan(value) for name, value in content.items()}
     if isinstance(content, list):
@@ -185,7 +188,7 @@ def _null_for_nan(content):
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def prepare_folder(path):
+def prepare_folder(path: str | Path) -> Path:
     """Make the folder and see that it can be written to, before any work. ValueError if not."""
     path = Path(path)
     if not processes.is_first():

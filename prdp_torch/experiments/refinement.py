@@ -1,6 +1,13 @@
 """How a training chooses K and the tolerance."""
 
+from collections.abc import Callable, Sequence
+from typing import Self, TypeAlias
+
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
+from prdp_torch.experiments import _C
+from prdp_torch.stepper import Stepper
+
+Controller: TypeAlias = LinearSchedule | PRDPController | ToleranceController
 
 
 class Refinement:
@@ -13,17 +20,23 @@ class Refinement:
         watches_error: whether the controller's `step` takes the relative error instead of the metric.
     """
 
-    def __init__(self, label, attach, direct=False, watches_error=False):
+    def __init__(
+        self,
+        label: str,
+        attach: Callable[[Sequence[Stepper]], Controller],
+        direct: bool = False,
+        watches_error: bool = False,
+    ) -> None:
         self.label = label
         self.attach = attach
         self.direct = direct
         self.watches_error = watches_error
 
     @classmethod
-    def auto(cls):
+    def auto(cls) -> Self:
         """A tolerance that follows the error (`ToleranceController`), and starts from the state: nothing to choose."""
 
-        def attach(steppers):
+        def attach(steppers: Sequence[Stepper]) -> ToleranceController:
             for stepper in steppers:
                 stepper.start = "state"
             return ToleranceController(steppers)
@@ -31,7 +44,7 @@ class Refinement:
         return cls("auto", attach, watches_error=True)
 
     @classmethod
-    def prdp(cls, scene, growth=None):
+    def prdp(cls, scene: _C.Scene, growth: float | None = None) -> Self:
         """PRDP with the settings of the scene, or with another `growth` (`PRDPController`)."""
         settings = dict(scene.prdp)
         if growth is not None:
@@ -40,15 +53,15 @@ class Refinement:
         return cls(label, lambda steppers: PRDPController(steppers, **settings))
 
     @classmethod
-    def constant(cls, k):
+    def constant(cls, k: int) -> Self:
         """The same K throughout."""
         return cls.schedule(k, 0, k, label=f"constant_{k}")
 
     @classmethod
-    def tolerance(cls, rtol, k):
+    def tolerance(cls, rtol: float, k: int) -> Self:
         """The same tolerance rtol throughout, with at most k iterations."""
 
-        def attach(steppers):
+        def attach(steppers: Sequence[Stepper]) -> LinearSchedule:
             for stepper in steppers:
                 stepper.rtol = rtol
             return LinearSchedule(steppers, initial=k, increment=0, maximum=k)
@@ -56,7 +69,7 @@ class Refinement:
         return cls(f"rtol_{rtol:g}", attach)
 
     @classmethod
-    def schedule(cls, start, step, maximum, label=None):
+    def schedule(cls, start: int, step: int, maximum: int, label: str | None = None) -> Self:
         """K starts at `start` and grows by `step` after each interval, up to `maximum`."""
         return cls(
             label or f"schedule_{start}_{step}",
@@ -64,6 +77,6 @@ class Refinement:
         )
 
     @classmethod
-    def exact(cls):
+    def exact(cls) -> Self:
         """The exact solver."""
         return cls("direct", lambda steppers: LinearSchedule(steppers, initial=1, increment=0, maximum=1), direct=True)

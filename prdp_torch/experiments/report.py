@@ -2,12 +2,16 @@
 
 import base64
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
+from matplotlib.figure import Figure
 
-from prdp_torch.experiments import charts, records, trajectory_charts
+from prdp_torch.experiments import _C, charts, records, trajectory_charts
+from prdp_torch.experiments.compare import Entry, Row
+from prdp_torch.experiments.trajectories import Trajectories
 
 
 class Column(NamedTuple):
@@ -18,7 +22,7 @@ class Column(NamedTuple):
     note: str = ""
 
 
-def columns(scene):
+def columns(scene: _C.Scene) -> list[Column]:
     """The table's columns, in order."""
     target = scene.compare.target
     error = {"parameters": "parameter error", "field": "error of the field"}.get(scene.task, "validation error")
@@ -55,7 +59,7 @@ def columns(scene):
     ]
 
 
-def cells(scene, entry):
+def cells(scene: _C.Scene, entry: Entry) -> list[str]:
     """A row of the table as text, in the order of `columns`."""
     spread = f" ±{entry['metric_std']:.0e}" if entry["metric_std"] else ""
     exact = entry["kind"] == "direct"
@@ -79,23 +83,23 @@ def cells(scene, entry):
     return row
 
 
-def _saving(entry, name):
+def _saving(entry: Entry, name: str) -> str:
     if not entry["as_good"]:
         return "fails"
     return "warns" if entry["warning"] else f"{100 * entry[name]:.1f} %"
 
 
-def in_terminal(scene):
+def in_terminal(scene: _C.Scene) -> list[int]:
     """The columns that eighty characters hold, by index."""
     return [i for i, column in enumerate(columns(scene)) if column.short or i == 0]
 
 
-def notes(scene, kept=None):
+def notes(scene: _C.Scene, kept: Sequence[int] | None = None) -> str:
     """What the columns mean; of those `kept` by index, or all."""
     return " ".join(c.note for i, c in enumerate(columns(scene)) if c.note and (kept is None or i in kept))
 
 
-def headline(scene, table):
+def headline(scene: _C.Scene, table: list[Entry]) -> str:
     """What the comparison shows of auto and of PRDP, in a sentence each, whichever way it went."""
     base = table[0]
     tried = [entry for entry in table if entry["kind"] in ("auto", "prdp")]
@@ -105,7 +109,7 @@ def headline(scene, table):
     return " ".join(_verdict(scene, base, entry) for entry in tried)
 
 
-def failures(scene, table):
+def failures(scene: _C.Scene, table: list[Entry]) -> list[str]:
     """The rows that do not end as well as the converged one, and what controllers warn of; a list of sentences.
     The sweep of constant K is there to fail at its coarse end: its rows are only marked."""
     worse = [_short(scene, entry) for entry in table if not entry["as_good"] and not entry["diverged"]]
@@ -122,11 +126,11 @@ def failures(scene, table):
     return said
 
 
-def _short(scene, entry):
+def _short(scene: _C.Scene, entry: Entry) -> str:
     return f"K = {scene.max_iter}" if entry["kind"] == "converged" else entry["title"]
 
 
-def _verdict(scene, base, entry):
+def _verdict(scene: _C.Scene, base: Entry, entry: Entry) -> str:
     """How far a row comes and what it saves. Nothing is said of savings where the error is worse or the controller
     warns."""
     name, against = _short(scene, entry), _short(scene, base)
@@ -147,21 +151,21 @@ def _verdict(scene, base, entry):
     return f"{ending}; its controller warns." if entry["warning"] else f"{ending}: {_savings(entry)}."
 
 
-def _savings(entry):
-    def change(share, what):
+def _savings(entry: Entry) -> str:
+    def change(share: float, what: str) -> str:
         return f"{abs(100 * share):.1f} % {'fewer' if share >= 0 else 'more'} {what}"
 
     text = change(entry["products_saved"], "products with A")
     return text if entry["saved"] is None else f"{text}, {change(entry['saved'], 'iterations allowed')}"
 
 
-def _svg(figure):
+def _svg(figure: Figure) -> str:
     image = io.BytesIO()
     figure.savefig(image, format="svg")
     return base64.b64encode(image.getvalue()).decode()
 
 
-def write(scene, rows, table, shown, folder):
+def write(scene: _C.Scene, rows: list[Row], table: list[Entry], shown: Trajectories | None, folder: Path) -> None:
     """`report.html`, one self-contained file with table, pictures and the scene; each chart also as PNG, and
     `trajectories.gif` for fields in 2D. shown: from `trajectories.collect`, or None."""
     drawn = charts.all_charts(scene, rows, table)

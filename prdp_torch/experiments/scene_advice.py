@@ -3,15 +3,16 @@
 from statistics import median
 
 import torch
+from torch import Tensor
 
-from prdp_torch.advice import Update, advise_on, checked_limit, milliseconds
+from prdp_torch.advice import Advice, Update, advise_on, checked_limit, milliseconds
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
-from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.experiments.scenes import make_solver, make_stepper
 from prdp_torch.trials import RUNS, now, random_cotangent, run
 
 
-def advise_scene(scene, seconds=5.0):
+def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
     """Advise on a scene from `prdp_torch.experiments.scenes.load`, as `advise` does on a step.
 
     It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
@@ -28,8 +29,9 @@ def advise_scene(scene, seconds=5.0):
         update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
     other = torch.float64 if sample.dtype == torch.float32 else torch.float32
     cotangent = random_cotangent(step, sample)
-    run(step, sample, cotangent)  # to warm up
-    physics = update.physics(run(step, sample, cotangent, max_runs=RUNS))
+    solver = make_solver(scene, scene.max_iter)
+    run(step, sample, cotangent, solver)  # to warm up
+    physics = update.physics(run(step, sample, cotangent, solver, RUNS))
     update.notes.append(
         f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
         f"{update.share(physics)}."
@@ -44,9 +46,10 @@ def advise_scene(scene, seconds=5.0):
     return advise_on(step, sample, seconds, update, [other])
 
 
-def _network_seconds(network, u, most):
+def _network_seconds(network: torch.nn.Module, u: Tensor, most: float) -> float:
     """One forward and one backward pass; a first one that takes more than `most` is also the last."""
-    times, deadline = [], now(u) + most
+    times: list[float] = []
+    deadline = now(u) + most
     while len(times) <= RUNS and (not times or now(u) < deadline):
         started = now(u)
         out = network(u)

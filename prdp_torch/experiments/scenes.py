@@ -1,9 +1,11 @@
 """Scenes: training experiments as TOML files, read by the compiled library for both languages."""
 
 from pathlib import Path
+from typing import Any
 
 from prdp_torch import solvers, steppers
 from prdp_torch.experiments import _C, field_task
+from prdp_torch.stepper import Stepper
 
 _PACKAGE = Path(__file__).parents[1]
 # In a checkout the scenes lie among the examples; a wheel carries them along.
@@ -12,7 +14,7 @@ _FOLDERS = [_PACKAGE.parent / "examples" / "scenes", _PACKAGE / "scenes"]
 _SOLVERS = {solver.method: solver for solver in solvers.Solver.__subclasses__()}
 
 
-def available():
+def available() -> dict[str, Path]:
     """Return the scenes that come with the project, as a dict from name to path."""
     for folder in _FOLDERS:
         if folder.is_dir():
@@ -20,7 +22,7 @@ def available():
     return {}
 
 
-def load(scene):
+def load(scene: str | Path) -> _C.Scene:
     """Read a scene by its name, or by the path of a .toml file. The ValueError for a mistake names the file, the line
     and what is allowed."""
     if str(scene).endswith(".toml"):
@@ -31,7 +33,7 @@ def load(scene):
     return _C.read_scene(str(known[str(scene)]))
 
 
-def make_stepper(scene, direct=False, max_iter=None):
+def make_stepper(scene: _C.Scene, direct: bool = False, max_iter: int | None = None) -> Stepper:
     """Make the stepper of a scene.
 
     Args:
@@ -43,8 +45,8 @@ def make_stepper(scene, direct=False, max_iter=None):
     `on_failure` says whether it gets a gradient.
     """
     physics = scene.physics
-    options = {
-        "solver": solvers.Direct() if direct else _solver(scene, scene.max_iter if max_iter is None else max_iter),
+    options: dict[str, Any] = {
+        "solver": solvers.Direct() if direct else make_solver(scene, scene.max_iter if max_iter is None else max_iter),
         "backward": scene.backward,
         "on_failure": scene.on_failure,
         "start": scene.start,
@@ -56,11 +58,14 @@ def make_stepper(scene, direct=False, max_iter=None):
     if physics.equation == "poisson":
         return steppers.Poisson(physics.shape, length=physics.length, **options)
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
-    return kinds[physics.equation](physics.shape, physics.nu, physics.dt, length=physics.length, **options)
+    kind = kinds[physics.equation]
+    made: Stepper = kind(physics.shape, physics.nu, physics.dt, length=physics.length, **options)
+    return made
 
 
-def _solver(scene, max_iter):
-    extra = {"restart": scene.restart} if scene.method == "gmres" else {}
+def make_solver(scene: _C.Scene, max_iter: int) -> solvers.Solver:
+    """Make the solver of a scene with K = max_iter."""
+    extra: dict[str, Any] = {"restart": scene.restart} if scene.method == "gmres" else {}
     if scene.preconditioner and scene.method != "multigrid":
         extra["preconditioner"] = scene.preconditioner
     return _SOLVERS[scene.method](max_iter=max_iter, rtol=scene.rtol, **extra)

@@ -1,5 +1,13 @@
 """`TensorBoard`: the curves of a training as TensorBoard shows them."""
 
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from prdp_torch.experiments.training import Interval
+
 
 class TensorBoard:
     """Write each interval of a training to a folder for TensorBoard. A callback of `training.train`.
@@ -14,7 +22,7 @@ class TensorBoard:
         >>> training.train(scene, refinement, callbacks=[TensorBoard("runs/heat_1d/tensorboard")])
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder: str | Path) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
@@ -22,7 +30,7 @@ class TensorBoard:
         # A training that is repeated or resumed writes its first interval again: what lay there before is hidden.
         self._writer = SummaryWriter(str(folder), purge_step=0)
 
-    def __call__(self, interval):
+    def __call__(self, interval: Interval) -> None:
         values = {
             "training/loss": interval.loss,
             "training/metric": interval.metric,

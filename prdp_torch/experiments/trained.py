@@ -1,13 +1,16 @@
 """`load_trained`: a network that `prdp train` or `prdp compare` has trained."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from prdp_torch import fields
-from prdp_torch.experiments import network_task, own_networks, records
+from prdp_torch.experiments import _C, network_task, own_networks, records
 from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.training import Curves
 
 
 class Trained(NamedTuple):
@@ -15,24 +18,24 @@ class Trained(NamedTuple):
 
     network: torch.nn.Module
     """With its trained weights, in evaluation mode."""
-    step: object
+    step: Callable[[Tensor], Tensor]
     """One time step u → u_next, both (batch, channels, *shape): the network itself, or for the task `corrector` the
     coarse solver with the network on top."""
-    scene: object
+    scene: _C.Scene
     """The scene as it was trained."""
-    curves: dict
+    curves: Curves
     """The curves of the record, as `training.train` returns them."""
 
-    def __call__(self, u):
+    def __call__(self, u: Tensor) -> Tensor:
         """Make one time step."""
         return self.step(u)
 
-    def rollout(self, u, steps):
+    def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channels, *shape)."""
         return fields.rollout(self.step, u, steps)
 
 
-def load_trained(run_folder, seed=0):
+def load_trained(run_folder: str | Path, seed: int = 0) -> Trained:
     """Load a trained network from the folder of its training.
 
     Args:
@@ -57,6 +60,7 @@ def load_trained(run_folder, seed=0):
     """
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
     record = records.read_training(path)
+    assert record is not None
     scene = records.scene_of(path, record)
     if not scene.trains_network:
         raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
@@ -72,7 +76,7 @@ def load_trained(run_folder, seed=0):
     return Trained(network, network_task.propagator(scene, network), scene, record["curves"])
 
 
-def _record_in(folder, name):
+def _record_in(folder: Path, name: str) -> Path:
     """The path of a record in a folder of records, or in the only such folder inside it."""
     if (folder / name).exists():
         return folder / name

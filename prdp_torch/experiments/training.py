@@ -5,15 +5,21 @@ import functools
 import math
 import sys
 import time
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 
 import torch
+from torch import Tensor
 
 from prdp_torch import processes
+from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
-from prdp_torch.experiments.checkpoint import check_tensors
+from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors
+from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.scenes import make_stepper
-from prdp_torch.solve import SolveStatus
+from prdp_torch.experiments.task import Task
+from prdp_torch.solve import SolveInfo, SolveStatus
+from prdp_torch.stepper import Stepper
 
 
 class Interval(NamedTuple):
@@ -47,7 +53,38 @@ class Interval(NamedTuple):
     """Whether the interval was done earlier, and read from a checkpoint."""
 
 
-def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, checkpoint=None, data=None):
+Callback: TypeAlias = Callable[[Interval], object]
+"""Stops the training if it returns True."""
+
+
+class Curves(TypedDict):
+    """The curves of a training: lists with one entry per interval. `train` says what is in each."""
+
+    update_loss: list[float]
+    metric: list[float]
+    error: list[float]
+    max_iter: list[int]
+    budget: list[int]
+    iterations: list[float]
+    operator_applications: list[float]
+    adjoint_applications: list[float]
+    rtol: list[float]
+    failed: list[int]
+    seconds: list[float]
+    warning: NotRequired[str]
+    diverged: NotRequired[str]
+
+
+def train(
+    scene: _C.Scene,
+    refinement: Refinement,
+    seed: int = 0,
+    network: torch.nn.Module | None = None,
+    callbacks: Iterable[Callback] = (),
+    on_data: datasets.OnData | None = None,
+    checkpoint: Checkpoint | None = None,
+    data: datasets.Own = None,
+) -> Curves:
     """Train a scene once.
 
     Args:
@@ -116,7 +153,7 @@ def train(scene, refinement, seed=0, network=None, callbacks=(), on_data=None, c
         run.go(task, found)
     except _Diverged as divergence:
         run.give_up(str(divergence))
-    return run.curves
+    return cast(Curves, run.curves)
 
 
 class _Diverged(Exception):
@@ -130,7 +167,15 @@ class _Run:
         "max_iter", "budget", "iterations", "operator_applications", "adjoint_applications", "rtol", "failed", "seconds"
     )  # fmt: skip
 
-    def __init__(self, scene, seed, steppers, refinement, checkpoint, callbacks):
+    def __init__(
+        self,
+        scene: _C.Scene,
+        seed: int,
+        steppers: list[Stepper],
+        refinement: Refinement,
+        checkpoint: Checkpoint | None,
+        callbacks: list[Callback],
+    ) -> None:
         self.who = f"{scene.name}, {refinement.label}, seed {seed}"
         self.goes_on = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
         self.intervals = scene.training.intervals
@@ -139,9 +184,9 @@ class _Run:
         self.watches_error = refinement.watches_error
         self.checkpoint = checkpoint
         self.callbacks = callbacks
-        self.curves = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
+        self.curves: dict[str, Any] = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
 
-    def go(self, task, found):
+    def go(self, task: Task, found: Found) -> None:
         stopped = False
         if not self._restores(task, found):
             self._observe(task, 0)
@@ -151,17 +196,17 @@ class _Run:
         while not stopped and self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
             self._observe(task, self._done())
-            unfinished = self.checkpoint is not None and self._done() < self.intervals
-            kept = unfinished and self.checkpoint.due()
-            if kept:
-                self._keep(task)
+            unfinished = self.checkpoint if self._done() < self.intervals else None
+            kept = unfinished is not None and unfinished.due()
+            if unfinished is not None and kept:
+                self._keep(task, unfinished)
             stopped = self._tell(self._done())
-            if stopped and unfinished and not kept:
-                self._keep(task)
+            if stopped and unfinished is not None and not kept:
+                self._keep(task, unfinished)
         if self.controller.warning is not None:
             self.curves["warning"] = self.controller.warning
 
-    def _tell(self, number, resumed=False):
+    def _tell(self, number: int, resumed: bool = False) -> bool:
         """Call the callbacks with an interval. True if one of them stops the training."""
         curves, updates = self.curves, len(self.curves["update_loss"]) // self._done()
         losses = curves["update_loss"][(number - 1) * updates : number * updates]
@@ -178,21 +223,21 @@ class _Run:
         stopped = any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
         return processes.sums([stopped])[0] > 0
 
-    def _done(self):
+    def _done(self) -> int:
         return len(self.curves["seconds"])
 
-    def _keep(self, task):
+    def _keep(self, task: Task, checkpoint: Checkpoint) -> None:
         tensors = {**task.state(), "random": torch.get_rng_state()}
-        self.checkpoint.save(tensors, self.curves, self.controller.state_dict())
+        checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
-    def _restores(self, task, found):
+    def _restores(self, task: Task, found: Found) -> bool:
         """Whether there is a checkpoint to continue from."""
         if self.checkpoint is None or not self.checkpoint.restore(found, functools.partial(self._load, task)):
             return False
         self.checkpoint.check_length(self._done(), self.intervals)
         return True
 
-    def _load(self, task, saved):
+    def _load(self, task: Task, saved: _C.Saved) -> None:
         """Take the state of this training. ValueError where it is another's; some of it may have been taken."""
         curves, controller = saved.progress(task.updates_per_interval)
         task.load(saved, len(curves["update_loss"]))
@@ -200,26 +245,26 @@ class _Run:
         saved.restore("random", torch.default_generator)
         self.curves = curves
 
-    def _run_interval(self, task, number):
+    def _run_interval(self, task: Task, number: int) -> None:
         k, rtol = self.controller.max_iter, self.steppers[0].rtol
         started, solves = time.perf_counter(), 0
         iterations = forward = adjoint = 0.0
         failures = _C.Failures()
         for loss, samples in task.updates(len(self.curves["update_loss"])):
-            solves += sum(stepper.info.iterations[0].numel() for stepper in self.steppers)
+            solves += sum(report.iterations[0].numel() for report in self._reports())
             loss, refused, *spent = processes.mean([loss, self._refused(), *self._spent()], self._samples())
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
             iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
             adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
-            failures.take([stepper.info.status for stepper in self.steppers], adjoints, samples)
+            failures.take([report.status for report in self._reports()], adjoints, samples)
         seconds = time.perf_counter() - started
         failed = int(processes.sums([failures.count])[0])
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
         if failures.count:
             print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)
 
-    def give_up(self, why):
+    def give_up(self, why: str) -> None:
         """The curves end with the interval that was lost."""
         self.curves["diverged"] = why
         lost = max(1, len(self.curves["metric"]))
@@ -228,11 +273,11 @@ class _Run:
         if self._done() < lost:
             self._append(self.controller.max_iter, 0, 0.0, 0.0, 0.0, self.steppers[0].rtol, 0, 0.0)
 
-    def _append(self, *costs):
+    def _append(self, *costs: float) -> None:
         for name, value in zip(self.COSTS, costs, strict=True):
             self.curves[name].append(value)
 
-    def _observe(self, task, done):
+    def _observe(self, task: Task, done: int) -> None:
         metric = task.metric()
         if not math.isfinite(metric):
             raise _Diverged(f"interval {done}: the metric is {metric}")
@@ -241,35 +286,38 @@ class _Run:
         if not math.isfinite(error):
             raise _Diverged(f"interval {done}: the relative error is {error}")
         self.curves["error"].append(error)
-        if self.watches_error:
+        if self.watches_error or isinstance(self.controller, ToleranceController):
             self.controller.step(error)
         else:
             self.controller.step(metric, error=error)
 
-    def _samples(self):
-        return len(self.steppers[0].info.iterations)
+    def _reports(self) -> list[SolveInfo]:
+        """Of the solves of the last update."""
+        return [stepper.info for stepper in self.steppers if stepper.info is not None]
 
-    def _refused(self):
+    def _samples(self) -> int:
+        return len(self._reports()[0].iterations)
+
+    def _refused(self) -> bool:
         """Whether the solver was given NaN or Inf by the last update."""
-        return any(bool((stepper.info.status <= SolveStatus.NONFINITE_INPUT).any()) for stepper in self.steppers)
+        return any(bool((report.status <= SolveStatus.NONFINITE_INPUT).any()) for report in self._reports())
 
-    def _spent(self):
+    def _spent(self) -> tuple[float, float, float]:
         """Iterations, operator applications and adjoint applications of the last update."""
-        reports = [stepper.info for stepper in self.steppers]
         adjoint = [report for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
         return (
-            sum(_per_sample(info.iterations) for info in reports),
-            sum(_per_sample(info.operator_applications) for info in reports),
+            sum((_per_sample(info.iterations) for info in self._reports()), 0.0),
+            sum((_per_sample(info.operator_applications) for info in self._reports()), 0.0),
             sum((_per_sample(info.operator_applications) for info in adjoint), 0.0),
         )
 
-    def _check(self, loss, refused, done):
+    def _check(self, loss: float, refused: float, done: int) -> None:
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
         if refused and not self.goes_on:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
 
 
-def _per_sample(counts):
+def _per_sample(counts: Tensor) -> float:
     """Of counts (batch,), or (batch, steps) of a rollout, summed over the steps."""
     return float(counts.double().mean(0).sum())

@@ -1,13 +1,18 @@
 """What trained networks do from the validation samples on, beside the reference: the arrays behind the
 pictures."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from prdp_torch import fields
-from prdp_torch.experiments import datasets, records
+from prdp_torch.experiments import _C, datasets, records
+from prdp_torch.experiments.compare import Row
+from prdp_torch.experiments.datasets import OnData
 from prdp_torch.experiments.network_task import error, propagator
 from prdp_torch.experiments.networks import make_network
 
@@ -31,12 +36,12 @@ class Course:
 class Trajectories:
     reference: torch.Tensor
     """(samples, steps + 1, channels, *shape), as `datasets.reference` makes them."""
-    courses: list
-    missing: list
+    courses: list[Course]
+    missing: list[str]
     """Titles of the trainings that left no weights, or diverged."""
 
 
-def collect(scene, rows, folder, on_data=None):
+def collect(scene: _C.Scene, rows: list[Row], folder: Path, on_data: OnData | None = None) -> Trajectories | None:
     """Follow the validation samples with the networks of converged training and of PRDP, whose weights lie
     beside their records in `folder`. None for a task without a network or without time, or if there are no weights.
 
@@ -57,7 +62,7 @@ def collect(scene, rows, folder, on_data=None):
     return Trajectories(reference, courses, [row.title for row in rows if not networks[row.label]])
 
 
-def field(scene, states):
+def field(scene: _C.Scene, states: Tensor) -> Tensor:
     """What the pictures show of states (time, channels, *shape), as (time, *shape): the vorticity of a flow,
     else the first component."""
     if scene.physics.equation == "navier_stokes":
@@ -65,7 +70,7 @@ def field(scene, states):
     return states[:, 0]
 
 
-def _networks(scene, row, folder):
+def _networks(scene: _C.Scene, row: Row, folder: Path) -> list[torch.nn.Module]:
     """The networks of the seeds that did not diverge and whose weights are there."""
     networks = [
         records.read_weights(folder / row.label / f"seed_{seed}.json", make_network(scene, seed))
@@ -75,7 +80,9 @@ def _networks(scene, row, folder):
     return [network for network in networks if network is not None]
 
 
-def _follow(scene, title, kind, networks, reference):
+def _follow(
+    scene: _C.Scene, title: str, kind: str, networks: Sequence[Callable[[Tensor], Tensor]], reference: Tensor
+) -> Course:
     steps = reference.shape[1] - 1
     with torch.no_grad():
         runs = [fields.rollout(propagator(scene, network), reference[:, 0], steps) for network in networks]

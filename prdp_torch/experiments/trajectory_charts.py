@@ -1,13 +1,23 @@
 """The pictures of what trained networks do, drawn from `trajectories.Trajectories`."""
 
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TypeAlias
+
 import numpy as np
 from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
-from prdp_torch.experiments.charts import FIXED, WIDTH, error_measure, make_figure, mean_and_band
-from prdp_torch.experiments.trajectories import field
+from prdp_torch.experiments import _C
+from prdp_torch.experiments.charts import FIXED, WIDTH, Drawn, error_measure, make_figure, mean_and_band
+from prdp_torch.experiments.trajectories import Course, Trajectories, field
+
+Contents: TypeAlias = list[tuple[str, np.ndarray]]
+"""Names, and fields over time."""
 
 _COARSE = ("#0072b2", "--")
 _SEEN = 2  # steps that the loss covers, in either task
@@ -15,7 +25,7 @@ _STATE, _DIFFERENCE = "RdBu_r", "PuOr_r"  # both safe for colour-blind readers
 _LARGEST_GIF = 2_000_000  # bytes
 
 
-def pictures(scene, shown):
+def pictures(scene: _C.Scene, shown: Trajectories) -> list[Drawn]:
     """(name, figure, caption) of every picture: the error over time; in 1D space against time, in 2D
     snapshots."""
     missing = f" Left out, for want of weights: {'; '.join(shown.missing)}." if shown.missing else ""
@@ -32,7 +42,7 @@ def pictures(scene, shown):
     return drawn
 
 
-def error_over_time(scene, shown):
+def error_over_time(scene: _C.Scene, shown: Trajectories) -> Figure:
     """The error after each step, measured as the metric does."""
     figure, (axes,) = make_figure(height=4.6)
     for course in shown.courses:
@@ -52,7 +62,7 @@ def error_over_time(scene, shown):
     return figure
 
 
-def space_time(scene, shown):
+def space_time(scene: _C.Scene, shown: Trajectories) -> Figure:
     """Reference and emulators, x to the right and t upwards, over their differences."""
     reference = field(scene, shown.reference[0]).numpy()
     states = [(_name(scene, course), field(scene, course.states[0]).numpy()) for course in shown.courses]
@@ -84,7 +94,7 @@ def space_time(scene, shown):
     return figure
 
 
-def snapshots(scene, shown):
+def snapshots(scene: _C.Scene, shown: Trajectories) -> Figure:
     """The fields in rows, at a few times in columns; a colour scale for each time."""
     contents = _fields(scene, shown)
     metric, last = scene.data.valid_steps, shown.reference.shape[1] - 1
@@ -100,7 +110,7 @@ def snapshots(scene, shown):
     return figure
 
 
-def animate(scene, shown, path):
+def animate(scene: _C.Scene, shown: Trajectories, path: Path) -> None:
     """Write the fields over time as a GIF, whole or not at all and small enough for a page."""
     contents = _fields(scene, shown)
     figure, (panels,) = _grid(1, len(contents), height=2.9)
@@ -112,7 +122,7 @@ def animate(scene, shown, path):
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # nothing moves from now on but the fields
 
-    def show(t):
+    def show(t: int) -> None:
         clock.set_text(f"t = {t} step{'s' if t != 1 else ''} of Δt = {scene.physics.dt:g}")
         scale = _scale(contents[0][1][t])
         images[0].set_clim(-scale, scale)  # all images and the bar have the same norm
@@ -134,38 +144,38 @@ def animate(scene, shown, path):
         unfinished.unlink(missing_ok=True)
 
 
-def _grid(rows, columns, height):
+def _grid(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _name(scene, course):
+def _name(scene: _C.Scene, course: Course) -> str:
     if course.kind == "coarse":
         return course.title
     return f"{'corrected' if scene.task == 'corrector' else 'emulator'} ({course.title})"
 
 
-def _whole_steps():
+def _whole_steps() -> MaxNLocator:
     return MaxNLocator(integer=True, steps=[1, 2, 5, 10])
 
 
-def _time(scene):
+def _time(scene: _C.Scene) -> str:
     return f"t in steps of Δt = {scene.physics.dt:g}"
 
 
-def _field_name(scene):
+def _field_name(scene: _C.Scene) -> str:
     if scene.physics.equation == "navier_stokes":
         return "vorticity ∂u₂/∂x − ∂u₁/∂y"
     return "u₁" if scene.physics.channels > 1 else "u"
 
 
-def _field_caption(scene):
+def _field_caption(scene: _C.Scene) -> str:
     return (
         f"{_field_name(scene)[0].upper()}{_field_name(scene)[1:]} over the unit square; each time has its colour scale."
     )
 
 
-def _error_caption(scene, shown):
+def _error_caption(scene: _C.Scene, shown: Trajectories) -> str:
     seeds = max(len(course.errors) for course in shown.courses)
     spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""
     of = "relative error of the velocity along x" if scene.task == "corrector" else "relative error"
@@ -175,13 +185,13 @@ def _error_caption(scene, shown):
     )
 
 
-def _fields(scene, shown):
+def _fields(scene: _C.Scene, shown: Trajectories) -> Contents:
     """(name, (time, Ny, Nx)) of the reference and of each course, the first validation sample."""
     named = [("reference", shown.reference), *((_name(scene, course), course.states) for course in shown.courses)]
     return [(name.replace(" (", "\n("), field(scene, states[0]).numpy()) for name, states in named]
 
 
-def _draw_fields(panels, contents, t):
+def _draw_fields(panels: Iterable[Axes], contents: Contents, t: int) -> list[AxesImage]:
     """Step t of each field in a panel of its own, in the colour scale of the first, the reference."""
     scale = _scale(contents[0][1][t])
     norm = Normalize(-scale, scale)
@@ -193,12 +203,12 @@ def _draw_fields(panels, contents, t):
     ]
 
 
-def _scale(content):
+def _scale(content: np.ndarray) -> float:
     """The largest finite magnitude."""
     return float(np.abs(content[np.isfinite(content)]).max(initial=1e-30))
 
 
-def _extent(scene, content):
+def _extent(scene: _C.Scene, content: np.ndarray) -> tuple[float, float, float, float]:
     """Left, right, lower and upper edge of an image whose pixels are the unknowns of an axis at each step."""
     steps, n = content.shape
     first = 0 if scene.physics.periodic else 1

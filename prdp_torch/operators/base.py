@@ -1,18 +1,30 @@
 """The base of all operators, and what several of them need."""
 
 import math
+from collections.abc import Iterable
 
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check
+from prdp_torch.types import NullSpace, Number
 
 
 class Operator:
     """The base of all operators. `kind`, `shape`, `parameters` and `tensors` describe it to the compiled library."""
 
     kind: str
+    shape: list[int]
+    parameters: list[float]
+    tensors: list[Tensor]
 
-    def __init__(self, shape, parameters, tensors, null_spaces=()):
+    def __init__(
+        self,
+        shape: list[int],
+        parameters: list[float],
+        tensors: Iterable[Tensor],
+        null_spaces: tuple[Tensor, ...] = (),
+    ) -> None:
         self.shape = shape
         self.parameters = parameters
         self.tensors = [full_precision(t) for t in (*tensors, *null_spaces)]
@@ -21,33 +33,37 @@ class Operator:
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
         return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
 
-    def apply(self, v):
+    def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v has the shape of a right-hand side."""
-        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
+        product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
+        return product
 
-    def apply_transpose(self, v):
+    def apply_transpose(self, v: Tensor) -> Tensor:
         """Return Aᵀ v, with gradients."""
-        return torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
+        product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, True)
+        return product
 
-    def diagonal(self):
+    def diagonal(self) -> Tensor:
         """Return the diagonal of A, in a shape that broadcasts against a batch of vectors."""
-        return torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
+        diagonal: Tensor = torch.ops.prdp.diagonal(self.tensors, self.kind, self.shape, self.parameters)
+        return diagonal
 
-    def dense(self, dtype=torch.float64):
+    def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples. Only for small n: ValueError if
         it would not fit into the memory of the machine."""
         self._check_dense_fits(dtype)
-        return torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
+        matrix: Tensor = torch.ops.prdp.dense(self.tensors, self.kind, self.shape, self.parameters, dtype)
+        return matrix
 
-    def _unknowns(self):
+    def _unknowns(self) -> int:
         """The length of a vector, in all its channels."""
         return math.prod(self.shape)
 
-    def _check_dense_fits(self, dtype):
+    def _check_dense_fits(self, dtype: torch.dtype) -> None:
         axes = _C.batched_axes(self.kind)
         if axes is None:  # a Function, whose vectors may be of any length
             return
@@ -62,34 +78,32 @@ class Operator:
             )
 
 
-def real_tensor(who, name, value):
+def real_tensor(who: str, name: str, value: Number) -> Tensor:
     """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
-    if isinstance(value, torch.Tensor):
+    if isinstance(value, Tensor):
         return value
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
 
 
-def full_precision(t):
+def full_precision(t: Tensor) -> Tensor:
     """float32 for float16 and bfloat16 under torch.autocast, as the solves take them there."""
     low = t.dtype in (torch.float16, torch.bfloat16) and torch.is_autocast_enabled(t.device.type)
     return t.float() if low else t
 
 
-def null_spaces_of(who, right, left, like):
+def null_spaces_of(who: str, right: NullSpace, left: NullSpace, like: Tensor | None) -> tuple[Tensor, ...]:
     """The two bases for the compiled library, an empty one for "constant"; none without a null space."""
     if right is None and left is None:
         return ()
     if right is None:
         raise ValueError(f"{who}: left_nullspace= stands beside nullspace=, which is missing")
-    return tuple(
-        _basis(who, *named, like)
-        for named in (("nullspace", right), ("left_nullspace", right if left is None else left))
-    )
+    left = right if left is None else left
+    return _basis(who, "nullspace", right, like), _basis(who, "left_nullspace", left, like)
 
 
-def _basis(who, name, value, like):
+def _basis(who: str, name: str, value: NullSpace, like: Tensor | None) -> Tensor:
     if isinstance(value, str) and value == "constant":
         return torch.empty(0) if like is None else like.new_empty(0)
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         raise TypeError(f"{who}: {name} must be None, 'constant' or a tensor (k, *shape), got {value!r:.80}")
     return _check.dense(who, name, value).detach()

@@ -1,7 +1,10 @@
 """The operators of the built-in equations."""
 
+from torch import Tensor
+
 from prdp_torch import _check
 from prdp_torch.operators.base import Operator, real_tensor
+from prdp_torch.types import Length, Number, Shape
 
 
 class Poisson(Operator):
@@ -14,7 +17,7 @@ class Poisson(Operator):
 
     kind = "poisson"
 
-    def __init__(self, shape, length=1.0):
+    def __init__(self, shape: Shape, length: Length = 1.0) -> None:
         shape = _check.shape("Poisson", shape)
         super().__init__(shape, _check.lengths("Poisson", length, len(shape)), [])
 
@@ -30,7 +33,7 @@ class Heat(Operator):
 
     kind = "heat"
 
-    def __init__(self, shape, nu, dt, length=1.0):
+    def __init__(self, shape: Shape, nu: Number, dt: float, length: Length = 1.0) -> None:
         shape = _check.shape("Heat", shape)
         parameters = [_check.real("Heat", "dt", dt), *_check.lengths("Heat", length, len(shape))]
         super().__init__(shape, parameters, [real_tensor("Heat", "nu", nu)])
@@ -55,10 +58,10 @@ class Burgers(Operator):
 
     kind = "burgers"
 
-    def __init__(self, winds, nu, dt, length=1.0):
+    def __init__(self, winds: Tensor, nu: Number, dt: float, length: Length = 1.0) -> None:
         super().__init__(*flow("Burgers", "winds", winds, nu, dt, length))
 
-    def _unknowns(self):
+    def _unknowns(self) -> int:
         return self.tensors[0].shape[1] * super()._unknowns()
 
 
@@ -84,14 +87,16 @@ class NavierStokes(Operator):
 
     kind = "navier_stokes"
 
-    def __init__(self, velocity, nu, dt, length=1.0):
+    def __init__(self, velocity: Tensor, nu: Number, dt: float, length: Length = 1.0) -> None:
         super().__init__(*flow("NavierStokes", "velocity", velocity, nu, dt, length))
 
-    def _unknowns(self):
+    def _unknowns(self) -> int:
         return 3 * super()._unknowns()
 
 
-def flow(who, name, winds, nu, dt, length):
+def flow(
+    who: str, name: str, winds: Tensor, nu: Number, dt: float, length: Length
+) -> tuple[list[int], list[float], list[Tensor]]:
     """Shape, parameters and tensors of a flow linearised about winds (batch, channel, *shape)."""
     if _check.dense(who, name, winds).dim() < 3:
         raise ValueError(f"{who}: {name} must have shape (batch, channel, *shape), got {tuple(winds.shape)}")

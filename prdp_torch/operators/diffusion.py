@@ -1,9 +1,21 @@
 """Diffusion by finite volumes."""
 
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
+
 import torch
+from torch import Tensor
 
 from prdp_torch import _check
 from prdp_torch.operators.base import Operator, real_tensor
+from prdp_torch.types import Length, Number
+
+Side: TypeAlias = Literal["zero", "flux", "periodic"]
+Sides: TypeAlias = Side | Sequence[Side | tuple[Side, Side] | list[Side]]
+"""One for all sides, one for each axis, or a pair (low, high) for each axis."""
+
+OfSides: TypeAlias = Number | Sequence[Sequence[Number]]
+"""One for all sides, or a pair (low, high) for each axis."""
 
 
 class Diffusion(Operator):
@@ -32,8 +44,18 @@ class Diffusion(Operator):
     """
 
     kind = "diffusion"
+    boundary: list[tuple[str, ...]]
+    length: list[float]
+    kappa: Tensor
 
-    def __init__(self, kappa, shift=0.0, boundary="zero", length=1.0, faces="harmonic"):
+    def __init__(
+        self,
+        kappa: Tensor,
+        shift: Number = 0.0,
+        boundary: Sides = "zero",
+        length: Length = 1.0,
+        faces: Literal["harmonic", "arithmetic"] = "harmonic",
+    ) -> None:
         dim = _check.dense("Diffusion", "kappa", kappa).dim() - 1
         if not 1 <= dim <= 3:
             raise ValueError(
@@ -61,7 +83,7 @@ class Diffusion(Operator):
         null_spaces = () if is_held else (kappa.new_empty(0).detach(),) * 2
         super().__init__(list(kappa.shape[1:]), parameters, [kappa.unsqueeze(1), shift], null_spaces)
 
-    def boundary_rhs(self, values=0.0, fluxes=0.0):
+    def boundary_rhs(self, values: OfSides = 0.0, fluxes: OfSides = 0.0) -> Tensor:
         """The part of b that given values and fluxes at the sides make, (batch or 1, 1, *shape), with gradients.
 
         Args:
@@ -89,10 +111,12 @@ class Diffusion(Operator):
         return b.unsqueeze(1)
 
 
-def _sides(boundary, dim):
+def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
     """The pair (low, high) of each axis."""
-    axes = [boundary] * dim if isinstance(boundary, str) else list(boundary)
-    pairs = [(of_axis,) * 2 if isinstance(of_axis, str) else tuple(of_axis) for of_axis in axes]
+    axes = [boundary] * dim if isinstance(boundary, str) else boundary
+    pairs: list[tuple[str, ...]] = [
+        (of_axis, of_axis) if isinstance(of_axis, str) else tuple(of_axis) for of_axis in axes
+    ]
     known = {"zero", "flux", "periodic"}
     if len(pairs) != dim or any(len(pair) != 2 or not set(pair) <= known for pair in pairs):
         raise ValueError(
@@ -104,7 +128,7 @@ def _sides(boundary, dim):
     return pairs
 
 
-def _of_sides(name, given, dim):
+def _of_sides(name: str, given: OfSides, dim: int) -> Sequence[Sequence[Number]]:
     """A value for each side: (low, high) for each axis."""
     if isinstance(given, (int, float, torch.Tensor)):
         return [(given, given)] * dim

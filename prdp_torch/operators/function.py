@@ -1,9 +1,17 @@
 """Products given by Python functions."""
 
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
 import torch
+from torch import Tensor
 
 from prdp_torch import _C, _check, batching
 from prdp_torch.operators.base import Operator, null_spaces_of
+from prdp_torch.types import NullSpace
+
+Product: TypeAlias = Callable[..., Tensor]
+"""`product(v, *tensors)`, a vector of the shape of v."""
 
 
 class Function(Operator):
@@ -29,14 +37,14 @@ class Function(Operator):
 
     def __init__(
         self,
-        matvec,
-        transpose=None,
-        tensors=(),
-        diagonal=None,
-        symmetric=False,
-        nullspace=None,
-        left_nullspace=None,
-    ):
+        matvec: Product,
+        transpose: Product | None = None,
+        tensors: Tensor | Sequence[Tensor] = (),
+        diagonal: Callable[..., Tensor] | None = None,
+        symmetric: bool = False,
+        nullspace: NullSpace = None,
+        left_nullspace: NullSpace = None,
+    ) -> None:
         for name, function in (("matvec", matvec), ("transpose", transpose), ("diagonal", diagonal)):
             if not callable(function) and (name == "matvec" or function is not None):
                 raise TypeError(f"Function: {name} must be callable, got {function!r}")
@@ -51,7 +59,7 @@ class Function(Operator):
         product = _returning_a_tensor("matvec", matvec)
         self._products = _C.RegisteredProducts(
             product,
-            product if symmetric else _returning_a_tensor("transpose", transpose),
+            product if symmetric else None if transpose is None else _returning_a_tensor("transpose", transpose),
             None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
@@ -59,18 +67,18 @@ class Function(Operator):
         self._null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         super().__init__([self._products.number], [], tensors, self._null_spaces)
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         matvec, transpose, diagonal, symmetric = self._made_of
         tensors = tuple(self.tensors[: len(self.tensors) - len(self._null_spaces)])
         return Function, (matvec, transpose, tensors, diagonal, symmetric, *(self._null_spaces or (None, None)))
 
 
-def _tensor(name, value):
+def _tensor(name: str, value: object) -> Tensor:
     if isinstance(value, torch.Tensor):
         return value
     raise TypeError(f"Function: {name} must return a torch tensor, got {type(value).__name__}")
 
 
-def _returning_a_tensor(name, function):
+def _returning_a_tensor(name: str, function: Product) -> Callable[[Tensor, list[Tensor]], Tensor]:
     """A product as the compiled library calls it."""
-    return None if function is None else lambda v, given: _tensor(name, function(v, *given))
+    return lambda v, given: _tensor(name, function(v, *given))

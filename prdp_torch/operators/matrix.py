@@ -1,11 +1,15 @@
 """Matrices, and what else is taken for an operator."""
 
 import warnings
+from collections.abc import Sequence
+from typing import Self
 
 import torch
+from torch import Tensor
 
-from prdp_torch import _check
+from prdp_torch import _check, torch_private
 from prdp_torch.operators.base import Operator, null_spaces_of
+from prdp_torch.types import NullSpace
 
 
 class Matrix(Operator):
@@ -14,13 +18,13 @@ class Matrix(Operator):
 
     `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n)."""
 
-    def __init__(self, matrix, nullspace=None, left_nullspace=None):
+    def __init__(self, matrix: Tensor, nullspace: NullSpace = None, left_nullspace: NullSpace = None) -> None:
         if not isinstance(matrix, torch.Tensor):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
         if matrix.layout == torch.sparse_csr:
             _warn_of_csr_gradient(matrix)
-            self.kind = "csr"
-            with torch._C._DisableFuncTorch():  # torch.func does not know sparse tensors
+            self.kind: str = "csr"
+            with torch_private.without_transforms():
                 tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
         elif matrix.layout == torch.strided:
             self.kind = "dense"
@@ -36,11 +40,19 @@ class Matrix(Operator):
             )
         super().__init__([], [], tensors, null_spaces_of("Matrix", nullspace, left_nullspace, tensors[-1]))
 
-    def _unknowns(self):
+    def _unknowns(self) -> int:
         return self.tensors[0].shape[-1] - (self.kind == "csr")
 
     @classmethod
-    def csr(cls, crow, col, values, size, nullspace=None, left_nullspace=None):
+    def csr(
+        cls,
+        crow: Tensor,
+        col: Tensor,
+        values: Tensor,
+        size: int | Sequence[int],
+        nullspace: NullSpace = None,
+        left_nullspace: NullSpace = None,
+    ) -> Self:
         """A sparse matrix by its compressed rows, as `torch.sparse_csr_tensor` takes them.
 
         Args:
@@ -81,7 +93,7 @@ class Matrix(Operator):
 _warned_of_csr_gradient = False
 
 
-def _warn_of_csr_gradient(matrix):
+def _warn_of_csr_gradient(matrix: Tensor) -> None:
     global _warned_of_csr_gradient
     if matrix.requires_grad and torch.is_grad_enabled() and not _warned_of_csr_gradient:
         _warned_of_csr_gradient = True
@@ -92,7 +104,7 @@ def _warn_of_csr_gradient(matrix):
         )
 
 
-def as_operator(who, name, value):
+def as_operator(who: str, name: str, value: object) -> Operator:
     """An operator as it is, a tensor as a `Matrix`; TypeError for all else."""
     if isinstance(value, Operator):
         return value

@@ -1,7 +1,15 @@
 """Coefficients at every point of a grid."""
 
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
+
+from torch import Tensor
+
 from prdp_torch import _check
 from prdp_torch.operators.base import Operator, null_spaces_of
+from prdp_torch.types import NullSpace
+
+Boundary: TypeAlias = Literal["zero", "periodic"]
 
 
 class Stencil(Operator):
@@ -32,8 +40,17 @@ class Stencil(Operator):
     """
 
     kind = "stencil"
+    offsets: list[tuple[int, ...]]
+    boundary: tuple[Boundary, ...]
 
-    def __init__(self, coefficients, offsets, boundary="zero", nullspace=None, left_nullspace=None):
+    def __init__(
+        self,
+        coefficients: Tensor,
+        offsets: Sequence[Sequence[int]],
+        boundary: Boundary | Sequence[Boundary] = "zero",
+        nullspace: NullSpace = None,
+        left_nullspace: NullSpace = None,
+    ) -> None:
         dim = _check.dense("Stencil", "coefficients", coefficients).dim() - 2
         if not 1 <= dim <= 3:
             raise ValueError(
@@ -52,12 +69,12 @@ class Stencil(Operator):
         null_spaces = null_spaces_of("Stencil", nullspace, left_nullspace, coefficients)
         super().__init__(list(coefficients.shape[2:]), periodic + cells, [coefficients], null_spaces)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         shape, tensors = tuple(self.shape), ", ".join(f"tensor{tuple(t.shape)}" for t in self.tensors)
         return f"Stencil(shape={shape}, offsets={self.offsets}, boundary={self.boundary}, tensors=[{tensors}])"
 
 
-def _offsets(offsets, dim):
+def _offsets(offsets: Sequence[Sequence[int]], dim: int) -> list[tuple[int, ...]]:
     """As a list of tuples of `dim` whole numbers."""
     if not isinstance(offsets, (tuple, list)) or not all(isinstance(o, (tuple, list)) for o in offsets):
         raise TypeError(f"Stencil: offsets must be a list of tuples such as [(0, 0), (0, -1)], got {offsets!r}")

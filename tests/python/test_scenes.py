@@ -90,7 +90,7 @@ def test_bicgstab_is_a_method_of_scenes_without_a_restart(tmp_path):
               'method = "bicgstab"\n')  # fmt: skip
     scene = scenes.load(written(tmp_path, solver, scene="burgers_1d"))
     assert (scene.method, scene.max_iter) == ("bicgstab", 23)
-    assert isinstance(scenes._solver(scene, 5), BiCGStab)
+    assert isinstance(scenes.make_solver(scene, 5), BiCGStab)
     with_restart = written(tmp_path, (solver[0], solver[1] + "restart = 2\n"), scene="burgers_1d", name="restart")
     assert_refused(with_restart, "restart = 2", "unknown name 'solver.restart'; allowed: backward")
 

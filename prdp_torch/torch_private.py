@@ -1,0 +1,51 @@
+"""All that the library takes from torch beside its public interface, each with the reason.
+
+Where a release of torch changes one of them, `tests/python/test_torch_private.py` fails with its name.
+"""
+
+from collections.abc import Callable
+from typing import Self
+
+import torch
+from torch import Tensor
+from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, maybe_get_bdim
+
+without_transforms = torch._C._DisableFuncTorch
+"""A context in which torch.func leaves tensors alone: it does not know sparse ones, whose parts are read in it."""
+
+
+def transforms_are_active() -> bool:
+    """Whether a transform of torch.func runs. Its wrappers must not leave it, and nothing public tells."""
+    return bool(torch._C._are_functorch_transforms_active())
+
+
+def unwrapped(t: Tensor) -> Tensor:
+    """A tensor without the wrappers of the transforms that run; the axes that are mapped come first. Reports of solves
+    outlive the transforms, and torch.func has no public way to take a wrapper off."""
+    while is_functorch_wrapped_tensor(t):
+        dim = maybe_get_bdim(t)
+        t = get_unwrapped(t)
+        t = t.movedim(dim, 0) if dim > 0 else t
+    return t
+
+
+def number_as_graph_input(module: torch.nn.Module, name: str) -> int:
+    """A whole number that a module holds, inside torch.compile, which otherwise takes it for a constant and compiles
+    again for each value. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole
+    process."""
+    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
+        number: int = getattr(module, name) + 0  # the number is read where it is used first, which must be here
+    return number
+
+
+class HearsOfMoves(torch.nn.Module):
+    """A module that is told when `to`, `half` and the like have given it new tensors: they all call `_apply`, and
+    modules have no public hook for that."""
+
+    def moved(self) -> None:
+        """Called when this module has new tensors."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.moved()
+        return self
