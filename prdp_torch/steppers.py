@@ -6,7 +6,7 @@ from typing import ClassVar, Unpack
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, _check, operators
+from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.operators.base import real_tensor
 from prdp_torch.solvers import Kept, Solver
 from prdp_torch.stepper import Stepper
@@ -120,6 +120,8 @@ class EquationStepper(Stepper):
         nu = self.nu
         if isinstance(nu, torch.Tensor):
             return [nu]
+        if torch_private.modes_are_active():
+            return [real_tensor(type(self).__name__, "nu", nu)]
         if self._number is None or nu != self._number[0]:
             self._number = nu, real_tensor(type(self).__name__, "nu", nu)
         return [self._number[1]]

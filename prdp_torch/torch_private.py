@@ -19,6 +19,12 @@ def transforms_are_active() -> bool:
     return bool(torch._C._are_functorch_transforms_active())
 
 
+def modes_are_active() -> bool:
+    """Whether a dispatch mode runs, such as that of fake tensors: then a number becomes a tensor of the mode's own kind,
+    and such a tensor must not outlive it. Nothing public tells."""
+    return not torch.compiler.is_compiling() and bool(torch._C._len_torch_dispatch_stack())
+
+
 def unwrapped(t: Tensor) -> Tensor:
     """A tensor without the wrappers of the transforms that run; the axes that are mapped come first. Reports of solves
     outlive the transforms, and torch.func has no public way to take a wrapper off."""

@@ -150,6 +150,17 @@ def test_a_mode_of_fake_tensors_makes_them():
     assert u.fake_mode is mode and info.status.fake_mode is mode
 
 
+def test_a_number_is_of_the_kind_that_a_mode_makes_and_does_not_outlive_it():
+    u = torch.randn(2, 1, 6)
+    before = prdp.Heat((6,), 1e-2, 1.0, prdp.CG(3))
+    with FakeTensorMode() as mode:
+        within = prdp.Heat((6,), 1e-2, 1.0, prdp.CG(3))
+        for step in (before, within):
+            assert step(torch.randn(2, 1, 6)).fake_mode is mode
+            assert step.rollout(torch.randn(2, 1, 6), 2).shape == (2, 3, 1, 6)
+    assert torch.equal(within(u), before(u)) and type(within(u)) is torch.Tensor
+
+
 @every_stepper
 def test_the_profiler_sees_the_op(make):
     step, u = make(), state(make)

@@ -16,6 +16,7 @@ NAMES = [
     "torch._C._DisableFuncTorch",
     "torch._C._are_functorch_transforms_active",
     "torch._C._functorch.get_unwrapped",
+    "torch._C._len_torch_dispatch_stack",
     "torch._C._functorch.is_functorch_wrapped_tensor",
     "torch._C._functorch.maybe_get_bdim",
     "torch._dynamo.patch_dynamo_config",
