@@ -20,8 +20,8 @@ def transforms_are_active() -> bool:
 
 
 def modes_are_active() -> bool:
-    """Whether a dispatch mode runs, such as that of fake tensors: then a number becomes a tensor of the mode's own kind,
-    and such a tensor must not outlive it. Nothing public tells."""
+    """Whether a dispatch mode runs, such as that of fake tensors: then a number becomes a tensor of the mode's kind,
+    which must not outlive it. Nothing public tells."""
     return not torch.compiler.is_compiling() and bool(torch._C._len_torch_dispatch_stack())
 
 
