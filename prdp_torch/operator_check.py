@@ -9,17 +9,21 @@ from torch import Generator, Tensor
 from prdp_torch import _C, _check
 from prdp_torch.operators import Operator
 from prdp_torch.operators.matrix import as_operator
+from prdp_torch.solve import linear_solve
+from prdp_torch.solvers import CG, Solver
 
 _UNIT_VECTORS = 256
 
 
-def check_operator(A: Operator | Tensor, example: Tensor) -> Literal[True]:
-    """Check that the parts of an operator fit each other. It takes any operator; `operators.Function` needs it most.
+def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None = None) -> Literal[True]:
+    """Check that the parts of an operator fit each other, and a preconditioner of your own. It takes any operator;
+    `operators.Function` needs it most.
 
     Args:
         A: an operator of `prdp_torch.operators`, or a tensor as `linear_solve` takes it.
         example: a right-hand side (batch, ...) in float32 or float64, of which only shape and dtype are used. In
             float64 the comparison is sharp; in float32 it finds only large mistakes.
+        solver: one whose preconditioner is checked as well, such as `CG(10, preconditioner=M)`.
 
     It checks that:
 
@@ -28,7 +32,8 @@ def check_operator(A: Operator | Tensor, example: Tensor) -> Literal[True]:
     - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
     - A does not map the constant to zero, unless that is its `nullspace`;
-    - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction.
+    - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction;
+    - an operator that preconditions is linear and fits its transpose, and that of `CG` is symmetric and definite.
 
     Returns:
         True.
@@ -54,6 +59,7 @@ def check_operator(A: Operator | Tensor, example: Tensor) -> Literal[True]:
             *_captures(A, v),
             *_diagonal(A, v),
             *_gradients(A, v, w, generator),
+            *_preconditioner(A, solver, v, w),
         ]
     if wrong:
         raise ValueError(f"{who}: {type(A).__name__}: " + "; ".join(wrong))
@@ -74,22 +80,23 @@ def _norm(v: Tensor) -> Tensor:
     return norm
 
 
-def _products(A: Operator, v: Tensor, w: Tensor) -> Iterator[str]:
+def _products(A: Operator, v: Tensor, w: Tensor, name: str = "A") -> Iterator[str]:
     rounding = 1e3 * torch.finfo(v.dtype).eps
     av, aw, atw = A.apply(v), A.apply(w), A.apply_transpose(w)
     scale = _norm(av) + _norm(aw)
     if (_norm(A.apply(2 * v + w) - (2 * av + aw)) > rounding * scale).any():
-        yield "A is not linear: A (2 v + w) differs from 2 A v + A w"
+        yield f"{name} is not linear: {name} (2 v + w) differs from 2 {name} v + {name} w"
     left, right = _dot(av, w), _dot(v, atw)
     bound = rounding * (_norm(av) * _norm(w) + _norm(v) * _norm(atw))
     if ((left - right).abs() > bound).any():
         worst = (left - right).abs().argmax()
-        yield f"the transpose is wrong: <A v, w> = {left[worst]:.6g} but <v, A^T w> = {right[worst]:.6g}"
+        at = f"<{name} v, w> = {left[worst]:.6g} but <v, {name}^T w> = {right[worst]:.6g}"
+        yield f"the transpose{'' if name == 'A' else f' of {name}'} is wrong: {at}"
     if len(v) > 1:
         other = v.clone()
         other[0] = w[0]
         if (_norm(A.apply(other) - av)[1:] > rounding * scale[1:]).any():
-            yield "samples influence each other: A v changes in a sample whose v did not"
+            yield f"samples influence each other: {name} v changes in a sample whose v did not"
 
 
 def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
@@ -157,3 +164,30 @@ def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Itera
                 f"the gradient for tensor {i} of shape {tuple(t.shape)} is wrong: "
                 f"{slope:.6g} along a direction in which the product changes by {expected:.6g}"
             )
+
+
+def _preconditioner(A: Operator, solver: Solver | None, v: Tensor, w: Tensor) -> Iterator[str]:
+    if solver is None or solver.preconditioner is None:
+        return
+    M = solver.preconditioner
+    if not isinstance(M, Operator):
+        linear_solve(A, v, solver, on_failure="return")  # says itself what it does not fit
+        return
+    product = M.apply(v)
+    if product.shape != v.shape or product.dtype != v.dtype:
+        yield (
+            f"the preconditioner makes {product.dtype} {tuple(product.shape)} of {v.dtype} {tuple(v.shape)}; "
+            "it must keep both"
+        )
+        return
+    yield from _products(M, v, w, "M")
+    if not isinstance(solver, CG):
+        return
+    left, right = _dot(product, w), _dot(v, M.apply(w))
+    bound = 1e3 * torch.finfo(v.dtype).eps * (_norm(product) * _norm(w) + _norm(v) * _norm(M.apply(w)))
+    if ((left - right).abs() > bound).any():
+        worst = (left - right).abs().argmax()
+        yield f"CG needs a symmetric preconditioner: <M v, w> = {left[worst]:.6g} but <v, M w> = {right[worst]:.6g}"
+    signs = torch.stack([_dot(x, M.apply(x)).sign() for x in (v, w, A.apply(v), A.apply(w))])
+    if (signs != signs[0]).any() or (signs == 0).any():
+        yield "CG needs a definite preconditioner: <v, M v> is not of one sign"

@@ -100,3 +100,39 @@ def test_bad_arguments():
         prdp.check_operator(3, EXAMPLE)
     with pytest.raises(ValueError, match=r"check_operator: example must have shape \(batch, ...\), got \(7,\)"):
         prdp.check_operator(torch.eye(N), torch.zeros(N))
+
+
+INVERSE = operators.Function(lambda v: v / 3, symmetric=True)
+
+
+def looked_at(preconditioner, solver=prdp.CG):
+    return prdp.check_operator(spd_matrices(2, N), EXAMPLE, solver(3, preconditioner=preconditioner))
+
+
+@pytest.mark.parametrize("preconditioner", [None, "diagonal", INVERSE, operators.Matrix(-spd_matrices(2, N))])
+def test_right_preconditioners_pass(preconditioner):
+    assert looked_at(preconditioner)
+    assert prdp.check_operator(
+        operators.Diffusion(K.expand(2, -1)), EXAMPLE[:, None], prdp.CG(3, preconditioner="multigrid")
+    )
+
+
+@pytest.mark.parametrize(
+    "matvec, transpose, message",
+    [
+        (lambda v: v.abs(), None, r"M is not linear: M \(2 v \+ w\) differs"),
+        (lambda v: v + v.roll(1, -1), lambda v: v, r"the transpose of M is wrong: <M v, w> = .* but <v, M\^T w>"),
+        (lambda v: v + v.roll(1, 0), None, "samples influence each other: M v changes"),
+        (lambda v: 3 * v + v.roll(1, -1), None, "CG needs a symmetric preconditioner: <M v, w>"),
+        (lambda v: v * torch.linspace(-1, 1, N), None, "CG needs a definite preconditioner"),
+    ],
+)
+def test_each_mistake_of_a_preconditioner_is_named(matvec, transpose, message):
+    with pytest.raises(ValueError, match="check_operator: Matrix: .*" + message):
+        looked_at(operators.Function(matvec, transpose))
+
+
+def test_a_preconditioner_of_gmres_need_not_be_symmetric():
+    assert looked_at(operators.Function(lambda v: 3 * v + v.roll(1, -1)), solver=prdp.GMRES)
+    with pytest.raises(ValueError, match="multigrid"):
+        looked_at("multigrid")
