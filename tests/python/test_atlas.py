@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from prdp_torch.experiments import atlas
-from prdp_torch.experiments.atlas import gradients, solves
+from prdp_torch.experiments.atlas import coarse_grids, gradients, solves
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "stability"
@@ -130,3 +130,16 @@ def test_the_docs_show_every_map_with_its_measured_answer(name, tmp_path):
 
 def test_the_whole_atlas_takes_less_than_ten_minutes():
     assert sum(json.loads((DOCS / f"{name}.json").read_text())["seconds"] for name in atlas.MAPS) < 600
+
+
+@pytest.mark.parametrize("measure", [coarse_grids.contrast, coarse_grids.anisotropy, coarse_grids.sizes])
+def test_multigrid_takes_as_many_products_at_every_distance_from_trouble(measure):
+    found = measure(quick=True)["lines"]
+    assert max(found['CG, preconditioner="multigrid"']) <= 8 and max(found["Multigrid"]) <= 12
+    assert max(found["CG"]) > 100
+
+
+def test_winds_slow_cycles_down_but_less_than_methods_without_them():
+    found = coarse_grids.peclet(quick=True)["lines"]
+    assert found['BiCGStab, preconditioner="multigrid"'][0] <= 8
+    assert found['BiCGStab, preconditioner="multigrid"'][-1] < found["BiCGStab"][-1] / 10

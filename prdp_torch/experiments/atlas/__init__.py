@@ -1,6 +1,7 @@
 """The failure atlas: maps of where methods work and where they break, measured and drawn by `prdp stability`.
 
-`problems` makes operators and right-hand sides, `solves` and `gradients` measure maps, `pictures` draws them.
+`problems` makes operators and right-hand sides; `solves`, `coarse_grids` and `gradients` measure maps; `pictures` draws
+them.
 """
 
 from prdp_torch.experiments.atlas.maps import MAPS, Map, run

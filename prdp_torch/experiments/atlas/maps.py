@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from prdp_torch.experiments import charts, records
-from prdp_torch.experiments.atlas import gradients, problems, solves
+from prdp_torch.experiments.atlas import coarse_grids, gradients, problems, solves
 
 
 class Map(NamedTuple):
@@ -41,6 +41,25 @@ MAPS = {
         solves.contrast,
         "cost",
         ("contrast of the diffusivity, max κ/min κ (random from cell to cell, 32²)",),
+    ),
+    "multigrid_contrast": Map(
+        "Does multigrid mind a contrast?",
+        coarse_grids.contrast,
+        "cost",
+        ("contrast of a smooth diffusivity, max κ/min κ (63²)",),
+    ),
+    "multigrid_anisotropy": Map(
+        "Does multigrid mind long cells?",
+        coarse_grids.anisotropy,
+        "cost",
+        ("length of a cell over its height (63²)",),
+    ),
+    "multigrid_sizes": Map("Does multigrid mind the size of the grid?", coarse_grids.sizes, "grid_size"),
+    "multigrid_winds": Map(
+        "Does multigrid mind winds?",
+        coarse_grids.peclet,
+        "cost",
+        ("cell Péclet number, max|w| dx/nu, of vortices (64²)",),
     ),
     "burgers_solvers": Map(
         "Which solver takes a Burgers step?",
