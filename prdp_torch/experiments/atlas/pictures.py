@@ -11,8 +11,9 @@ from prdp_torch.experiments.charts import make_figure
 # One colour per method in all pictures; Okabe and Ito's, which colour-blind readers can tell apart.
 COLOURS = {"GMRES(2)": "#56B4E9", "BiCGStab": "#8C6D31",
            "Jacobi": "#0072B2", "Chebyshev": "#009E73", "SteepestDescent": "#CC79A7", "CG": "#E69F00",
-           "GMRES": "#D55E00", "Multigrid": "#5B2C8A", "Direct": "#222222", "constant K": "#0072B2", "implicit": "#0072B2",
-           "unrolled": "#D55E00", "solution": "#888888", "primal": "#0072B2", "adjoint": "#D55E00"}  # fmt: skip
+           "GMRES": "#D55E00", "Multigrid": "#5B2C8A", "Direct": "#222222", "constant K": "#0072B2",
+           "implicit": "#0072B2", "unrolled": "#D55E00",
+           "solution": "#888888", "primal": "#0072B2", "adjoint": "#D55E00"}  # fmt: skip
 STATUSES = {"CONVERGED": "#4daf7c", "CONVERGED_BREAKDOWN": "#8fd0ad", "MAX_ITER": "#f2e6a2", "STAGNATED": "#e8c468",
             "DIVERGED": "#d7301f", "OVERFLOW": "#a50f15", "BREAKDOWN": "#f08a5d", "ZERO_DIAGONAL": "#9e9ac8",
             "INCONSISTENT": "#807dba", "NONFINITE_INPUT": "#54278f", "NONFINITE_OPERATOR": "#3f007d"}  # fmt: skip
