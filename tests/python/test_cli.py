@@ -92,7 +92,7 @@ def test_scenes_are_listed(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, diffusion_inverse"),
+        (["compare", "nosuch"], "prdp: no scene 'nosuch'; available: burgers_1d, burgers_2d, darcy_emulator"),
         (["compare", "nosuch.toml"], "prdp: scene: cannot read 'nosuch.toml'"),
         (
             ["train", "heat_1d", "--schedule", "3"],

@@ -6,7 +6,7 @@ import torch
 from helpers import field, statuses
 
 import prdp_torch as prdp
-from prdp_torch import operators
+from prdp_torch import _C, operators
 
 F64 = torch.float64
 MULTIGRID = {"preconditioner": "multigrid"}
@@ -220,3 +220,56 @@ def test_a_controller_sets_the_number_of_cycles():
         assert step.info.iterations.tolist() == [k, k]
     with pytest.raises(ValueError, match="max_iter must be >= 0, got -1"):
         step.max_iter = -1
+
+
+FLOW = field((6, 7), 2, channels=3)
+SYSTEMS = {
+    "heat": (operators.Heat((9, 10), 1.0, 0.02), (9, 10), 1),
+    "diffusion": (operators.Diffusion(blobs((9, 10), 50.0, 1)[None]), (9, 10), 1),
+    "burgers": (operators.Burgers(FLOW[:, :2], 1e-2, 0.1), (6, 7), 2),
+    "navier_stokes": (operators.NavierStokes(FLOW, 1e-2, 0.1), (6, 7), 3),
+}
+SOLVERS_OF = {
+    "heat": [prdp.CG(3, rtol=0.0, **MULTIGRID), prdp.Multigrid(3, rtol=0.0)],
+    "diffusion": [prdp.CG(3, rtol=0.0, **MULTIGRID), prdp.GMRES(1, rtol=0.0, restart=3, **MULTIGRID)],
+    "burgers": [prdp.BiCGStab(2, rtol=0.0, **MULTIGRID), prdp.Multigrid(2, rtol=0.0)],
+    "navier_stokes": [prdp.GMRES(2, rtol=0.0, restart=3, **MULTIGRID)],
+}
+PAIRS = [(kind, solver) for kind, solvers in SOLVERS_OF.items() for solver in solvers]
+PAIR_IDS = [f"{kind}-{type(solver).__name__}" for kind, solver in PAIRS]
+
+
+@pytest.mark.parametrize("kind, solver", PAIRS, ids=PAIR_IDS)
+def test_plain_tensors_take_the_same_iterations(kind, solver):
+    a, shape, channels = SYSTEMS[kind]
+    b = field(shape, 2, channels=channels, seed=4)
+    u, _ = prdp.linear_solve(a, b, solver, on_failure="return")
+    v, _ = _C.solve_with_tensors(
+        b, a.tensors, a.kind, a.shape, a.parameters, False, solver.method, solver.max_iter, 0.0, solver.restart,
+        preconditioner="multigrid",
+    )  # fmt: skip
+    torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10 * float(u.abs().max()))
+
+
+@pytest.mark.parametrize("kind, solver", PAIRS, ids=PAIR_IDS)
+def test_recorded_derivatives_of_unrolled_iterations_know_the_cycles(kind, solver):
+    """With create_graph=True and in forward mode, the iterations run in plain tensor operations."""
+    a, shape, channels = SYSTEMS[kind]
+
+    def solve(b):
+        return prdp.linear_solve(a, b, solver, backward="unrolled", on_failure="return")[0]
+
+    b = field(shape, 2, channels=channels, seed=4).requires_grad_()
+    w = field(shape, 2, channels=channels, seed=5)
+    u = solve(b)
+    (plain,) = torch.autograd.grad((u * w).sum(), b)
+    (recorded,) = torch.autograd.grad((solve(b) * w).sum(), b, create_graph=True)
+    torch.testing.assert_close(recorded, plain, rtol=1e-7, atol=1e-9 * float(plain.abs().max()))
+    if solver.method == "multigrid":  # linear in b
+        _, along = torch.func.jvp(solve, (b.detach(),), (w,))
+        torch.testing.assert_close(along, solve(w).detach(), rtol=1e-7, atol=1e-9 * float(u.abs().max()))
+    step = 1e-6
+    _, along = torch.func.jvp(solve, (b.detach(),), (w,))
+    ahead, behind = (solve(b.detach() + s * w) for s in (step, -step))
+    expected = (ahead - behind) / (2 * step)
+    torch.testing.assert_close(along, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))

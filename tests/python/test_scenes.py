@@ -123,7 +123,8 @@ def test_missing_files_and_unknown_scenes():
         scenes.load("nowhere.toml")
     with pytest.raises(
         ValueError,
-        match="no scene 'heat1d'; available: burgers_1d, burgers_2d, diffusion_inverse, heat_1d, heat_2d, heat_3d",
+        match="no scene 'heat1d'; available: burgers_1d, burgers_2d, darcy_emulator, darcy_inverse, diffusion_inverse, "
+        "heat_1d, heat_2d, heat_3d",
     ):
         scenes.load("heat1d")
 

@@ -117,6 +117,7 @@ class TapeSpace {
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
   bool is_preconditioned() const { return values_.is_preconditioned(); }
+  void correct(const Vector& v, Vector& out) { precondition(v, out); }
   Scalar precondition(const Vector& v, Vector& out) {
     const T* from = value(v);
     const auto of = v.version;

@@ -45,7 +45,7 @@ class CorrectionMethod {
 };
 
 struct VCycle {
-  static void apply(auto& space, auto& r, auto& d) { space.precondition(r, d); }
+  static void apply(auto& space, auto& r, auto& d) { space.correct(r, d); }
 };
 template <VectorSpace Space>
 struct MultigridMethod : CorrectionMethod<Space, VCycle> {

@@ -124,6 +124,7 @@ class SampleSpace {
     project_solution(out);  // cycles leave rounding there, which they would amplify
     return dot(v, out);
   }
+  void correct(const T* v, Vector out) { precondition(v, out); }
   /// The transpose of this without a diagonal; v is overwritten.
   void precondition_transpose(Vector v, Vector out) {
     project_solution(v);

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/status.h"
 
@@ -67,7 +68,7 @@ class StepwiseSolve {
 
  private:
   Solver solver_;
-  std::unique_ptr<Operator> inverse_;
+  Inverse inverse_;
   at::Tensor scale_, rhs_, start_;
   at::Tensor scale_of_a_, scale_of_inverse_;  // TensorSpace::System
   std::vector<double> b2_;  // of b, scaled

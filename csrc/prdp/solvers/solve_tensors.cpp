@@ -94,14 +94,6 @@ at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& sta
   return start.defined() ? b - a.project(a.apply(start)) : b;
 }
 
-/// The operator that a preconditioner is; null for others. Raises ValueError or TypeError unless it takes vectors as b.
-std::unique_ptr<Operator> make_inverse(const Preconditioner& preconditioner, const at::Tensor& b) {
-  if (!preconditioner.is_operator()) return nullptr;
-  auto inverse = make_operator(preconditioner.spec());
-  inverse->check_vector(b);
-  return inverse;
-}
-
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
 /// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
@@ -158,8 +150,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
   const auto rhs = a.project(whole);
   const auto inconsistent = find_inconsistent(whole, rhs, solver.rtol);
-  const auto inverse = make_inverse(solver.preconditioner, b);
-  TensorSpace::System system{a, solver.preconditioner, inverse.get()};
+  const auto inverse = make_inverse(a, solver.preconditioner, b);
+  TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, rhs, states);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
@@ -213,8 +205,8 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   std::vector<SampleState> states(b.size(0));
   const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   const auto whole = a.project(rhs);
-  const auto inverse = make_inverse(solver.preconditioner, b);
-  TensorSpace::System system{a, solver.preconditioner, inverse.get()};
+  const auto inverse = make_inverse(a, solver.preconditioner, b);
+  TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, whole, states, /*recording=*/true);
   const auto b2 = space.lanes(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
@@ -235,7 +227,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
 
 StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
                              const at::Tensor& caps)
-    : solver_(solver), inverse_(make_inverse(solver.preconditioner, b)) {
+    : solver_(solver), inverse_(make_inverse(a, solver.preconditioner, b)) {
   const auto [scaled, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
   scale_ = scale;
   rhs_ = a.project(scaled);
@@ -255,7 +247,7 @@ int64_t StepwiseSolve::iterations() const { return *std::max_element(caps_.begin
 
 StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rhs, const State& before, int64_t done) {
   std::vector<SampleState> states(caps_.size());
-  TensorSpace::System system{a, solver_.preconditioner, inverse_.get(), scale_of_a_, scale_of_inverse_};
+  TensorSpace::System system{a, solver_.preconditioner, inverse_, scale_of_a_, scale_of_inverse_};
   TensorSpace space(system, rhs, states, /*recording=*/true);
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = caps_[i];

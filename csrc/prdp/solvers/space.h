@@ -48,6 +48,8 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   /// Whether there is a preconditioner M; y = M⁻¹ x, which returns x·y.
   { s.is_preconditioned() } -> std::same_as<bool>;
   { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
+  /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
+  s.correct(x, y);
   /// y = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖y‖².
   { s.residual(x, y) } -> std::same_as<typename S::Scalar>;
   /// a/b for a step, where the third and fourth are the squares of the norms whose product bounds b: 0 where a is

@@ -61,7 +61,7 @@ TensorSpace::Vector TensorSpace::scaled(const Vector& product, const Vector& v, 
 }
 
 TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
-  auto z = system_.inverse ? scaled(system_.inverse->apply(v), v, system_.scale_of_inverse) : v / diagonal();
+  auto z = system_.inverse ? scaled(system_.inverse(v), v, system_.scale_of_inverse) : v / diagonal();
   if (system_.inverse && system_.a.leaks()) z = system_.a.project_solution(z);
   out = keep_frozen(z, out);
   return dot(v, z);

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/threads/interruption.h"
@@ -20,12 +21,12 @@ class TensorSpace {
   using Scalar = at::Tensor;  // (batch, 1, ...)
   using States = std::vector<SampleState>;
 
-  /// What a solve computes with: A, and the inverse of the preconditioner if it is an operator. Both are scaled by a
-  /// power of two for each sample, which their first product gives: so no product of theirs over- or underflows.
+  /// What a solve computes with: A, and the inverse of the preconditioner unless it is the diagonal. Both are scaled by
+  /// a power of two for each sample, which their first product gives: so no product of theirs over- or underflows.
   struct System {
     const Operator& a;
     const Preconditioner& preconditioner;
-    const Operator* inverse = nullptr;
+    Inverse inverse{};
     at::Tensor scale_of_a{}, scale_of_inverse{};  // (batch, 1, …); undefined before the first product
   };
   /// b must be finite and scaled to the order of one, or zero.
@@ -70,6 +71,10 @@ class TensorSpace {
   }
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
   Scalar precondition(const Vector& v, Vector& out);
+  void correct(const Vector& v, Vector& out) {
+    const auto z = system_.inverse(v);
+    out = keep_frozen(system_.a.leaks() ? system_.a.project_solution(z) : z, out);
+  }
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
     for (int64_t s = 0; s < n; ++s) {

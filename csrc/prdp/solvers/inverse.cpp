@@ -1,0 +1,114 @@
+#include "prdp/solvers/inverse.h"
+
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/custom_class.h>
+
+#include <limits>
+#include <memory>
+
+#include "prdp/kernels/kernel.h"
+#include "prdp/kernels/preconditioner.h"
+#include "prdp/solvers/tensor_cycles.h"
+
+namespace prdp {
+
+namespace {
+
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+/// V-cycles of every sample of a batch.
+class Cycles : public torch::CustomClassHolder {
+ public:
+  virtual at::Tensor apply(const at::Tensor& v, bool transposed) = 0;
+};
+
+template <class T>
+class CyclesOf final : public Cycles {
+ public:
+  CyclesOf(std::shared_ptr<const kernels::Kernels> a, std::shared_ptr<const kernels::Kernels> transpose,
+           int64_t smoothing, int64_t batch)
+      : memory_of_a_(std::move(a)), memory_of_transpose_(std::move(transpose)) {
+    const auto& kernels = std::get<kernels::KernelBatch<T>>(memory_of_a_->of_dtype);
+    const auto& transposes = std::get<kernels::KernelBatch<T>>(memory_of_transpose_->of_dtype);
+    for (int64_t s = 0; s < (kernels.is_shared ? 1 : batch); ++s) {
+      auto& sample = samples_.emplace_back();
+      sample.a = kernels.make(s);
+      sample.transpose = transposes.make(s);
+      if (sample.a && sample.transpose) sample.inverse = sample.a->multigrid(sample.transpose.get(), smoothing);
+    }
+  }
+
+  at::Tensor apply(const at::Tensor& v, bool transposed) override {
+    const auto from = v.contiguous();
+    const auto out = at::full_like(from, std::numeric_limits<double>::quiet_NaN());
+    const int64_t unknowns = from.numel() / std::max<int64_t>(from.size(0), 1);
+    for (int64_t s = 0; s < from.size(0); ++s) {
+      auto& sample = samples_.size() == 1 ? samples_[0] : samples_[s];
+      if (!sample.inverse) continue;
+      const auto& layout = sample.a->layout();
+      workspace_.prepare(2, sample.a->length(), layout.halo);
+      T *r = workspace_.vector(0), *z = workspace_.vector(1);
+      layout.load(from.const_data_ptr<T>() + s * unknowns, T(1), r);
+      if (transposed) sample.inverse->apply_transpose(r, z);
+      else sample.inverse->apply(r, z);
+      layout.store(z, sample.a->factor(), out.mutable_data_ptr<T>() + s * unknowns);
+    }
+    return out;
+  }
+
+ private:
+  struct Sample {
+    std::unique_ptr<kernels::Kernel<T>> a, transpose;
+    std::unique_ptr<kernels::Preconditioner<T>> inverse;  // null where A is not finite, or a diagonal is zero
+  };
+
+  std::shared_ptr<const kernels::Kernels> memory_of_a_, memory_of_transpose_;
+  std::vector<Sample> samples_;
+  kernels::Workspace<T> workspace_;
+};
+
+/// M⁻¹ v, or M⁻ᵀ v. It is linear in v, so its derivative is the transpose.
+class ApplyCycles : public torch::autograd::Function<ApplyCycles> {
+ public:
+  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& v, const c10::intrusive_ptr<Cycles>& cycles,
+                            bool transposed) {
+    ctx->saved_data["cycles"] = c10::IValue::make_capsule(cycles);
+    ctx->saved_data["transposed"] = transposed;
+    return cycles->apply(v, transposed);
+  }
+  static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
+    const auto cycles = c10::static_intrusive_pointer_cast<Cycles>(ctx->saved_data["cycles"].toCapsule());
+    return {ApplyCycles::apply(grads[0], cycles, !ctx->saved_data["transposed"].toBool()), {}, {}};
+  }
+};
+
+c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, int64_t smoothing, const at::Tensor& b) {
+  auto kernels = a.kernels(b, false), transpose = a.kernels(b, true);
+  if (b.scalar_type() == at::kFloat)
+    return c10::make_intrusive<CyclesOf<float>>(std::move(kernels), std::move(transpose), smoothing, b.size(0));
+  return c10::make_intrusive<CyclesOf<double>>(std::move(kernels), std::move(transpose), smoothing, b.size(0));
+}
+
+}  // namespace
+
+Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
+  if (preconditioner.is_operator()) {
+    const std::shared_ptr<Operator> inverse = make_operator(preconditioner.spec());
+    inverse->check_vector(b);
+    return [inverse](const at::Tensor& v) { return inverse->apply(v); };
+  }
+  if (!preconditioner.is_multigrid()) return {};
+  const auto like = b.detach();
+  if (like.is_cpu())
+    return [cycles = make_cycles(a, preconditioner.smoothing(), like)](const at::Tensor& v) {
+      return ApplyCycles::apply(v, cycles, /*transposed=*/false);
+    };
+  TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(), "linear_solve: this operator has a multigrid preconditioner on the ",
+                              "CPU alone, got vectors on ", b.device(), "; take GMRES without it");
+  const bool transposed = preconditioner.spec().transposed;
+  const auto cycles = std::make_shared<TensorCycles>(a, transposed, preconditioner.smoothing(), like);
+  return [cycles, transposed](const at::Tensor& v) { return cycles->apply(v, transposed); };
+}
+
+}  // namespace prdp
