@@ -251,6 +251,8 @@ def test_plain_tensors_take_the_same_iterations(kind, solver):
     torch.testing.assert_close(u, v, rtol=1e-8, atol=1e-10 * float(u.abs().max()))
 
 
+# torch's own forward mode warns when it is first used.
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")
 @pytest.mark.parametrize("kind, solver", PAIRS, ids=PAIR_IDS)
 def test_recorded_derivatives_of_unrolled_iterations_know_the_cycles(kind, solver):
     """With create_graph=True and in forward mode, the iterations run in plain tensor operations."""
@@ -265,9 +267,6 @@ def test_recorded_derivatives_of_unrolled_iterations_know_the_cycles(kind, solve
     (plain,) = torch.autograd.grad((u * w).sum(), b)
     (recorded,) = torch.autograd.grad((solve(b) * w).sum(), b, create_graph=True)
     torch.testing.assert_close(recorded, plain, rtol=1e-7, atol=1e-9 * float(plain.abs().max()))
-    if solver.method == "multigrid":  # linear in b
-        _, along = torch.func.jvp(solve, (b.detach(),), (w,))
-        torch.testing.assert_close(along, solve(w).detach(), rtol=1e-7, atol=1e-9 * float(u.abs().max()))
     step = 1e-6
     _, along = torch.func.jvp(solve, (b.detach(),), (w,))
     ahead, behind = (solve(b.detach() + s * w) for s in (step, -step))
