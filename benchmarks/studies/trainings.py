@@ -89,11 +89,11 @@ class Study:
         return row
 
     def _row(self, scene, how, seed, changes, keep):
-        network = make_network(scene, seed)
+        network = make_network(scene, seed) if scene.trains_network else None
         refinement = REFINEMENTS[how](scene)
         callbacks = refinement.callbacks() if isinstance(refinement, PRDPOnLoss) else ()
         curves = train(scene, refinement, seed=seed, network=network, callbacks=callbacks)
-        errors = evaluation.validation_errors(scene, network)
+        errors = curves["metric"][-1:] if network is None else evaluation.validation_errors(scene, network)
         return {
             "scene": scene.name,
             "how": how,
