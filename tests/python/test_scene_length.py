@@ -86,7 +86,7 @@ def test_the_flows_of_a_corrector_have_no_divergence_on_their_domain(tmp_path):
     np.testing.assert_allclose(fields.project(projected, sides), projected, rtol=0, atol=1e-12)
 
 
-def test_the_diffusion_of_a_field_has_the_sides_of_its_domain():
+def test_the_diffusion_of_a_field_has_the_sides_of_its_domain(tmp_path):
     kappa = torch.rand(4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.5
     sides = (2.0, 0.5)
     a = operators.Stencil(*_C.diffusion_stencil(kappa, 0.03, sides), "periodic").dense()
@@ -101,7 +101,9 @@ def test_the_diffusion_of_a_field_has_the_sides_of_its_domain():
                 truth[one, other] -= 0.03 * k * per_length**2
     torch.testing.assert_close(a, truth, rtol=1e-13, atol=1e-13)
     slopes = [(kappa.roll(-1, d) - kappa) * kappa.shape[d] / sides[d] for d in (0, 1)]
-    assert float(_C.roughness(kappa, sides)) == pytest.approx(
+    changes = ("shape = [10, 12]", "shape = [4, 6]\nlength = [2.0, 0.5]")
+    physics = scenes.load(small_field(tmp_path, changes)).physics
+    assert float(_C.roughness(kappa, physics)) == pytest.approx(
         float((slopes[0] ** 2 + slopes[1] ** 2).mean()), rel=1e-14
     )
 

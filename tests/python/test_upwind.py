@@ -16,7 +16,9 @@ GRIDS_1D = [(2,), (3,), (7,), (17,), (33,)]
 GRIDS_2D = [(2, 2), (3, 2), (5, 18), (9, 4)]
 CASES = [(operators.Burgers, dense_burgers, shape, len(shape), len(shape)) for shape in GRIDS_1D + GRIDS_2D]
 CASES += [(operators.NavierStokes, dense_navier_stokes, shape, w, 3) for shape in GRIDS_2D for w in (2, 3)]
-cases = pytest.mark.parametrize("kind, dense, shape, wind_channels, channels", CASES, ids=lambda c: str(c))
+cases = pytest.mark.parametrize(
+    "kind, dense, shape, wind_channels, channels", CASES, ids=lambda case: getattr(case, "__name__", str(case))
+)
 
 
 @cases

@@ -1,6 +1,7 @@
 #pragma once
+#include <functional>
+
 #include "prdp/operators/operator.h"
-#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/status.h"
 
@@ -68,7 +69,7 @@ class StepwiseSolve {
 
  private:
   Solver solver_;
-  Inverse inverse_;
+  std::function<at::Tensor(const at::Tensor&)> inverse_;  // M⁻¹; empty: none, or the diagonal
   at::Tensor scale_, rhs_, start_;
   at::Tensor scale_of_a_, scale_of_inverse_;  // TensorSpace::System
   std::vector<double> b2_;  // of b, scaled

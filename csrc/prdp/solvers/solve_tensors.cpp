@@ -1,6 +1,7 @@
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/solvers/tensor_space.h"
