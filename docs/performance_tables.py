@@ -162,8 +162,24 @@ def _with_unit(seconds):
     return f"{_short(seconds * factor)} {unit}"
 
 
+def large():
+    """Seconds of a first solve, and of one more in brackets, on each grid; the residual on the largest."""
+    found = record("large")
+    sides = sorted({point["side"] for point in found})
+    body = []
+    for solver in dict.fromkeys(point["solver"] for point in found):
+        of_side = {point["side"]: point for point in found if point["solver"] == solver}
+        times = [
+            f"{_short(of_side[n]['seconds'])} ({_short(of_side[n]['again'])})" if n in of_side else "–" for n in sides
+        ]
+        last = of_side.get(sides[-1])
+        body.append([solver, *times, f"{last['residual']:.1e}" if last else "–"])
+    return page_tables.markdown(["", *(f"{n}²" for n in sides), f"residual at {sides[-1]}²"], body)
+
+
 TABLES = {
     "change of K": change_of_k,
+    "large grids": large,
     "other libraries": beside_others,
     "diffusion": diffusion,
     "memory": memory,
