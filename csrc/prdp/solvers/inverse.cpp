@@ -104,7 +104,8 @@ Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, co
     return [cycles = make_cycles(a, preconditioner.smoothing(), like)](const at::Tensor& v) {
       return ApplyCycles::apply(v, cycles, /*transposed=*/false);
     };
-  TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(), "linear_solve: this operator has a multigrid preconditioner on the ",
+  TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(),
+                              "linear_solve: this operator has a multigrid preconditioner on the ",
                               "CPU alone, got vectors on ", b.device(), "; take GMRES without it");
   const bool transposed = preconditioner.spec().transposed;
   const auto cycles = std::make_shared<TensorCycles>(a, transposed, preconditioner.smoothing(), like);
