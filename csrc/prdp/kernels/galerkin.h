@@ -1,6 +1,7 @@
 #pragma once
 #include <vector>
 
+#include "prdp/kernels/coarsening.h"
 #include "prdp/kernels/raw_stencil.h"
 
 /// Coarser grids by dropping every second point of one axis, and operators on them (black-box multigrid, Dendy 1982,
@@ -14,9 +15,6 @@ template <class T>
 struct Weights {
   std::vector<T> left, right;
 };
-
-/// The number of coarse points.
-inline int64_t coarse_points(int64_t n, bool periodic) { return periodic ? (n + 1) / 2 : n / 2; }
 
 /// The interpolation and the restriction along an axis that belong to an operator. Of a symmetric one they are the
 /// same; else interpolation comes from the symmetric part and restriction from the transpose (Dendy 1983).

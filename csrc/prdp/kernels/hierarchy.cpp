@@ -11,8 +11,6 @@ namespace prdp::kernels {
 
 namespace {
 
-constexpr int64_t kCoarsest = 4;  // points of an axis that is coarsened no further
-
 /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero.
 template <class T>
 double radius_of(const RawStencil<T>& a) {
@@ -31,10 +29,9 @@ double radius_of(const RawStencil<T>& a) {
   return static_cast<double>(largest);
 }
 
-/// The axes along which to coarsen: those whose coupling is at least a quarter of the strongest one.
+/// By a sample of the points.
 template <class T>
 std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
-  constexpr double weak = 0.25;
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
   double coupling[3] = {};
   for (int k = 0; k < 27; ++k) {
@@ -44,13 +41,7 @@ std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
     for (int d = 0; d < 3; ++d)
       if (RawStencil<T>::offset(k).along[d] != 0) coupling[d] += sum;
   }
-  double strongest = 0;
-  for (int d = 0; d < 3; ++d)
-    if (a.grid.shape[d] > kCoarsest) strongest = std::max(strongest, coupling[d]);
-  std::vector<int> axes;
-  for (int d = 0; d < 3; ++d)
-    if (a.grid.shape[d] > kCoarsest && coupling[d] >= weak * strongest) axes.push_back(d);
-  return axes;
+  return kernels::axes_to_coarsen(a.grid.shape, coupling);
 }
 
 template <class T>

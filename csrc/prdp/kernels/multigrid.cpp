@@ -5,26 +5,6 @@
 
 namespace prdp::kernels {
 
-namespace {
-
-/// The steps x ← x + p (x - x₋) + q D⁻¹(b - A x) of Chebyshev's iteration over [ρ/4, ρ].
-template <class T>
-void set_smoothing(double radius, int64_t steps, std::vector<T>& p, std::vector<T>& q) {
-  constexpr double ratio = 4.0;
-  const double middle = (radius + radius / ratio) / 2, half = (radius - radius / ratio) / 2, sigma = middle / half;
-  p.push_back(T(0));
-  q.push_back(static_cast<T>(1.0 / middle));
-  double rho = 1.0 / sigma;
-  for (int64_t s = 1; s < steps; ++s) {
-    const double next = 1.0 / (2.0 * sigma - rho);
-    p.push_back(static_cast<T>(next * rho));
-    q.push_back(static_cast<T>(2.0 * next / half));
-    rho = next;
-  }
-}
-
-}  // namespace
-
 template <class T>
 std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing) {
   auto given = a.grid_operator();
@@ -82,7 +62,10 @@ void Multigrid<T>::add_level(size_t l, const Kernel<T>& a, const Kernel<T>* tran
   levels_.emplace_back();
   levels_.back().a = &a;
   levels_.back().transpose = transpose;
-  set_smoothing(hierarchy_->levels()[l].radius, smoothing, levels_.back().p, levels_.back().q);
+  for (const auto& [p, q] : smoothing_steps(hierarchy_->levels()[l].radius, smoothing)) {
+    levels_.back().p.push_back(static_cast<T>(p));
+    levels_.back().q.push_back(static_cast<T>(q));
+  }
 }
 
 template <class T>

@@ -3,13 +3,12 @@
 #include <ATen/core/grad_mode.h>
 
 #include <limits>
-#include <numeric>
+
+#include "prdp/kernels/coarsening.h"
 
 namespace prdp {
 
 namespace {
-
-constexpr int64_t kCoarsest = 4;  // points of an axis that is coarsened no further
 
 /// A number for each sample, to multiply vectors (batch, channel, *shape) with.
 at::Tensor for_vectors(const at::Tensor& per_sample, int64_t dim) {
@@ -18,35 +17,21 @@ at::Tensor for_vectors(const at::Tensor& per_sample, int64_t dim) {
   return per_sample.view(sizes);
 }
 
-/// As kernels/hierarchy.cpp: the axes whose coupling is at least a quarter of the strongest one.
-std::vector<int64_t> axes_to_coarsen(const TensorStencil& a) {
+std::vector<int> axes_to_coarsen(const TensorStencil& a) {
   std::vector<double> coupling(a.dim());
   for (const auto& [offset, coefficient] : a.entries) {
     const double size = coefficient.abs().sum().item<double>();
     for (int64_t d = 0; d < a.dim(); ++d)
       if (offset[d] != 0) coupling[d] += size;
   }
-  double strongest = 0.0;
-  for (int64_t d = 0; d < a.dim(); ++d)
-    if (a.shape[d] > kCoarsest) strongest = std::max(strongest, coupling[d]);
-  std::vector<int64_t> axes;
-  for (int64_t d = 0; d < a.dim(); ++d)
-    if (a.shape[d] > kCoarsest && coupling[d] >= 0.25 * strongest) axes.push_back(d);
-  return axes;
+  return kernels::axes_to_coarsen(a.shape, coupling);
 }
 
-/// The steps x ← x + p (x - x₋) + q D⁻¹(b - A x) of Chebyshev's iteration over [ρ/4, ρ], of each sample.
+/// p and q of each step, for vectors: over [ρ/4, ρ] with the radius of each sample, to which q is inverse.
 std::vector<std::array<at::Tensor, 2>> smoothing_steps(const at::Tensor& radius, int64_t count, int64_t dim) {
-  constexpr double ratio = 4.0, sigma = (1 + 1 / ratio) / (1 - 1 / ratio);
-  const auto middle = radius * ((1 + 1 / ratio) / 2), half = radius * ((1 - 1 / ratio) / 2);
-  std::vector<std::array<at::Tensor, 2>> steps{
-      {for_vectors(at::zeros_like(radius), dim), for_vectors(middle.reciprocal(), dim)}};
-  double rho = 1.0 / sigma;
-  for (int64_t s = 1; s < count; ++s) {
-    const double next = 1.0 / (2.0 * sigma - rho);
-    steps.push_back({for_vectors(at::full_like(radius, next * rho), dim), for_vectors(2.0 * next / half, dim)});
-    rho = next;
-  }
+  std::vector<std::array<at::Tensor, 2>> steps;
+  for (const auto& [p, q] : kernels::smoothing_steps(1.0, count))
+    steps.push_back({for_vectors(at::full_like(radius, p), dim), for_vectors(q / radius, dim)});
   return steps;
 }
 
@@ -67,7 +52,7 @@ TensorCycles::Transfer TensorCycles::make_transfer(const TensorStencil& a, const
                                                    int64_t axis) {
   const int64_t n = a.shape[axis], from_end = axis - a.dim();
   const bool periodic = a.periodic[axis];
-  Transfer t{from_end, n, periodic ? (n + 1) / 2 : n / 2, periodic, {}, {}, {}};
+  Transfer t{from_end, n, kernels::coarse_points(n, periodic), periodic, {}, {}, {}};
   const auto options = a.diagonal().options().dtype(at::kLong);
   const auto places = at::arange(n, options), is_coarse = places.remainder(2).eq(periodic ? 0 : 1);
   const auto between = is_coarse.logical_not().nonzero().flatten();
@@ -132,7 +117,8 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
     const auto axes = axes_to_coarsen(stencil);
     if (axes.empty()) break;
     for (const auto axis : axes) {
-      const auto transfer = make_transfer(stencil, stencil.transposed(), axis);
+      const auto transfer =
+          make_transfer(stencil, axis == axes.front() ? levels_.back().transpose : stencil.transposed(), axis);
       auto shape = stencil.shape;
       shape[axis] = transfer.coarse;
       const auto galerkin = [&](const at::Tensor& v) {
