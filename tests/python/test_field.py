@@ -59,6 +59,8 @@ def test_the_roughness_is_the_mean_square_of_the_gradient(tmp_path):
     np.testing.assert_allclose(_C.roughness(theta, periodic), (slopes[0] ** 2 + slopes[1] ** 2).mean(), rtol=1e-14)
     inner = (slopes[0][:-1] ** 2).mean() + (slopes[1][:, :-1] ** 2).mean()
     np.testing.assert_allclose(_C.roughness(theta, box), inner, rtol=1e-14)
+    along_x = (slopes[1][:1, :-1] ** 2).mean()  # an axis of one cell has no slope
+    np.testing.assert_allclose(_C.roughness(theta[:1], box), along_x, rtol=1e-14)
 
 
 def test_the_snapshots_are_states_of_the_field_with_noise(tmp_path):

@@ -91,12 +91,12 @@ at::Tensor observed(const at::Tensor& states, const Scene& scene) {
 }
 
 at::Tensor roughness(const at::Tensor& theta, const Scene::Physics& physics) {
-  at::Tensor sum;
+  auto sum = at::zeros({}, theta.options());
   for (int64_t axis = 0; axis < theta.dim(); ++axis) {
+    if (theta.size(axis) == 1) continue;  // no slope, and no mean of none
     const auto after = physics.periodic() ? theta.roll(-1, axis) : theta.slice(axis, 1);
     const auto here = physics.periodic() ? theta : theta.slice(axis, 0, -1);
-    const auto mean = ((after - here) * per_length(theta, physics.lengths, axis)).square().mean();
-    sum = sum.defined() ? sum + mean : mean;
+    sum = sum + ((after - here) * per_length(theta, physics.lengths, axis)).square().mean();
   }
   return sum;
 }
