@@ -22,6 +22,7 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update
     "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
     "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
+    "diffusion_inverse_256": 'method = "cg"\nmax_iter = 100',
 }
 
 
@@ -120,9 +121,14 @@ def train(row, options, folder, environment):
 
 
 def _curves(row):
-    """How the first seed refined: iterations a solve took in the mean, and the tolerance, of each interval."""
-    k = row.taken_per_solve()[0]
-    return {"iterations": [float(f"{x:.4g}") for x in k], "rtol": [float(f"{x:.3g}") for x in row.curves[0]["rtol"]]}
+    """How the first seed refined, interval by interval: iterations a solve took in the mean, the tolerance, and what it
+    reached at which cost."""
+    curves = row.curves[0]
+    costs = {name: curves[name] for name in ("rtol", "metric", "operator_applications", "seconds")}
+    return {
+        name: [float(f"{x:.4g}") for x in curve]
+        for name, curve in {"iterations": row.taken_per_solve()[0], **costs}.items()
+    }
 
 
 if __name__ == "__main__":
