@@ -19,6 +19,7 @@ from prdp_torch.experiments.compare import Row
 from prdp_torch.experiments.refinement import Refinement
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
+OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
 MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update
     "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
     "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
@@ -35,7 +36,7 @@ def rows_of(scene):
         _tolerance("tolerance", "tolerance", adjoint_ratio=1.0, adjoint_floor=1e-5),
         _tolerance("tolerance_adjoint", "tolerance, adjoint looser"),
         Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
-        *map(_constant, TOLERANCES),
+        *map(_constant, OF_PARAMETERS if scene.task == "parameters" else TOLERANCES),
     ]
     if scene.physics.direct_is_cheap or scene.task == "field":
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))

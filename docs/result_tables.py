@@ -114,6 +114,49 @@ def time_and_products():
     return page_tables.markdown(head, body)
 
 
+def constant_tolerances():
+    """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
+    body = []
+    for name in SCENES:
+        found = rows(f"refinement_{name}")
+        seeds = record(f"refinement_{name}")["seeds"]
+        for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found)]):
+            title = "**auto**" if row["label"] == "auto" else row["title"]
+            title += ", one seed" if row["seeds"] == 1 < seeds else ""
+            costs = _products(row)[2], _beside(row, found["auto"]), _saved(row)
+            body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
+            body[-1] += [error(row), *costs]
+    return page_tables.markdown(["scene", "", "error", "products", "products / auto's", "saved"], body)
+
+
+def the_best_constant():
+    """The loosest tolerance that ends as converged solves do, beside auto; and what a wrong one costs."""
+    body = []
+    for name in SCENES:
+        found = rows(f"refinement_{name}")
+        tolerances = _constant(found)
+        good = [row for row in tolerances if row["as_good"]]
+        best = min(good, key=lambda row: row["operator_applications"], default=None)
+        of_best = ["none", "–"] if best is None else [_power_of(best), _beside(best, found["auto"])]
+        loosest, tightest = tolerances[0], tolerances[-1]
+        wrong = f"{loosest['metric'] / found['converged']['metric']:.2g}", _beside(tightest, found["auto"])
+        body.append([name, *of_best, wrong[0], f"{wrong[1]} with {_power_of(tightest)}"])
+    head = ["scene", "loosest that ends as converged", "products / auto's", "error with 1e-1 / converged"]
+    return page_tables.markdown([*head, "products of the tightest / auto's"], body)
+
+
+def _constant(found):
+    return [row for label, row in found.items() if label.startswith("rtol_")]
+
+
+def _beside(row, auto):
+    return f"{row['operator_applications'] / auto['operator_applications']:.2f}"
+
+
+def _power_of(row):
+    return f"{float(row['label'].removeprefix('rtol_')):.0e}".replace("e-0", "e-")
+
+
 # What takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has no network.
 TAKES_THE_TIME = {
     "burgers_2d": "solves",
@@ -261,6 +304,8 @@ TABLES = {
     "three parameters": three_parameters,
     "time and products": time_and_products,
     "seconds": seconds,
+    "constant tolerances": constant_tolerances,
+    "the best constant": the_best_constant,
 }
 
 
