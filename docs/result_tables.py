@@ -40,6 +40,11 @@ def error(row):
     return f"{_with_spread(row)}{missed}{warns}"
 
 
+def _fewer_seeds(row, seeds):
+    """How many seeds a row has, where others have more."""
+    return "" if row["seeds"] == seeds else ", one seed" if row["seeds"] == 1 else f", {row['seeds']} seeds"
+
+
 def _warns(row):
     return "warns" if row["seeds"] == 1 else f"{row['warnings']} of {row['seeds']} warn"
 
@@ -80,7 +85,7 @@ def parts_of_auto():
         seeds = f", {found['seeds']} seeds" if found["seeds"] > 1 else ""
         for i, row in enumerate(found["rows"]):
             title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += ", one seed" if row["seeds"] == 1 < found["seeds"] else ""
+            title += _fewer_seeds(row, found["seeds"])
             costs = *_products(row), _saved(row), _seconds(row)
             body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *costs])
     return page_tables.markdown(["scene", "", "error", "forward", "adjoint", "in all", "saved", "s"], body)
@@ -122,7 +127,7 @@ def constant_tolerances():
         seeds = record(f"refinement_{name}")["seeds"]
         for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found)]):
             title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += ", one seed" if row["seeds"] == 1 < seeds else ""
+            title += _fewer_seeds(row, seeds)
             costs = _products(row)[2], _beside(row, found["auto"]), _saved(row)
             body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
             body[-1] += [error(row), *costs]
@@ -195,7 +200,7 @@ def comparison(name, seconds=True):
     body = []
     for row in record(name)["rows"]:
         title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        title += ", one seed" if row["seeds"] == 1 < record(name)["seeds"] else ""
+        title += _fewer_seeds(row, record(name)["seeds"])
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
         body.append([title, error(row), last, *_products(row), _saved(row), *([_seconds(row)] if seconds else [])])
     head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if seconds else [])]
