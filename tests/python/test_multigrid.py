@@ -272,3 +272,20 @@ def test_recorded_derivatives_of_unrolled_iterations_know_the_cycles(kind, solve
     ahead, behind = (solve(b.detach() + s * w) for s in (step, -step))
     expected = (ahead - behind) / (2 * step)
     torch.testing.assert_close(along, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_cycles_end_at_the_rounding_of_float32(backward):
+    """A tolerance that float32 cannot reach does not cost every cycle that is allowed."""
+    A = diffusion(blobs((63, 63), 100.0).float())
+    b = noise((63, 63), dtype=torch.float32).requires_grad_()
+    u, info = prdp.linear_solve(A, b, prdp.Multigrid(max_iter=200, rtol=1e-12), backward=backward)
+    assert statuses(info) == ["STAGNATED"] and info.solved.all() and info.floor.item() > 0
+    assert info.iterations.item() <= 20
+    (gradient,) = torch.autograd.grad(u.sum(), b)
+    exact = torch.linalg.solve(A.dense().double(), torch.ones(63 * 63, dtype=F64)).view_as(b)
+    assert (gradient - exact).norm() < 1e-3 * exact.norm()
+    refined, of_float64 = prdp.linear_solve(
+        diffusion(blobs((63, 63), 100.0)), b.detach().double(), prdp.Multigrid(max_iter=200, rtol=1e-12)
+    )
+    assert statuses(of_float64) == ["CONVERGED"] and (u.double() - refined).norm() < 1e-3 * refined.norm()

@@ -57,9 +57,9 @@ class Controller {
   /// Restores a state. Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
   virtual void load_state(State state) = 0;
 
-  /// A sentence about what is wrong, or nothing. It is about the first of these that holds:
-  ///   - The last step() raised an error for its metric.
-  ///   - The metric grows: it was more than twice its least value, three times in a row.
+  /// What is wrong, or nothing: a sentence about the metric, one about the solves, or both.
+  ///   - The last step() raised an error for its metric; or else the metric grows: it was more than twice its least
+  ///     value, three times in a row.
   ///   - The solves stop so far from the solution that their error dominates what is trained. The reason: say the
   ///     network gives v, and training makes the solve P_K v meet u₂ = P v_ref. If the loss is small, v - v_ref is the
   ///     residual of that solve. So a residual as large as the error is the error. If the error is not known, a large

@@ -39,7 +39,9 @@ class ToleranceController final : public Controller {
 
  private:
   const char* name() const override { return "ToleranceController"; }
-  const char* remedy() const override { return "raise maximum or take a solver that needs fewer iterations"; }
+  const char* remedy() const override {
+    return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\"";
+  }
   bool stalled() const override { return true; }  // not used: its metric is the error
 
   ToleranceSettings settings_;

@@ -2,8 +2,8 @@
 #include <cmath>
 #include <numbers>
 
+#include "prdp/kernels/axis_products.h"
 #include "prdp/kernels/laplacian.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp::kernels {
 
@@ -42,10 +42,10 @@ class Thomas final : public Factors<T> {
 template <class T, int Dim>
 class SineTransform final : public Factors<T> {
  public:
-  SineTransform(const LaplacianParameters& p, const Layout<T>& layout) : layout_(layout), inverse_(layout.unknowns()) {
-    basis_[0] = basis(layout.nx);
-    basis_[1] = basis(layout.rows);
-    if (Dim > 2) basis_[2] = basis(layout.planes);
+  SineTransform(const LaplacianParameters& p, const Layout<T>& layout)
+      : layout_(layout),
+        inverse_(layout.unknowns()),
+        basis_({Dim > 2 ? basis(layout.planes) : Matrix(Matrix::Ones(1, 1)), basis(layout.rows), basis(layout.nx)}) {
     int64_t at = 0;
     for (int64_t k = 1; k <= layout.planes; ++k)
       for (int64_t j = 1; j <= layout.rows; ++j)
@@ -62,16 +62,15 @@ class SineTransform final : public Factors<T> {
     field.resize(inverse_.size());
     other.resize(inverse_.size());
     layout_.store(r, T(1), field.data());
-    transform(field, other);
+    basis_.apply(field, other, /*transposed=*/false);
     for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse_[i];
-    transform(field, other);
+    basis_.apply(field, other, /*transposed=*/false);
     layout_.load(field.data(), T(1), d);
     return all_finite(field.data(), static_cast<int64_t>(field.size()));
   }
 
  private:
-  using Matrix = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-  using View = Eigen::Map<Matrix>;
+  using Matrix = typename AxisProducts<T>::Matrix;
 
   static double cosine(int64_t k, int64_t n) {
     return std::cos(std::numbers::pi * static_cast<double>(k) / static_cast<double>(n + 1));
@@ -87,40 +86,9 @@ class SineTransform final : public Factors<T> {
       for (int64_t k = 0; k < n; ++k) s(j, k) = static_cast<T>(sine[(j + 1) * (k + 1) % (2 * (n + 1))]);
     return s;
   }
-  /// Calls body(first, count) for the n rows of a product whose rows take `work` multiplications each, with looks for
-  /// an interruption in between.
-  template <class Body>
-  static void in_pieces(int64_t n, int64_t work, const Body& body) {
-    const int64_t each = std::max<int64_t>(int64_t{1 << 26} / std::max<int64_t>(work, 1), 16);
-    for (int64_t first = 0; first < n; first += each) {
-      const int64_t count = std::min(each, n - first);
-      interruption::Watch::local().spend(count * work);
-      body(first, count);
-    }
-  }
-  /// field ← S field along every axis; the axes commute.
-  void transform(std::vector<T>& field, std::vector<T>& other) const {
-    const int64_t nz = layout_.planes, ny = layout_.rows, nx = layout_.nx;
-    in_pieces(nz * ny, nx * nx, [&](int64_t first, int64_t count) {
-      View(other.data() + first * nx, count, nx).noalias() = View(field.data() + first * nx, count, nx) * basis_[0];
-    });
-    for (int64_t z = 0; z < nz; ++z)
-      in_pieces(ny, ny * nx, [&](int64_t first, int64_t count) {
-        View(field.data() + (z * ny + first) * nx, count, nx).noalias() =
-            basis_[1].middleRows(first, count) * View(other.data() + z * ny * nx, ny, nx);
-      });
-    if constexpr (Dim > 2) {
-      in_pieces(nz, nz * ny * nx, [&](int64_t first, int64_t count) {
-        View(other.data() + first * ny * nx, count, ny * nx).noalias() =
-            basis_[2].middleRows(first, count) * View(field.data(), nz, ny * nx);
-      });
-      field.swap(other);
-    }
-  }
-
   Layout<T> layout_;
   std::vector<T> inverse_;
-  Matrix basis_[3];
+  AxisProducts<T> basis_;
 };
 
 }  // namespace

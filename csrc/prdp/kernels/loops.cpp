@@ -1,6 +1,7 @@
 // Compiled once per instruction set, with PRDP_LEVEL naming it. Everything but the two tables has
 // internal linkage, and nothing of the standard library is instantiated: no code for one processor can
 // be linked in the place of another's.
+#include "prdp/kernels/dense_loops.h"
 #include "prdp/kernels/laplacian_loops.h"
 #include "prdp/kernels/multigrid_loops.h"
 #include "prdp/kernels/stencil_loops.h"
@@ -43,7 +44,8 @@ constexpr Loops<T> table(const char* level) {
           add_interpolated<T>,
           split<T>,
           add_merged<T>,
-          collapse<T>};
+          collapse<T>,
+          multiply<T>};
 }
 
 }  // namespace

@@ -77,6 +77,14 @@ struct Collapse {
   T *left, *centre, *right;  // out
 };
 
+/// out (rows, columns) = a (rows, inner) times b (inner, columns), all contiguous row by row.
+template <class T>
+struct DenseProduct {
+  const T *a, *b;
+  T* out;
+  int64_t rows, inner, columns;
+};
+
 /// Rows of a field from `begin` to `end`, counted over all planes.
 struct Lines {
   int64_t begin, end;
@@ -150,6 +158,8 @@ struct Loops {
   void (*add_merged)(const T* first, const T* second, T* row, int64_t n);
   /// For n coarse points, whose fine ones lie one or two values apart.
   void (*collapse)(const Collapse<T>& c, int64_t step, int64_t n);
+
+  void (*multiply)(const DenseProduct<T>& p);
 };
 
 /// The loops for this processor; the environment variable PRDP_CPU_LEVEL asks for a lower level by its

@@ -1,6 +1,7 @@
 #include <optional>
 
 #include "prdp/kernels/cyclic_thomas.h"
+#include "prdp/kernels/fast_diagonalisation.h"
 #include "prdp/kernels/navier_stokes.h"
 #include "prdp/kernels/sparse_factors.h"
 #include "prdp/kernels/stencil.h"
@@ -34,10 +35,13 @@ class StencilFactors final : public Factors<T> {
     if (a.pattern().nearest && a.rows() == 1 && !kernel.null_space()) thomas_.emplace(a);
     if (thomas_ && thomas_->is_dominant()) return;
     thomas_.reset();
+    if (a.rows() > 1) axes_ = fast_diagonalisation(a, key, kernel.null_space() ? kernel.null_space()->count() : 0);
+    if (axes_) return;
     sparse_ = sparse_factors(a, key, transposed, layout_.rows * layout_.nx,
                              pins_of(kernel.null_space(), kernel.left_null_space(), 0));
   }
   bool solve(const T* r, T* d) const override {
+    if (axes_) return solve_along_axes(r, d);
     if (sparse_ ? !sparse_->is_regular() : !thomas_->is_regular()) return false;
     Eigen::VectorXd x = values_of(r, layout_);
     const int64_t points = layout_.rows * layout_.nx;
@@ -54,9 +58,25 @@ class StencilFactors final : public Factors<T> {
   }
 
  private:
+  bool solve_along_axes(const T* r, T* d) const {
+    if (!axes_->is_regular()) return false;
+    static thread_local std::vector<T> values, field;
+    values.resize(layout_.unknowns());
+    layout_.store(r, T(1), values.data());
+    const int64_t points = layout_.rows * layout_.nx;
+    for (auto at = values.begin(); at != values.end(); at += points) {
+      field.assign(at, at + points);
+      axes_->solve(field);
+      std::copy(field.begin(), field.end(), at);
+    }
+    layout_.load(values.data(), T(1), d);
+    return std::isfinite(largest_magnitude(values.data(), layout_.unknowns()));
+  }
+
   Layout<T> layout_;
   bool transposed_;
   std::optional<CyclicThomas> thomas_;
+  std::shared_ptr<const FastDiagonalisation<T>> axes_;
   std::shared_ptr<const SparseFactors> sparse_;
 };
 

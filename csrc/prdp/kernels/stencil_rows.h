@@ -39,6 +39,13 @@ class StencilRows {
   T* coefficient(int64_t r, int64_t k) { return coefficients_ + (r * count_ + k) * row_; }
   const T* coefficient(int64_t r, int64_t k) const { return coefficients_ + (r * count_ + k) * row_; }
 
+  /// The same at point i; what leaves a periodic row along x is included.
+  T value(int64_t r, int64_t k, int64_t i) const {
+    const int64_t x = pattern_->offsets[k].along[2];
+    const bool leaves = i + x < 0 || i + x >= nx_;
+    return leaves && grid().periodic[2] ? wrapped(r, k, i) : coefficient(r, k)[i];
+  }
+
   void close() {
     for (int64_t r = 0; r < rows(); ++r) {
       T* const to = coupled(r);
@@ -113,13 +120,8 @@ class StencilRows {
   template <class Body>
   void for_each_coefficient(const Body& body) const {
     for (int64_t r = 0; r < rows(); ++r)
-      for (int64_t k = 0; k < count_; ++k) {
-        const int64_t x = pattern_->offsets[k].along[2];
-        for (int64_t i = 0; i < nx_; ++i) {
-          const bool leaves = i + x < 0 || i + x >= nx_;
-          body(r, k, i, leaves && grid().periodic[2] ? wrapped(r, k, i) : coefficient(r, k)[i]);
-        }
-      }
+      for (int64_t k = 0; k < count_; ++k)
+        for (int64_t i = 0; i < nx_; ++i) body(r, k, i, value(r, k, i));
   }
   /// Calls body(row, column, value) for the entries of the matrix; where nearest neighbours coincide they
   /// come one by one.

@@ -10,6 +10,7 @@ namespace prdp {
 template <class Space, class B>
 class CorrectionMethod {
  public:
+  static constexpr bool kContracts = true;
   explicit CorrectionMethod(Space& space) : x(space.vector()), space_(space), r_(space.vector()), d_(space.vector()) {}
 
   void start() {

@@ -58,7 +58,7 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
   if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
   if (made_for == MadeFor::kDefinite) return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
-  return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, or Direct";
+  return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
 }
 
 std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {

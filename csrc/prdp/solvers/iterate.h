@@ -80,6 +80,10 @@ inline constexpr bool kDescendsEnergy = requires { Method::kDescendsEnergy; };
 template <class Method>
 inline constexpr bool kIsExact = requires { Method::kIsExact; };
 
+/// Methods whose every iteration takes about the same share off the error.
+template <class Method>
+inline constexpr bool kContracts = requires { Method::kContracts; };
+
 /// Whether a residual asks to be confirmed by the true one.
 inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
 
@@ -187,8 +191,9 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     s.claims = rtol > 0.0;
     any_claims = any_claims || s.claims;
   }
-  if constexpr (kTakesStrides<Method>) {  // sweeps go on at their rounding for ever, and never claim what is below it
-    constexpr int64_t patience = 128;
+  // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
+  if constexpr (kTakesStrides<Method> || kContracts<Method>) {
+    constexpr int64_t patience = kContracts<Method> ? 2 : 128;
     stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
       return rtol > 0.0 && s.active && !s.claims && s.iterations - s.best > patience;
     });

@@ -235,6 +235,7 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   const auto& n = scene.network;
   const auto dim = static_cast<int64_t>(p.shape.size());
   torch::manual_seed(static_cast<uint64_t>(seed));
+  TORCH_CHECK_VALUE(n.kind == "mlp" || n.kind == "resnet", "network: unknown kind '", n.kind, "'");
   auto network = n.kind == "mlp" ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
                                  : AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()));
   if (n.zero_output) {

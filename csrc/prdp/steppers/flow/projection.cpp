@@ -10,8 +10,14 @@ namespace {
 /// the sums of its rows are zero to the last bit in any dtype.
 double scale_of(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
 
-OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
-  return stencil_of(box, box.fields(u.options()).pressure);
+/// A direct solver is told of the null space. Iterations do not meet it: no right-hand side has a part there.
+OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const SolveOptions& options) {
+  const auto& fields = box.fields(u.options());
+  auto a = stencil_of(box, fields.pressure);
+  if (options.solver.method != Method::kDirect || !fields.closed_parts.defined()) return a;
+  a.kind = "singular_stencil";
+  a.tensors.insert(a.tensors.end(), 2, fields.closed_parts);
+  return a;
 }
 
 /// Takes off the mean of each closed part of the fluid: differences of pressures have none, but for rounding.
@@ -54,7 +60,7 @@ at::Tensor flow_gradient(const FlowBox& box, const at::Tensor& p) {
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
   const auto b = without_means(box, flow_divergence(box, u) * -scale_of(box));
-  const auto phi = without_means(box, solve(pressure_operator(box, u), b, options, info));
+  const auto phi = without_means(box, solve(pressure_operator(box, u, options), b, options, info));
   return {u - flow_gradient(box, phi), phi};
 }
 
@@ -62,7 +68,8 @@ at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const So
                        CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
   const auto phi_bar = without_means(box, flow_divergence(box, masked(cotangent, fields.free)));
-  const auto b_bar = without_means(box, solve_vjp(pressure_operator(box, cotangent), phi_bar, {}, options, info).b);
+  const auto a = pressure_operator(box, cotangent, options);
+  const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
   return cotangent + differences(box, masked(b_bar, fields.cells)) * scale_of(box);
 }
 

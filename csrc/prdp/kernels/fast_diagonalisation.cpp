@@ -1,0 +1,182 @@
+#include "prdp/kernels/fast_diagonalisation.h"
+
+#include <cmath>
+#include <limits>
+#include <numeric>
+
+namespace prdp::kernels {
+
+namespace {
+
+/// Coefficients as StencilPattern::nearest_neighbours() orders them: that of the neighbour one step (-1 or 1) along an
+/// axis, where x is axis 2.
+int64_t place_of(int axis, int64_t step) { return 1 + 2 * (2 - axis) + (step > 0); }
+
+/// Reads a stencil of nearest neighbours point by point.
+template <class T>
+class Reader {
+ public:
+  explicit Reader(const StencilRows<T>& a)
+      : a_(a), n_(a.grid().shape), slack_(16.0 * std::numeric_limits<T>::epsilon() * a.norm()) {}
+
+  /// A_d, as it is on the line of points through the first one.
+  Eigen::MatrixXd along(int axis) const {
+    const int64_t n = n_[axis];
+    Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(n, n);
+    for (int64_t i = 0; i < n; ++i) {
+      matrix(i, i) = at(axis, i, 0) - (axis == 2 ? 0.0 : at(axis, 0, 0));
+      for (const int64_t step : {-1, 1})
+        if (const auto j = neighbour(i, step, n, a_.grid().periodic[axis]); j >= 0)
+          matrix(i, j) = at(axis, i, place_of(axis, step));
+    }
+    return matrix;
+  }
+
+  /// Whether every point couples to its neighbours as the matrices say.
+  bool agrees_with(const SumOverAxes& sum) const {
+    for (int64_t r = 0; r < a_.rows(); ++r) {
+      const int64_t z = r / n_[1], y = r % n_[1];
+      const double centre = sum[0](z, z) + sum[1](y, y);
+      if (!row_is(r, 0, [&](int64_t i) { return centre + sum[2](i, i); })) return false;
+      for (const int64_t step : {-1, 1}) {
+        if (!row_is(r, place_of(2, step), [&](int64_t i) { return coupling(sum[2], 2, i, step); })) return false;
+        if (!row_is_constant(sum[1], 1, y, r, step) || !row_is_constant(sum[0], 0, z, r, step)) return false;
+      }
+    }
+    return true;
+  }
+  bool is_symmetric(const Eigen::MatrixXd& matrix) const {
+    return (matrix - matrix.transpose()).cwiseAbs().maxCoeff() <= slack_;
+  }
+
+ private:
+  double at(int axis, int64_t i, int64_t k) const {
+    const int64_t row = axis == 0 ? i * n_[1] : axis == 1 ? i : 0;
+    return static_cast<double>(a_.value(row, k, axis == 2 ? i : 0));
+  }
+  double coupling(const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {
+    const auto j = neighbour(i, step, n_[axis], a_.grid().periodic[axis]);
+    return j < 0 ? 0.0 : matrix(i, j);
+  }
+  bool row_is_constant(const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t r, int64_t step) const {
+    if (n_[axis] == 1) return true;
+    const auto j = neighbour(i, step, n_[axis], a_.grid().periodic[axis]);
+    // What points beyond the grid couples to nothing.
+    return j < 0 || row_is(r, place_of(axis, step), [value = matrix(i, j)](int64_t) { return value; });
+  }
+  template <class Wanted>
+  bool row_is(int64_t r, int64_t k, const Wanted& wanted) const {
+    double farthest = 0.0;
+    for (int64_t i = 0; i < n_[2]; ++i)
+      farthest = std::max(farthest, std::abs(static_cast<double>(a_.value(r, k, i)) - wanted(i)));
+    return farthest <= slack_;
+  }
+
+  const StencilRows<T>& a_;
+  const int64_t* n_;
+  double slack_;
+};
+
+template <class T>
+typename AxisProducts<T>::Matrices rounded(const SumOverAxes& matrices) {
+  typename AxisProducts<T>::Matrices all;
+  for (int d = 0; d < 3; ++d) all[d] = matrices[d].template cast<T>();
+  return all;
+}
+
+Diagonalised diagonalise(const SumOverAxes& a) {
+  Diagonalised found;
+  for (int d = 2; d >= 0; --d) {
+    if (d < 2 && a[d].rows() == a[d + 1].rows() && a[d] == a[d + 1]) {
+      found.eigenvectors[d] = found.eigenvectors[d + 1];
+      found.eigenvalues[d] = found.eigenvalues[d + 1];
+      continue;
+    }
+    const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> solver(a[d]);
+    found.eigenvectors[d] = solver.eigenvectors();
+    found.eigenvalues[d] = solver.eigenvalues();
+  }
+  return found;
+}
+
+}  // namespace
+
+template <class T>
+std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
+  const auto& grid = a.grid();
+  constexpr int64_t longest = 2048;  // beyond that the eigenvectors take longer than sparse factors
+  for (int d = 0; d < 3; ++d) {
+    const bool is_there = d >= 3 - grid.dim;
+    if (is_there && (grid.shape[d] < 3 || grid.shape[d] > longest)) return std::nullopt;
+  }
+  if (!a.pattern().nearest) return std::nullopt;
+  const Reader<T> reader(a);
+  SumOverAxes sum;
+  for (int d = 0; d < 3; ++d) {
+    const bool is_there = d >= 3 - grid.dim;
+    sum[d] = is_there ? reader.along(d) : Eigen::MatrixXd(Eigen::MatrixXd::Zero(1, 1));
+    if (!reader.is_symmetric(sum[d])) return std::nullopt;
+  }
+  return reader.agrees_with(sum) ? std::optional(std::move(sum)) : std::nullopt;
+}
+
+template <class T>
+FastDiagonalisation<T>::FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors) : eigenvectors_(rounded<T>(a)) {
+  const auto found = diagonalise(a);
+  eigenvectors_ = AxisProducts<T>(rounded<T>(found.eigenvectors));
+  std::vector<double> values;
+  for (const double z : found.eigenvalues[0])
+    for (const double y : found.eigenvalues[1])
+      for (const double x : found.eigenvalues[2]) values.push_back(z + y + x);
+  std::vector<size_t> order(values.size());
+  std::iota(order.begin(), order.end(), size_t{0});
+  const auto least = std::min(null_vectors + 1, std::ssize(order));
+  const auto smaller = [&](size_t i, size_t j) { return std::abs(values[i]) < std::abs(values[j]); };
+  std::partial_sort(order.begin(), order.begin() + least, order.end(), smaller);
+
+  double largest = 0.0;
+  for (const double value : values) largest = std::max(largest, std::abs(value));
+  int64_t longest = 1;
+  for (const auto& of_axis : found.eigenvalues) longest = std::max(longest, int64_t{of_axis.size()});
+  const double rounding = static_cast<double>(longest) * std::numeric_limits<double>::epsilon() * largest;
+  is_regular_ = null_vectors < std::ssize(order) && std::abs(values[order[null_vectors]]) > rounding;
+  inverse_.resize(values.size());
+  for (size_t i = 0; i < values.size(); ++i) inverse_[i] = static_cast<T>(1.0 / values[i]);
+  for (int64_t i = 0; i < std::min(null_vectors, std::ssize(order)); ++i) inverse_[order[i]] = T(0);
+}
+
+template <class T>
+void FastDiagonalisation<T>::solve(std::vector<T>& field) const {
+  static thread_local std::vector<T> other;
+  other.resize(field.size());
+  eigenvectors_.apply(field, other, /*transposed=*/true);
+  for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse_[i];
+  eigenvectors_.apply(field, other, /*transposed=*/false);
+}
+
+template <class T>
+int64_t FastDiagonalisation<T>::bytes() const {
+  return eigenvectors_.bytes() + static_cast<int64_t>(inverse_.size() * sizeof(T));
+}
+
+template <class T>
+std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const StencilRows<T>& a, const FactorKey& key,
+                                                                   int64_t null_vectors) {
+  const auto sum = as_sum_over_axes(a);
+  if (!sum) return nullptr;
+  FactorKeyMaker of_both;
+  of_both.add(key).add(null_vectors);
+  return factor_cache::find_or_make<FastDiagonalisation<T>>(
+      of_both.key(), [&] { return std::make_shared<FastDiagonalisation<T>>(*sum, null_vectors); });
+}
+
+template class FastDiagonalisation<float>;
+template class FastDiagonalisation<double>;
+template std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<float>&);
+template std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<double>&);
+template std::shared_ptr<const FastDiagonalisation<float>> fast_diagonalisation(const StencilRows<float>&,
+                                                                                const FactorKey&, int64_t);
+template std::shared_ptr<const FastDiagonalisation<double>> fast_diagonalisation(const StencilRows<double>&,
+                                                                                 const FactorKey&, int64_t);
+
+}  // namespace prdp::kernels
