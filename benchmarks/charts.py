@@ -9,7 +9,15 @@ from matplotlib.ticker import NullFormatter
 COLOURS = {"Jacobi": "#0072B2", "Chebyshev": "#009E73", "steepest descent": "#CC79A7", "CG": "#E69F00",
            "GMRES": "#D55E00", "multigrid": "#56B4E9", "Multigrid": "#0072B2", "direct": "#222222", "LU": "#999999",
            "diagonal": "#009E73", "Function": "#CC79A7", "CSR": "#D55E00"}  # fmt: skip
-MARKS = {"torch eager": "s", "torch.compile": "P", "JAX jit": "^", "lineax": "v", "SciPy": "D", "pyamg": "v"}
+MARKS = {
+    "torch eager": "s",
+    "torch.compile": "P",
+    "JAX jit": "^",
+    "lineax": "v",
+    "SciPy": "D",
+    "pyamg": "v",
+    "Function": "X",
+}
 
 
 def colour(label):
@@ -19,6 +27,14 @@ def colour(label):
 
 def library(label):
     return next((name for name in MARKS if label.startswith(name)), None)
+
+
+def _marker(label):
+    """Solvers with growing K are small points on a line. All else is large and hollow, so that it hides nothing."""
+    name = "Function" if "Function" in label else library(label)
+    if name is None and label != "direct":
+        return {"marker": "o", "ms": 4}
+    return {"marker": MARKS.get(name, "o"), "ms": 9, "mfc": "none", "mew": 2, "zorder": 3}
 
 
 def accuracy(title, points):
@@ -50,19 +66,16 @@ def _curves(axes, points, error, cost, measure):
             series.setdefault((p["label"], p["mode"]), []).append((x, max(p[error], 1e-16)))
     for (label, mode), values in series.items():
         x, y = zip(*values, strict=True)
-        mark = MARKS.get(library(label), "o")
         style = {"ls": "--", "mfc": "white"} if mode == "unrolled" else {"ls": "-"}
-        size = 9 if library(label) or label == "direct" else 4
-        axes.plot(x, y, color=colour(label), marker=mark, ms=size, lw=1.4, mec=colour(label), **style)
+        axes.plot(x, y, color=colour(label), lw=1.4, **_marker(label) | style)
 
 
 def _legend(points):
     handles = []
     for label in dict.fromkeys(p["label"] for p in points):
-        mark = MARKS.get(library(label), "o")
-        line = "" if library(label) or label == "direct" else "-"
-        size = 9 if not line else 4
-        handles.append(Line2D([], [], color=colour(label), marker=mark, ls=line, ms=size, label=label))
+        marker = _marker(label)
+        line = "-" if marker["ms"] < 9 else ""
+        handles.append(Line2D([], [], color=colour(label), ls=line, label=label, **marker))
     if any(p["mode"] == "unrolled" for p in points):
         dashed = {"ls": "--", "marker": "o", "mfc": "white", "ms": 4}
         handles.append(Line2D([], [], color="#666666", label="dashed: unrolled", **dashed))
@@ -94,7 +107,7 @@ def large(points):
     """Seconds, with the setup and of one more solve, and the true residual, over the unknowns of one sample."""
     figure = Figure(figsize=(11.5, 4.8), layout="constrained")
     panels = figure.subplots(1, 3)
-    points = [p for p in points if p["grid"].endswith("²") and not p["solver"].endswith(("threads", "κ"))]
+    points = [p for p in points if p.get("grid", "²").endswith("²") and not p["solver"].endswith(("threads", "κ"))]
     for label in dict.fromkeys(p["solver"] for p in points):
         line = [p for p in points if p["solver"] == label]
         mark = MARKS.get(library(label), "o")
@@ -155,21 +168,23 @@ def change_of_k(found):
 
 
 def training(found):
-    """An update in parts: the network with its optimiser, and what the physics adds."""
+    """An update in parts: the network with its optimiser, and the physics."""
     names = [f"{p['scene']}, K = {p['k']}" for p in found]
-    figure = Figure(figsize=(9.2, 1.2 + 0.4 * len(found)), layout="constrained")
+    figure = Figure(figsize=(9.2, 1.6 + 0.36 * len(found)), layout="constrained")
     axes = figure.subplots()
     for at, p in enumerate(reversed(found)):
-        added = 100 * (p["update_seconds"] / p["network_seconds"] - 1)
-        axes.barh(at, 100, color="#999999", height=0.7)
-        axes.barh(at, added, left=100, color="#D55E00", height=0.7)
-        text = f" {added:+.1f} %, network {1e3 * p['network_seconds']:.3g} ms"
-        axes.text(100 + max(0, added), at, text, va="center", fontsize=9)
+        share = 100 * (1 - p["network_seconds"] / p["update_seconds"])
+        axes.barh(at, 100 - max(0, share), color="#bbbbbb", height=0.7)
+        axes.barh(at, max(0, share), left=100 - max(0, share), color="#D55E00", height=0.7)
+        physics = f"{share:.0f} %" if share >= 5 else "below 5 %"
+        whole = f"{1e3 * p['update_seconds']:.3g} ms" if p["update_seconds"] < 1 else f"{p['update_seconds']:.2f} s"
+        axes.text(101, at, f"{physics} of {whole}", va="center", fontsize=9)
     axes.set_yticks(range(len(found)), list(reversed(names)))
-    axes.set(xlabel="% of the update without physics", xlim=(0, None))
-    axes.margins(x=0.3)
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set(xlabel="% of an update", xlim=(0, 125), xticks=range(0, 101, 20))
     axes.spines[["top", "right"]].set_visible(False)
+    parts = (("#bbbbbb", "network and optimiser"), ("#D55E00", "physics, with its derivative"))
+    handles = [Line2D([], [], color=shade, lw=8, label=text) for shade, text in parts]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 

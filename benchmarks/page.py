@@ -30,9 +30,9 @@ def sections(results):
         failed = "".join(f" {label} failed: {error}." for label, error in found["failures"].items())
         yield {
             "name": f"accuracy_{name}", "title": f"{title}: accuracy against cost",
-            "text": "Batch of 25, float32. A curve is a solver with growing K, a large mark another library or an "
-            "exact method. Lower left is better. Errors are measured in float64, the gradient's against the exact one."
-            + failed,
+            "text": "Batch of 25, float32. A curve is a solver with growing K, a large hollow mark another library or "
+            "an exact method. Lower left is better. Errors are measured in float64, the gradient's against the exact "
+            "one." + failed,
             "figure": charts.accuracy(title, points), "table": accuracy_table(points),
         }  # fmt: skip
     if "size" in results:
@@ -65,8 +65,8 @@ def sections(results):
         yield {
             "name": "training", "title": "What the physics adds to an update", "table": None,
             "figure": charts.training(results["training"]),
-            "text": "One batch of the scene: network, loss, backward and fused Adam (grey), and what the solves "
-            "and their derivatives add, at K = 1 and at the converged K.",
+            "text": "One batch of the scene: network, loss, backward and fused Adam (grey), and the share of the "
+            "solves and their derivatives, at K = 1 and at the converged K.",
         }  # fmt: skip
     if "memory" in results:
         yield {

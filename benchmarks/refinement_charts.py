@@ -2,10 +2,12 @@
 from the records in docs/results."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from prdp_torch.experiments.charts import write_png
@@ -19,6 +21,9 @@ ROWS = {  # label: title, colour, marker
     "tolerance_adjoint": ("tolerance, adjoint looser", "#2ca02c", "D"),
     "auto": ("auto", "#1f77b4", "P"),
 }
+CONSTANT = "#9467bd"  # of the rows with one tolerance throughout
+GREEN = "#e8f4e8"
+HIGHEST = 3  # times the converged error; what is above has an arrow
 FOLLOWED = ("heat_1d", "burgers_2d", "diffusion_inverse")
 
 
@@ -28,38 +33,88 @@ def summaries():
     return {path.stem.removeprefix("refinement_"): json.loads(path.read_text()) for path in paths}
 
 
-def error_against_cost(found):
-    """Every scene in one picture: error, products and seconds as ratios to the converged row's."""
-    figure = Figure(figsize=(9.2, 4.6), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, cost in zip(panels, ("operator_applications", "seconds"), strict=True):
-        for label, (title, colour, marker) in ROWS.items():
-            points = [point for summary in found.values() if (point := _ratios(summary, label, cost))]
-            if label == "converged":
-                points = points[:1]
-            axes.scatter([], [], color=colour, marker=marker, s=36, label=title)
-            for *point, is_claimed in points:
-                axes.scatter(*point, **_marker(colour, marker, is_claimed), alpha=0.8)
-        axes.set(xscale="log", yscale="log")
-        axes.axhspan(0.0, 1.1, color="#e8f4e8", zorder=0, lw=0)
-        axes.grid(alpha=0.3, lw=0.4)
-        axes.xaxis.set_major_locator(FixedLocator([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 4.0]))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.xaxis.set_minor_locator(NullLocator())
-    panels[0].set(xlabel="products with A, converged = 1", ylabel="error, converged = 1")
-    panels[1].set(xlabel="seconds, converged = 1")
-    panels[0].legend(frameon=False, fontsize=8)
-    title = f"{len(found)} scenes: error against work. Green: at most a tenth above the converged error"
-    figure.suptitle(f"{title}. Hollow: fails or warns")
+def error_against_products(found):
+    """One panel for each scene: the error and the products as ratios to the converged row's."""
+    height = math.ceil(len(found) / 3)
+    figure = Figure(figsize=(9.2, 1.0 + 2.3 * height), layout="constrained")
+    panels = figure.subplots(height, 3, squeeze=False).ravel()
+    for axes, (name, summary) in zip(panels, found.items(), strict=False):
+        _panel(axes, summary)
+        axes.set_title(f"{name} ({seeds_of(summary)})", fontsize=10)
+    for axes in panels[len(found) :]:
+        axes.remove()
+    figure.supxlabel("products with A, converged = 1", fontsize=10)
+    figure.supylabel("error, converged = 1", fontsize=10)
+    handles = [_legend_entry(colour, marker, title) for title, colour, marker in ROWS.values()]
+    handles.append(_legend_entry("#444444", "o", "hollow: fails or warns", hollow=True))
+    handles.append(Line2D([], [], color=GREEN, lw=8, label="at most a tenth above converged"))
+    handles.append(_legend_entry("#444444", 6, "above the panel, with its error"))
+    if any(row["label"].startswith("rtol_") for summary in found.values() for row in summary["rows"]):
+        handles.append(Line2D([], [], color=CONSTANT, marker=".", label="one rtol throughout"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8)
     return figure
 
 
-def _ratios(summary, label, cost):
+def _panel(axes, summary):
     base = summary["rows"][0]
-    row = next(row for row in summary["rows"] if row["label"] == label)
-    if row["diverged"]:
-        return None
-    return row[cost] / base[cost], row["metric"] / base["metric"], _claims(row)
+    shown = [row for row in summary["rows"] if row["label"] in ROWS or row["label"].startswith("rtol_")]
+    errors = [_error(row, base) for row in shown]
+    low, high = min(0.8, *errors) / 1.15, 1.2 * max(1.3, *(error for error in errors if error <= HIGHEST))
+    axes.axhspan(low, 1.1, color=GREEN, zorder=0, lw=0)
+    constants = [row for row in shown if row["label"] not in ROWS]
+    x, y = [_products(row, base) for row in constants], [_error(row, base) for row in constants]
+    axes.plot(x, y, ".-", color=CONSTANT, lw=1, ms=6, zorder=2)
+    for row, at, error in zip(constants, x, y, strict=True):
+        if error <= high:
+            axes.annotate(row["label"][5:], (at, error), xytext=(2, 3), textcoords="offset points", fontsize=6)
+    for label, (_, colour, marker) in ROWS.items():
+        for row in shown:
+            if row["label"] == label:
+                _point(axes, row, base, high, colour, marker)
+    axes.set(xscale="log", yscale="log", ylim=(low, high))
+    axes.grid(alpha=0.3, lw=0.4)
+    _plain(axes.xaxis, [0.05, 0.1, 0.2, 0.5, 1, 2, 4])
+    _plain(axes.yaxis, [0.1, 0.2, 0.5, 0.7, 1, 1.5, 2, 3])
+    axes.tick_params(labelsize=8)
+
+
+def _products(row, base):
+    return row["operator_applications"] / base["operator_applications"]
+
+
+def _error(row, base):
+    return math.inf if row["diverged"] else row["metric"] / base["metric"]
+
+
+def _point(axes, row, base, high, colour, marker):
+    """A row, or an arrow with its error where that is above the panel."""
+    at, error = _products(row, base), _error(row, base)
+    if error <= high:
+        axes.scatter(at, error, **_marker(colour, marker, _claims(row)), zorder=3)
+        return
+    axes.plot(at, 0.93, marker=6, ms=8, color=colour, transform=axes.get_xaxis_transform())
+    beside = {"xytext": (7, 0), "textcoords": "offset points", "va": "center", "fontsize": 8, "color": colour}
+    text = f"{error:.2g}" if math.isfinite(error) else f"{row['diverged']} of {row['seeds']} diverged"
+    axes.annotate(text, (at, 0.93), xycoords=axes.get_xaxis_transform(), **beside)
+
+
+def _plain(axis, ticks):
+    """These ticks, written as plain numbers."""
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def seeds_of(summary):
+    """How many seeds the rows have, in words."""
+    counts = sorted({row["seeds"] for row in summary["rows"]})
+    several = " to ".join(map(str, counts[:: len(counts) - 1] if len(counts) > 1 else counts))
+    return "one seed" if counts == [1] else f"{several} seeds"
+
+
+def _legend_entry(colour, marker, title, hollow=False):
+    face = "none" if hollow else colour
+    return Line2D([], [], ls="", color=colour, marker=marker, mfc=face, ms=6, label=title)
 
 
 def _claims(row):
@@ -72,26 +127,34 @@ def _marker(colour, marker, is_claimed):
 
 
 def time_against_products(found):
-    """What is saved of the products, and of the seconds with network and optimiser: one point per scene, hollow where
-    the row fails or warns."""
-    figure = Figure(figsize=(6.2, 4.6), layout="constrained")
+    """What auto and tuned PRDP save: a line for each, from the seconds to the products, hollow where the row fails
+    or warns."""
+    figure = Figure(figsize=(8.0, 1.2 + 0.5 * len(found)), layout="constrained")
     axes = figure.subplots()
-    for label in ("prdp", "auto"):
-        title, colour, marker = ROWS[label]
-        axes.scatter([], [], color=colour, marker=marker, s=36, label=title)
-        for name, summary in found.items():
-            row, base = next(row for row in summary["rows"] if row["label"] == label), summary["rows"][0]
-            saved = [100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds")]
-            axes.scatter(*saved, **_marker(colour, marker, _claims(row)))
-            if label == "auto":  # those below zero are named to the right, out of the way of the others
-                place = {"xytext": (0, 6), "rotation": 60} if saved[1] > -3 else {"xytext": (7, -3)}
-                axes.annotate(name, saved, **place, textcoords="offset points", fontsize=8)
-    axes.axline((0, 0), slope=1, color="#888888", lw=1, ls="--")
-    axes.set(xlabel="products saved, %", ylabel="time saved, %", xlim=(0, 100), ylim=(None, 100))
-    axes.axhline(0, color="#888888", lw=1)
-    axes.grid(alpha=0.3, lw=0.4)
-    axes.scatter([], [], **_marker("#444444", "o", False), label="fails or warns")
-    axes.legend(frameon=False, loc="upper left")
+    for at, summary in enumerate(found.values()):
+        for label, shift in (("auto", -0.16), ("prdp", 0.16)):
+            _, colour, _ = ROWS[label]
+            row, base = next((row for row in summary["rows"] if row["label"] == label), None), summary["rows"][0]
+            if row is None:
+                continue
+            products, seconds = (100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds"))
+            axes.plot([seconds, products], [at + shift] * 2, color=colour, lw=1, alpha=0.6, zorder=1)
+            for saved, marker in ((products, "o"), (seconds, "D")):
+                # White inside, so that the line does not run through a hollow one.
+                fill = colour if _claims(row) else "white"
+                axes.scatter(saved, at + shift, marker=marker, s=36, facecolors=fill, edgecolors=colour, zorder=2)
+    axes.set_yticks(range(len(found)), [f"{name} ({seeds_of(summary)})" for name, summary in found.items()])
+    axes.invert_yaxis()
+    axes.axvline(0, color="#888888", lw=1, zorder=0)
+    axes.axvspan(-15, 15, color="#eeeeee", lw=0, zorder=-1)
+    axes.set(xlabel="saved of the converged training, %. Grey: the noise of the seconds", xlim=(-20, 100))
+    axes.grid(alpha=0.3, lw=0.4, axis="x")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    handles = [Line2D([], [], color=ROWS[label][1], lw=3, label=ROWS[label][0]) for label in ("auto", "prdp")]
+    for marker, title in (("o", "products with A"), ("D", "seconds")):
+        handles.append(_legend_entry("#444444", marker, title))
+    handles.append(_legend_entry("#444444", "o", "hollow: fails or warns", hollow=True))
+    figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
     return figure
 
 
@@ -115,6 +178,7 @@ def over_the_training(found):
     panels[0, 0].set_ylabel("iterations of a solve")
     panels[1, 0].set_ylabel("rtol of the forward solves")
     panels[0, 0].legend(frameon=False, fontsize=8)
+    figure.suptitle("One seed of each scene", fontsize=11)
     return figure
 
 
@@ -148,12 +212,19 @@ def error_over_cost(summary):
     return figure
 
 
-def main():
+def figures():
+    """(file name, figure) of each picture. The costs need curves that older records do not have."""
     found = summaries()
-    write_png(error_over_cost(found["burgers_2d"]), RESULTS / "burgers_2d_cost.png", dpi=110)
-    write_png(error_against_cost(found), RESULTS / "refinement.png", dpi=110)
-    write_png(time_against_products(found), RESULTS / "time_saved.png", dpi=110)
-    write_png(over_the_training(found), RESULTS / "refinement_training.png", dpi=110)
+    if all("seconds" in found["burgers_2d"]["curves"].get(label, ()) for label in FIVE):
+        yield "burgers_2d_cost.png", error_over_cost(found["burgers_2d"])
+    yield "refinement.png", error_against_products(found)
+    yield "time_saved.png", time_against_products(found)
+    yield "refinement_training.png", over_the_training(found)
+
+
+def main():
+    for name, figure in figures():
+        write_png(figure, RESULTS / name, dpi=110)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ COLOURS = {"GMRES(2)": "#56B4E9", "BiCGStab": "#8C6D31",
 STATUSES = {"CONVERGED": "#4daf7c", "CONVERGED_BREAKDOWN": "#8fd0ad", "MAX_ITER": "#f2e6a2", "STAGNATED": "#e8c468",
             "DIVERGED": "#d7301f", "OVERFLOW": "#a50f15", "BREAKDOWN": "#f08a5d", "ZERO_DIAGONAL": "#9e9ac8",
             "INCONSISTENT": "#807dba", "NONFINITE_INPUT": "#54278f", "NONFINITE_OPERATOR": "#3f007d"}  # fmt: skip
+DARK = ("DIVERGED", "OVERFLOW", "INCONSISTENT", "NONFINITE_INPUT", "NONFINITE_OPERATOR")
 
 SHARES = LinearSegmentedColormap.from_list("shares", ["#e8644a", "#f6e3a1", "#6cc294"])
 
@@ -131,8 +132,13 @@ def statuses(question, data):
     colours = ListedColormap(list(STATUSES.values()))
     axes.imshow(numbers, cmap=colours, norm=BoundaryNorm(np.arange(len(names) + 1) - 0.5, len(names)), aspect="auto")
     for i, j in np.ndindex(numbers.shape):
-        axes.text(j, i, data["status"][i][j].replace("_", "\n"), ha="center", va="center", fontsize=7, linespacing=0.9)
-    axes.set_xticks(range(len(columns)), columns)
+        status = data["status"][i][j]
+        ink = "white" if status in DARK else "black"
+        # In lower case the longest fits its cell at a size that can be read.
+        text = status.lower().replace("_", "\n")
+        axes.text(j, i, text, ha="center", va="center", fontsize=9.5, linespacing=0.95, color=ink)
+    axes.set_xticks(range(len(columns)), [column.replace("SteepestDescent", "Steepest\nDescent") for column in columns])
+    axes.xaxis.tick_top()
     axes.set_yticks(range(len(rows)), rows)
     axes.set_xticks(np.arange(len(columns)) - 0.5, minor=True)
     axes.set_yticks(np.arange(len(rows)) - 0.5, minor=True)
@@ -209,7 +215,9 @@ def few(question, data):
     _draw_lines(axes, data["x"], data["lines"])
     axes.axhline(data["auto"], color="#D55E00", lw=1.8, ls="--", label="auto (ToleranceController)")
     _mark(axes, data["fewest"], f"K = {data['fewest']}", height=0.9)
-    axes.set(xlabel="K, Jacobi iterations of every solve", ylabel="validation error of heat_1d\nafter the training")
+    axes.set(
+        xlabel="K, Jacobi iterations of every solve", ylabel="validation error of heat_1d\nafter the training, one seed"
+    )
     _plain_ticks(axes, data["x"])
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center", frameon=False)
     return figure

@@ -14,6 +14,12 @@ def spread(values):
     return f"{np.mean(values):.2e}{deviation}"
 
 
+def seeds_of(rows):
+    """How many seeds a chart shows, in words."""
+    count = len({row["seed"] for row in rows})
+    return "one seed" if count == 1 else f"{count} seeds"
+
+
 def validation_errors(scene, network):
     """(‖u - reference‖ / ‖reference‖)² of each validation sample after `valid_steps` steps, whose mean is the
     scene's metric."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 import prdp_torch as prdp
+from benchmarks.studies.evaluation import seeds_of
 from benchmarks.studies.trainings import variant
 from prdp_torch.experiments import _C, records, trajectory_charts
 from prdp_torch.experiments.charts import make_figure, write_png
@@ -146,6 +147,7 @@ def chart(rows):
         axes.grid(alpha=0.3, lw=0.4)
     left.set_title("K of the solves in use", fontsize=10)
     right.set_title("converged solves", fontsize=10)
+    figure.suptitle(f"navier_stokes, trained correctors in use ({seeds_of(rows)})", fontsize=11)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", frameon=False, ncols=3, fontsize=8)
     right.legend(frameon=False)
     return figure

@@ -10,9 +10,9 @@ import time
 
 import numpy as np
 import torch
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from benchmarks.studies.evaluation import spread
+from benchmarks.studies.evaluation import seeds_of, spread
 from benchmarks.studies.trainings import variant
 from prdp_torch.experiments import _C, records, scenes
 from prdp_torch.experiments.charts import make_figure
@@ -160,30 +160,43 @@ def table(rows):
 
 
 def chart(rows):
+    """The errors as ratios to those without a gradient: bars reach from the lowest to the highest seed."""
     figure, panels = make_figure(panels=2)
     for axes, name in zip(panels, CHANGES, strict=True):
-        for gradient, colour in zip(GRADIENTS, ("#222222", "#1f77b4", "#d62728"), strict=True):
-            for n, line in zip(BEYOND, ("-", ":"), strict=True):
-                found = [(m, [row["errors"][n] for row in _of(rows, name, m, gradient)]) for m in STEPS]
-                found = [(m, values) for m, values in found if values]
+        axes.axhline(1.0, color=COLOURS["none"], lw=2, label="none")
+        for at, gradient in enumerate(("exact", "three iterations")):
+            for n, line, shift in zip(BEYOND, ("-", ":"), (0.96, 1.04), strict=True):
+                found = [(m, *_ratios(rows, name, m, gradient, n)) for m in STEPS if _of(rows, name, m, gradient)]
                 if not found:
                     continue
+                x, middle, low, high = map(np.array, zip(*found, strict=True))
                 axes.errorbar(
-                    [m for m, _ in found], [np.mean(v) for _, v in found], [np.std(v) for _, v in found],
-                    color=colour, ls=line, marker="o", capsize=3, label=f"{gradient}, {n} steps",
+                    x * shift * (1 + 0.02 * at), middle, [middle - low, high - middle], color=COLOURS[gradient],
+                    ls=line, marker="o", ms=5, capsize=3, label=f"{gradient}, {n} steps",
                 )  # fmt: skip
-        alone = [row["alone"] for row in rows if row["scene"] == name and row["alone"]]
-        for n, line in zip(BEYOND, ("-", ":"), strict=True):
-            if alone:
-                axes.axhline(alone[0][n], color="#999999", ls=line, label=f"coarse solver alone, {n} steps")
         axes.set(xscale="log", yscale="log", xlabel="steps that are trained through", title=name)
         axes.set_xticks(STEPS, STEPS)
-        axes.xaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_locator(FixedLocator(RATIOS))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_minor_locator(NullLocator())
         axes.grid(alpha=0.3, lw=0.4)
-    panels[0].set_ylabel(f"error, {VALID} samples")
-    entries = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    panels[0].set_ylabel("error / error without a gradient")
     figure.legend(
-        entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8,
-        title="gradient through the solver, and how far the network is followed",
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=8,
+        title=f"gradient through the solver, and how far the network is followed ({seeds_of(rows)})",
     )  # fmt: skip
     return figure
+
+
+COLOURS = {"exact": "#222222", "three iterations": "#1f77b4", "none": "#d62728"}
+RATIOS = (0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5)
+
+
+def _ratios(rows, name, steps, gradient, n):
+    """The ratio of the mean errors after n steps, and the lowest and the highest of the seeds."""
+    these, none = (
+        {row["seed"]: row["errors"][n] for row in _of(rows, name, steps, kind)} for kind in (gradient, "none")
+    )
+    each = [these[seed] / none[seed] for seed in these]
+    return np.mean([*these.values()]) / np.mean([*none.values()]), min(each), max(each)

@@ -4,7 +4,7 @@ The learning rate falls to a tenth over the whole training in both."""
 
 import numpy as np
 
-from benchmarks.studies.evaluation import spread
+from benchmarks.studies.evaluation import seeds_of, spread
 from prdp_torch.experiments.charts import make_figure
 
 EPOCHS = (100, 300)
@@ -42,6 +42,7 @@ def chart(rows):
             done = np.linspace(0, updates, len(row["metric"]))  # from before the first update to after the last
             axes.plot(done, row["metric"], color=colour, lw=1, label=title)
     axes.set(yscale="log", ylim=(None, 0.1), xlabel="update", ylabel=f"validation error on {VALID} samples, at t = 5")
+    axes.set_title(f"navier_stokes, three times as many updates ({seeds_of(rows)})")
     axes.grid(alpha=0.3, lw=0.4)
     axes.legend(frameon=False)
     return figure

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 from PIL import Image
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from prdp_torch.experiments.compare import Entry, Row
 
 Colour: TypeAlias = str | tuple[float, float, float, float]
-Limits: TypeAlias = list[tuple[float, float]]
+Limits: TypeAlias = tuple[float, float]
 Drawn: TypeAlias = tuple[str, Figure, str]
 """Name, figure and caption."""
 
@@ -40,13 +40,14 @@ FIXED = {
 }
 
 
-def _style(row: Row, rows: list[Row]) -> tuple[Colour, str]:
-    """Colour and line of a row; constant K run through one colour map, from coarse to fine."""
-    if row.kind in FIXED:
-        return FIXED[row.kind]
-    sweep = [r.k for r in rows if r.kind == "constant"]
-    position = sweep.index(row.k) / max(1, len(sweep) - 1)
-    return matplotlib.colormaps["viridis"](0.05 + 0.85 * position), "-"
+def _styles(kinds: list[str]) -> list[tuple[Colour, str]]:
+    """Colour and line of each row by its kind; constant K run through one colour map, from coarse to fine."""
+    shades = iter(np.linspace(0.05, 0.9, max(2, kinds.count("constant"))))
+    return [FIXED[kind] if kind in FIXED else (matplotlib.colormaps["viridis"](next(shades)), "-") for kind in kinds]
+
+
+def _styles_of(rows: list[Row]) -> list[tuple[Colour, str]]:
+    return _styles([row.kind for row in rows])
 
 
 def make_figure(panels: int = 1, height: float = 4.2) -> tuple[Figure, np.ndarray]:
@@ -97,9 +98,9 @@ def mean_and_band(
 def metric_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
     """Metric over epochs for every way of choosing K: geometric mean and spread over the seeds."""
     figure, (axes,) = make_figure(height=4.8)
-    for row in rows:
+    for row, style in zip(rows, _styles_of(rows), strict=True):
         values = row.stack("metric")
-        mean_and_band(axes, range(values.shape[1]), values, row.title, *_style(row, rows), lead=row.kind in FIXED)
+        mean_and_band(axes, range(values.shape[1]), values, row.title, *style, lead=row.kind in FIXED)
     axes.set(yscale="log", xlabel=scene.unit, ylabel=_metric_name(scene))
     axes.margins(x=0.01)
     axes.grid(alpha=0.3)
@@ -110,10 +111,9 @@ def metric_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
 def k_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
     """K over epochs, or the iterations that a solve took where K is only a cap: each seed thin, their mean bold."""
     figure, (axes,) = make_figure()
-    for row in rows:
+    for row, (colour, line) in zip(rows, _styles_of(rows), strict=True):
         if row.kind not in ("auto", "tolerance", "prdp", "growth", "schedule"):
             continue
-        colour, line = _style(row, rows)
         k = row.taken_per_solve() if row.capped else row.stack("max_iter")
         if len(k) > 1:
             axes.plot(k.T, color=colour, lw=0.7, alpha=0.35)
@@ -178,105 +178,97 @@ _COSTS = (
 
 
 def _cost_panels(scene: _C.Scene, draw: Callable[[Axes, str], None], limits: Limits | None = None) -> Figure:
-    """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one. With `limits`, (lowest, highest)
-    of the y axis from below, the axis is broken between them."""
-    ranges: Sequence[tuple[float, float] | None] = limits or [None]
-    figure = Figure(figsize=(WIDTH, 4.8 if len(ranges) == 1 else 6.0), layout="constrained")
-    heights = [1.0, 2.2][-len(ranges) :]
-    panels = figure.subplots(len(ranges), 2, sharex="col", squeeze=False, height_ratios=heights)
-    for column, (cost, label) in zip(panels.T, _COSTS, strict=True):
-        for axes, limit in zip(column[::-1], ranges, strict=True):
-            draw(axes, cost)
-            axes.set(yscale="log", xlim=(0, None), ylim=limit)
-            axes.grid(alpha=0.3, which="both", lw=0.4)
-            if limit and limit[1] > 10 * limit[0]:  # powers of ten suffice; other labels run into each other
-                axes.yaxis.set_minor_formatter(NullFormatter())
-        for upper, lower in pairwise(column):
-            _break(upper, lower)
-        column[-1].set_xlabel(label)
-        column[-1].xaxis.set_major_locator(MaxNLocator(5))
+    """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one."""
+    figure, panels = make_figure(panels=2, height=4.8)
+    for axes, (cost, label) in zip(panels, _COSTS, strict=True):
+        axes.set(yscale="log", ylim=limits, xlabel=label)
+        draw(axes, cost)
+        axes.grid(alpha=0.3, which="both", lw=0.4)
+        low, high = axes.get_ylim()
+        if high > 10 * low:  # powers of ten suffice; other labels run into each other
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.yaxis.set_minor_formatter(FuncFormatter(lambda y, _: f"{y:.2g}"))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.2g}"))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         if cost == "operator_applications":
-            column[-1].xaxis.set_major_formatter(EngFormatter(sep=" "))
-    panels[-1, 0].set_ylabel(_metric_name(scene))
-    figure.legend(*panels[-1, 0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
+    panels[0].set_ylabel(_metric_name(scene))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
     return figure
 
 
-def _break(upper: Axes, lower: Axes) -> None:
-    """Two axes as one whose y axis is broken between them."""
-    upper.spines["bottom"].set_visible(False)
-    lower.spines["top"].set_visible(False)
-    upper.tick_params(axis="x", which="both", bottom=False)
-    marker = [(-1, -0.6), (1, 0.6)]
-    mark: dict[str, Any] = {"marker": marker, "ms": 9, "ls": "none", "color": "black", "mew": 1, "clip_on": False}
-    upper.plot([0, 1], [0, 0], transform=upper.transAxes, **mark)
-    lower.plot([0, 1], [1, 1], transform=lower.transAxes, **mark)
-
-
 def _zoom(errors: np.ndarray, spreads: np.ndarray) -> Limits | None:
-    """Limits of a y axis on which errors within ten times the best are told apart: those around them, and above a
-    break those of the rest. None where all are that close."""
+    """Limits of a y axis on which errors within ten times the best are told apart. None where all are that close."""
     known = np.isfinite(errors)
     if not known.any() or errors[known].min() <= 0:
         return None
     best = errors[known].min()
-    near, far = known & (errors <= _NEAR * best), known & (errors > _NEAR * best)
-    if not far.any():
+    near = known & (errors <= _NEAR * best)
+    if near.sum() == known.sum():
         return None
     lowest = max(best / _NEAR, (errors - spreads)[near].min())
-    highest = (errors + spreads)[near].max()
     margin = 1.15
-    return [(lowest / margin, highest * margin), (max(highest * margin, errors[far].min() / 2), errors[far].max() * 2)]
+    return lowest / margin, (errors + spreads)[near].max() * margin
 
 
-def accuracy_against_cost(scene: _C.Scene, rows: list[Row]) -> Figure:
-    """Final metric against what the training cost, one point a row, with the Pareto front as stairs."""
-    error = np.array([row.final().mean() for row in rows])
-    spread = np.array([row.final().std(ddof=1) if len(row.curves) > 1 else 0.0 for row in rows])
+MARKERS = {"auto": "X", "tolerance": "v", "prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}
+
+
+def accuracy_against_cost(scene: _C.Scene, table: list[Entry]) -> Figure:
+    """Final metric against what the training cost, one point a row, with the Pareto front as stairs. Errors that are
+    far above the best are arrows at the upper edge, with their values in the legend."""
+    error = np.array([math.nan if entry["metric"] is None else entry["metric"] for entry in table])  # None in records
+    spread = np.array([entry["metric_std"] or 0.0 for entry in table])
+    limits = _zoom(error, spread)
+    styles = _styles([entry["kind"] for entry in table])
 
     def draw(axes: Axes, name: str) -> None:
-        cost = np.array([row.total(name).mean() for row in rows])
-        for row, x, y in zip(rows, cost, error, strict=True):
-            marker = {
-                "auto": "X",
-                "tolerance": "v",
-                "prdp": "*",
-                "growth": "^",
-                "direct": "D",
-                "converged": "s",
-                "schedule": "P",
-            }.get(row.kind, "o")
-            bars = {}
-            if len(row.curves) > 1:
-                bars = {"xerr": row.total(name).std(ddof=1), "yerr": row.final().std(ddof=1)}
+        cost = np.array([entry[name] for entry in table])
+        for entry, x, y, (colour, _) in zip(table, cost, error, styles, strict=True):
+            if limits and y > limits[1]:
+                above = axes.get_xaxis_transform()
+                label = f"{entry['title']}: {y:.2g}, above"
+                axes.errorbar(x, 0.975, fmt="^", color=colour, ms=9, mec="white", mew=0.6, transform=above, label=label)
+                continue
+            marker = MARKERS.get(entry["kind"], "o")
+            x_spread, y_spread = _spreads(entry, name)
             axes.errorbar(
-                x, y, **bars, fmt=marker, color=_style(row, rows)[0], ms=13 if marker == "*" else 8, lw=1,
-                mec="white", mew=0.6, zorder=4 if marker == "*" else 3, label=row.title,
+                x, y, y_spread, x_spread, fmt=marker, color=colour, ms=13 if marker == "*" else 8, lw=1,
+                mec="white", mew=0.6, zorder=4 if marker == "*" else 3, label=entry["title"],
             )  # fmt: skip
-        front = pareto_front(cost, error)
+        right = 1.05 * cost.max()
+        front = [i for i in pareto_front(cost, error) if not limits or error[i] <= limits[1]]
         if front:  # every row may have diverged
-            right = axes.get_xlim()[1]
             axes.step(
                 [*cost[front], right], [*error[front], error[front[-1]]], where="post", color="#bbbbbb", lw=4,
                 zorder=1, label="Pareto front",
             )  # fmt: skip
-            axes.set_xlim(right=right)
+        axes.set_xlim(0, right)
 
-    return _cost_panels(scene, draw, _zoom(error, spread))
+    return _cost_panels(scene, draw, limits)
+
+
+def _spreads(entry: Entry, cost: str) -> tuple[float | None, float | None]:
+    """The error bars of a row of several seeds, along x and y. Old records have no cost of each seed."""
+    if entry["seeds"] < 2:
+        return None, None
+    each = entry.get("each")
+    return float(np.std(each[cost], ddof=1)) if each else None, entry["metric_std"]
 
 
 def error_against_cost(scene: _C.Scene, rows: list[Row]) -> Figure:
     """The error as the cost of the training grows, one curve a row: means over the seeds."""
 
     def draw(axes: Axes, name: str) -> None:
-        for row in rows:
-            colour, line = _style(row, rows)
+        for row, (colour, line) in zip(rows, _styles_of(rows), strict=True):
             cost = np.concatenate([[0.0], np.cumsum(row.stack(name).mean(0))])
             lead = row.kind in FIXED
             axes.plot(
                 cost, row.stack("metric").mean(0), color=colour, ls=line, lw=2.2 if lead else 1.3, label=row.title,
                 zorder=3 if lead else 2,
             )  # fmt: skip
+        axes.set_xlim(0, None)
         if scene.compare.target is not None:
             axes.axhline(scene.compare.target, color="#bbbbbb", lw=4, zorder=1, label="error to reach")
 
@@ -298,14 +290,13 @@ def all_charts(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> list[Dra
     spread = f" (line: mean of {seeds} seeds, band: one standard deviation)" if seeds > 1 else ""
     if scene.task != "parameters":
         cost = (
-            accuracy_against_cost(scene, rows),
-            "Accuracy against cost; lower left is better, the grey stairs join the runs that no other beats in both.",
+            accuracy_against_cost(scene, table),
+            "Accuracy against cost; lower left is better. The grey stairs join the runs that no other beats in both. "
+            f"Arrows at the upper edge are errors above {_NEAR} times the best.",
         )
-        if len(cost[0].axes) > len(_COSTS):
-            cost = (cost[0], f"{cost[1]} The error axis is broken above {_NEAR} times the best error.")
     else:
         cost = (error_against_cost(scene, rows), "The error against the cost so far; lower left is better.")
-    return [
+    drawn = [
         ("metric", metric_over_intervals(scene, rows), f"The metric over the training{spread}."),
         ("k", k_over_intervals(scene, rows), _k_caption(scene, rows)),
         (
@@ -321,3 +312,5 @@ def all_charts(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> list[Dra
             "the sweeps back through the iterations. Wall time includes the network and the optimiser.",
         ),
     ]
+    only = " One seed." if seeds == 1 else ""
+    return [(name, figure, caption + only) for name, figure, caption in drawn]

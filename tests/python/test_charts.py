@@ -6,38 +6,54 @@ import pytest
 from prdp_torch.experiments import charts, compare, scenes
 
 
-def rows_with(errors):
-    """Rows of heat_1d's comparison of two seeds, with these errors at the end."""
-    rows = compare.rows_of(scenes.load("heat_1d"))[: len(errors)]
+def table_with(errors):
+    """The table of heat_1d's comparison of two seeds, with these errors at the end."""
+    scene = scenes.load("heat_1d")
+    rows = compare.rows_of(scene)[: len(errors)]
+    costs = ("operator_applications", "adjoint_applications", "seconds", "budget", "iterations")
     for row, error in zip(rows, errors, strict=True):
-        costs = {name: [100.0 * (1 + row.k)] for name in ("operator_applications", "seconds", "budget", "iterations")}
-        row.curves = [{"metric": [1.0, s * error], "max_iter": [row.k], **costs} for s in (0.98, 1.02)]
-    return rows
+        spent = {name: [100.0 * (1 + row.k)] for name in costs}
+        row.curves = [{"metric": [1.0, s * error], "max_iter": [row.k], **spent} for s in (0.98, 1.02)]
+    return compare.summarise(scene, rows)
 
 
-def panels(errors):
-    """The limits of the y axes of the left column, from below."""
-    figure = charts.accuracy_against_cost(scenes.load("heat_1d"), rows_with(errors))
+def drawn(errors):
+    figure = charts.accuracy_against_cost(scenes.load("heat_1d"), table_with(errors))
     figure.draw_without_rendering()
-    left = [axes for axes in figure.axes if axes.get_subplotspec().colspan.start == 0]
-    return [axes.get_ylim() for axes in left[::-1]]
+    return figure
 
 
-def test_the_rows_within_ten_times_the_best_have_a_panel_to_themselves():
+def labels(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_the_rows_within_ten_times_the_best_have_the_axis_to_themselves():
     errors = [0.040, 0.041, 0.3, 0.042, 40.0, 0.5]
-    near, far = panels(errors)
-    inside = [near[0] < error < near[1] for error in errors]
-    assert inside == [True, True, True, True, False, False]
-    assert all(far[0] < error < far[1] for error in (40.0, 0.5)) and near[1] <= far[0]
-    # Of the height of its panel, a difference of a twentieth takes at least a fiftieth, not a two-hundredth.
-    assert np.log(0.042 / 0.040) / np.log(near[1] / near[0]) > 0.02
+    figure = drawn(errors)
+    low, high = figure.axes[0].get_ylim()
+    assert [low < error < high for error in errors] == [True, True, True, True, False, False]
+    # Of the height of the panel, a difference of a twentieth takes at least a fiftieth, not a two-hundredth.
+    assert np.log(0.042 / 0.040) / np.log(high / low) > 0.02
+    above = [label for label in labels(figure) if label.endswith("above")]
+    assert above == ["PRDP, K ← 1.5 K: 40, above", "K = 1: 0.5, above"]
 
 
 @pytest.mark.parametrize("errors", [[0.04, 0.05, 0.39], [0.04, np.nan, 0.05], [np.nan, np.nan]])
-def test_a_chart_without_far_rows_is_whole(errors):
-    assert len(panels(errors)) == 1
+def test_a_chart_without_far_rows_has_no_arrows(errors):
+    assert not any(label.endswith("above") for label in labels(drawn(errors)))
 
 
 def test_a_lost_row_does_not_hide_the_others():
-    near, _ = panels([0.04, np.nan, 40.0])
-    assert near[0] < 0.04 < near[1] < 40.0
+    low, high = drawn([0.04, np.nan, 40.0]).axes[0].get_ylim()
+    assert low < 0.04 < high < 40.0
+
+
+def test_a_kept_table_is_drawn_again():
+    """Records of an earlier format have no values of each seed, and null where a training was lost."""
+    table = table_with([0.04, 0.05])
+    for entry in table:
+        del entry["each"]
+    table[1] |= {"metric": None, "metric_std": None}
+    figure = charts.accuracy_against_cost(scenes.load("heat_1d"), table)
+    figure.draw_without_rendering()
+    assert "converged, K = 25" in labels(figure)

@@ -1,0 +1,51 @@
+"""The pictures of docs/ are drawn from their records, and say what they leave out."""
+
+import copy
+import subprocess
+
+import pytest
+
+from benchmarks import charts, pictures, refinement_charts
+
+OF_TRAININGS = {"burgers_1d_metric", "heat_1d_metric", "snapshots"}  # their records are not in the repository
+OF_EXAMPLES = "docs/gallery/*.png"
+
+
+def tracked(pattern):
+    listed = subprocess.run(["git", "ls-files", pattern], cwd=pictures.DOCS.parent, capture_output=True, text=True)
+    return {pictures.DOCS.parent / name for name in listed.stdout.split()}
+
+
+def test_every_picture_is_drawn_again_from_a_record():
+    drawn = {path for path, _, _ in pictures.all_of_them()}
+    left = tracked("docs/*.png") - tracked(OF_EXAMPLES) - drawn
+    assert {path.stem for path in left} <= OF_TRAININGS
+
+
+def test_scenes_of_one_seed_are_marked():
+    found = refinement_charts.summaries()
+    figure = refinement_charts.error_against_products(found)
+    titles = {axes.get_title() for axes in figure.axes}
+    assert len(titles) == len(found)
+    for name, summary in found.items():
+        seeds = {row["seeds"] for row in summary["rows"]}
+        assert (f"{name} (one seed)" in titles) == (seeds == {1})
+
+
+def test_an_error_far_above_the_others_does_not_flatten_a_panel():
+    summary = copy.deepcopy(refinement_charts.summaries()["heat_1d"])
+    summary["rows"][2]["metric"] *= 1e5
+    (axes,) = refinement_charts.error_against_products({"heat_1d": summary}).axes
+    assert axes.get_ylim()[1] < 2
+    assert any("e+04" in text.get_text() or "e+05" in text.get_text() for text in axes.texts)
+
+
+def test_the_bars_of_an_update_have_one_length():
+    found = [
+        {"scene": "a", "k": 1, "network_seconds": 1e-3, "update_seconds": 1e-2},
+        {"scene": "b", "k": 1, "network_seconds": 1.02, "update_seconds": 1.0},  # within the noise
+    ]
+    (axes,) = charts.training(found).axes
+    ends = [bar.get_x() + bar.get_width() for bar in axes.patches]
+    assert max(ends) == pytest.approx(100)
+    assert [text.get_text() for text in axes.texts] == ["below 5 % of 1.00 s", "90 % of 10 ms"]
