@@ -122,7 +122,7 @@ def time_and_products():
 def constant_tolerances():
     """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
     body = []
-    for name in SCENES:
+    for name in _with_constant():
         found = rows(f"refinement_{name}")
         seeds = record(f"refinement_{name}")["seeds"]
         for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found)]):
@@ -137,7 +137,7 @@ def constant_tolerances():
 def the_best_constant():
     """The loosest tolerance that ends as converged solves do, beside auto; and what a wrong one costs."""
     body = []
-    for name in SCENES:
+    for name in _with_constant():
         found = rows(f"refinement_{name}")
         tolerances = _constant(found)
         good = [row for row in tolerances if row["as_good"]]
@@ -148,6 +148,11 @@ def the_best_constant():
         body.append([name, *of_best, wrong[0], f"{wrong[1]} with {_power_of(tightest)}"])
     head = ["scene", "loosest that ends as converged", "products / auto's", "error with 1e-1 / converged"]
     return page_tables.markdown([*head, "products of the tightest / auto's"], body)
+
+
+def _with_constant():
+    """The scenes that were trained with constant tolerances."""
+    return [name for name in SCENES if _constant(rows(f"refinement_{name}"))]
 
 
 def _constant(found):
