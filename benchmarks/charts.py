@@ -94,10 +94,13 @@ def large(points):
     """Seconds, with the setup and of one more solve, and the true residual, over the unknowns of one sample."""
     figure = Figure(figsize=(11.5, 4.8), layout="constrained")
     panels = figure.subplots(1, 3)
+    points = [p for p in points if p["grid"].endswith("²") and not p["solver"].endswith(("threads", "κ"))]
     for label in dict.fromkeys(p["solver"] for p in points):
         line = [p for p in points if p["solver"] == label]
         mark = MARKS.get(library(label), "o")
         style = {"color": colour(label), "marker": mark, "lw": 1.4, "ms": 5, "label": label}
+        if "aggregation" in label:
+            style["ls"] = "--"
         for axes, what in zip(panels, ("seconds", "again", "residual"), strict=True):
             axes.plot([p["unknowns"] for p in line], [max(p[what], 1e-12) for p in line], **style)
     titles = ("first solve, with its setup: seconds", "one more with the same κ: seconds", "‖b - A u‖ / ‖b‖ in float64")

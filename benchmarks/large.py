@@ -1,4 +1,4 @@
-"""Large grids: seconds and errors of one elliptic solve against the number of unknowns, to a million, with what users
+"""Large grids: seconds and errors of one elliptic solve against the number of unknowns, to two million, with what users
 would take instead: conjugate gradients of SciPy's kind, a sparse LU, algebraic multigrid of an assembled matrix."""
 
 import importlib.util
@@ -10,16 +10,25 @@ import torch
 import prdp_torch as prdp
 from benchmarks import volumes
 from prdp_torch import _C
-from prdp_torch.operators import Diffusion
+from prdp_torch.operators import Diffusion, Poisson
 
 SIDES = (63, 127, 255, 511, 1023)
+CUBES = (63, 127)
 CONTRAST = 800.0
 RTOL = 1e-5
 PATIENCE = 60.0  # seconds a solve may have taken on the grid before
+TWO = ", two threads"
+MULTIGRID = prdp.CG(50, RTOL, preconditioner="multigrid")
+OF_CUBES = {
+    "CG": prdp.CG(30000, RTOL),
+    "Chebyshev": prdp.Chebyshev(30000, RTOL),
+    "CG, multigrid": MULTIGRID,
+    "direct": prdp.Direct(),
+}
 
 
 def run(report, quick=False):
-    """[{solver, side, unknowns, seconds, again, iterations, residual, status}]: a first solve, with what it needs to
+    """[{solver, grid, unknowns, seconds, again, iterations, residual, status}]: a first solve, with what it needs to
     set up, and one more with the same κ. The residual is that of u in float64."""
     points, too_slow = [], set()
     for side in SIDES[: 2 if quick else None]:
@@ -28,20 +37,32 @@ def run(report, quick=False):
             if name in too_slow:
                 continue
             report(f"large: {side}², {name}")
-            solve = prepare(kappa, b)
-            started = time.perf_counter()
-            u, iterations, status = solve()
-            first = time.perf_counter() - started
-            started = time.perf_counter()
-            solve()
-            again = time.perf_counter() - started
-            if max(first, again) * 16 > PATIENCE:  # CG: four times the unknowns, twice the iterations, out of the cache
+            point = timed(prepare(kappa, b), lambda u, kappa=kappa, b=b: residual(Diffusion(kappa), b, u))
+            points.append({"solver": name, "grid": f"{side}²", "unknowns": side**2, **point})
+            # CG: four times the unknowns, twice the iterations, out of the cache
+            if max(point["seconds"], point["again"]) * 16 > PATIENCE:
                 too_slow.add(name)
-            points.append({
-                "solver": name, "side": side, "unknowns": side**2, "seconds": first, "again": again,
-                "iterations": iterations, "residual": residual(kappa, b, u), "status": status,
-            })  # fmt: skip
+    for side in CUBES[: 1 if quick else None]:
+        b = torch.tensor(np.random.default_rng(1).standard_normal((1, 1, side, side, side)))
+        operator = Poisson((side,) * 3)
+        for name, solver in OF_CUBES.items():
+            report(f"large: {side}³, {name}")
+            for threads in (1, 2):
+                solve = call(lambda operator=operator: operator, b.float(), solver, threads)
+                point = timed(solve, lambda u, b=b, operator=operator: residual(operator, b, u))
+                points.append({"solver": name + TWO * (threads == 2), "grid": f"{side}³", "unknowns": side**3, **point})
     return points
+
+
+def timed(solve, residual):
+    """The seconds of two calls, and what the first one found."""
+    started = time.perf_counter()
+    u, iterations, status = solve()
+    first = time.perf_counter() - started
+    started = time.perf_counter()
+    solve()
+    again = time.perf_counter() - started
+    return {"seconds": first, "again": again, "iterations": iterations, "residual": residual(u), "status": status}
 
 
 def problem(side):
@@ -57,8 +78,8 @@ def problem(side):
     return kappa, torch.tensor(noise.standard_normal((1, 1, side, side)))
 
 
-def residual(kappa, b, u):
-    left = b - Diffusion(kappa).apply(torch.as_tensor(u, dtype=torch.float64).reshape(b.shape))
+def residual(operator, b, u):
+    left = b - operator.apply(torch.as_tensor(u, dtype=torch.float64).reshape(b.shape))
     return float(left.norm() / b.norm())
 
 
@@ -67,7 +88,10 @@ def solvers():
     found = {
         "CG": ours(prdp.CG(30000, RTOL)),
         "CG, diagonal": ours(prdp.CG(30000, RTOL, preconditioner="diagonal")),
-        "CG, multigrid": ours(prdp.CG(50, RTOL, preconditioner="multigrid")),
+        "CG, two threads": ours(prdp.CG(30000, RTOL), threads=2),
+        "CG, multigrid": ours(MULTIGRID),
+        "CG, multigrid, two threads": ours(MULTIGRID, threads=2),
+        "CG, multigrid, with the gradients for b and κ": ours(MULTIGRID, gradient=True),
         "Multigrid": ours(prdp.Multigrid(50, RTOL)),
         "direct": ours(prdp.Direct()),
     }
@@ -79,19 +103,30 @@ def solvers():
     return found
 
 
-def ours(solver):
+def ours(solver, threads=1, gradient=False):
     def prepare(kappa, b):
-        kappa, b = kappa.float(), b.float()
-        _C.clear_factorisations()
-
-        def solve():
-            with torch.no_grad():
-                u, info = prdp.linear_solve(Diffusion(kappa), b, solver, on_failure="return")
-            return u, int(info.iterations), prdp.SolveStatus(int(info.status)).name
-
-        return solve
+        kappa, b = (t.float().requires_grad_(gradient) for t in (kappa, b))
+        return call(lambda: Diffusion(kappa), b, solver, threads)
 
     return prepare
+
+
+def call(operator, b, solver, threads):
+    """A call that solves, with the gradients of whatever needs one."""
+    _C.clear_factorisations()
+
+    def solve():
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            u, info = prdp.linear_solve(operator(), b, solver, on_failure="return")
+            if u.requires_grad:
+                u.square().sum().backward()
+        finally:
+            torch.set_num_threads(before)
+        return u.detach(), int(info.iterations), prdp.SolveStatus(int(info.status)).name
+
+    return solve
 
 
 def assembled(kappa):

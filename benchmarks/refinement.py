@@ -1,19 +1,30 @@
-"""The parts of auto one by one, beside PRDP and converged solves: `python -m benchmarks.refinement SCENE`.
+"""The parts of auto one by one, beside PRDP, constant tolerances and converged solves:
+`python -m benchmarks.refinement SCENE`.
 
 Writes a record for each training and a summary, as `prdp compare` does, and prints its rows. The summaries kept in
 docs/results are what docs/result_tables.py and `python -m benchmarks.refinement_charts` read. With --resume, finished
-trainings are kept. With --rows, the summary also holds the trainings that other rows have.
+trainings are kept. With --rows, only these are trained: the summary takes the others from --keep, an earlier summary.
 """
 
 import argparse
+import json
+import re
 from pathlib import Path
 
 import torch
 
-from prdp_torch.controller import PRDPController, ToleranceController
-from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
+from prdp_torch.experiments import _C, compare, records, scenes
 from prdp_torch.experiments.compare import Row
 from prdp_torch.experiments.refinement import Refinement
+
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
+OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
+MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update
+    "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
+    "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
+    "diffusion_inverse_256": 'method = "cg"\nmax_iter = 100',
+}
 
 
 def rows_of(scene):
@@ -25,7 +36,13 @@ def rows_of(scene):
         _tolerance("tolerance", "tolerance", adjoint_ratio=1.0, adjoint_floor=1e-5),
         _tolerance("tolerance_adjoint", "tolerance, adjoint looser"),
         Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
+        *map(_constant, OF_PARAMETERS if scene.task == "parameters" else TOLERANCES),
     ]
+    if scene.physics.direct_is_cheap or scene.task == "field":
+        rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
+    if scene.name in MULTIGRID:
+        rows.append(Row("multigrid", "converged, multigrid", "tolerance", Refinement.tolerance(1e-5, 100)))
+        rows.append(Row("auto_multigrid", "auto, multigrid", "auto", Refinement.auto()))
     if scene.task == "corrector":
         rows.append(
             Row("none", f"K = {converged}, backward none", "constant", Refinement.constant(converged), converged)
@@ -38,51 +55,81 @@ def _tolerance(label, title, **settings):
     return Row(label, title, "auto", refinement)
 
 
+def _constant(rtol):
+    """One tolerance throughout. The start, the adjoint's share and the cap on K are those of auto."""
+
+    def attach(steppers):
+        for stepper in steppers:
+            stepper.start, stepper.rtol, stepper.adjoint_rtol = "state", rtol, min(0.5, 10 * rtol)
+        return LinearSchedule(steppers, initial=10_000, increment=0, maximum=10_000)
+
+    label = f"rtol_{rtol:g}"
+    return Row(label, f"rtol = {rtol:g} throughout", "tolerance", Refinement(label, attach))
+
+
+def scene_of(name, row):
+    """The scene as the row trains it."""
+    scene = scenes.load(name)
+    if row.label == "none":
+        scene.backward = "none"
+    if row.label in ("multigrid", "auto_multigrid"):
+        solver = (
+            f'[solver]\n{MULTIGRID[scene.name]}\npreconditioner = "multigrid"\nrtol = 1e-5\nbackward = "implicit"\n\n'
+        )
+        text = re.sub(r"\[solver\]\n.*?\n\n", lambda _: solver, scene.text, flags=re.DOTALL)
+        scene = _C.parse_scene(text, scene.path)
+    return scene
+
+
 def main():
     parser = argparse.ArgumentParser(prog="python -m benchmarks.refinement")
     parser.add_argument("scene")
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--rows", nargs="*", help="labels of the rows to train; all where none is given")
+    parser.add_argument("--rows", nargs="+", help="labels of the rows to train; all where none is given")
+    parser.add_argument("--keep", type=Path, help="a summary whose rows are kept where they are not trained")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--resume", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
     scene = scenes.load(options.scene)
     folder = records.prepare_folder(options.out or Path("runs") / f"{scene.name}-refinement")
+    kept = json.loads(options.keep.read_text()) if options.keep else {"rows": [], "curves": {}}
     environment = records.environment()
-    rows = []
-    for row in rows_of(scene):
+    asked = [row for row in rows_of(scene) if not options.rows or row.label in options.rows]
+    summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, **kept}
+    for row in asked:
         train(row, options, folder, environment)
-        if not row.curves:
-            continue
-        rows.append(row)
-        table = compare.summarise(scene, rows)
-        print(f"{row.title}: {table[-1]['metric']:.2e}, {table[-1]['operator_applications']:,.0f} products", flush=True)
-    trained = [records.read(path) for row in rows for path in sorted((folder / row.label).glob("seed_*.json"))]
-    environment["commit"] = ", ".join(dict.fromkeys(record["commit"] for record in trained))  # some were resumed
-    environment["machine"] = trained[0]["machine"]
-    summary = {"settings": records.settings(scene), **environment}
-    curves = {row.label: _curves(row) for row in rows}
-    records.write(folder / "summary.json", {**summary, "seeds": options.seeds, "rows": table, "curves": curves})
+        (entry,) = compare.summarise(scene, [row], _row(summary, "converged"))
+        entry |= {key: environment[key] for key in ("commit", "machine")}
+        print(f"{row.title}: {entry['metric']:.2e}, {entry['operator_applications']:,.0f} products", flush=True)
+        order = [other.label for other in rows_of(scene)]
+        others = [other for other in summary["rows"] if other["label"] != row.label]
+        summary["rows"] = sorted([*others, entry], key=lambda entry: order.index(entry["label"]))
+        summary["curves"][row.label] = _curves(row)
+        records.write(folder / "summary.json", summary)
+
+
+def _row(summary, label):
+    return next((row for row in summary["rows"] if row["label"] == label), None)
 
 
 def train(row, options, folder, environment):
-    """Fill in the curves of a row: one of each seed, or those that are there where the row is not asked for."""
-    scene = scenes.load(options.scene)
-    if row.label == "none":
-        scene.backward = "none"
-    asked = not options.rows or row.label in options.rows
-    seeds = options.seeds if asked else len(list((folder / row.label).glob("seed_*.json")))
-    resume = options.resume or not asked
-    for seed in range(seeds):
-        run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, resume)
+    """Fill in the curves of a row, one for each seed."""
+    for seed in range(options.seeds):
+        scene = scene_of(options.scene, row)
+        run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume)
         row.curves.append(run)
 
 
 def _curves(row):
-    """How the first seed refined: iterations a solve took in the mean, and the tolerance, of each interval."""
-    k = row.taken_per_solve()[0]
-    return {"iterations": [float(f"{x:.4g}") for x in k], "rtol": [float(f"{x:.3g}") for x in row.curves[0]["rtol"]]}
+    """How the first seed refined, interval by interval: iterations a solve took in the mean, the tolerance, and what it
+    reached at which cost."""
+    curves = row.curves[0]
+    costs = {name: curves[name] for name in ("rtol", "metric", "operator_applications", "seconds")}
+    return {
+        name: [float(f"{x:.4g}") for x in curve]
+        for name, curve in {"iterations": row.taken_per_solve()[0], **costs}.items()
+    }
 
 
 if __name__ == "__main__":

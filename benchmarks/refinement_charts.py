@@ -118,8 +118,39 @@ def over_the_training(found):
     return figure
 
 
+FIVE = {  # label: title, colour
+    "converged": ("converged", "#222222"),
+    "multigrid": ("converged, with multigrid", "#9467bd"),
+    "rtol_0.01": ("rtol = 1e-2 throughout", "#2ca02c"),
+    "prdp": ("PRDP, tuned", "#d62728"),
+    "auto": ("auto", "#1f77b4"),
+}
+
+
+def error_over_cost(summary):
+    """The validation error of one scene against the seconds and the products spent so far."""
+    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, cost, title in zip(
+        panels, ("seconds", "operator_applications"), ("seconds of training", "products with A"), strict=True
+    ):
+        for label, (name, colour) in FIVE.items():
+            curves = summary["curves"][label]
+            spent = np.cumsum(curves[cost])
+            axes.plot(spent, curves["metric"][1:], color=colour, lw=1.6, label=name)
+            axes.plot(spent[-1], curves["metric"][-1], "o", color=colour, ms=5)
+        axes.set(yscale="log", xlabel=title)
+        axes.grid(alpha=0.3, lw=0.4)
+        axes.ticklabel_format(axis="x", scilimits=(-3, 5))
+    panels[0].set_ylabel("validation error")
+    panels[1].legend(frameon=False, fontsize=9)
+    figure.suptitle(f"{summary['settings']['scene']}: what an error costs (one seed; the dots are the ends)")
+    return figure
+
+
 def main():
     found = summaries()
+    write_png(error_over_cost(found["burgers_2d"]), RESULTS / "burgers_2d_cost.png", dpi=110)
     write_png(error_against_cost(found), RESULTS / "refinement.png", dpi=110)
     write_png(time_against_products(found), RESULTS / "time_saved.png", dpi=110)
     write_png(over_the_training(found), RESULTS / "refinement_training.png", dpi=110)

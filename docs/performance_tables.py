@@ -162,24 +162,25 @@ def _with_unit(seconds):
     return f"{_short(seconds * factor)} {unit}"
 
 
-def large():
+def large(power="²"):
     """Seconds of a first solve, and of one more in brackets, on each grid; the residual on the largest."""
-    found = record("large")
-    sides = sorted({point["side"] for point in found})
+    found = [point for point in record("large") if point["grid"].endswith(power)]
+    grids = list(dict.fromkeys(point["grid"] for point in found))
     body = []
     for solver in dict.fromkeys(point["solver"] for point in found):
-        of_side = {point["side"]: point for point in found if point["solver"] == solver}
+        of_grid = {point["grid"]: point for point in found if point["solver"] == solver}
         times = [
-            f"{_short(of_side[n]['seconds'])} ({_short(of_side[n]['again'])})" if n in of_side else "–" for n in sides
+            f"{_short(of_grid[n]['seconds'])} ({_short(of_grid[n]['again'])})" if n in of_grid else "–" for n in grids
         ]
-        last = of_side.get(sides[-1])
+        last = of_grid.get(grids[-1])
         body.append([solver, *times, f"{last['residual']:.1e}" if last else "–"])
-    return page_tables.markdown(["", *(f"{n}²" for n in sides), f"residual at {sides[-1]}²"], body)
+    return page_tables.markdown(["", *grids, f"residual at {grids[-1]}"], body)
 
 
 TABLES = {
     "change of K": change_of_k,
     "large grids": large,
+    "cubes": lambda: large("³"),
     "other libraries": beside_others,
     "diffusion": diffusion,
     "memory": memory,

@@ -40,6 +40,11 @@ def error(row):
     return f"{_with_spread(row)}{missed}{warns}"
 
 
+def _fewer_seeds(row, seeds):
+    """How many seeds a row has, where others have more."""
+    return "" if row["seeds"] == seeds else ", one seed" if row["seeds"] == 1 else f", {row['seeds']} seeds"
+
+
 def _warns(row):
     return "warns" if row["seeds"] == 1 else f"{row['warnings']} of {row['seeds']} warn"
 
@@ -80,7 +85,7 @@ def parts_of_auto():
         seeds = f", {found['seeds']} seeds" if found["seeds"] > 1 else ""
         for i, row in enumerate(found["rows"]):
             title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += ", one seed" if row["seeds"] == 1 < found["seeds"] else ""
+            title += _fewer_seeds(row, found["seeds"])
             costs = *_products(row), _saved(row), _seconds(row)
             body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *costs])
     return page_tables.markdown(["scene", "", "error", "forward", "adjoint", "in all", "saved", "s"], body)
@@ -112,6 +117,49 @@ def time_and_products():
     of_each = ("products saved", "time saved", "error / converged")
     head = ["scene", "converged, s", *(f"{who}: {what}" for who in ("PRDP", "auto") for what in of_each)]
     return page_tables.markdown(head, body)
+
+
+def constant_tolerances():
+    """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
+    body = []
+    for name in SCENES:
+        found = rows(f"refinement_{name}")
+        seeds = record(f"refinement_{name}")["seeds"]
+        for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found)]):
+            title = "**auto**" if row["label"] == "auto" else row["title"]
+            title += _fewer_seeds(row, seeds)
+            costs = _products(row)[2], _beside(row, found["auto"]), _saved(row)
+            body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
+            body[-1] += [error(row), *costs]
+    return page_tables.markdown(["scene", "", "error", "products", "products / auto's", "saved"], body)
+
+
+def the_best_constant():
+    """The loosest tolerance that ends as converged solves do, beside auto; and what a wrong one costs."""
+    body = []
+    for name in SCENES:
+        found = rows(f"refinement_{name}")
+        tolerances = _constant(found)
+        good = [row for row in tolerances if row["as_good"]]
+        best = min(good, key=lambda row: row["operator_applications"], default=None)
+        of_best = ["none", "–"] if best is None else [_power_of(best), _beside(best, found["auto"])]
+        loosest, tightest = tolerances[0], tolerances[-1]
+        wrong = f"{loosest['metric'] / found['converged']['metric']:.2g}", _beside(tightest, found["auto"])
+        body.append([name, *of_best, wrong[0], f"{wrong[1]} with {_power_of(tightest)}"])
+    head = ["scene", "loosest that ends as converged", "products / auto's", "error with 1e-1 / converged"]
+    return page_tables.markdown([*head, "products of the tightest / auto's"], body)
+
+
+def _constant(found):
+    return [row for label, row in found.items() if label.startswith("rtol_")]
+
+
+def _beside(row, auto):
+    return f"{row['operator_applications'] / auto['operator_applications']:.2f}"
+
+
+def _power_of(row):
+    return f"{float(row['label'].removeprefix('rtol_')):.0e}".replace("e-0", "e-")
 
 
 # What takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has no network.
@@ -152,7 +200,7 @@ def comparison(name, seconds=True):
     body = []
     for row in record(name)["rows"]:
         title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        title += ", one seed" if row["seeds"] == 1 < record(name)["seeds"] else ""
+        title += _fewer_seeds(row, record(name)["seeds"])
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
         body.append([title, error(row), last, *_products(row), _saved(row), *([_seconds(row)] if seconds else [])])
     head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if seconds else [])]
@@ -261,6 +309,8 @@ TABLES = {
     "three parameters": three_parameters,
     "time and products": time_and_products,
     "seconds": seconds,
+    "constant tolerances": constant_tolerances,
+    "the best constant": the_best_constant,
 }
 
 

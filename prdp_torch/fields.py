@@ -1,9 +1,8 @@
 """Functions of periodic velocity fields on the staggered grid of `NavierStokes`. All are differentiable.
 
 Fields are (batch, 2 or 3, Ny, Nx) with dx = length/N. `length` is the side of the domain, one number or one per axis,
-(y, x), as the steps take it. Channel 0 is u₁ along x, the last axis, on
-the left face of a cell. Channel 1 is u₂ along y on its lower face. A third channel, the pressure in the cell's centre,
-has no influence.
+(y, x), as the steps take it. Channel 0 is u₁ along x, the last axis, on the left face of a cell. Channel 1 is u₂ along
+y on its lower face. A third channel, the pressure in the cell's centre, has no influence.
 """
 
 import math

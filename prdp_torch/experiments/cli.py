@@ -1,18 +1,28 @@
 """The command `prdp`: list scenes, train them, compare ways of choosing K."""
 
 import functools
+import importlib
 import os
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from prdp_torch import processes
@@ -22,6 +32,7 @@ from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.tensorboard import TensorBoard
+from prdp_torch.experiments.training import Callback, Interval
 
 app = typer.Typer(
     add_completion=False,
@@ -43,14 +54,18 @@ SUITES = (
 )  # modules of benchmarks/
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
-COUNT = {"min": 1, "max": _C.MOST_COUNTED}
+COUNT: dict[str, Any] = {"min": 1, "max": _C.MOST_COUNTED}
 Seeds = Annotated[int | None, typer.Option(**COUNT, help="How many seeds, counted from 0.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(**COUNT, help="Epochs (or updates) in place of the scene's.")]
 
 
-def print_versions(asked):
+def _folder(default: str) -> Any:
+    return typer.Option(help=f"Folder for the results; default {default}.")
+
+
+def print_versions(asked: bool) -> None:
     if asked:
         print(f"prdp_torch {VERSION}, torch {torch.__version__}")
         raise typer.Exit
@@ -60,19 +75,15 @@ Version = Annotated[bool, typer.Option("--version", is_eager=True, callback=prin
 
 
 @app.callback()
-def _about(version: Version = False):
+def _about(version: Version = False) -> None:
     pass  # the option has done it
 
 
-def out(default):
-    return Annotated[Path | None, typer.Option(help=f"Folder for the results; default {default}.")]
-
-
-def command(function):
+def command(function: Callable[..., None]) -> Callable[..., None]:
     """A command whose user's errors are one line and exit 2; Ctrl-C exits 130."""
 
     @functools.wraps(function)
-    def guarded(*args, **kwargs):
+    def guarded(*args: Any, **kwargs: Any) -> None:
         try:
             if processes.launched() > 1 and function.__name__ != "train":
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
@@ -96,7 +107,7 @@ def command(function):
 
 
 @command
-def scenes():
+def scenes() -> None:
     """List the scenes that come with the project."""
     known = scene_files.available()
     for name, path in known.items():
@@ -112,12 +123,12 @@ def train(
     schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
     direct: Annotated[bool, typer.Option("--direct", help="The exact solver.")] = False,
     seeds: Seeds = None,
-    out: out("runs/SCENE-train") = None,
+    out: Annotated[Path | None, _folder("runs/SCENE-train")] = None,
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write the curves for TensorBoard.")] = False,
-):
+) -> None:
     """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
     loaded = _load(scene, backward, intervals)
     chosen = [
@@ -142,16 +153,17 @@ def train(
         refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment()
-    diverged, warnings = {}, {}
+    diverged: dict[int, str] = {}
+    warnings: dict[int, str] = {}
     with records.alone_in([folder / refinement.label]), _progress() as progress:
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
-            def show(interval, task=task):
+            def show(interval: Interval, task: TaskID = task) -> None:
                 note = f"metric {interval.metric:.3e}  K {interval.max_iter}"
                 progress.update(task, completed=interval.number, note=note)
 
-            callbacks = [show]
+            callbacks: list[Callback] = [show]
             if tensorboard and processes.is_first():
                 callbacks.append(TensorBoard(folder / refinement.label / f"seed_{seed}.tensorboard"))
             curves = comparison.run_one(
@@ -183,11 +195,11 @@ def train(
 def compare(
     scene: SceneName,
     seeds: Seeds = None,
-    out: out("runs/SCENE") = None,
+    out: Annotated[Path | None, _folder("runs/SCENE")] = None,
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
-):
+) -> None:
     """Compare converged, exact, auto, PRDP and a sweep of constant K: table, records and an HTML report."""
     loaded = _load(scene, backward, intervals)
     folder = records.prepare_folder(out or Path("runs") / loaded.name)
@@ -195,9 +207,9 @@ def compare(
     with _progress() as progress:
         trainings = len(comparison.rows_of(loaded)) * seeds
         task = progress.add_task("", total=trainings * loaded.training.intervals, note="")
-        finished = {}
+        finished: dict[tuple[str, int], int] = {}
 
-        def show(row, seed, done):
+        def show(row: comparison.Row, seed: int, done: int) -> None:
             finished[row.label, seed] = done
             progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
 
@@ -221,7 +233,7 @@ def export(
     steps: Annotated[
         int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
     ] = None,
-):
+) -> None:
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
     path = out or Path(f"{loaded.name}.h5")
@@ -234,7 +246,7 @@ def export(
 def advise(
     scene: SceneName,
     seconds: Annotated[float, typer.Option(metavar="S", help="The limit for each solver.")] = 5.0,
-):
+) -> None:
     """Measure which solver a scene needs and how much refinement can save, without training."""
     loaded = scene_files.load(scene)
     with console.status("trying the solvers"):
@@ -245,13 +257,11 @@ def advise(
 @command
 def bench(
     suites: Annotated[list[str] | None, typer.Argument(metavar="[SUITE]...", help=f"{', '.join(SUITES)}; all.")] = None,
-    out: out("runs/bench") = None,
+    out: Annotated[Path | None, _folder("runs/bench")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
-):
+) -> None:
     """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
-    project = Path(__file__).resolve().parents[2]
-    if not (project / "benchmarks").is_dir():
-        raise ValueError("bench: the benchmarks are in the project's folder, not in the installed package; clone it")
+    project = _project("bench")
     for suite in suites or ():
         if suite not in SUITES:
             raise ValueError(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
@@ -265,24 +275,32 @@ def bench(
 @command
 def stability(
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="A map; give it again for more. All.")] = None,
-    out: out("runs/stability") = None,
+    out: Annotated[Path | None, _folder("runs/stability")] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="A few points of each map, to see that all of it runs.")
     ] = False,
-):
+) -> None:
     """Map where the methods work and where they break: a picture and a record for each question."""
-    from prdp_torch.experiments import atlas
-
+    sys.path.insert(0, str(_project("stability")))
+    atlas = importlib.import_module("benchmarks.atlas")
     folder = records.prepare_folder(out or Path("runs") / "stability")
 
-    def show(name, answer, seconds):
+    def show(name: str, answer: str, seconds: float) -> None:
         console.print(f"{name}: {atlas.MAPS[name].question} {answer} ({seconds:.0f} s)", soft_wrap=True)
 
     atlas.run(folder, only or (), quick, show)
     console.print(f"pictures and records: {folder}", soft_wrap=True)
 
 
-def _load(scene, backward, intervals):
+def _project(who: str) -> Path:
+    """The folder of the clone that this package lies in."""
+    project = Path(__file__).resolve().parents[2]
+    if not (project / "benchmarks").is_dir():
+        raise ValueError(f"{who}: the benchmarks are in the project's folder, not in the installed package; clone it")
+    return project
+
+
+def _load(scene: str, backward: str | None, intervals: int | None) -> _C.Scene:
     loaded = scene_files.load(scene)
     if backward is not None:
         loaded.backward = backward
@@ -291,7 +309,7 @@ def _load(scene, backward, intervals):
     return loaded
 
 
-def _schedule(text):
+def _schedule(text: str) -> tuple[int, int]:
     parts = text.split(":")
     most = _C.MOST_COUNTED
     if len(parts) != 2 or not all(part.isdecimal() and len(part) < 20 and int(part) <= most for part in parts):
@@ -299,7 +317,7 @@ def _schedule(text):
     return int(parts[0]), int(parts[1])
 
 
-def _progress():
+def _progress() -> Progress:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -312,11 +330,11 @@ def _progress():
     return Progress(*columns, console=console)
 
 
-def _bar(progress, name):
+def _bar(progress: Progress, name: str) -> Callable[[int, int], None]:
     """A callback (done, total) that has a bar of its own from its first call on."""
-    task = None
+    task: TaskID | None = None
 
-    def show(done, total):
+    def show(done: int, total: int) -> None:
         nonlocal task
         if task is None:
             task = progress.add_task(name, total=total, note="")
@@ -325,7 +343,7 @@ def _bar(progress, name):
     return show
 
 
-def _print_table(scene, table):
+def _print_table(scene: _C.Scene, table: list[comparison.Entry]) -> None:
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     names = [column.short for column in report.columns(scene)]
     kept = report.in_terminal(scene)  # the report has the others

@@ -203,11 +203,12 @@ def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | N
     return curves
 
 
-def summarise(scene: _C.Scene, rows: list[Row]) -> list[Entry]:
-    """The table of a comparison: one dict a row, means over seeds; savings against the first row."""
+def summarise(scene: _C.Scene, rows: list[Row], base: Entry | None = None) -> list[Entry]:
+    """The table of a comparison: one dict a row, means over seeds and the values of each; savings against `base`, or
+    the first row."""
     target = scene.compare.target
     table = [_entry(scene, row, target) for row in rows]
-    base = table[0]
+    base = base or table[0]
     for entry in table:
         entry["as_good"] = _as_good(entry, base)
         # A cap on K is no allowance; the products are everybody's.
@@ -236,6 +237,10 @@ def _entry(scene: _C.Scene, row: Row, target: float | None) -> Entry:
         "reaches_target": None if target is None else bool(row.reaches(target).all()),
         "saved_by_incomplete_convergence": float(max(0.0, 1 - row.last_k().mean() / scene.max_iter)),
         **{cost: float(row.total(cost, target).mean()) for cost in costs},
+        "each": {
+            "metric": final.tolist(),
+            **{cost: row.total(cost, target).tolist() for cost in ("operator_applications", "seconds")},
+        },
     }
 
 

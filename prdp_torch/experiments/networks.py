@@ -1,7 +1,7 @@
 """The scenes' networks. `MLP` and `ResNet` are twins of those in C++: same names, order and initialisation."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -74,6 +74,14 @@ class ResNet(torch.nn.Module):
         return projected
 
 
+_KINDS: dict[str, Callable[[_C.Physics, _C.Network], torch.nn.Module]] = {
+    "mlp": lambda physics, network: MLP(physics.channels * math.prod(physics.shape), network.hidden),
+    "resnet": lambda physics, network: ResNet(
+        len(physics.shape), physics.channels, network.blocks, network.width, physics.periodic
+    ),
+}
+
+
 def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> torch.nn.Module:
     """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
     it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is."""
@@ -82,11 +90,7 @@ def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> to
     physics, network = scene.physics, scene.network
     with torch.random.fork_rng(devices=[]), torch.device("meta" if without_memory else "cpu"):
         torch.manual_seed(seed)
-        made: torch.nn.Module
-        if network.kind == "mlp":
-            made = MLP(physics.channels * math.prod(physics.shape), network.hidden)
-        else:
-            made = ResNet(len(physics.shape), physics.channels, network.blocks, network.width, physics.periodic)
+        made = _KINDS[network.kind](physics, network)
         if network.zero_output:
             for parameter in list(made.parameters())[-2:]:  # weight and bias of the last layer
                 torch.nn.init.zeros_(parameter)

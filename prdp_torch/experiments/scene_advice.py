@@ -16,6 +16,11 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
     """Advise on a scene from `prdp_torch.experiments.scenes.load`, as `advise` does on a step.
 
     It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
+    if scene.task == "field":
+        raise ValueError(
+            f"advise: the equation of '{scene.name}' changes in every update, as its field does; make the step with a "
+            "field of yours and call prdp_torch.advise on it"
+        )
     seconds, step, update = checked_limit(seconds), make_stepper(scene), Update()
     if scene.task == "parameters":
         problem = _C.make_parameter_problem(scene)

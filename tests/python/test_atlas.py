@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from prdp_torch.experiments import atlas
-from prdp_torch.experiments.atlas import coarse_grids, gradients, solves
+from benchmarks import atlas
+from benchmarks.atlas import coarse_grids, gradients, solves
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "stability"

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import torch
 
+from benchmarks.atlas import coarse_grids, gradients, problems, solves
 from prdp_torch.experiments import charts, records
-from prdp_torch.experiments.atlas import coarse_grids, gradients, problems, solves
 
 
 class Map(NamedTuple):
@@ -22,7 +22,7 @@ class Map(NamedTuple):
     """Where that function makes the drawing function: its arguments."""
 
     def draw(self, data):
-        from prdp_torch.experiments.atlas import pictures  # matplotlib, only now
+        from benchmarks.atlas import pictures  # matplotlib, only now
 
         function = getattr(pictures, self.picture)
         return (function(*self.arguments) if self.arguments else function)(self.question, data)

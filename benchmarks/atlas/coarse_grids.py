@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
+from benchmarks.atlas import problems
+from benchmarks.atlas.solves import lines, spaced
 from prdp_torch import operators
-from prdp_torch.experiments.atlas import problems
-from prdp_torch.experiments.atlas.solves import lines, spaced
 from prdp_torch.solvers import CG, GMRES, BiCGStab, Multigrid
 
 OF_SYMMETRIC = {

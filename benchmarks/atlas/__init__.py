@@ -4,6 +4,6 @@
 them.
 """
 
-from prdp_torch.experiments.atlas.maps import MAPS, Map, run
+from benchmarks.atlas.maps import MAPS, Map, run
 
 __all__ = ["MAPS", "Map", "run"]

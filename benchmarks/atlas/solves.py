@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import torch
 
+from benchmarks.atlas import problems
 from prdp_torch import operators
-from prdp_torch.experiments.atlas import problems
 from prdp_torch.solve import SolveStatus, linear_solve
 from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, SteepestDescent
 

@@ -4,9 +4,9 @@ import math
 
 import torch
 
+from benchmarks.atlas import problems
+from benchmarks.atlas.solves import spaced
 from prdp_torch.experiments import scenes
-from prdp_torch.experiments.atlas import problems
-from prdp_torch.experiments.atlas.solves import spaced
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 from prdp_torch.solvers import CG, GMRES, Direct, Jacobi

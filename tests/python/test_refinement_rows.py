@@ -1,0 +1,55 @@
+"""The rows of `python -m benchmarks.refinement`."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import refinement
+from prdp_torch.experiments import compare, scenes
+
+LARGE = str(Path(refinement.__file__).parent / "scenes" / "diffusion_inverse_256.toml")
+
+
+def run(monkeypatch, folder, *arguments):
+    monkeypatch.setattr(sys, "argv", ["refinement", "poisson_1p", "--out", str(folder), *arguments])
+    refinement.main()
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_rows_that_are_not_trained_are_kept(tmp_path, monkeypatch):
+    first = run(monkeypatch, tmp_path / "first", "--rows", "converged", "rtol_0.1")
+    kept = str(tmp_path / "first" / "summary.json")
+    both = run(monkeypatch, tmp_path / "both", "--rows", "rtol_0.01", "--keep", kept)
+    assert [row["label"] for row in both["rows"]] == ["converged", "rtol_0.1", "rtol_0.01"]
+    assert both["rows"][:2] == first["rows"] and both["curves"].keys() >= first["curves"].keys()
+    base, looser, tighter = both["rows"]
+    for row in (looser, tighter):  # the saving is measured against the converged row that was kept
+        share = 1 - row["operator_applications"] / base["operator_applications"]
+        assert row["products_saved"] == pytest.approx(share) and row["commit"] and row["machine"]
+    # Each solve meets its tolerance, and no more: the tighter one takes more products, and ends nearer.
+    assert looser["operator_applications"] < tighter["operator_applications"] < base["operator_applications"]
+    assert looser["metric"] > tighter["metric"]
+
+
+def test_a_row_keeps_the_value_of_each_seed():
+    scene = scenes.load("poisson_1p")
+    (row,) = (row for row in refinement.rows_of(scene) if row.label == "rtol_0.1")
+    for seed in (0, 1):
+        row.curves.append(compare.train(scene, row.refinement, seed))
+    (entry,) = compare.summarise(scene, [row])
+    for name in ("operator_applications", "seconds"):
+        assert len(entry["each"][name]) == 2
+        assert sum(entry["each"][name]) / 2 == pytest.approx(entry[name])
+    assert sum(entry["each"]["metric"]) / 2 == pytest.approx(entry["metric"])
+
+
+@pytest.mark.parametrize("name", ["burgers_2d", "diffusion_inverse", LARGE])
+def test_rows_with_multigrid_differ_from_the_scene_in_the_solver_alone(name):
+    plain = scenes.load(name)
+    (row,) = (row for row in refinement.rows_of(plain) if row.label == "multigrid")
+    scene = refinement.scene_of(name, row)
+    assert scene.preconditioner == "multigrid" and scene.rtol == 1e-5 and scene.name == plain.name
+    changed = set(scene.text.splitlines()) ^ set(plain.text.splitlines())
+    assert {line.split(" = ")[0] for line in changed} <= {"method", "restart", "max_iter", "preconditioner"}
