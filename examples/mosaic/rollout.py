@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 import prdp_torch as prdp
+from prdp_torch.flow import Boundary
 
 
 def rollout(
-    v0: Tensor, viscosity: Tensor, dt: float, steps: int, extent: float, boundary: Sequence[prdp.flow.Boundary]
+    v0: Tensor, viscosity: Tensor, dt: float, steps: int, extent: float, boundary: Sequence[Boundary]
 ) -> Tensor:
     """Follow a flow from the velocity v0 in the centres of the cells to the one after so many steps.
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 from rollout import rollout
-from tesseract_core.runtime import Array, Differentiable, Float32, ShapeDType  # pyright: ignore[reportMissingImports]
+from tesseract_core.runtime import Array, Differentiable, Float32, ShapeDType
 
 
 class InputSchema(BaseModel):
