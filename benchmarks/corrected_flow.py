@@ -11,6 +11,7 @@ import torch
 
 from benchmarks import refinement
 from prdp_torch.experiments import datasets, records, scenes, trajectories, trajectory_charts
+from prdp_torch.experiments.charts import write_png
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SHOWN = ("converged", "auto")  # in the pictures
@@ -37,7 +38,7 @@ def main():
         print(course.title, *(f"{m:.2e} ± {s:.0e}" for m, s in zip(errors.mean(0), errors.std(0), strict=True)))
     shown = trajectories.Trajectories(reference, [courses[label] for label in ("coarse", *SHOWN)], [])
     for name, draw in (("error", trajectory_charts.error_over_time), ("vorticity", trajectory_charts.snapshots)):
-        draw(scene, shown).savefig(RESULTS / f"kolmogorov_{name}.png", dpi=70)
+        write_png(draw(scene, shown), RESULTS / f"kolmogorov_{name}.png", dpi=70)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 
 from prdp_torch import fields
+from prdp_torch.experiments.charts import write_png
 
 DOCS = Path(__file__).parent
 EXAMPLES = DOCS.parent / "examples"
@@ -95,7 +96,7 @@ def main():
         figure = Figure(figsize=(8.5, 3.6), layout="constrained")
         draw(figure)
         path = DOCS / "results" / f"{draw.__name__}.png"
-        figure.savefig(path, dpi=80)
+        write_png(figure, path, dpi=80)
         print(path, path.stat().st_size)
 
 
