@@ -60,6 +60,9 @@ class Physics:
     def equation(self) -> str:
         ...
     @property
+    def force(self) -> torch.Tensor | None:
+        ...
+    @property
     def length(self) -> list[float]:
         ...
     @property
@@ -89,6 +92,9 @@ class Data:
         ...
     @property
     def train(self) -> int:
+        ...
+    @property
+    def trained_steps(self) -> int:
         ...
     @property
     def valid(self) -> int:
@@ -238,7 +244,7 @@ class Dataset:
     def train_end(self) -> torch.Tensor:
         ...
     @property
-    def train_first(self) -> torch.Tensor:
+    def train_between(self) -> torch.Tensor:
         ...
     @property
     def train_start(self) -> torch.Tensor:

@@ -17,17 +17,15 @@ OnData: TypeAlias = Callable[[int, int], None]
 Own: TypeAlias = Any
 """Trajectories: a tensor, whatever `torch.as_tensor` takes, a dataset, or a pair of them."""
 
-TRAINED_STEPS = 2  # that the loss looks ahead
-
 
 class Data(NamedTuple):
     """Training and validation states; each (samples, channels, *shape)."""
 
     train_start: Tensor
-    train_first: Tensor
-    """One step later."""
+    train_between: Tensor
+    """(samples, trained_steps - 1, channels, *shape): the steps between."""
     train_end: Tensor
-    """Two steps later."""
+    """`data.trained_steps` steps later."""
     valid_start: Tensor
     valid_end: Tensor
     """`data.valid_steps` steps later."""
@@ -55,12 +53,13 @@ def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) ->
     if len(pair) != 2:
         raise ValueError(f"train: data must be trajectories, or a pair (training, validation), got {len(pair)} of them")
     train, valid = (_tensor(scene, name, part) for name, part in zip(("data[0]", "data[1]"), pair, strict=True))
-    _check_times("training", train, TRAINED_STEPS)
+    steps = scene.data.trained_steps
+    _check_times("training", train, steps)
     _check_times("validation", valid, scene.data.valid_steps)
-    starts, first, end = (
-        train[:, n : train.shape[1] - TRAINED_STEPS + n].flatten(0, 1) for n in range(TRAINED_STEPS + 1)
+    starts, *between, end = (train[:, n : train.shape[1] - steps + n].flatten(0, 1) for n in range(steps + 1))
+    return Data(
+        starts, torch.stack(between, 1), end, valid[:, 0].contiguous(), valid[:, scene.data.valid_steps].contiguous()
     )
-    return Data(starts, first, end, valid[:, 0].contiguous(), valid[:, scene.data.valid_steps].contiguous())
 
 
 def reference(scene: _C.Scene, steps: int, on_data: OnData | None = None) -> Tensor:
@@ -81,7 +80,7 @@ def export(
         path: of the file, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
         steps: how many steps each has; by default what the training and the validation metric need.
     """
-    steps = max(TRAINED_STEPS, scene.data.valid_steps) if steps is None else steps
+    steps = max(scene.data.trained_steps, scene.data.valid_steps) if steps is None else steps
     trajectories = _C.all_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
     pdebench.write(path, trajectories, scene)
     return tuple(trajectories.shape)

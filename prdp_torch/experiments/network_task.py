@@ -70,7 +70,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torc
 
 
 class _TrainingSamples:
-    """Start, first and end of the training samples: the same in every epoch, or those of `data.fresh`."""
+    """Start, end and the states between of the training samples: the same in every epoch, or those of `data.fresh`."""
 
     def __init__(self, scene: _C.Scene, data: Data) -> None:
         self.count = len(data.train_start)
@@ -84,7 +84,7 @@ class _TrainingSamples:
             self._take(self._fresh.epoch(update // self.updates_per_epoch))
 
     def _take(self, data: Data) -> None:
-        self.start, self.first, self.end = data.train_start, data.train_first, data.train_end
+        self.start, self.between, self.end = data.train_start, data.train_between, data.train_end
 
 
 def _metric(scene: _C.Scene, data: Data, network: torch.nn.Module) -> Callable[[], float]:
@@ -120,19 +120,20 @@ def corrected(stepper: Stepper, network: Callable[[Tensor], Tensor], u: Tensor) 
 
 
 def _corrector(scene: _C.Scene, steppers: list[Stepper], train: _TrainingSamples, network: torch.nn.Module) -> Loss:
-    """The loss of a batch: the network on top of a coarse step, twice."""
-    first, second = steppers
+    """The loss of a batch: the network on top of coarse steps in a row."""
 
     def loss(batch: Tensor) -> Tensor:
-        u1 = corrected(first, network, train.start[batch])
-        u2 = corrected(second, network, u1)
-        if (
-            scene.on_failure == "zero_grad" and first.info and second.info
-        ):  # the network's share is no better than the coarse step below it
-            worst = torch.minimum(first.info.status, second.info.status)
-            u1, u2 = detach_failed(u1, first.info), detach_failed(u2, second.info._replace(status=worst))
-        kind = scene.training.loss
-        return _C.loss(kind, u1, train.first[batch]) + _C.loss(kind, u2, train.end[batch])
+        u, sum_of_steps = train.start[batch], torch.zeros(())
+        worst: Tensor | None = None
+        for number, stepper in enumerate(steppers):
+            seen = u = corrected(stepper, network, u)
+            if scene.on_failure == "zero_grad" and stepper.info:
+                # The network's share is no better than the coarse steps below it.
+                worst = stepper.info.status if worst is None else torch.minimum(worst, stepper.info.status)
+                seen = detach_failed(u, stepper.info._replace(status=worst))
+            reference = train.between[batch, number] if number + 1 < len(steppers) else train.end[batch]
+            sum_of_steps = sum_of_steps + _C.loss(scene.training.loss, seen, reference)
+        return sum_of_steps
 
     return loss
 

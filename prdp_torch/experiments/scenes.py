@@ -5,6 +5,7 @@ from typing import Any
 
 from prdp_torch import solvers, steppers
 from prdp_torch.experiments import _C, field_task
+from prdp_torch.flow import Flow
 from prdp_torch.stepper import Stepper
 
 _PACKAGE = Path(__file__).parents[1]
@@ -57,6 +58,12 @@ def make_stepper(scene: _C.Scene, direct: bool = False, max_iter: int | None = N
         return field_task.make_darcy_step(scene, **options)
     if physics.equation == "poisson":
         return steppers.Poisson(physics.shape, length=physics.length, **options)
+    if physics.force is not None:
+        # As the C++ trainer has it: central differences would make waves grow at these Courant numbers.
+        return Flow(
+            physics.shape, physics.nu, physics.dt, length=physics.length, force=physics.force, advection="upwind",
+            **options,
+        )  # fmt: skip
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
     kind = kinds[physics.equation]
     made: Stepper = kind(physics.shape, physics.nu, physics.dt, length=physics.length, **options)

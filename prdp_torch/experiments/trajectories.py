@@ -65,7 +65,7 @@ def collect(scene: _C.Scene, rows: list[Row], folder: Path, on_data: OnData | No
 def field(scene: _C.Scene, states: Tensor) -> Tensor:
     """What the pictures show of states (time, channels, *shape), as (time, *shape): the vorticity of a flow,
     else the first component."""
-    if scene.physics.equation == "navier_stokes":
+    if scene.task == "corrector":
         states = fields.curl(states, scene.physics.length)
     return states[:, 0]
 

@@ -20,7 +20,6 @@ Contents: TypeAlias = list[tuple[str, np.ndarray]]
 """Names, and fields over time."""
 
 _COARSE = ("#0072b2", "--")
-_SEEN = 2  # steps that the loss covers, in either task
 _STATE, _DIFFERENCE = "RdBu_r", "PuOr_r"  # both safe for colour-blind readers
 _LARGEST_GIF = 2_000_000  # bytes
 
@@ -34,7 +33,7 @@ def pictures(scene: _C.Scene, shown: Trajectories) -> list[Drawn]:
     if len(scene.physics.shape) == 1:
         caption = (
             "Space and time: reference and emulators, in colours that reach to the reference's largest value from "
-            f"t = {_SEEN} on, and on a scale of their own the differences. {first}"
+            f"t = {scene.data.trained_steps} on, and on a scale of their own the differences. {first}"
         )
         drawn.append(("space_time", space_time(scene, shown), caption))
     elif len(scene.physics.shape) == 2:
@@ -48,12 +47,13 @@ def error_over_time(scene: _C.Scene, shown: Trajectories) -> Figure:
     for course in shown.courses:
         steps = range(1, course.errors.shape[1] + 1)
         mean_and_band(axes, steps, course.errors, _name(scene, course), *FIXED.get(course.kind, _COARSE))
-    if scene.data.valid_steps == _SEEN:
+    seen = scene.data.trained_steps
+    if scene.data.valid_steps == seen:
         axes.axvline(
-            _SEEN, color="#888888", lw=1.2, ls="--", zorder=1, label="last step in the loss,\nstep of the metric"
+            seen, color="#888888", lw=1.2, ls="--", zorder=1, label="last step in the loss,\nstep of the metric"
         )
     else:
-        axes.axvline(_SEEN, color="#888888", lw=1.2, ls=":", zorder=1, label="last step in the loss")
+        axes.axvline(seen, color="#888888", lw=1.2, ls=":", zorder=1, label="last step in the loss")
         axes.axvline(scene.data.valid_steps, color="#888888", lw=1.2, ls="--", zorder=1, label="step of the metric")
     axes.set(yscale="log", xlabel=_time(scene), ylabel=",\n".join(error_measure(scene)))
     axes.xaxis.set_major_locator(_whole_steps())
@@ -70,7 +70,7 @@ def space_time(scene: _C.Scene, shown: Trajectories) -> Figure:
     if len(states) == 2:
         (converged, u), (prdp, v) = states
         differences.insert(0, (f"{prdp}\nminus {converged}", v - u))
-    scale = _scale(reference[_SEEN:])
+    scale = _scale(reference[scene.data.trained_steps :])
     farthest = min(scale, max(_scale(content) for _, content in differences))  # one may have blown up
     figure, panels = _grid(2, 1 + len(states), height=6.6)
     for line, contents, colours, limit, label in (
@@ -98,7 +98,7 @@ def snapshots(scene: _C.Scene, shown: Trajectories) -> Figure:
     """The fields in rows, at a few times in columns; a colour scale for each time."""
     contents = _fields(scene, shown)
     metric, last = scene.data.valid_steps, shown.reference.shape[1] - 1
-    times = sorted({_SEEN, metric, 2 * metric, last})
+    times = sorted({scene.data.trained_steps, metric, 2 * metric, last})
     figure, panels = _grid(len(contents), len(times), height=1.2 + 2.1 * len(contents))
     for column, t in zip(panels.T, times, strict=True):
         images = _draw_fields(column, contents, t)
@@ -164,7 +164,7 @@ def _time(scene: _C.Scene) -> str:
 
 
 def _field_name(scene: _C.Scene) -> str:
-    if scene.physics.equation == "navier_stokes":
+    if scene.task == "corrector":
         return "vorticity ∂u₂/∂x − ∂u₁/∂y"
     return "u₁" if scene.physics.channels > 1 else "u"
 

@@ -31,7 +31,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def tensors(data):
-    return [data.train_start, data.train_first, data.train_end, data.valid_start, data.valid_end]
+    return [data.train_start, data.train_between, data.train_end, data.valid_start, data.valid_end]
 
 
 def no_solve(done, total):
@@ -81,7 +81,7 @@ def test_data_are_made_once_and_read_from_then_on(tmp_path, cache):
     again = _C.make_dataset(scenes.load(tiny(tmp_path, ("seeds = 1", "seeds = 2"))), no_solve)
     assert file.stat().st_mtime_ns == before
     assert all(torch.equal(a, b) for a, b in zip(tensors(once), tensors(again), strict=True))
-    assert once.train_first.shape == (8, 3, 8, 8) and once.valid_end.shape == (2, 3, 8, 8)
+    assert once.train_between.shape == (8, 1, 3, 8, 8) and once.valid_end.shape == (2, 3, 8, 8)
     assert once.train_start.dtype == torch.float32
 
 
@@ -183,7 +183,9 @@ def test_the_loss_is_that_of_both_times_and_its_gradient_passes_the_second_solve
             u1 = u1 + network(u1)
             u2 = exact(u1)
             u2 = u2 + network(u2)
-            return float((u1 - data.train_first[batch]).square().mean() + (u2 - data.train_end[batch]).square().mean())
+            return float(
+                (u1 - data.train_between[batch, 0]).square().mean() + (u2 - data.train_end[batch]).square().mean()
+            )
 
     loss = loss_of(batch)
     assert float(loss.detach()) == pytest.approx(written_out(), rel=1e-9)

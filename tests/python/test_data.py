@@ -143,7 +143,9 @@ def test_every_state_of_a_longer_trajectory_is_a_start(tmp_path):
     data = datasets.of_scene(scene, states)
     first = data.train_start[:, 0, 0]
     assert len(first) == 50 * 4 and set(first.tolist()) == {6.0 * i + t for i in range(50) for t in range(4)}
-    assert torch.equal(data.train_first, data.train_start + 1) and torch.equal(data.train_end, data.train_start + 2)
+    assert torch.equal(data.train_between[:, 0], data.train_start + 1) and torch.equal(
+        data.train_end, data.train_start + 2
+    )
     assert torch.equal(data.valid_start, states[50:, 0]) and torch.equal(data.valid_end, states[50:, 2])
 
 
@@ -152,7 +154,7 @@ def test_a_corrector_takes_trajectories_too(tmp_path):
     states = _C.all_trajectories(scene, 5)
     made = datasets.of_scene(scene)
     own = datasets.of_scene(scene, (states[:8, :3], states[8:]))
-    for name in ("train_start", "train_first", "train_end", "valid_start", "valid_end"):
+    for name in ("train_start", "train_between", "train_end", "valid_start", "valid_end"):
         torch.testing.assert_close(getattr(own, name), getattr(made, name), rtol=0, atol=0)
     assert math.isfinite(train(scene, Refinement.constant(2), data=states)["metric"][-1])
 

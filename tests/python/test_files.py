@@ -348,7 +348,7 @@ def test_emulators_whose_data_take_long_are_cached(tmp_path):
         raise AssertionError("the data were made again")
 
     again = _C.make_dataset(scene, no_solve)
-    assert torch.equal(once.train_end, again.train_end) and again.train_first is None
+    assert torch.equal(once.train_end, again.train_end) and again.train_between is None
     _C.make_dataset(scenes.load("heat_1d"))
     assert len(list((tmp_path / "cache").iterdir())) == 1
     other = Path(shutil.copy(path, tmp_path / "modes.toml"))

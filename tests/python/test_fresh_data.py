@@ -41,9 +41,9 @@ def test_a_corrector_gets_its_first_step_too(tmp_path):
     data = _C.make_dataset(scene)
     source = _C.FreshData(scene, data)
     one, other = source.epoch(0), source.epoch(1)
-    assert torch.equal(one.train_first, data.train_first)
-    assert one.train_first.shape == other.train_first.shape == one.train_start.shape
-    assert not torch.equal(one.train_first, other.train_first)
+    assert torch.equal(one.train_between, data.train_between)
+    assert one.train_between[:, 0].shape == other.train_between[:, 0].shape == one.train_start.shape
+    assert not torch.equal(one.train_between, other.train_between)
 
 
 def test_the_end_does_not_wait_for_the_next_epoch(tmp_path):

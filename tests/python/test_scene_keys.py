@@ -124,6 +124,7 @@ def test_the_defaults_are_those_of_a_scene_without_the_keys():
         ("solver", "preconditioner"): f"`{scene.preconditioner or 'none'}`",
         ("data", "file"): scene.data.file or "none",
         ("data", "fresh"): f"`{str(scene.data.fresh).lower()}`",
+        ("data", "trained_steps"): str(scene.data.trained_steps),
         ("network", "zero_output"): f"`{str(scene.network.zero_output).lower()}`",
         ("prdp", "growth"): f"{scene.prdp['growth']:g}",
         ("prdp", "maximum"): str(scene.prdp["maximum"]).lower(),

@@ -7,7 +7,8 @@
 namespace prdp {
 
 /// A flow (batch, 3, Ny, Nx) with the mean of its pressure taken off, which the flow does not determine.
-/// A cotangent without it passes through an implicit solve, which refuses one with a mean.
+/// A cotangent without it passes through an implicit solve, which refuses one with a mean. A velocity alone, of two
+/// channels, stays as it is.
 at::Tensor without_mean_pressure(const at::Tensor& u);
 
 /// One implicit Euler step of the incompressible Navier-Stokes equations in two dimensions, periodic,

@@ -12,7 +12,7 @@ using namespace prdp;
 void bind_data(py::module_& m) {
   py::class_<Dataset>(m, "Dataset")
       .def_readonly("train_start", &Dataset::train_start)
-      .def_readonly("train_first", &Dataset::train_first)
+      .def_readonly("train_between", &Dataset::train_between)
       .def_readonly("train_end", &Dataset::train_end)
       .def_readonly("valid_start", &Dataset::valid_start)
       .def_readonly("valid_end", &Dataset::valid_end);

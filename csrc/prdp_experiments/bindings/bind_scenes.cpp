@@ -2,6 +2,7 @@
 
 #include "bindings/convert.h"
 #include "prdp_experiments/bindings/bindings.h"
+#include "prdp_experiments/data/kolmogorov.h"
 #include "prdp_experiments/scenes/scene.h"
 
 namespace py = pybind11;
@@ -13,6 +14,8 @@ void bind_scenes(py::module_& m) {
       .def_readonly("shape", &Scene::Physics::shape)
       .def_readonly("nu", &Scene::Physics::nu)
       .def_readonly("dt", &Scene::Physics::dt)
+      .def_property_readonly(
+          "force", [](const Scene::Physics& p) { return p.is_kolmogorov() ? kolmogorov_force(p) : at::Tensor(); })
       .def_property_readonly("length",
                              [](const Scene::Physics& p) {
                                return p.lengths.empty() ? std::vector<double>(p.shape.size(), 1.0) : p.lengths;
@@ -27,6 +30,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("train", &Scene::Data::train)
       .def_readonly("valid", &Scene::Data::valid)
       .def_readonly("seed", &Scene::Data::seed)
+      .def_readonly("trained_steps", &Scene::Data::trained_steps)
       .def_readonly("valid_steps", &Scene::Data::valid_steps)
       .def_readonly("valid_max_iter", &Scene::Data::valid_max_iter)
       .def_readonly("reference_shape", &Scene::Data::reference_shape);

@@ -56,11 +56,9 @@ at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_
   return values.reshape(shape).to(dtype);
 }
 
-at::Tensor converged_step(Stepper& reference, const at::Tensor& u) {
-  auto next = reference(u);
+void check_converged(const StepperBase& reference) {
   TORCH_CHECK(reference.converged(), "data: a reference solve stopped at a residual of ",
               reference.info()->residual.max().item<double>(), "; the scene's dt is too long for it");
-  return next;
 }
 
 namespace {
@@ -71,8 +69,10 @@ at::Tensor starts(const Scene& scene, int64_t samples) {
   const auto& d = scene.data;
   TORCH_CHECK_VALUE(d.file.empty(), "data.file: only the Python trainer reads HDF5 and .npz; run prdp train ",
                     scene.path);
-  if (scene.task == Scene::Task::kCorrector)
-    return random_flow(d.reference_shape, samples, d.seed, scene.physics.lengths);
+  if (scene.task == Scene::Task::kCorrector) {
+    const auto u = random_flow(d.reference_shape, samples, d.seed, scene.physics.lengths);
+    return scene.physics.is_kolmogorov() ? u.narrow(1, 0, 2) : u;
+  }
   return fourier_series(scene.physics, samples, d.modes, d.seed, at::kDouble);
 }
 
@@ -124,29 +124,29 @@ OnSteps counted(int64_t total, const OnProgress& on_progress) {
 
 namespace {
 
-constexpr int64_t kTrainedSteps = 2;  // that the loss looks ahead
-
 at::Tensor at_time(const at::Tensor& states, int64_t t) { return states.select(1, t).contiguous(); }
 
 Dataset training_samples(const Scene& scene, const at::Tensor& start, const OnSteps& on_steps) {
-  const auto states = follow(scene, start, kTrainedSteps, on_steps);
+  const int64_t steps = scene.data.trained_steps;
+  const auto states = follow(scene, start, steps, on_steps);
   Dataset data;
   data.train_start = at_time(states, 0);
-  data.train_end = at_time(states, kTrainedSteps);
-  if (scene.task == Scene::Task::kCorrector) data.train_first = at_time(states, 1);
+  data.train_end = at_time(states, steps);
+  if (scene.task == Scene::Task::kCorrector) data.train_between = states.slice(1, 1, steps).contiguous();
   return data;
 }
 
 }  // namespace
 
 Dataset compute_training_samples(const Scene& scene, const OnProgress& on_progress) {
-  const int64_t samples = scene.data.train;
-  return training_samples(scene, starts(scene, samples), counted(kTrainedSteps * samples, on_progress));
+  const auto& d = scene.data;
+  return training_samples(scene, starts(scene, d.train), counted((d.spin_up + d.trained_steps) * d.train, on_progress));
 }
 
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto& d = scene.data;
-  const auto on_steps = counted(kTrainedSteps * d.train + d.valid_steps * d.valid, on_progress);
+  const auto on_steps =
+      counted((d.spin_up + d.trained_steps) * d.train + (d.spin_up + d.valid_steps) * d.valid, on_progress);
   const auto start = starts(scene, d.train + d.valid);
   auto data = training_samples(scene, start.narrow(0, 0, d.train), on_steps);
   const auto valid = follow(scene, start.narrow(0, d.train, d.valid), d.valid_steps, on_steps);
@@ -168,7 +168,7 @@ at::Tensor trajectories_of(const char* who, const Scene& scene, int64_t first, i
   TORCH_CHECK_VALUE(scene.trains_network(), who, ": the task trains no network and has no samples");
   TORCH_CHECK_VALUE(steps >= 0, who, ": steps must be >= 0, got ", steps);
   return follow(scene, starts(scene, scene.data.train + scene.data.valid).narrow(0, first, samples), steps,
-                counted(steps * samples, on_progress));
+                counted((scene.data.spin_up + steps) * samples, on_progress));
 }
 
 }  // namespace

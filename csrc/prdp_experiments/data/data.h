@@ -13,18 +13,25 @@ namespace prdp {
 at::Tensor fourier_series(const Scene::Physics& physics, int64_t samples, int64_t modes, int64_t seed,
                           at::ScalarType dtype);
 
-/// One step of the reference solver. Raises RuntimeError if its solve does not converge.
-at::Tensor converged_step(Stepper& reference, const at::Tensor& u);
+/// Raises RuntimeError if the last solve of the reference solver did not converge.
+void check_converged(const StepperBase& reference);
+/// One step of the reference solver, checked.
+template <class Step>
+at::Tensor converged_step(Step& reference, const at::Tensor& u) {
+  auto next = reference(u);
+  check_converged(reference);
+  return next;
+}
 
 /// Called while data are made, with the number of steps done and of all steps. Steps are counted per sample.
 using OnProgress = std::function<void(int64_t, int64_t)>;
 
 /// The samples of a scene: initial states, and the states after converged steps from them, each
-/// (samples, channels, *shape). Training samples make two steps, validation samples data.valid_steps. Of "darcy" the
-/// states are pressures and log κ in turn.
+/// (samples, channels, *shape). Training samples make data.trained_steps, validation samples data.valid_steps. Of
+/// "darcy" the states are pressures and log κ in turn.
 struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
-  at::Tensor train_first;  // after one step; only for the task "corrector"
+  at::Tensor train_between;  // (samples, trained_steps - 1, channels, *shape); only for the task "corrector"
 };
 /// Makes the samples of a scene. Flows in two dimensions take seconds to minutes, because their reference solves are
 /// iterative. Their data are kept on disk (data_cache.h).

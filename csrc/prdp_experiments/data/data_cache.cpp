@@ -15,7 +15,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr int kFormat = 3;
+constexpr int kFormat = 4;
 
 fs::path cache_folder() {
   const char *chosen = std::getenv("PRDP_CACHE"), *home = std::getenv("HOME");
@@ -34,20 +34,24 @@ TensorMap tensors_of(const Dataset& d) {
                     {"train_end", d.train_end},
                     {"valid_start", d.valid_start},
                     {"valid_end", d.valid_end}};
-  if (d.train_first.defined()) tensors["train_first"] = d.train_first;
+  if (d.train_between.defined()) tensors["train_between"] = d.train_between;
   return tensors;
 }
 
 Dataset dataset_of(Saved saved, const Scene& scene) {
-  const auto states = [&](const char* name, int64_t samples) {
-    std::vector<int64_t> sizes{samples, scene.physics.channels()};
+  const auto states = [&](const char* name, std::vector<int64_t> sizes) {
+    sizes.push_back(scene.physics.channels());
     sizes.insert(sizes.end(), scene.physics.shape.begin(), scene.physics.shape.end());
     return saved.take(name, scene.dtype, sizes);
   };
   const auto [train, valid] = std::pair(scene.data.train, scene.data.valid);
-  Dataset data{states("train_start", train), states("train_end", train), states("valid_start", valid),
-               states("valid_end", valid),
-               scene.task == Scene::Task::kCorrector ? states("train_first", train) : at::Tensor()};
+  Dataset data{states("train_start", {train}),
+               states("train_end", {train}),
+               states("valid_start", {valid}),
+               states("valid_end", {valid}),
+               {}};
+  if (scene.task == Scene::Task::kCorrector)
+    data.train_between = states("train_between", {train, scene.data.trained_steps - 1});
   saved.finish();
   return data;
 }

@@ -3,6 +3,7 @@
 #include <numbers>
 
 #include "prdp/grid/grid.h"
+#include "prdp_experiments/data/kolmogorov.h"
 
 namespace prdp {
 
@@ -54,16 +55,36 @@ at::Tensor random_flow(const std::vector<int64_t>& shape, int64_t samples, int64
 
 at::Tensor downsample(const at::Tensor& u) { return u.slice(-2, 1, std::nullopt, 2).slice(-1, 1, std::nullopt, 2); }
 
-at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
+namespace {
+
+/// A step of the scene on the finer grid, and a state of that on the scene's grid.
+struct Reference {
+  std::function<at::Tensor(const at::Tensor&)> step, coarse;
+};
+
+Reference make_reference(const Scene& scene) {
+  if (scene.physics.is_kolmogorov()) {
+    const auto flow = std::make_shared<KolmogorovReference>(scene);
+    return {[flow](const at::Tensor& u) { return flow->step(u); },
+            [flow](const at::Tensor& u) { return flow->coarse(u); }};
+  }
   auto fine = scene;
   fine.physics.shape = scene.data.reference_shape;
-  auto reference = fine.stepper(fine.reference_solver());
+  const auto stepper = std::make_shared<Stepper>(fine.stepper(fine.reference_solver()));
+  return {[stepper](const at::Tensor& u) { return converged_step(*stepper, u); }, downsample};
+}
+
+}  // namespace
+
+at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
+  const auto reference = make_reference(scene);
   std::vector<at::Tensor> parts;
   for (auto u : start.split(kSamplesAtOnce)) {
-    std::vector<at::Tensor> states{downsample(u)};
-    for (int64_t i = 0; i < steps; ++i) {
-      u = converged_step(reference, u);
-      states.push_back(downsample(u));
+    std::vector<at::Tensor> states;
+    for (int64_t i = -scene.data.spin_up; i <= steps; ++i) {
+      if (i >= 0) states.push_back(reference.coarse(u));
+      if (i == steps) break;
+      u = reference.step(u);
       on_steps(u.size(0));
     }
     parts.push_back(at::stack(states, 1));

@@ -15,9 +15,9 @@ at::Tensor downsample(const at::Tensor& u);
 /// Called with the number of samples that have just made a step.
 using OnSteps = std::function<void(int64_t)>;
 
-/// The reference of the task "corrector": `steps` converged steps from `start` on the grid data.reference_shape,
-/// downsampled to physics.shape. Returns all states, the start included, (samples, steps + 1, 3, Ny, Nx). Raises
-/// RuntimeError if a reference solve does not converge.
+/// The reference of the task "corrector": `steps` converged steps on the grid data.reference_shape, brought to
+/// physics.shape, after data.spin_up steps from `start`. Returns all states from there on, (samples, steps + 1,
+/// channels, Ny, Nx). Raises RuntimeError if a reference solve does not converge.
 at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps);
 
 }  // namespace prdp

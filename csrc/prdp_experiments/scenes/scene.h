@@ -22,11 +22,15 @@ struct Scene {
     std::string equation;
     std::vector<int64_t> shape;
     double nu = 0.0, dt = 0.0;  // length²/time, time; poisson and darcy have neither, diffusion no nu
+    double amplitude = 0.0;  // of the force of kolmogorov, length/time²
+    int64_t waves = 0;       // of it along y
     std::vector<double> lengths{};  // the sides of the domain, as a Grid takes them: empty where all are 1
 
     bool periodic() const;  // of the grid
     /// -∇·(κ ∇p) = f on the cells of a box, p = 0 on its sides: no time, and no unknowns on a boundary's neighbours.
     bool is_darcy() const { return equation == "darcy"; }
+    /// A flow of two velocities that a wave of force drives: the steps of prdp::Flow.
+    bool is_kolmogorov() const { return equation == "kolmogorov"; }
     /// The side of the domain along an axis of `shape`.
     double length(int64_t axis) const { return lengths.empty() ? 1.0 : lengths[axis]; }
     /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
@@ -45,6 +49,8 @@ struct Scene {
     // empty if there is none. Only the Python trainer reads it.
     std::string file{};
     bool fresh = false;  // new training samples in every epoch (fresh_data.h)
+    int64_t trained_steps = 2;  // that the loss looks ahead
+    int64_t spin_up = 0;  // steps before the first state of a sample
   };
   struct Network {
     std::string python{};  // "module:Class" of the Python trainer, in place of all the rest
@@ -103,7 +109,7 @@ struct Scene {
 
   bool trains_network() const { return task == Task::kEmulator || task == Task::kCorrector; }
   /// How many steps an update makes one after the other. K is the budget of each of their solves.
-  int64_t executions() const { return task == Task::kCorrector ? 2 : 1; }
+  int64_t executions() const { return task == Task::kCorrector ? data.trained_steps : 1; }
   /// The solver of data and references: exact if that is cheap, otherwise iterative, with an error below the rounding
   /// of float32.
   Solver reference_solver() const;

@@ -19,6 +19,7 @@ namespace {
 using Task = Scene::Task;
 
 When corrector(const Scene& s) { return {s.task == Task::kCorrector, "only for `corrector`"}; }
+When kolmogorov(const Scene& s) { return {s.physics.is_kolmogorov(), "only for `kolmogorov`"}; }
 When field(const Scene& s) { return {s.task == Task::kField, "only for `field`"}; }
 When parameters(const Scene& s) { return {s.task == Task::kParameters, "only for `parameters`"}; }
 When network(const Scene& s) { return {s.trains_network(), "only for `emulator` and `corrector`"}; }
@@ -47,6 +48,7 @@ void read_physics(Section& s, Scene& scene) {
       {"heat", grid},
       {"burgers", grid},
       {"navier_stokes", corrector(scene)},
+      {"kolmogorov", corrector(scene)},
       {"diffusion", field(scene)},
       {"darcy", {field(scene).holds || scene.task == Task::kEmulator, "only for `field` and `emulator`"}}};
   s.choice(p.equation, equations, {"equation", "the equation"});
@@ -65,12 +67,15 @@ void read_physics(Section& s, Scene& scene) {
   const When has_dt{p.equation != "poisson" && !p.is_darcy(), "not for `poisson` and `darcy`"};
   s.at_least(p.nu, 0.0, {"nu", "viscosity or diffusivity", "length²/time", has_nu});
   s.above(p.dt, 0.0, {"dt", "time step", "time", has_dt});
+  s.above(p.amplitude, 0.0,
+          {"amplitude", "largest acceleration by the force, along x", "length/time²", kolmogorov(scene)});
+  s.whole(p.waves, 1, {"waves", "waves of the force along y", "", kolmogorov(scene)});
 }
 
 template <class Section>
 void read_solver(Section& s, Scene& scene) {
   const When spectrum{!scene.physics.periodic() && !scene.physics.is_darcy(), "only for `heat` and `poisson`"};
-  const When coarse_grids{!corrector(scene).holds, "not for `navier_stokes`"};
+  const When coarse_grids{scene.physics.equation != "navier_stokes", "not for `navier_stokes`"};
   Choices methods;
   for (const auto& method : kTraits)
     methods.emplace_back(method.name.data(), method.made_for == MadeFor::kKnownSpectrum ? spectrum
@@ -95,6 +100,19 @@ void read_solver(Section& s, Scene& scene) {
 }
 
 template <class Section>
+void check_finer(Section& s, const Scene& scene, bool given) {
+  const auto &reference = scene.data.reference_shape, &coarse = scene.physics.shape;
+  const bool multiple = scene.physics.is_kolmogorov();
+  const auto is_finer = [&](int64_t fine, int64_t n) {
+    return multiple ? fine % n == 0 && fine / n == reference[0] / coarse[0] : fine == 2 * n + 1;
+  };
+  s.check(!given || std::equal(reference.begin(), reference.end(), coarse.begin(), coarse.end(), is_finer),
+          "reference_shape",
+          multiple ? "expected the same multiple of each N of physics.shape"
+                   : "expected 2 N + 1 for each N of physics.shape");
+}
+
+template <class Section>
 void read_data(Section& s, Scene& scene) {
   auto& d = scene.data;
   const When in_time{!scene.physics.is_darcy(), "not for `darcy`"};
@@ -106,11 +124,22 @@ void read_data(Section& s, Scene& scene) {
   const When random{d.file.empty(), "not with `file`"};
   const When emulator{scene.task == Task::kEmulator, "only for `emulator`"};
   const When flow = corrector(scene) && random;
-  s.wholes(d.reference_shape, 1,
-           {"reference_shape", "grid of the reference solution: 2 N + 1 for each N of `physics.shape`", "", flow});
-  auto finer = scene.physics.shape;
-  for (auto& n : finer) n = 2 * n + 1;
-  s.check(!flow.holds || d.reference_shape == finer, "reference_shape", "expected 2 N + 1 for each N of physics.shape");
+  s.wholes(
+      d.reference_shape, 1,
+      {"reference_shape",
+       "grid of the reference solution: 2 N + 1 for each N of `physics.shape`; for `kolmogorov` the same multiple of "
+       "each N",
+       "", flow});
+  check_finer(s, scene, flow.holds);
+  s.count(d.spin_up, 0,
+          {"spin_up", "how far random flows are followed before the data begin", "time steps",
+           kolmogorov(scene) && random});
+  s.whole(d.trained_steps, 2,
+          {.name = "trained_steps",
+           .means = "how many steps in a row the loss covers",
+           .unit = "time steps",
+           .when = corrector(scene),
+           .optional = true});
   s.whole(d.modes, 1,
           {"modes", "sine and cosine modes of the random initial states; of `darcy` of log κ", "", emulator && random});
   s.whole(d.seed, 0, {"seed", "seed of the data; every training of the scene uses the same data", "", random});

@@ -3,6 +3,7 @@
 #include <memory>
 
 #include "prdp_experiments/data/darcy.h"
+#include "prdp_experiments/data/kolmogorov.h"
 #include "prdp_experiments/scenes/scene.h"
 
 namespace prdp::train {
@@ -23,6 +24,8 @@ SceneStep scene_step(Step step) {
 }
 inline SceneStep scene_step(const Scene& scene, Solver solver) {
   if (scene.physics.is_darcy()) return scene_step(darcy_step(scene.physics, scene.options(std::move(solver))));
+  if (scene.physics.is_kolmogorov())
+    return scene_step(kolmogorov_step(scene.physics, scene.options(std::move(solver))));
   return scene_step(scene.stepper(std::move(solver)));
 }
 

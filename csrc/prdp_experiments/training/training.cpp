@@ -275,15 +275,20 @@ Objective corrector(const Scene& scene, Steppers& steppers, const Dataset& data,
   };
   const bool zero_grad = scene.on_failure == OnFailure::kZeroGrad;
   const auto loss_of = [&, corrected, zero_grad](const at::Tensor& batch) {
-    auto u1 = corrected(steppers[0], data.train_start.index_select(0, batch));
-    auto u2 = corrected(steppers[1], u1);
-    if (zero_grad) {  // the network's share of a prediction is no better than the coarse step below it
-      const auto &first = steppers[0].info()->status, &second = steppers[1].info()->status;
-      u1 = detach_failed(u1, first);
-      u2 = detach_failed(u2, at::minimum(first, second));
+    auto u = data.train_start.index_select(0, batch);
+    at::Tensor sum, worst;
+    for (size_t i = 0; i < steppers.size(); ++i) {
+      u = corrected(steppers[i], u);
+      const auto& status = steppers[i].info()->status;
+      worst = i == 0 ? status : at::minimum(worst, status);
+      // The network's share of a prediction is no better than the coarse steps below it.
+      const auto seen = zero_grad ? detach_failed(u, worst) : u;
+      const auto reference =
+          i + 1 < steppers.size() ? data.train_between.select(1, static_cast<int64_t>(i)) : data.train_end;
+      const auto added = loss(scene.training.loss, seen, reference.index_select(0, batch));
+      sum = i == 0 ? added : sum + added;
     }
-    return loss(scene.training.loss, u1, data.train_first.index_select(0, batch)) +
-           loss(scene.training.loss, u2, data.train_end.index_select(0, batch));
+    return sum;
   };
   auto solver = scene.solver;
   solver.max_iter = scene.data.valid_max_iter;
@@ -312,8 +317,8 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
   const auto updates = [&](int64_t update, const OnUpdate& on_update) {
     if (scene.data.fresh) {
       const auto samples = fresh.epoch(update / updates_of_epoch);
-      std::tie(data.train_start, data.train_first, data.train_end) =
-          std::tie(samples.train_start, samples.train_first, samples.train_end);
+      std::tie(data.train_start, data.train_between, data.train_end) =
+          std::tie(samples.train_start, samples.train_between, samples.train_end);
     }
     for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
