@@ -32,15 +32,15 @@ class Reader {
     return matrix;
   }
 
-  /// Whether every point couples to its neighbours as the matrices say.
+  /// Whether every point couples to its neighbours as the matrices say, which the first row of each axis agrees with.
   bool agrees_with(const SumOverAxes& sum) const {
+    const double first = sum[0](0, 0) + sum[1](0, 0);
     for (int64_t r = 0; r < a_.rows(); ++r) {
       const int64_t z = r / n_[1], y = r % n_[1];
-      const double centre = sum[0](z, z) + sum[1](y, y);
-      if (!row_is(r, 0, [&](int64_t i) { return centre + sum[2](i, i); })) return false;
+      if (!is_first_row(r, 0, sum[0](z, z) + sum[1](y, y) - first)) return false;
       for (const int64_t step : {-1, 1}) {
-        if (!row_is(r, place_of(2, step), [&](int64_t i) { return coupling(sum[2], 2, i, step); })) return false;
-        if (!row_is_constant(sum[1], 1, y, r, step) || !row_is_constant(sum[0], 0, z, r, step)) return false;
+        if (!is_first_row(r, place_of(2, step), 0.0)) return false;
+        if (!is_constant(r, sum[1], 1, y, step) || !is_constant(r, sum[0], 0, z, step)) return false;
       }
     }
     return true;
@@ -54,22 +54,28 @@ class Reader {
     const int64_t row = axis == 0 ? i * n_[1] : axis == 1 ? i : 0;
     return static_cast<double>(a_.value(row, k, axis == 2 ? i : 0));
   }
-  double coupling(const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {
-    const auto j = neighbour(i, step, n_[axis], a_.grid().periodic[axis]);
-    return j < 0 ? 0.0 : matrix(i, j);
+  /// Whether coefficient k of row r is that of the first row, and `more`.
+  bool is_first_row(int64_t r, int64_t k, double more) const {
+    const int64_t last = n_[2] - 1;
+    for (const int64_t end : {int64_t{0}, last})
+      if (!(std::abs(a_.value(r, k, end) - a_.value(0, k, end) - more) <= slack_)) return false;
+    const T *row = a_.coefficient(r, k), *first = a_.coefficient(0, k);
+    return all_within(1, last, [&, added = static_cast<T>(more)](int64_t i) { return row[i] - first[i] - added; });
   }
-  bool row_is_constant(const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t r, int64_t step) const {
+  /// Whether the coefficient of the neighbour along another axis than x is the same at all points of a row.
+  bool is_constant(int64_t r, const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {
     if (n_[axis] == 1) return true;
     const auto j = neighbour(i, step, n_[axis], a_.grid().periodic[axis]);
-    // What points beyond the grid couples to nothing.
-    return j < 0 || row_is(r, place_of(axis, step), [value = matrix(i, j)](int64_t) { return value; });
+    if (j < 0) return true;  // what points beyond the grid couples to nothing
+    const T* row = a_.coefficient(r, place_of(axis, step));
+    return all_within(0, n_[2], [row, value = static_cast<T>(matrix(i, j))](int64_t x) { return row[x] - value; });
   }
-  template <class Wanted>
-  bool row_is(int64_t r, int64_t k, const Wanted& wanted) const {
-    double farthest = 0.0;
-    for (int64_t i = 0; i < n_[2]; ++i)
-      farthest = std::max(farthest, std::abs(static_cast<double>(a_.value(r, k, i)) - wanted(i)));
-    return farthest <= slack_;
+  template <class Difference>
+  bool all_within(int64_t first, int64_t end, const Difference& difference) const {
+    const auto slack = static_cast<T>(slack_);
+    int farther = 0;  // no early return, so that it becomes vector code
+    for (int64_t i = first; i < end; ++i) farther |= !(std::abs(difference(i)) <= slack);
+    return farther == 0;
   }
 
   const StencilRows<T>& a_;

@@ -32,8 +32,12 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
 
 }  // namespace
 
-SingularOperator::SingularOperator(std::unique_ptr<Operator> a, at::Tensor right, at::Tensor left, const char* title)
-    : a_(std::move(a)), right_{right.detach(), {}}, left_{left.detach(), {}}, title_(title) {
+SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title)
+    : a_(std::move(a)),
+      spec_(spec),
+      right_{spec.tensors[spec.tensors.size() - 2].detach(), {}},
+      left_{spec.tensors.back().detach(), {}},
+      title_(title) {
   TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
                     ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
                     left_.count());
@@ -93,14 +97,52 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
   }
 }
 
+namespace {
+
+/// An operator by its numbers and tensors, as these were.
+class Remembered {
+ public:
+  void take(const OperatorSpec& spec, at::ScalarType dtype) {
+    tensors_.clear();
+    for (const auto& t : spec.tensors) {
+      if (t.is_inference()) return;  // its version is not counted
+      tensors_.emplace_back(t.getIntrusivePtr(), t._version());
+    }
+    kind_ = spec.kind;
+    shape_ = spec.shape;
+    parameters_ = spec.parameters;
+    dtype_ = dtype;
+  }
+  bool is(const OperatorSpec& spec, at::ScalarType dtype) const {
+    if (tensors_.empty() || tensors_.size() != spec.tensors.size()) return false;
+    for (size_t i = 0; i < tensors_.size(); ++i) {
+      const auto& [tensor, version] = tensors_[i];
+      const auto& t = spec.tensors[i];
+      if (tensor.lock().get() != t.unsafeGetTensorImpl() || version != t._version()) return false;
+    }
+    return kind_ == spec.kind && shape_ == spec.shape && parameters_ == spec.parameters && dtype_ == dtype;
+  }
+
+ private:
+  std::vector<std::pair<c10::weak_intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>, uint32_t>> tensors_;
+  std::string kind_;
+  std::vector<int64_t> shape_;
+  std::vector<double> parameters_;
+  at::ScalarType dtype_{};
+};
+
+}  // namespace
+
 void SingularOperator::check_null_spaces(const at::Tensor& b) const {
-  if (b.numel() == 0) return;
+  static thread_local Remembered checked;
+  if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
   const at::NoGradGuard no_grad;
   // How large products can be: that of a vector which changes its sign from point to point.
   const auto alternating = 1.0 - 2.0 * at::arange(by_channel(b).size(-1), b.options()).remainder(2.0);
   const double magnitude = largest(apply_on_loops(*a_, as_vector(alternating, b), /*transpose=*/false));
   check_is_mapped_to_zero(right_, b, magnitude, /*transposed=*/false);
   check_is_mapped_to_zero(left_, b, magnitude, /*transposed=*/true);
+  checked.take(spec_, b.scalar_type());
 }
 
 namespace {
@@ -143,7 +185,7 @@ std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda,
 
 std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
   auto chosen = a_->select(index);
-  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), right_.given, left_.given, title_) : nullptr;
+  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), spec_, title_) : nullptr;
 }
 
 std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {

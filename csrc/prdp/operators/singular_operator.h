@@ -11,13 +11,15 @@ namespace prdp {
 /// bases.
 class SingularOperator final : public Operator {
  public:
-  /// `right` and `left`: (k, *shape), the same for every sample, and for every channel that a vector (batch, channel,
-  /// *shape) has; empty for the constant vector. Raises ValueError if they do not fit each other.
-  SingularOperator(std::unique_ptr<Operator> a, at::Tensor right, at::Tensor left, const char* title);
+  /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are (k, *shape), the same for
+  /// every sample, and for every channel that a vector (batch, channel, *shape) has; empty for the constant vector.
+  /// Raises ValueError if they do not fit each other.
+  SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title);
 
   void check_vector(const at::Tensor& b) const override;
   void check_parameters() const override { a_->check_parameters(); }
-  /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero.
+  /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero. Of the operator that this thread
+  /// checked last, it is known.
   void check_null_spaces(const at::Tensor& b) const override;
 
   /// Without what rounding leaves along the null space, which would add up in the residuals that a method carries on.
@@ -53,6 +55,7 @@ class SingularOperator final : public Operator {
   void check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude, bool transposed) const;
 
   std::unique_ptr<Operator> a_;
+  OperatorSpec spec_;
   Basis right_, left_;
   const char* title_;
 };
@@ -65,9 +68,8 @@ template <class T>
 std::unique_ptr<Operator> make_singular(const OperatorSpec& spec, const char* title) {
   TORCH_CHECK_VALUE(spec.tensors.size() >= 2, title, ": its null spaces are missing");
   OperatorSpec regular = spec;
-  const auto left = regular.tensors.back(), right = *(regular.tensors.end() - 2);
   regular.tensors.resize(spec.tensors.size() - 2);
-  return std::make_unique<SingularOperator>(std::make_unique<T>(regular), right, left, title);
+  return std::make_unique<SingularOperator>(std::make_unique<T>(regular), spec, title);
 }
 
 }  // namespace prdp
