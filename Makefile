@@ -4,6 +4,7 @@
 # make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
 # make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
+# make records  the records of the documentation again, with its pictures and tables: a day on one core, and it goes on where it stopped
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -14,7 +15,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs tidy sanitize fuzz bench-peers clean
+.PHONY: demo test docs tidy sanitize fuzz bench-peers records clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -37,6 +38,11 @@ bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	.venv-peers/bin/python -m prdp_torch bench
+
+records: $(STAMPS)/configure
+	$(BIN)/cmake --build build --parallel $$(nproc) --target python
+	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
+	$(BIN)/python -m benchmarks.records
 
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)

@@ -99,7 +99,7 @@ def accuracy_table(points):
 def large_table(points):
     rows = [["unknowns", "solver", "first solve, s", "one more, s", "iterations", "residual", "status"]]
     for p in points:
-        rows.append([f"{p['side']}²", p["solver"], f"{p['seconds']:.3g}", f"{p['again']:.3g}", p["iterations"],
+        rows.append([p["grid"], p["solver"], f"{p['seconds']:.3g}", f"{p['again']:.3g}", p["iterations"],
                      f"{p['residual']:.1e}", p["status"]])  # fmt: skip
     return rows
 

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks import page, refinement_charts
+from benchmarks.atlas import MAPS
 from prdp_torch.experiments import charts, scenes
-from prdp_torch.experiments.atlas import MAPS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -120,7 +120,7 @@ def test_readings_are_taken_in_turn():
 
 
 def test_all_suites_run_and_leave_a_page(tmp_path):
-    suites = ("roofline", "training", "memory")
+    suites = ("roofline", "training", "memory", "large")
     done = subprocess.run(
         [sys.executable, "-m", "prdp_torch", "bench", *suites, "--quick", "--out", tmp_path],
         cwd=ROOT, capture_output=True, text=True,

@@ -1,0 +1,57 @@
+"""`make records`: its list, and what it does without a training."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import records
+
+DOCS = Path(records.__file__).parents[1] / "docs"
+# Made by commands of their own: three seeds of nine hours, other machines, and tests that are not run every time.
+ELSEWHERE = {"results/heat_3d.json", "performance/calls.json", "performance/processes.json",
+             "stability/forgeries.json", "stability/kills.json"}  # fmt: skip
+
+
+def test_every_record_of_the_documentation_is_in_the_list():
+    kept = {entry.kept for entry in records.LIST}
+    assert len({entry.name for entry in records.LIST}) == len(records.LIST)
+    found = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.json")}
+    atlas = {path for path in found if path.startswith("stability/")}
+    assert found - atlas - ELSEWHERE <= kept
+
+
+def test_what_is_done_on_this_commit_is_not_done_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "ROOT", tmp_path)
+    monkeypatch.setattr(records, "RUNS", tmp_path / "runs")
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    calls = []
+
+    def run(command, **options):
+        calls.append(command)
+        folder = tmp_path / command[-1]
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text("{}")
+
+    monkeypatch.setattr(records.subprocess, "run", run)
+    entry = records.refinement("heat_1d", 10, 3)
+    for commit in ("a", "a", "b"):
+        records.make(entry, commit)
+    assert len(calls) == 2 and "--resume" in calls[0]
+    assert (tmp_path / "docs" / "results" / "refinement_heat_1d.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("arguments, words", [(["moon"], "unknown record 'moon'"), (["heat_1d"], "not committed")])
+def test_it_refuses_what_it_does_not_know_and_changes_that_are_not_committed(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr(records.records, "environment", lambda: {"commit": "abc-dirty"})
+    monkeypatch.setattr(sys, "argv", ["records", *arguments])
+    with pytest.raises(SystemExit):
+        records.main()
+    assert words in capsys.readouterr().err
+
+
+def test_the_list_can_be_printed():
+    done = subprocess.run([sys.executable, "-m", "benchmarks.records", "--list"], cwd=DOCS.parent, capture_output=True,
+                          text=True)  # fmt: skip
+    assert done.returncode == 0 and len(done.stdout.splitlines()) == len(records.LIST)
