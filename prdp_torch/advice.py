@@ -94,7 +94,9 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
     if not isinstance(step, Stepper):
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
     if type(step).operator is Stepper.operator:
-        raise TypeError(f"advise: {type(step).__name__} must define operator(u)")
+        raise TypeError(
+            f"advise: {type(step).__name__} must define operator(u), the one equation of a step, to try solvers on"
+        )
     _check.dense("advise", "sample", sample)
     if sample.dim() < 2 or sample.numel() == 0 or sample.dtype not in (torch.float32, torch.float64):
         raise ValueError(
@@ -138,7 +140,13 @@ def advise_on(
         notes.append(
             f"{best.name} in {_name(twin.dtype)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}."
         )
-    if best is None and not other_dtypes and not isinstance(step, EquationStepper):
+    at_rounding = best is not None and any(solve.status == "STAGNATED" for solve in best.solves)
+    if best is not None and at_rounding:
+        notes.append(
+            f"At {_power(TOLERANCES[-1])} the residual of {best.name} is the rounding of {_name(best.dtype)}. "
+            "The error of u may be far smaller; a smaller residual needs float64."
+        )
+    if (best is None or at_rounding) and not other_dtypes and not isinstance(step, EquationStepper):
         notes.append("Only the dtype of the sample was tried, as the step is your own; dtypes=... tries others.")
     if best is not None and not isinstance(best.solver, Direct):
         notes.append(_start_gain(best, measure_with_start(step, sample, best)))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from prdp_torch import _C, operators
 from prdp_torch.operators.matrix import as_operator
-from prdp_torch.solve import SolveInfo, SolveStatus
+from prdp_torch.solve import AdjointLog, SolveInfo, SolveStatus
 from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Solver, SteepestDescent
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
@@ -179,12 +179,16 @@ def _solve(info: SolveInfo, seconds: list[float]) -> Solve:
         int(info.operator_applications.max()),
         median(seconds),
         worst,
-        bool((info.status > 0).all()),
+        bool(info.solved.all()),
     )
 
 
 def _copy(step: Stepper) -> Stepper:
-    trial = copy.deepcopy(step)
+    try:
+        trial = copy.deepcopy(step)
+    except RuntimeError:  # of an operator made of tensors that are not leaves of a graph
+        trial = copy.copy(step)
+        trial._adjoint_log = AdjointLog()
     trial.backward, trial.on_failure = "implicit", "return"
     trial.adjoint_max_iter = trial.adjoint_rtol = trial.checkpoint_every = None
     return trial

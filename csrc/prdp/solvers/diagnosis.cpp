@@ -8,6 +8,7 @@
 #include <sstream>
 
 #include "prdp/operators/kinds.h"
+#include "prdp/operators/singular_operator.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
@@ -30,6 +31,10 @@ std::string number(double x) {
   return text.str();
 }
 
+double rounding_of(const at::Tensor& b) {
+  return b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
+}
+
 double norm_of(const at::Tensor& v) { return v.to(at::kDouble).norm().item<double>(); }
 
 double value_of_sample(const at::Tensor& t, int64_t sample) {
@@ -43,12 +48,19 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
   return norm_of(product - other) / norm_of(product);
 }
 
+/// Whether A maps the constant to zero, though nobody named its null space.
+bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (is_singular(role.a) || operator_kind(role.a.kind).has_pressure) return false;
+  const auto alternating =
+      (1.0 - 2.0 * at::arange(b[0].numel(), b.options()).remainder(2.0)).view_as(b[0]).expand_as(b);
+  const double of_constant = norm_of(a.apply(at::ones_like(b)).select(0, sample));
+  return of_constant <= 100.0 * rounding_of(b) * norm_of(a.apply(alternating).select(0, sample));
+}
+
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
-  const double rounding = 100.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
-                                                                 : std::numeric_limits<double>::epsilon());
   const double share = asymmetry(a, b, sample);
-  if (share > rounding)
+  if (share > 100.0 * rounding_of(b))
     return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
   return "A is symmetric but not definite; take GMRES";
 }
@@ -110,6 +122,9 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
                       int64_t sample) {
   const at::NoGradGuard no_grad;
   const auto why = [&]() -> std::string {
+    if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
+        forgets_constants(role, a, b, sample))
+      return "A maps the constant to zero, so it is singular; give nullspace=\"constant\"";
     switch (status) {
       case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
       case SolveStatus::kOverflow: return overflow(a, b, sample);

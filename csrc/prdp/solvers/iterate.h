@@ -292,7 +292,8 @@ auto worse_than_zero(Space& space, const typename Space::States& states) {
 
 /// Whether the iterates of a method for definite operators do what they are made for, for each sample: A is symmetric,
 /// judged by x·A r and r·A x; x·A x and r·A r have the same sign; and x is nearer to the solution than zero in the norm
-/// of A, which is (x·b)² > (x·r)² for a definite A of either sign. One product.
+/// of A, which is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in
+/// the null space of A, and says nothing. One product.
 template <class Space, class Method>
 auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
   const auto& x = method.x;
@@ -308,7 +309,8 @@ auto energy_falls(Space& space, Method& method, const typename Space::States& st
     const double ax2 = bb[i] - 2 * rb[i] + rr[i];
     const double scale = std::sqrt(rr[i]) * std::sqrt(std::max(ax2, 0.0)) + std::sqrt(xx[i]) * std::sqrt(ar2[i]);
     const bool symmetric = std::abs(rb[i] - rr[i] - x_ar[i]) <= 2e3 * space.epsilon() * scale;
-    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i], definite = r_ar[i] * (xb[i] - xr[i]) > 0;
+    const double energy = xb[i] - xr[i], rounding = 2e3 * space.epsilon() * std::abs(xb[i]);
+    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i] && std::abs(energy) > rounding, definite = r_ar[i] * energy > 0;
     ++i;
     return symmetric && definite && nearer;
   });
