@@ -127,7 +127,7 @@ def test_all_suites_run_and_leave_a_page(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "page.html").read_text()
-    assert "limits of this machine" in page and page.count("<figure>") == 3
+    assert "limits of this machine" in page and page.count("<figure>") == 4
     found = json.loads((tmp_path / "roofline.json").read_text())
     assert found["machine"]["threads"] == 1
     for point in found["roofline"]["points"]:
