@@ -122,14 +122,12 @@ def train(row, options, folder, environment):
 
 
 def _curves(row):
-    """How the first seed refined, interval by interval: iterations a solve took in the mean, the tolerance, and what it
-    reached at which cost."""
-    curves = row.curves[0]
-    costs = {name: curves[name] for name in ("rtol", "metric", "operator_applications", "seconds")}
-    return {
-        name: [float(f"{x:.4g}") for x in curve]
-        for name, curve in {"iterations": row.taken_per_solve()[0], **costs}.items()
-    }
+    """How the first seed refined, interval by interval: iterations a solve took in the mean, the tolerance and, where
+    intervals are few, what it reached at which cost."""
+    curves, few = row.curves[0], 200
+    costs = ("metric", "operator_applications", "seconds") if len(curves["rtol"]) <= few else ()
+    kept = {"iterations": row.taken_per_solve()[0], **{name: curves[name] for name in ("rtol", *costs)}}
+    return {name: [float(f"{x:.4g}") for x in curve] for name, curve in kept.items()}
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ class Physics:
     def equation(self) -> str:
         ...
     @property
-    def force(self) -> torch.Tensor | None:
+    def force(self) -> torch.Tensor:
         ...
     @property
     def length(self) -> list[float]:
@@ -241,10 +241,10 @@ class Scene:
         ...
 class Dataset:
     @property
-    def train_end(self) -> torch.Tensor:
+    def train_between(self) -> torch.Tensor:
         ...
     @property
-    def train_between(self) -> torch.Tensor:
+    def train_end(self) -> torch.Tensor:
         ...
     @property
     def train_start(self) -> torch.Tensor:

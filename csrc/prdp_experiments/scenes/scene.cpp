@@ -17,9 +17,9 @@ int64_t Scene::Physics::channels() const {
 }
 
 Solver Scene::reference_solver() const {
+  if (physics.direct_is_cheap()) return Direct{};
   // The errors of this one in space and time are far above that of its solves.
   if (physics.is_kolmogorov()) return CG{100, 1e-5, Preconditioner::multigrid()};
-  if (physics.direct_is_cheap()) return Direct{};
   return GMRES{.restart = 20, .max_iter = 1000, .rtol = 1e-8};
 }
 

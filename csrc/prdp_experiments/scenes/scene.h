@@ -36,8 +36,8 @@ struct Scene {
     /// Of a state (batch, channels, *shape): a velocity has one for each axis, a flow the pressure too.
     int64_t channels() const;
     /// Whether an exact solve costs about as much as an iterative one. On periodic grids of two and more dimensions it
-    /// does not, as their sparse LU takes tens of times as long, but for constant coefficients.
-    bool direct_is_cheap() const { return is_kolmogorov() || !(periodic() && shape.size() > 1); }
+    /// does not: their sparse LU takes tens of times as long.
+    bool direct_is_cheap() const { return !(periodic() && shape.size() > 1); }
   };
   struct Data {
     int64_t modes = 0, train = 0, valid = 0, seed = 0;
