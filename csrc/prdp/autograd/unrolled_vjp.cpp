@@ -31,10 +31,6 @@ using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&,
 /// Residuals up to so many units of rounding are rounding.
 constexpr double kRoundings = 8.0;
 
-double epsilon_of(const at::Tensor& t) {
-  return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
-}
-
 /// One number per sample, on the host.
 template <class T>
 std::vector<T> to_host(const at::Tensor& t, int64_t batch) {

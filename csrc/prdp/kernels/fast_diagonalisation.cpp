@@ -168,12 +168,14 @@ int64_t FastDiagonalisation<T>::bytes() const {
 template <class T>
 std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const StencilRows<T>& a, const FactorKey& key,
                                                                    int64_t null_vectors) {
+  using Solver = FastDiagonalisation<T>;
+  const auto of_both = FactorKeyMaker().add(key).add(null_vectors).key();
+  // The key tells the matrix: what was found to be a sum before is not looked at again.
+  if (const auto kept = factor_cache::find(of_both, typeid(Solver)))
+    return std::static_pointer_cast<const Solver>(kept);
   const auto sum = as_sum_over_axes(a);
   if (!sum) return nullptr;
-  FactorKeyMaker of_both;
-  of_both.add(key).add(null_vectors);
-  return factor_cache::find_or_make<FastDiagonalisation<T>>(
-      of_both.key(), [&] { return std::make_shared<FastDiagonalisation<T>>(*sum, null_vectors); });
+  return factor_cache::find_or_make<Solver>(of_both, [&] { return std::make_shared<Solver>(*sum, null_vectors); });
 }
 
 template class FastDiagonalisation<float>;

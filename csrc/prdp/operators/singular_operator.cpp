@@ -5,6 +5,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -84,8 +85,7 @@ at::Tensor as_vector(const at::Tensor& q, const at::Tensor& b) { return q.expand
 void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude,
                                                bool transposed) const {
   const auto q = orthonormal(basis, b);
-  const double rounding = 200.0 * (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon()
-                                                                 : std::numeric_limits<double>::epsilon());
+  const double rounding = 200.0 * epsilon_of(b);
   for (int64_t k = 0; k < q.size(0); ++k) {
     const auto v = q[k] / q[k].abs().amax();
     const double left = largest(apply_on_loops(*a_, as_vector(v, b), transposed));

@@ -2,6 +2,7 @@
 #include <ATen/ATen.h>
 
 #include <algorithm>
+#include <limits>
 #include <tuple>
 
 /// What batches of tensors need everywhere.
@@ -11,6 +12,11 @@ namespace prdp {
 inline at::Tensor per_sample(at::Tensor t, const at::Tensor& like) {
   while (t.dim() < like.dim()) t = t.unsqueeze(-1);
   return t;
+}
+
+/// The distance from 1 to the next number of a float32 or float64 tensor.
+inline double epsilon_of(const at::Tensor& t) {
+  return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
 }
 
 /// The powers of two that bring these magnitudes to the order of one.

@@ -4,11 +4,11 @@
 
 #include <cmath>
 #include <iomanip>
-#include <limits>
 #include <sstream>
 
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/singular_operator.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
@@ -31,10 +31,6 @@ std::string number(double x) {
   return text.str();
 }
 
-double rounding_of(const at::Tensor& b) {
-  return b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
-}
-
 double norm_of(const at::Tensor& v) { return v.to(at::kDouble).norm().item<double>(); }
 
 double value_of_sample(const at::Tensor& t, int64_t sample) {
@@ -54,13 +50,13 @@ bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tenso
   const auto alternating =
       (1.0 - 2.0 * at::arange(b[0].numel(), b.options()).remainder(2.0)).view_as(b[0]).expand_as(b);
   const double of_constant = norm_of(a.apply(at::ones_like(b)).select(0, sample));
-  return of_constant <= 100.0 * rounding_of(b) * norm_of(a.apply(alternating).select(0, sample));
+  return of_constant <= 100.0 * epsilon_of(b) * norm_of(a.apply(alternating).select(0, sample));
 }
 
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
   const double share = asymmetry(a, b, sample);
-  if (share > 100.0 * rounding_of(b))
+  if (share > 100.0 * epsilon_of(b))
     return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
   return "A is symmetric but not definite; take GMRES";
 }

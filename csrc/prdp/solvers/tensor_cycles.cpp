@@ -2,9 +2,8 @@
 
 #include <ATen/core/grad_mode.h>
 
-#include <limits>
-
 #include "prdp/kernels/coarsening.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -134,9 +133,7 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
   auto unit = last.shape;
   unit.insert(unit.begin(), {1, n});
   const auto columns = last.apply(at::eye(n, b.options()).view(unit)).flatten(2).mT();
-  const double tiny =
-      10.0 * static_cast<double>(n) *
-      (b.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon());
+  const double tiny = 10.0 * static_cast<double>(n) * epsilon_of(b);
   coarsest_inverse_ = at::linalg_pinv(columns.to(at::kDouble).nan_to_num(0.0, 0.0, 0.0), tiny).to(b.scalar_type());
 }
 
