@@ -18,6 +18,7 @@ class DenseOperator final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
+  bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:
@@ -44,6 +45,7 @@ class CsrOperator final : public Operator {
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return {n()}; }
+  bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:

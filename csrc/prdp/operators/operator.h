@@ -53,6 +53,9 @@ class Operator {
   /// Whether rounding leaves parts along the null spaces in what methods carry on, which no product takes away; as of
   /// operators whose null space somebody named.
   virtual bool leaks() const { return false; }
+  /// Whether it is of somebody's own numbers or functions, and may be singular though nobody said so. Then Aᵀ v is to
+  /// be had without derivatives.
+  virtual bool may_be_singular() const { return false; }
   /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
   /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;

@@ -32,6 +32,7 @@ class StencilOperator final : public Operator {
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override;
   bool has_coarse_grids() const override;
+  bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
 
  private:

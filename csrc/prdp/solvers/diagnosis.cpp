@@ -10,6 +10,7 @@
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/unnamed_null_space.h"
 
 namespace prdp {
 
@@ -47,10 +48,7 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
 /// Whether A maps the constant to zero, though nobody named its null space.
 bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (is_singular(role.a) || operator_kind(role.a.kind).has_pressure) return false;
-  const auto alternating =
-      (1.0 - 2.0 * at::arange(b[0].numel(), b.options()).remainder(2.0)).view_as(b[0]).expand_as(b);
-  const double of_constant = norm_of(a.apply(at::ones_like(b)).select(0, sample));
-  return of_constant <= 100.0 * epsilon_of(b) * norm_of(a.apply(alternating).select(0, sample));
+  return maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
 }
 
 /// Why a method for symmetric definite operators fails on this one.
@@ -101,6 +99,10 @@ std::string zero_diagonal(const SolveRole& role) {
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (!is_singular(role.a) && !operator_kind(role.a.kind).has_pressure)
+    return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which A cannot reach, as " +
+           (role.adjoint ? "A" : "Aᵀ") +
+           " maps the constant to zero; give nullspace=\"constant\", which takes that part off";
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure)

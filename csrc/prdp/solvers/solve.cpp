@@ -5,6 +5,7 @@
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_samples.h"
+#include "prdp/solvers/unnamed_null_space.h"
 
 namespace prdp {
 
@@ -65,8 +66,11 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
   const auto kernels = b.is_cpu() && runs_on_loops(request.solver) ? a.kernels(b, false) : nullptr;
-  if (!kernels) return solve_with_tensors(a, b, request);
-  return std::visit([&](const auto& batch) { return solve_on_cpu(batch, b, request); }, kernels->of_dtype);
+  auto result = kernels
+                    ? std::visit([&](const auto& batch) { return solve_on_cpu(batch, b, request); }, kernels->of_dtype)
+                    : solve_with_tensors(a, b, request);
+  find_inconsistent_constants(a, b, request, result.info);
+  return result;
 }
 
 }  // namespace prdp

@@ -1,0 +1,111 @@
+"""Singular operators of one's own whose null space nobody named: right-hand sides and cotangents with a constant part
+raise, with every method; nothing else does."""
+
+import pytest
+import torch
+from helpers import statuses
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+OFFSETS = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
+METHODS = {
+    "cg": lambda k, rtol: prdp.CG(k, rtol),
+    "cg diagonal": lambda k, rtol: prdp.CG(k, rtol, preconditioner="diagonal"),
+    "cg multigrid": lambda k, rtol: prdp.CG(k, rtol, preconditioner="multigrid"),
+    "gmres": lambda k, rtol: prdp.GMRES(k, rtol),
+    "gmres multigrid": lambda k, rtol: prdp.GMRES(k, rtol, preconditioner="multigrid"),
+    "bicgstab": lambda k, rtol: prdp.BiCGStab(k, rtol),
+    "bicgstab multigrid": lambda k, rtol: prdp.BiCGStab(k, rtol, preconditioner="multigrid"),
+    "steepest descent": lambda k, rtol: prdp.SteepestDescent(k, rtol),
+    "jacobi": lambda k, rtol: prdp.Jacobi(k, rtol),
+    "multigrid": lambda k, rtol: prdp.Multigrid(k, rtol),
+    "direct": lambda k, rtol: prdp.Direct(),
+}
+
+
+def insulated(n, dtype, leak=0.0):
+    """-∇·(κ ∇u) + leak u on n × n cells, through whose sides no flux passes."""
+    kappa = torch.exp(torch.randn(n, n, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    up, left = torch.zeros_like(kappa), torch.zeros_like(kappa)
+    up[1:], left[:, 1:] = 2 / (1 / kappa[1:] + 1 / kappa[:-1]), 2 / (1 / kappa[:, 1:] + 1 / kappa[:, :-1])
+    down, right = up.roll(-1, 0), left.roll(-1, 1)
+    sides = [side.to(dtype) for side in (up, down, left, right)]
+    return operators.Stencil(torch.stack([sum(sides) + leak, *(-side for side in sides)])[None], OFFSETS)
+
+
+def point(n, dtype):
+    b = torch.zeros(1, 1, n, n, dtype=dtype)
+    b[0, 0, n // 3, n // 2] = 1.0
+    return b
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [16, 33, 64])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_constant_part_of_b_raises(method, n, dtype):
+    solver = METHODS[method](500, 1e-6)
+    with pytest.raises(torch.linalg.LinAlgError, match='give nullspace="constant"'):
+        prdp.linear_solve(insulated(n, dtype), point(n, dtype), solver)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_constant_part_of_a_cotangent_raises(method, dtype):
+    """A loss of one value: its cotangent has a mean, though b has none."""
+    n = 32
+    b = torch.randn(1, 1, n, n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    b = (b - b.mean()).to(dtype).requires_grad_()
+    with pytest.raises(torch.linalg.LinAlgError, match='give nullspace="constant"'):
+        u, _ = prdp.linear_solve(insulated(n, dtype), b, METHODS[method](500, 1e-3))
+        torch.autograd.grad(u[0, 0, 3, 4], b)
+
+
+def winds(n):
+    """Upwind transport around a ring, whose rows and columns sum to zero."""
+    return torch.eye(n) - torch.eye(n).roll(1, 0)
+
+
+KINDS = {
+    "matrix": lambda: operators.Matrix(winds(12)),
+    "csr": lambda: operators.Matrix(winds(12).to_sparse_csr()),
+    "function": lambda: operators.Function(lambda v: v - v.roll(1, -1), transpose=lambda v: v - v.roll(-1, -1)),
+    "symmetric function": lambda: operators.Function(lambda v: 2 * v - v.roll(1, -1) - v.roll(-1, -1), symmetric=True),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_says_so_of_the_sample_alone(kind):
+    b = torch.randn(3, 12, generator=torch.Generator().manual_seed(2))
+    b = b - b.mean(1, keepdim=True)
+    b[1] += 0.5
+    # Two vectors a cycle do not solve it, so that every sample ends unsolved.
+    _, info = prdp.linear_solve(KINDS[kind](), b, prdp.GMRES(12, 1e-6, restart=2), on_failure="return")
+    assert statuses(info)[1] == "INCONSISTENT"
+    assert "INCONSISTENT" not in (statuses(info)[0], statuses(info)[2])
+
+
+def test_a_few_iterations_are_left_alone():
+    """They are truncated, as any others, and rounding has not grown yet."""
+    n = 32
+    _, info = prdp.linear_solve(insulated(n, torch.float32), point(n, torch.float32), prdp.CG(5, 1e-6))
+    assert statuses(info) == ["MAX_ITER"]
+
+
+@pytest.mark.parametrize("leak", [1e-4, 1e-2])
+def test_regular_operators_may_end_at_max_iter(leak):
+    n = 64
+    for b in (point(n, torch.float32), torch.ones(1, 1, n, n)):
+        _, info = prdp.linear_solve(insulated(n, torch.float32, leak), b, prdp.CG(40, 1e-6), on_failure="return")
+        assert statuses(info)[0] in ("MAX_ITER", "STAGNATED")  # at the rounding of its dtype
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_tolerance_above_that_part_is_reached_or_raises(method, dtype):
+    n = 64
+    b = point(n, dtype)  # its constant part is 1/64
+    u, info = prdp.linear_solve(insulated(n, dtype), b, METHODS[method](500, 0.1), on_failure="return")
+    left = b - insulated(n, dtype).apply(u)
+    if info.status.item() >= -2:
+        assert statuses(info) == ["CONVERGED"] and left.norm() <= 0.1 * b.norm()
