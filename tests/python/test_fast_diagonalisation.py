@@ -39,6 +39,8 @@ def faces(n, seed=None, closed=False):
 
 CASES = {
     "periodic": ([faces(12), faces(9)], [True, True], 0.3),
+    "periodic, varying": ([faces(12, seed=5), faces(9)], [True, True], 0.3),
+    "periodic cubes": ([faces(5), 2 * faces(4), faces(7)], [True, True, True], 0.2),
     "zero": ([faces(7), faces(12)], [False, False], 0.0),
     "mixed": ([faces(8), faces(5)], [True, False], 0.0),
     "walls": ([faces(6, closed=True), faces(5, closed=True)], [False, False], 0.1),
@@ -105,6 +107,20 @@ def test_a_large_solve_needs_no_sparse_factors():
         u, info = prdp.linear_solve(A, b, prdp.Direct(rtol=1e-10))
         u.sum().backward()
     assert _C.count_factorisations() == made + 1 and statuses(info) == ["CONVERGED"]
+
+
+def test_threads_and_the_rest_of_a_batch_do_not_change_a_bit():
+    A = stencil([faces(40), faces(30)], [True, True], F32, shift=0.1)
+    b = noise((40, 30), batch=5, dtype=F32)
+    before = torch.get_num_threads()
+    answers = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        answers.append(prdp.linear_solve(A, b, prdp.Direct())[0])
+    torch.set_num_threads(before)
+    assert torch.equal(*answers)
+    for i in range(5):
+        assert torch.equal(prdp.linear_solve(A, b[i : i + 1], prdp.Direct())[0], answers[0][i : i + 1])
 
 
 def test_a_stencil_that_is_no_sum_is_solved_as_well():

@@ -27,8 +27,12 @@ class Ours:
             length=box.length,
             obstacle=None if box.obstacle is None else torch.as_tensor(box.obstacle),
             diffusion="explicit" if 2 * dim * box.nu * box.dt <= h**2 else "implicit",
-            solver=prdp.CG(100, rtol=box.rtol, preconditioner="multigrid"),
+            solver=self.solver(box),
         )
+
+    @staticmethod
+    def solver(box):
+        return prdp.CG(100, rtol=box.rtol, preconditioner="multigrid")
 
     def rollout(self, steps):
         @torch.no_grad()
@@ -71,3 +75,11 @@ class Ours:
 
     def _tensor(self, u):
         return torch.as_tensor(u, dtype=self.dtype)[None]
+
+
+class Direct(Ours):
+    """By FFT in periodic boxes."""
+
+    @staticmethod
+    def solver(box):
+        return prdp.Direct()

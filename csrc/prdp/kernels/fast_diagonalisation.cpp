@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <limits>
+#include <numbers>
 #include <numeric>
 
 namespace prdp::kernels {
@@ -90,6 +91,12 @@ typename AxisProducts<T>::Matrices rounded(const SumOverAxes& matrices) {
   return all;
 }
 
+/// The eigenvectors of the A_d, as columns, and their eigenvalues.
+struct Diagonalised {
+  SumOverAxes eigenvectors;
+  std::array<Eigen::VectorXd, 3> eigenvalues;
+};
+
 Diagonalised diagonalise(const SumOverAxes& a) {
   Diagonalised found;
   for (int d = 2; d >= 0; --d) {
@@ -103,6 +110,54 @@ Diagonalised diagonalise(const SumOverAxes& a) {
     found.eigenvalues[d] = solver.eigenvalues();
   }
   return found;
+}
+
+/// Whether each row of A_d is the one before it, moved on by a point, up to rounding in T.
+template <class T>
+bool is_circulant(const Eigen::MatrixXd& a) {
+  const double slack = 16.0 * std::numeric_limits<T>::epsilon() * a.cwiseAbs().maxCoeff();
+  const auto n = a.rows();
+  for (Eigen::Index i = 0; i < n; ++i)
+    for (Eigen::Index j = 0; j < n; ++j)
+      if (!(std::abs(a(i, j) - a(0, (j - i + n) % n)) <= slack)) return false;
+  return true;
+}
+
+/// The eigenvalues of a symmetric circulant matrix, in the order of the wavenumbers.
+Eigen::VectorXd of_waves(const Eigen::MatrixXd& a) {
+  const auto n = a.rows();
+  const Eigen::VectorXd cosines =
+      (Eigen::VectorXd::LinSpaced(n, 0, static_cast<double>(n - 1)) * (2.0 * std::numbers::pi / static_cast<double>(n)))
+          .array()
+          .cos();
+  Eigen::VectorXd values = Eigen::VectorXd::Constant(n, a(0, 0));
+  for (Eigen::Index j = 1; j < n; ++j)
+    if (a(0, j) != 0.0)
+      for (Eigen::Index k = 0; k < n; ++k) values(k) += a(0, j) * cosines(j * k % n);
+  return values;
+}
+
+/// The inverses of all eigenvalues, zero for the `null_vectors` smallest ones; nothing if others vanish too.
+std::optional<std::vector<double>> inverted(const std::array<Eigen::VectorXd, 3>& eigenvalues, int64_t null_vectors) {
+  std::vector<double> values;
+  for (const double z : eigenvalues[0])
+    for (const double y : eigenvalues[1])
+      for (const double x : eigenvalues[2]) values.push_back(z + y + x);
+  std::vector<size_t> order(values.size());
+  std::iota(order.begin(), order.end(), size_t{0});
+  const auto least = std::min(null_vectors + 1, std::ssize(order));
+  const auto smaller = [&](size_t i, size_t j) { return std::abs(values[i]) < std::abs(values[j]); };
+  std::partial_sort(order.begin(), order.begin() + least, order.end(), smaller);
+
+  double largest = 0.0;
+  for (const double value : values) largest = std::max(largest, std::abs(value));
+  int64_t longest = 1;
+  for (const auto& of_axis : eigenvalues) longest = std::max(longest, int64_t{of_axis.size()});
+  const double rounding = static_cast<double>(longest) * std::numeric_limits<double>::epsilon() * largest;
+  if (null_vectors >= std::ssize(order) || !(std::abs(values[order[null_vectors]]) > rounding)) return std::nullopt;
+  for (double& value : values) value = 1.0 / value;
+  for (int64_t i = 0; i < null_vectors; ++i) values[order[i]] = 0.0;
+  return values;
 }
 
 }  // namespace
@@ -127,42 +182,34 @@ std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
 }
 
 template <class T>
-FastDiagonalisation<T>::FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors) : eigenvectors_(rounded<T>(a)) {
+FastDiagonalisation<T>::FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors) {
+  if (is_circulant<T>(a[0]) && is_circulant<T>(a[1]) && is_circulant<T>(a[2])) {
+    const auto inverse = inverted({of_waves(a[0]), of_waves(a[1]), of_waves(a[2])}, null_vectors);
+    if (inverse) made_ = FourierMultiplier<T>({a[0].rows(), a[1].rows(), a[2].rows()}, *inverse);
+    return;
+  }
   const auto found = diagonalise(a);
-  eigenvectors_ = AxisProducts<T>(rounded<T>(found.eigenvectors));
-  std::vector<double> values;
-  for (const double z : found.eigenvalues[0])
-    for (const double y : found.eigenvalues[1])
-      for (const double x : found.eigenvalues[2]) values.push_back(z + y + x);
-  std::vector<size_t> order(values.size());
-  std::iota(order.begin(), order.end(), size_t{0});
-  const auto least = std::min(null_vectors + 1, std::ssize(order));
-  const auto smaller = [&](size_t i, size_t j) { return std::abs(values[i]) < std::abs(values[j]); };
-  std::partial_sort(order.begin(), order.begin() + least, order.end(), smaller);
-
-  double largest = 0.0;
-  for (const double value : values) largest = std::max(largest, std::abs(value));
-  int64_t longest = 1;
-  for (const auto& of_axis : found.eigenvalues) longest = std::max(longest, int64_t{of_axis.size()});
-  const double rounding = static_cast<double>(longest) * std::numeric_limits<double>::epsilon() * largest;
-  is_regular_ = null_vectors < std::ssize(order) && std::abs(values[order[null_vectors]]) > rounding;
-  inverse_.resize(values.size());
-  for (size_t i = 0; i < values.size(); ++i) inverse_[i] = static_cast<T>(1.0 / values[i]);
-  for (int64_t i = 0; i < std::min(null_vectors, std::ssize(order)); ++i) inverse_[order[i]] = T(0);
+  const auto inverse = inverted(found.eigenvalues, null_vectors);
+  if (inverse) made_ = Products{AxisProducts<T>(rounded<T>(found.eigenvectors)), {inverse->begin(), inverse->end()}};
 }
 
 template <class T>
 void FastDiagonalisation<T>::solve(std::vector<T>& field) const {
+  if (const auto* waves = std::get_if<FourierMultiplier<T>>(&made_)) return waves->apply(field);
+  const auto& [eigenvectors, inverse] = std::get<Products>(made_);
   static thread_local std::vector<T> other;
   other.resize(field.size());
-  eigenvectors_.apply(field, other, /*transposed=*/true);
-  for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse_[i];
-  eigenvectors_.apply(field, other, /*transposed=*/false);
+  eigenvectors.apply(field, other, /*transposed=*/true);
+  for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse[i];
+  eigenvectors.apply(field, other, /*transposed=*/false);
 }
 
 template <class T>
 int64_t FastDiagonalisation<T>::bytes() const {
-  return eigenvectors_.bytes() + static_cast<int64_t>(inverse_.size() * sizeof(T));
+  if (const auto* waves = std::get_if<FourierMultiplier<T>>(&made_)) return waves->bytes();
+  if (!is_regular()) return 0;
+  const auto& [eigenvectors, inverse] = std::get<Products>(made_);
+  return eigenvectors.bytes() + static_cast<int64_t>(inverse.size() * sizeof(T));
 }
 
 template <class T>

@@ -2,10 +2,12 @@
 #include <array>
 #include <memory>
 #include <optional>
+#include <variant>
 #include <vector>
 
 #include "prdp/kernels/axis_products.h"
 #include "prdp/kernels/factor_cache.h"
+#include "prdp/kernels/fourier_multiplier.h"
 #include "prdp/kernels/stencil_rows.h"
 
 namespace prdp::kernels {
@@ -18,30 +20,25 @@ using SumOverAxes = std::array<Eigen::MatrixXd, 3>;
 template <class T>
 std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a);
 
-/// The eigenvectors of the A_d, as columns, and their eigenvalues.
-struct Diagonalised {
-  SumOverAxes eigenvectors;
-  std::array<Eigen::VectorXd, 3> eigenvalues;
-};
-
-/// The exact solver of such a sum, in the eigenvectors of the A_d (Lynch, Rice and Thomas 1964).
+/// The exact solver of such a sum, in the eigenvectors of the A_d (Lynch, Rice and Thomas 1964). With constant
+/// coefficients on a periodic grid these are waves.
 template <class T>
 class FastDiagonalisation {
  public:
   /// `null_vectors`: how many vectors A maps to zero, as somebody named them.
   FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors);
 
-  bool is_regular() const { return is_regular_; }
+  bool is_regular() const { return !std::holds_alternative<std::monostate>(made_); }
   /// field ← A⁻¹ field, or the pseudo-inverse where null vectors were named. Any thread may call this.
   void solve(std::vector<T>& field) const;
   int64_t bytes() const;
 
  private:
-  FastDiagonalisation(const Diagonalised& found, int64_t null_vectors);
-
-  AxisProducts<T> eigenvectors_;
-  std::vector<T> inverse_;  // of the eigenvalues
-  bool is_regular_ = true;
+  struct Products {
+    AxisProducts<T> eigenvectors;
+    std::vector<T> inverse;  // of the eigenvalues
+  };
+  std::variant<std::monostate, Products, FourierMultiplier<T>> made_;  // nothing of a singular sum
 };
 
 /// That of a stencil, from the cache or made; null if the stencil is no such sum.
