@@ -9,6 +9,7 @@ from benchmarks.mosaic import solvers
 # Okabe and Ito's colours, which colour-blind readers can tell apart: one per library, a dash per variant.
 STYLES = {
     "ours": ("#D55E00", "-", "o"),
+    "ours_direct": ("#D55E00", "--", "o"),
     "jax_cfd": ("#0072B2", "--", "^"),
     "jax_cfd_central": ("#0072B2", "-", "^"),
     "jax_cfd_cg": ("#0072B2", ":", "^"),

@@ -233,4 +233,8 @@ def test_a_page_gets_its_tables_from_the_records(tmp_path, monkeypatch):
     monkeypatch.setattr(flow_tables, "RECORDS", tmp_path)
     place = "<!-- docs/flow_tables.py writes cost, 2D: seconds, forward and gradient -->\nold\n<!-- end -->\n"
     page = flow_tables.with_tables(f"before\n{place}after\n")
-    assert "old" not in page and "| prdp_torch, CG and multigrid | 2.5 s |" in page and page == flow_tables.with_tables(page)
+    assert (
+        "old" not in page
+        and "| prdp_torch, CG and multigrid | 2.5 s |" in page
+        and page == flow_tables.with_tables(page)
+    )

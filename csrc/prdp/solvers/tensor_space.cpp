@@ -29,13 +29,14 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
     : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
+  in_loops_ = !recording_ && BatchLoops::take(b_);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
 }
 
 void TensorSpace::start_from(at::Tensor x, at::Tensor r) {
   start_ = std::move(x);
-  whole_b_ = std::exchange(b_, std::move(r));
+  whole_b_ = std::exchange(b_, laid_out(r));
   b2_ = dot(b_, b_);
 }
 
@@ -49,20 +50,22 @@ const at::Tensor& TensorSpace::diagonal() {
   return diagonal_;
 }
 
-TensorSpace::Vector TensorSpace::scaled(const Vector& product, const Vector& v, at::Tensor& scale) const {
-  if (!scale.defined()) {
-    const auto magnitude = [&](const Vector& t) { return t.detach().abs().amax(all_but_batch_, /*keepdim=*/true); };
-    const auto of_product = magnitude(product), of_v = magnitude(v);
-    const auto usable = of_product.gt(0).logical_and(of_product.isfinite()).logical_and(of_v.gt(0));
-    const auto one = at::ones_like(of_v);
-    scale = power_of_two_scale(at::where(usable, of_product, one)) / power_of_two_scale(at::where(usable, of_v, one));
-  }
-  return product * scale;
+void TensorSpace::define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const {
+  if (scale.defined()) return;
+  const auto magnitude = [&](const Vector& t) { return t.detach().abs().amax(all_but_batch_, /*keepdim=*/true); };
+  const auto of_product = magnitude(product), of_v = magnitude(v);
+  const auto usable = of_product.gt(0).logical_and(of_product.isfinite()).logical_and(of_v.gt(0));
+  const auto one = at::ones_like(of_v);
+  scale = power_of_two_scale(at::where(usable, of_product, one)) / power_of_two_scale(at::where(usable, of_v, one));
 }
 
 TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
-  auto z = system_.inverse ? scaled(system_.inverse(v), v, system_.scale_of_inverse) : v / diagonal();
-  if (system_.inverse && system_.a.leaks()) z = system_.a.project_solution(z);
+  auto z = system_.inverse ? laid_out(system_.inverse(v)) : v / diagonal();
+  if (system_.inverse) {
+    define_scale(z, v, system_.scale_of_inverse);
+    z = z * system_.scale_of_inverse;
+    if (system_.a.leaks()) z = system_.a.project_solution(z);
+  }
   out = keep_frozen(z, out);
   return dot(v, z);
 }
@@ -74,10 +77,15 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
   const auto singular = every.logical_not();
   note_broken(singular);
-  d = at::where(every, solution, at::zeros_like(solution));
+  d = laid_out(at::where(every, solution, at::zeros_like(solution)));
 }
 
 TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
+  if (in_loops_) {
+    const auto [length, vanishes] = BatchLoops::step_length(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
+    if (vanishes.defined()) note_broken(vanishes);
+    return length;
+  }
   // As SampleSpace::step_length; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
@@ -90,6 +98,7 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
 }
 
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) const {
+  if (in_loops_) return BatchLoops::ratio(num, den, negligible_);
   const auto none = den.detach() < negligible_;
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
@@ -14,7 +15,7 @@ namespace prdp {
 
 /// A whole batch as a space for iterate(), in plain tensor operations: it serves every device,
 /// operators without CPU loops, and, run under autograd, the derivative of the iterations. Nothing
-/// is written in place. A frozen sample keeps its values by at::where.
+/// is written in place but by BatchLoops. A frozen sample keeps its values by at::where.
 class TensorSpace {
  public:
   using Vector = at::Tensor;  // (batch, ...)
@@ -51,20 +52,31 @@ class TensorSpace {
     next = before;
   }
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
-  void xpby(const Vector& x, const Scalar& beta, Vector& y) { y = keep_frozen(x + beta * y, y); }
+  void xpby(const Vector& x, const Scalar& beta, Vector& y) {
+    if (in_loops_) return BatchLoops::xpby(x, beta, y, active_);
+    y = keep_frozen(x + beta * y, y);
+  }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
     xpby(x, beta, y);
     return dot(y, y);
   }
-  Scalar dot(const Vector& a, const Vector& b) const { return (a * b).sum(all_but_batch_, true); }
+  Scalar dot(const Vector& a, const Vector& b) const {
+    return in_loops_ ? BatchLoops::dot(a, b) : (a * b).sum(all_but_batch_, true);
+  }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
+    if (in_loops_ && !system_.a.leaks()) return BatchLoops::descend(alpha, p, q, x, r, active_);
     x = keep_frozen(x + alpha * p, x);
     const auto left = r - alpha * q;
     r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
     return dot(r, r);
   }
 
-  void apply(const Vector& v, Vector& out) { out = scaled(product(v), v, system_.scale_of_a); }
+  void apply(const Vector& v, Vector& out) {
+    const auto unscaled = product(v);
+    define_scale(unscaled, v, system_.scale_of_a);
+    if (!in_loops_) out = unscaled * system_.scale_of_a;
+    else BatchLoops::scale(system_.scale_of_a, last_product_ = unscaled, out);
+  }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
     apply(v, out);
     return {dot(v, out), dot(out, out)};
@@ -72,7 +84,7 @@ class TensorSpace {
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
   Scalar precondition(const Vector& v, Vector& out);
   void correct(const Vector& v, Vector& out) {
-    const auto z = system_.inverse(v);
+    const auto z = laid_out(system_.inverse(v));
     out = keep_frozen(system_.a.leaks() ? system_.a.project_solution(z) : z, out);
   }
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
@@ -115,16 +127,19 @@ class TensorSpace {
   int derivatives() const { return recording_ ? 2 : 0; }
   Scalar constant(const Scalar& value) const { return value.detach(); }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) const {
+    if (in_loops_) return BatchLoops::dots(v, count, factor, w, h);
     const auto scaled = factor * w.detach();
     for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
   }
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar& factor,
                               Vector& w) const {
+    if (in_loops_) return BatchLoops::combine(-1.0, h, v, count, &factor, w, {});
     w = factor * w;
     for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
     return dot(w.detach(), w.detach());
   }
   void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
+    if (in_loops_) return void(BatchLoops::combine(1.0, y, v, count, nullptr, x, active_));
     auto sum = x;
     for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
     x = keep_frozen(sum, x);
@@ -136,6 +151,7 @@ class TensorSpace {
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
   void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const {
+    if (in_loops_ && !BatchLoops::any(where)) return;
     to = at::where(where.ne(0), from, to);
   }
   Scalar is_zero(const Scalar& value) const { return value.eq(0).to(b_.scalar_type()); }
@@ -165,19 +181,24 @@ class TensorSpace {
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
   }
+  /// As BatchLoops take it.
+  Vector laid_out(const Vector& v) const { return in_loops_ ? v.contiguous() : v; }
   static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
     return omega ? before + *omega * (x + change - before) : x + change;
   }
-  Vector jacobi_change(const Vector& c, const Vector& x) { return c - product(x) / diagonal(); }
+  Vector jacobi_change(const Vector& c, const Vector& x) {
+    auto change = product(x) / diagonal();
+    return in_loops_ ? at::sub_out(change, c, change) : c - change;
+  }
   /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
   const at::Tensor& diagonal();
   /// A v, not scaled.
   Vector product(const Vector& v) {
     count();
-    return system_.a.apply(v);
+    return laid_out(system_.a.apply(in_loops_ ? v.detach() : v));  // a handle of its own, which a product may keep
   }
-  /// product·scale; where the scale is not known yet, it brings the product to the order of v.
-  Vector scaled(const Vector& product, const Vector& v, at::Tensor& scale) const;
+  /// Sets the scale that brings the product to the order of v, if it is not known yet.
+  void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
   void note_broken(const at::Tensor& rows) { broken_ = broken_.defined() ? broken_.logical_or(rows) : rows; }
   void set_active(const std::vector<bool>& active);
   void count();
@@ -186,13 +207,15 @@ class TensorSpace {
   System& system_;
   at::Tensor b_, b2_, diagonal_;
   at::Tensor start_, whole_b_;  // undefined: from zero
+  /// Kept until the next one: where it ends the heap, its pages would go back to the system, to be faulted in again.
+  at::Tensor last_product_;
   States& states_;
   std::vector<int64_t> all_but_batch_;
   std::vector<bool> active_;
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
-  bool recording_;
+  bool recording_, in_loops_;
 };
 
 }  // namespace prdp
