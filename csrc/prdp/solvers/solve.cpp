@@ -69,7 +69,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   auto result = kernels
                     ? std::visit([&](const auto& batch) { return solve_on_cpu(batch, b, request); }, kernels->of_dtype)
                     : solve_with_tensors(a, b, request);
-  find_inconsistent_constants(a, b, request, result.info);
+  find_inconsistent_constants(a, b, request, result);
   return result;
 }
 

@@ -8,7 +8,9 @@ at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool tr
 
 /// Calls those unsolved samples INCONSISTENT whose b has a constant part, beyond rounding, that A cannot reach, as Aᵀ
 /// maps the constant to zero and nobody has said so. Their u is of no use: what rounding adds along the null space of A
-/// grows from iteration to iteration. The products that tell it are spent where a solve took many.
-void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request, SolveInfo& info);
+/// grows from iteration to iteration. The products that tell it are spent where a solve took hundreds, or where u looks
+/// like that.
+void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+                                 SolveResult& result);
 
 }  // namespace prdp
