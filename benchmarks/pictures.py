@@ -11,6 +11,7 @@ from pathlib import Path
 
 from benchmarks import page, refinement_charts
 from benchmarks.atlas import MAPS
+from benchmarks.mosaic import charts as mosaic_charts
 from prdp_torch.experiments import charts, scenes
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -33,6 +34,9 @@ def all_of_them():
         yield stability / f"{name}.png", 110, partial(atlas, name, stability / f"{name}.json")
     for part in page.sections(performance()):
         yield DOCS / "performance" / f"{part['name']}.png", 130, partial(lambda figure: figure, part["figure"])
+    for task in ("cost", "conduction"):
+        for name, figure in mosaic_charts.of(task, read(DOCS / "flows" / f"{task}.json")["rows"]).items():
+            yield DOCS / "flows" / f"{name}.png", 110, partial(lambda figure: figure, figure)
 
 
 def accuracy(path):

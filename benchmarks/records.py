@@ -76,6 +76,10 @@ LIST = [
     study("widths", "--seeds 3", 60),
     *(suite(name, 5) for name in ("accuracy", "diffusion", "size", "large", "roofline")),
     *(suite(name, 5) for name in ("change_of_k", "training", "memory")),
+    *(
+        Made(f"mosaic_{task}", f"-m benchmarks.mosaic {task} --limit 150", 60, f"{task}.json", f"flows/{task}.json")
+        for task in ("forward", "cost", "gradient", "conduction")
+    ),
     Made("atlas", "-m prdp_torch stability", 3, "*", "stability"),
 ]
 
@@ -99,7 +103,7 @@ def main():
         parser.error("there are changes that are not committed: commit them, or pass --dirty")
     for entry in chosen:
         make(entry, commit)
-    for script in ("benchmarks.pictures", "docs.result_tables", "docs.performance_tables"):
+    for script in ("benchmarks.pictures", "docs.result_tables", "docs.performance_tables", "docs.flow_tables"):
         subprocess.run([sys.executable, "-m", script], cwd=ROOT, check=True)
 
 

@@ -57,7 +57,7 @@ class Ours:
         b[:, -1] = self.plate.flux * self.plate.h
         operator = prdp.operators.Stencil(coefficients, OFFSETS, boundary="zero")
         u, info = prdp.linear_solve(operator, b[None, None], self.solver)
-        if info.status[0] < 0:
+        if not info.solved[0]:
             raise RuntimeError(f"CG: residual {info.residual[0]:.1e} after {info.iterations[0]} iterations")
         return u[0, 0]
 
