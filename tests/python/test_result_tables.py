@@ -92,11 +92,11 @@ def test_the_seconds_of_the_first_pages_are_those_of_the_records():
     assert all(said in first for said in (trained, found, exact))
     assert f"{seconds(b, 'converged')} to {seconds(b, 'auto')} s" in results
     assert f"{seconds(b, 'converged')} s with converged solves, {seconds(b, 'auto')} s with `auto`" in readme
-    updates = {
-        row["scene"]: row["update_seconds"] for row in performance_tables.record("training")
-    }  # the last K of each
-    for text in (first, results, readme):
-        assert f"about {640 * updates['burgers_2d']:.0f} s" in text
+    assert f"takes {seconds(b, 'multigrid')} s converged" in readme
+    assert f"constant rtol of 1e-2 {seconds(b, 'rtol_0.01')} s" in readme
+    large = "refinement_diffusion_inverse_256"
+    assert f"from {seconds(large, 'converged')} to {seconds(large, 'multigrid')} s" in results
+    assert f"top of it to {seconds(large, 'auto_multigrid')} s" in results
 
 
 @pytest.mark.parametrize("path", sorted((DOCS / "results").rglob("*.json")), ids=lambda path: path.stem)
