@@ -181,7 +181,9 @@ def _cost_panels(scene: _C.Scene, draw: Callable[[Axes, str], None], limits: Lim
     """Two panels, by products with A and by wall time; `draw(axes, cost)` fills one."""
     figure, panels = make_figure(panels=2, height=4.8)
     for axes, (cost, label) in zip(panels, _COSTS, strict=True):
-        axes.set(yscale="log", ylim=limits, xlabel=label)
+        axes.set(yscale="log", xlabel=label)
+        if limits is not None:  # None would keep the limits of an empty chart
+            axes.set_ylim(limits)
         draw(axes, cost)
         axes.grid(alpha=0.3, which="both", lw=0.4)
         low, high = axes.get_ylim()

@@ -39,8 +39,11 @@ def test_the_rows_within_ten_times_the_best_have_the_axis_to_themselves():
 
 
 @pytest.mark.parametrize("errors", [[0.04, 0.05, 0.39], [0.04, np.nan, 0.05], [np.nan, np.nan]])
-def test_a_chart_without_far_rows_has_no_arrows(errors):
-    assert not any(label.endswith("above") for label in labels(drawn(errors)))
+def test_a_chart_without_far_rows_has_no_arrows_and_shows_every_row(errors):
+    figure = drawn(errors)
+    assert not any(label.endswith("above") for label in labels(figure))
+    low, high = figure.axes[0].get_ylim()
+    assert all(low < error < high for error in errors if np.isfinite(error))
 
 
 def test_a_lost_row_does_not_hide_the_others():
