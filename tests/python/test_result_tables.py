@@ -93,7 +93,7 @@ def test_the_seconds_of_the_first_pages_are_those_of_the_records():
     assert f"{seconds(b, 'converged')} to {seconds(b, 'auto')} s" in results
     assert f"{seconds(b, 'converged')} s with converged solves, {seconds(b, 'auto')} s with `auto`" in readme
     assert f"takes {seconds(b, 'multigrid')} s converged" in readme
-    assert f"constant rtol of 1e-2 {seconds(b, 'rtol_0.01')} s" in readme
+    assert f"constant rtol of 1e-2 takes {seconds(b, 'rtol_0.01')} s" in readme
     large = "refinement_diffusion_inverse_256"
     assert f"from {seconds(large, 'converged')} to {seconds(large, 'multigrid')} s" in results
     assert f"top of it to {seconds(large, 'auto_multigrid')} s" in results
