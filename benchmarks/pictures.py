@@ -27,16 +27,20 @@ def all_of_them():
     for path in sorted(results.glob("*_accuracy.png")):
         yield path, 120, partial(accuracy, path.with_name(path.name.replace("_accuracy.png", ".json")))
     for name, figure in refinement_charts.figures():
-        yield results / name, 110, partial(lambda figure: figure, figure)
+        yield results / name, 110, partial(as_it_is, figure)
     for path in sorted((results / "studies").glob("*.json")):
         yield path.with_suffix(".png"), 110, partial(study, path)
     for name in MAPS:
         yield stability / f"{name}.png", 110, partial(atlas, name, stability / f"{name}.json")
     for part in page.sections(performance()):
-        yield DOCS / "performance" / f"{part['name']}.png", 130, partial(lambda figure: figure, part["figure"])
+        yield DOCS / "performance" / f"{part['name']}.png", 130, partial(as_it_is, part["figure"])
     for task in ("cost", "conduction"):
         for name, figure in mosaic_charts.of(task, read(DOCS / "flows" / f"{task}.json")["rows"]).items():
-            yield DOCS / "flows" / f"{name}.png", 110, partial(lambda figure: figure, figure)
+            yield DOCS / "flows" / f"{name}.png", 110, partial(as_it_is, figure)
+
+
+def as_it_is(figure):
+    return figure
 
 
 def accuracy(path):

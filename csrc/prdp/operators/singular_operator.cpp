@@ -11,9 +11,6 @@ namespace prdp {
 
 namespace {
 
-/// The unknowns of one channel of v, as its last axis: (…, n).
-at::Tensor by_channel(const at::Tensor& v) { return v.dim() < 3 ? v : v.flatten(2); }
-
 /// Orthonormal vectors in double by Gram and Schmidt, twice.
 at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
   std::vector<at::Tensor> done;
@@ -137,9 +134,7 @@ void SingularOperator::check_null_spaces(const at::Tensor& b) const {
   static thread_local Remembered checked;
   if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
   const at::NoGradGuard no_grad;
-  // How large products can be: that of a vector which changes its sign from point to point.
-  const auto alternating = 1.0 - 2.0 * at::arange(by_channel(b).size(-1), b.options()).remainder(2.0);
-  const double magnitude = largest(apply_on_loops(*a_, as_vector(alternating, b), /*transpose=*/false));
+  const double magnitude = largest(apply_on_loops(*a_, alternating(b), /*transposed=*/false));
   check_is_mapped_to_zero(right_, b, magnitude, /*transposed=*/false);
   check_is_mapped_to_zero(left_, b, magnitude, /*transposed=*/true);
   checked.take(spec_, b.scalar_type());

@@ -1,14 +1,12 @@
 #include "prdp/solvers/batch_loops.h"
 
-#include <ATen/Dispatch.h>
-#include <ATen/Parallel.h>
-
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/kernels/loops.h"
+#include "prdp/kernels/share_samples.h"
+#include "prdp/kernels/whole_vectors.h"
 
-namespace prdp {
+namespace prdp::batch_loops {
 
 namespace {
 
@@ -38,14 +36,14 @@ at::Tensor numbers_like(const at::Tensor& v) {
   return at::empty(shape, v.options());
 }
 
-bool goes_on(const BatchLoops::Active& active, int64_t sample) { return active.empty() || active[sample]; }
+bool goes_on(const Active& active, int64_t sample) { return active.empty() || active[sample]; }
 
 /// Calls body(sample, its first entry) for each sample of v, on all threads where that pays.
 template <class Body>
 void for_each_sample(const at::Tensor& v, const Body& body) {
   constexpr int64_t worthwhile = int64_t{1} << 18;  // entries for a thread
-  const int64_t n = unknowns(v), grain = std::max<int64_t>(1, worthwhile / n);
-  at::parallel_for(0, v.size(0), grain, [&](int64_t begin, int64_t end) {
+  const int64_t n = unknowns(v);
+  share_samples(v.size(0), n, std::max<int64_t>(1, worthwhile / n), [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) body(s, s * n);
   });
 }
@@ -57,49 +55,48 @@ auto with_type(const at::Tensor& t, const Body& body) {
 
 }  // namespace
 
-bool BatchLoops::take(const at::Tensor& b) {
+bool take(const at::Tensor& b) {
   if (!b.is_cpu() || !b.is_contiguous() || b.numel() == 0) return false;
   return unknowns(b) % (b.scalar_type() == at::kFloat ? kernels::kLanes<float> : kernels::kLanes<double>) == 0;
 }
 
-at::Tensor BatchLoops::dot(const Vector& a, const Vector& b) {
+at::Tensor dot(const Vector& a, const Vector& b) {
   auto found = numbers_like(a);
   with_type(a, [&]<class T>(T) {
     const T *left = data<T>(a), *right = data<T>(b);
     T* to = found.mutable_data_ptr<T>();
-    const auto& loops = kernels::loops<T>();
+    const kernels::WholeVectors<T> loops;
     for_each_sample(a, [&](int64_t s, int64_t at) { to[s] = loops.dot(left + at, right + at, unknowns(a)); });
   });
   return found;
 }
 
-void BatchLoops::scale(const Scalar& factor, const Vector& v, Vector& out) {
+void scale(const Scalar& factor, const Vector& v, Vector& out) {
   with_type(v, [&]<class T>(T) {
     T* to = own<T>(out);
     const T *from = data<T>(v), *times = numbers<T>(factor, v);
-    const auto& loops = kernels::loops<T>();
+    const kernels::WholeVectors<T> loops;
     for_each_sample(v, [&](int64_t s, int64_t at) { loops.scale(times[s], from + at, to + at, unknowns(v)); });
   });
 }
 
-void BatchLoops::xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active) {
+void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active) {
   with_type(y, [&]<class T>(T) {
     T* to = own<T>(y);
     const T *from = data<T>(x), *factor = numbers<T>(beta, y);
-    const auto& loops = kernels::loops<T>();
+    const kernels::WholeVectors<T> loops;
     for_each_sample(y, [&](int64_t s, int64_t at) {
       if (goes_on(active, s)) loops.xpby(from + at, factor[s], to + at, unknowns(y));
     });
   });
 }
 
-at::Tensor BatchLoops::descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r,
-                               const Active& active) {
+at::Tensor descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r, const Active& active) {
   auto rr = numbers_like(r);
   with_type(r, [&]<class T>(T) {
     T *to_x = own<T>(x), *to_r = own<T>(r), *square = rr.mutable_data_ptr<T>();
     const T *along = data<T>(p), *taken = data<T>(q), *factor = numbers<T>(alpha, r);
-    const auto& loops = kernels::loops<T>();
+    const kernels::WholeVectors<T> loops;
     for_each_sample(r, [&](int64_t s, int64_t at) {
       const int64_t n = unknowns(r);
       square[s] = goes_on(active, s) ? loops.descend(factor[s], along + at, taken + at, to_x + at, to_r + at, n)
@@ -109,7 +106,7 @@ at::Tensor BatchLoops::descend(const Scalar& alpha, const Vector& p, const Vecto
   return rr;
 }
 
-void BatchLoops::dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
+void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {
   for (int64_t i = 0; i < count; ++i) h[i] = numbers_like(w);
   with_type(w, [&]<class T>(T) {
     const T *from = data<T>(w), *times = numbers<T>(factor, w);
@@ -117,14 +114,14 @@ void BatchLoops::dots(const std::vector<Vector>& v, int64_t count, const Scalar&
       std::vector<const T*> vectors(count);
       std::vector<T> found(count);
       for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at;
-      kernels::loops<T>().multi_dot(vectors.data(), count, times[s], from + at, found.data(), unknowns(w));
+      kernels::WholeVectors<T>().multi_dot(vectors.data(), count, times[s], from + at, found.data(), unknowns(w));
       for (int64_t i = 0; i < count; ++i) h[i].template mutable_data_ptr<T>()[s] = found[i];
     });
   });
 }
 
-at::Tensor BatchLoops::combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count,
-                               const Scalar* factor, Vector& w, const Active& active) {
+at::Tensor combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
+                   Vector& w, const Active& active) {
   auto square = numbers_like(w);
   with_type(w, [&]<class T>(T) {
     T *to = own<T>(w), *squares = square.mutable_data_ptr<T>();
@@ -133,21 +130,22 @@ at::Tensor BatchLoops::combine(double sign, const Scalar* h, const std::vector<V
       std::vector<const T*> vectors(count);
       std::vector<T> weights(count);
       for (int64_t i = 0; i < count; ++i) vectors[i] = data<T>(v[i]) + at, weights[i] = numbers<T>(h[i], w)[s];
-      squares[s] = kernels::loops<T>().multi_axpy(static_cast<T>(sign), weights.data(), vectors.data(), count,
-                                                  factor ? numbers<T>(*factor, w)[s] : T(1), to + at, unknowns(w));
+      squares[s] =
+          kernels::WholeVectors<T>().multi_axpy(static_cast<T>(sign), weights.data(), vectors.data(), count,
+                                                factor ? numbers<T>(*factor, w)[s] : T(1), to + at, unknowns(w));
     });
   });
   return square;
 }
 
-bool BatchLoops::any(const Scalar& where) {
+bool any(const Scalar& where) {
   return with_type(where, [&]<class T>(T) {
     const T* values = data<T>(where);
     return std::any_of(values, values + where.numel(), [](T value) { return value != T(0); });
   });
 }
 
-at::Tensor BatchLoops::ratio(const Scalar& num, const Scalar& den, double negligible) {
+at::Tensor ratio(const Scalar& num, const Scalar& den, double negligible) {
   auto quotient = at::empty_like(den);
   with_type(den, [&]<class T>(T) {
     const T *above = data<T>(num), *below = data<T>(den);
@@ -158,8 +156,8 @@ at::Tensor BatchLoops::ratio(const Scalar& num, const Scalar& den, double neglig
   return quotient;
 }
 
-BatchLoops::Step BatchLoops::step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2,
-                                         double epsilon, double negligible) {
+Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
+                 double negligible) {
   Step step{at::empty_like(num), {}};
   auto vanishes = at::zeros_like(num, num.options().dtype(at::kBool));
   bool any = false;
@@ -178,4 +176,4 @@ BatchLoops::Step BatchLoops::step_length(const Scalar& num, const Scalar& den, c
   return step;
 }
 
-}  // namespace prdp
+}  // namespace prdp::batch_loops

@@ -3,46 +3,43 @@
 
 #include <vector>
 
-namespace prdp {
-
 /// The operations of TensorSpace that an iteration spends its time on, by the loops of this processor: for a batch in
 /// the host's memory that autograd does not record. A plain tensor operation takes a pass over memory of its own for
 /// each product and sum.
 ///
 /// A vector is written in place unless somebody else refers to its memory, such as a product that keeps what it was
 /// given. Numbers are (batch, 1, …), as those of TensorSpace. `active` is empty where every sample is.
-class BatchLoops {
- public:
-  using Vector = at::Tensor;
-  using Scalar = at::Tensor;
-  using Active = std::vector<bool>;
+namespace prdp::batch_loops {
 
-  /// Whether they can take vectors like b. The loops work on whole registers.
-  static bool take(const at::Tensor& b);
+using Vector = at::Tensor;
+using Scalar = at::Tensor;
+using Active = std::vector<bool>;
 
-  static Scalar dot(const Vector& a, const Vector& b);
-  /// out = factor v, of all samples.
-  static void scale(const Scalar& factor, const Vector& v, Vector& out);
-  /// y = x + beta y
-  static void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active);
-  /// x += alpha p and r -= alpha q; returns ‖r‖².
-  static Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r,
-                        const Active& active);
-  /// h_i = v_i·(factor w) for the first `count` of v.
-  static void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h);
-  /// w = factor w + sign Σ h_i v_i; returns ‖w‖². Without a factor, w keeps its length.
-  static Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
-                        Vector& w, const Active& active);
+/// Whether they can take vectors like b. The loops work on whole registers.
+bool take(const at::Tensor& b);
 
-  static bool any(const Scalar& where);
-  /// As TensorSpace's: num / den, or 0; the latter says of which samples it breaks down.
-  static Scalar ratio(const Scalar& num, const Scalar& den, double negligible);
-  struct Step {
-    Scalar length;
-    at::Tensor vanishes;  // undefined: nowhere
-  };
-  static Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
-                          double negligible);
+Scalar dot(const Vector& a, const Vector& b);
+/// out = factor v, of all samples.
+void scale(const Scalar& factor, const Vector& v, Vector& out);
+/// y = x + beta y
+void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active);
+/// x += alpha p and r -= alpha q; returns ‖r‖².
+Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r, const Active& active);
+/// h_i = v_i·(factor w) for the first `count` of v.
+void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h);
+/// w = factor w + sign Σ h_i v_i; returns ‖w‖². Without a factor, w keeps its length.
+Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar* factor,
+               Vector& w, const Active& active);
+
+/// Whether a number is not zero.
+bool any(const Scalar& where);
+/// As TensorSpace's: num / den, or 0; the latter says of which samples it breaks down.
+Scalar ratio(const Scalar& num, const Scalar& den, double negligible);
+struct Step {
+  Scalar length;
+  at::Tensor vanishes;  // undefined: nowhere
 };
+Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
+                 double negligible);
 
-}  // namespace prdp
+}  // namespace prdp::batch_loops

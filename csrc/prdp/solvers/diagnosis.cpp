@@ -45,10 +45,12 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
   return norm_of(product - other) / norm_of(product);
 }
 
+/// Whether the null space of A is known: somebody named it, or it is that of a pressure.
+bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
+
 /// Whether A maps the constant to zero, though nobody named its null space.
 bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (is_singular(role.a) || operator_kind(role.a.kind).has_pressure) return false;
-  return maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
+  return !knows_null_space(role) && maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
 }
 
 /// Why a method for symmetric definite operators fails on this one.
@@ -99,7 +101,7 @@ std::string zero_diagonal(const SolveRole& role) {
 }
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (!is_singular(role.a) && !operator_kind(role.a.kind).has_pressure)
+  if (!knows_null_space(role))
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which A cannot reach, as " +
            (role.adjoint ? "A" : "Aᵀ") +
            " maps the constant to zero; give nullspace=\"constant\", which takes that part off";

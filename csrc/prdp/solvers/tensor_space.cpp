@@ -29,7 +29,7 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
     : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
   for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
-  in_loops_ = !recording_ && BatchLoops::take(b_);
+  in_loops_ = !recording_ && batch_loops::take(b_);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
 }
@@ -82,7 +82,7 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
 
 TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
   if (in_loops_) {
-    const auto [length, vanishes] = BatchLoops::step_length(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
+    const auto [length, vanishes] = batch_loops::step_length(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
     if (vanishes.defined()) note_broken(vanishes);
     return length;
   }
@@ -98,7 +98,7 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
 }
 
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) const {
-  if (in_loops_) return BatchLoops::ratio(num, den, negligible_);
+  if (in_loops_) return batch_loops::ratio(num, den, negligible_);
   const auto none = den.detach() < negligible_;
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }

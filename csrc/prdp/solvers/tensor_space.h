@@ -15,7 +15,7 @@ namespace prdp {
 
 /// A whole batch as a space for iterate(), in plain tensor operations: it serves every device,
 /// operators without CPU loops, and, run under autograd, the derivative of the iterations. Nothing
-/// is written in place but by BatchLoops. A frozen sample keeps its values by at::where.
+/// is written in place but by batch_loops. A frozen sample keeps its values by at::where.
 class TensorSpace {
  public:
   using Vector = at::Tensor;  // (batch, ...)
@@ -53,7 +53,7 @@ class TensorSpace {
   }
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
   void xpby(const Vector& x, const Scalar& beta, Vector& y) {
-    if (in_loops_) return BatchLoops::xpby(x, beta, y, active_);
+    if (in_loops_) return batch_loops::xpby(x, beta, y, active_);
     y = keep_frozen(x + beta * y, y);
   }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
@@ -61,10 +61,10 @@ class TensorSpace {
     return dot(y, y);
   }
   Scalar dot(const Vector& a, const Vector& b) const {
-    return in_loops_ ? BatchLoops::dot(a, b) : (a * b).sum(all_but_batch_, true);
+    return in_loops_ ? batch_loops::dot(a, b) : (a * b).sum(all_but_batch_, true);
   }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
-    if (in_loops_ && !system_.a.leaks()) return BatchLoops::descend(alpha, p, q, x, r, active_);
+    if (in_loops_ && !system_.a.leaks()) return batch_loops::descend(alpha, p, q, x, r, active_);
     x = keep_frozen(x + alpha * p, x);
     const auto left = r - alpha * q;
     r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
@@ -72,10 +72,10 @@ class TensorSpace {
   }
 
   void apply(const Vector& v, Vector& out) {
-    const auto unscaled = product(v);
-    define_scale(unscaled, v, system_.scale_of_a);
-    if (!in_loops_) out = unscaled * system_.scale_of_a;
-    else BatchLoops::scale(system_.scale_of_a, last_product_ = unscaled, out);
+    last_product_ = product(v);
+    define_scale(last_product_, v, system_.scale_of_a);
+    if (in_loops_) return batch_loops::scale(system_.scale_of_a, last_product_, out);
+    out = std::exchange(last_product_, {}) * system_.scale_of_a;
   }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
     apply(v, out);
@@ -127,19 +127,19 @@ class TensorSpace {
   int derivatives() const { return recording_ ? 2 : 0; }
   Scalar constant(const Scalar& value) const { return value.detach(); }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) const {
-    if (in_loops_) return BatchLoops::dots(v, count, factor, w, h);
+    if (in_loops_) return batch_loops::dots(v, count, factor, w, h);
     const auto scaled = factor * w.detach();
     for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
   }
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar& factor,
                               Vector& w) const {
-    if (in_loops_) return BatchLoops::combine(-1.0, h, v, count, &factor, w, {});
+    if (in_loops_) return batch_loops::combine(-1.0, h, v, count, &factor, w, {});
     w = factor * w;
     for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
     return dot(w.detach(), w.detach());
   }
   void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
-    if (in_loops_) return void(BatchLoops::combine(1.0, y, v, count, nullptr, x, active_));
+    if (in_loops_) return void(batch_loops::combine(1.0, y, v, count, nullptr, x, active_));
     auto sum = x;
     for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
     x = keep_frozen(sum, x);
@@ -151,7 +151,7 @@ class TensorSpace {
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
   void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const {
-    if (in_loops_ && !BatchLoops::any(where)) return;
+    if (in_loops_ && !batch_loops::any(where)) return;
     to = at::where(where.ne(0), from, to);
   }
   Scalar is_zero(const Scalar& value) const { return value.eq(0).to(b_.scalar_type()); }
@@ -181,7 +181,7 @@ class TensorSpace {
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
   }
-  /// As BatchLoops take it.
+  /// As batch_loops take it.
   Vector laid_out(const Vector& v) const { return in_loops_ ? v.contiguous() : v; }
   static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
     return omega ? before + *omega * (x + change - before) : x + change;
