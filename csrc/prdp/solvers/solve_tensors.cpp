@@ -10,15 +10,38 @@ namespace prdp {
 
 namespace {
 
-/// Says of each sample whether it is settled before iterating, and how; MAX_ITER: it is not.
-std::vector<SolveStatus> settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& magnitude,
-                                           const at::Tensor& start_magnitude) {
+/// What is known of the samples before they are iterated, (batch,) each, on their device: the status, which is MAX_ITER
+/// of those that are not settled yet; ‖b‖²; whether b lies outside the range of A; whether the start took a product.
+struct Beforehand {
+  at::Tensor status, b2, inconsistent, applied;
+
+  /// One copy.
+  void tell(std::vector<SampleState>& states) const {
+    const auto host =
+        at::stack({status.to(b2.scalar_type()), b2, applied.to(b2.scalar_type())}).to(at::kCPU, at::kDouble);
+    const auto rows = host.accessor<double, 2>();
+    for (size_t i = 0; i < states.size(); ++i) {
+      auto& s = states[i];
+      s.status = static_cast<SolveStatus>(static_cast<int64_t>(rows[0][i]));
+      s.b2 = rows[1][i];
+      if (s.status == SolveStatus::kMaxIter) {
+        s.applications += static_cast<int64_t>(rows[2][i]);
+        continue;
+      }
+      s.active = false;
+      s.settled = true;
+      s.iterations = s.applications = 0;
+    }
+  }
+};
+
+/// The status of each sample that is settled before iterating, and MAX_ITER of the others.
+at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& magnitude,
+                             const at::Tensor& start_magnitude) {
   const int64_t batch = magnitude.size(0);
-  std::vector<SolveStatus> status(batch, SolveStatus::kMaxIter);
+  auto status = at::full({batch}, static_cast<int64_t>(SolveStatus::kMaxIter), magnitude.options().dtype(at::kLong));
   const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
-    const auto host = rows.reshape({-1}).expand({batch}).to(at::kCPU).contiguous();
-    for (int64_t i = 0; i < batch; ++i)
-      if (host.const_data_ptr<bool>()[i]) status[i] = why;
+    status = status.masked_fill(rows.reshape({-1}).expand({batch}).to(status.device()), static_cast<int64_t>(why));
   };
   // The last mark holds: the order is that of the CPU loops, from the end.
   mark(magnitude.eq(0), SolveStatus::kConverged);
@@ -52,18 +75,24 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
   return info;
 }
 
-/// b with its rows scaled, and rows that do not take part set to zero.
+/// b with its rows scaled, and `others` in place of the rows that do not take part.
 struct ScaledRhs {
   at::Tensor b, scale;
 };
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part,
+                    const at::Tensor& others) {
   const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
   const auto scale = per_sample(power_of_two_scale(safe), b);
   const auto rows = per_sample(takes_part, b);
-  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
+  return {at::where(rows, b, others) * scale, scale};
 }
 
 at::Tensor largest_magnitude(const at::Tensor& b) { return b.detach().abs().flatten(1).amax(1); }
+
+ScaledRhs scale_whole(const at::Tensor& b) {
+  const auto scale = per_sample(power_of_two_scale(largest_magnitude(b)), b);
+  return {b * scale, scale};
+}
 
 /// Where the iterations of a batch start, and whether that took a product.
 struct TensorStart {
@@ -77,7 +106,7 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   const auto of_order_one = [](const at::Tensor& v) {
     const auto magnitude = largest_magnitude(v);
     const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
-    return scale_rhs(v, magnitude, usable);
+    return scale_rhs(v, magnitude, usable, at::zeros_like(v));
   };
   const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
   const auto y = of_order_one(x0.detach()).b;
@@ -98,12 +127,23 @@ at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& sta
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
 /// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
-std::vector<bool> find_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
+at::Tensor is_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
   const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
   const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
-  const auto found = (norm(b - projected) > bound * norm(b)).to(at::kCPU).contiguous();
-  const bool* rows = found.const_data_ptr<bool>();
-  return std::vector<bool>(rows, rows + found.numel());
+  return norm(b - projected) > bound * norm(b);
+}
+
+/// Where a method's own residual claims convergence, in vain as the samples are `wanted` further.
+template <class M, class Predicate>
+void go_on_from_true_residuals(TensorSpace& space, M& method, std::vector<SampleState>& states, double rtol,
+                               const Predicate& wanted) {
+  const auto residual2 = space.lanes(method.residual2());
+  for (size_t i = 0; i < states.size(); ++i)
+    states[i].claims = wanted(states[i]) && detail::is_within(residual2[i], rtol, states[i].b2);
+  const auto claims = [](const SampleState& s) { return s.claims; };
+  if (std::none_of(states.begin(), states.end(), claims)) return;
+  space.freeze_unless(states, claims);
+  method.recompute_residual();
 }
 
 /// One more iteration of the samples whose cap is beyond the `done` that they have taken, as iterate() takes
@@ -112,16 +152,7 @@ template <class M>
 void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& states, double rtol, int64_t done) {
   const auto wanted = [&](const SampleState& s) { return done < s.cap; };
   if constexpr (detail::kHasRecursiveResidual<M>) {
-    const auto residual2 = space.lanes(method.residual2());
-    for (size_t i = 0; i < states.size(); ++i) {
-      auto& s = states[i];
-      s.claims = rtol > 0.0 && done > 0 && wanted(s) && detail::is_within(residual2[i], rtol, s.b2);
-    }
-    const auto claims = [](const SampleState& s) { return s.claims; };
-    if (std::any_of(states.begin(), states.end(), claims)) {
-      space.freeze_unless(states, claims);
-      method.recompute_residual();
-    }
+    if (rtol > 0.0 && done > 0) go_on_from_true_residuals(space, method, states, rtol, wanted);
   }
   space.freeze_unless(states, wanted);
   if constexpr (detail::kTakesStrides<M>) method.step(1);
@@ -137,46 +168,42 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto& solver = request.solver;
   const bool starts = takes_start(solver.method, request.x0);
   const auto status = settle_beforehand(a, solver, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
-  auto takes_part = at::empty({b.size(0)}, at::kBool);
-  std::vector<SampleState> states(status.size());
+  const auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
+  std::vector<SampleState> states(b.size(0));
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
-  for (size_t i = 0; i < states.size(); ++i) {
-    auto& s = states[i];
-    s.status = status[i];
-    s.active = s.status == SolveStatus::kMaxIter;
-    s.settled = !s.active;
-    s.cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : solver.max_iter.expect_int();
-    takes_part.mutable_data_ptr<bool>()[i] = s.active;
-  }
-  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part.to(b.device()));
+  for (size_t i = 0; i < states.size(); ++i)
+    states[i].cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : solver.max_iter.expect_int();
+  // A device that nobody has to look at iterates all samples, with something to do for those that need no iterations.
+  const bool looks_late = solver.rtol == 0.0 && !b.is_cpu();
+  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, looks_late ? alternating(b) : at::zeros_like(b));
   const auto rhs = a.project(whole);
-  const auto inconsistent = find_inconsistent(whole, rhs, solver.rtol);
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, rhs, states);
-  const auto b2 = space.lanes(space.b2());
-  for (size_t i = 0; i < states.size(); ++i) states[i].b2 = b2[i];
+  Beforehand beforehand{status, space.b2().flatten(), is_inconsistent(whole, rhs, solver.rtol).logical_and(takes_part),
+                        at::zeros_like(takes_part)};
   if (starts) {
-    const auto made =
-        make_start(a, rhs, at::where(per_sample(takes_part.to(b.device()), b), request.x0, at::zeros_like(rhs)));
-    const auto applied = made.applied.to(at::kCPU);
-    for (size_t i = 0; i < states.size(); ++i) states[i].applications = applied.const_data_ptr<bool>()[i];
+    const auto made = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
+    beforehand.applied = made.applied.flatten();
     space.start_from(made.x, made.r);
   }
+  if (looks_late) space.settle_by([&](auto& samples) { beforehand.tell(samples); });
+  else beforehand.tell(states);
 
   auto u = with_method(solver.method, solver.restart, space, [&](auto method) {
     iterate(space, method, states, solver.rtol, request.guarded);
     return a.project_solution(space.solution(method.x));
   });
+  u = at::where(per_sample(takes_part, b), u / scale, at::zeros_like(b));
+  const auto finite = u.isfinite().flatten(1).all(1);
+  const auto rows = at::stack({beforehand.inconsistent, finite}).to(at::kCPU);
+  const bool *inconsistent = rows.const_data_ptr<bool>(), *finite_rows = inconsistent + states.size();
   for (size_t i = 0; i < states.size(); ++i)
     if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
-  u = at::where(per_sample(takes_part.to(b.device()), b), u / scale, at::zeros_like(b));
   if (!request.guarded) return {u.contiguous(), info_of(states, b.options())};
-  const auto finite = u.isfinite().flatten(1).all(1);
   u = at::where(per_sample(finite, b), u, at::zeros_like(u));
-  const auto finite_rows = finite.to(at::kCPU);
   for (size_t i = 0; i < states.size(); ++i) {
-    if (finite_rows.const_data_ptr<bool>()[i]) continue;
+    if (finite_rows[i]) continue;
     states[i].status = SolveStatus::kOverflow;
     states[i].iterations = 0;
     states[i].residual2 = states[i].b2;
@@ -204,7 +231,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const int64_t most =
       *std::max_element(host_caps.const_data_ptr<int64_t>(), host_caps.const_data_ptr<int64_t>() + host_caps.numel());
   std::vector<SampleState> states(b.size(0));
-  const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
+  const auto [rhs, scale] = scale_whole(b);
   const auto whole = a.project(rhs);
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
@@ -229,7 +256,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
 StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
                              const at::Tensor& caps)
     : solver_(solver), inverse_(make_inverse(a, solver.preconditioner, b)) {
-  const auto [scaled, scale] = scale_rhs(b, largest_magnitude(b), at::ones_like(caps, at::kBool));
+  const auto [scaled, scale] = scale_whole(b);
   scale_ = scale;
   rhs_ = a.project(scaled);
   const auto b2 = rhs_.square().flatten(1).sum(1).to(at::kCPU, at::kDouble);

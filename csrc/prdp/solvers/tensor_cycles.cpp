@@ -18,11 +18,12 @@ at::Tensor for_vectors(const at::Tensor& per_sample, int64_t dim) {
 
 std::vector<int> axes_to_coarsen(const TensorStencil& a) {
   std::vector<double> coupling(a.dim());
-  for (const auto& [offset, coefficient] : a.entries) {
-    const double size = coefficient.abs().sum().item<double>();
+  std::vector<at::Tensor> sizes;
+  for (const auto& entry : a.entries) sizes.push_back(entry.coefficient.abs().sum());
+  const auto host = at::stack(sizes).to(at::kCPU, at::kDouble);
+  for (size_t e = 0; e < sizes.size(); ++e)
     for (int64_t d = 0; d < a.dim(); ++d)
-      if (offset[d] != 0) coupling[d] += size;
-  }
+      if (a.entries[e].offset[d] != 0) coupling[d] += host.const_data_ptr<double>()[e];
   return kernels::axes_to_coarsen(a.shape, coupling);
 }
 
@@ -54,7 +55,7 @@ TensorCycles::Transfer TensorCycles::make_transfer(const TensorStencil& a, const
   Transfer t{from_end, n, kernels::coarse_points(n, periodic), periodic, {}, {}, {}};
   const auto options = a.diagonal().options().dtype(at::kLong);
   const auto places = at::arange(n, options), is_coarse = places.remainder(2).eq(periodic ? 0 : 1);
-  const auto between = is_coarse.logical_not().nonzero().flatten();
+  const auto between = at::arange(periodic ? 1 : 0, n, 2, options);
   t.order = at::where(is_coarse, places.div(2, "floor"), t.coarse + places.div(2, "floor"));
   const auto own = sums_along(a, axis), of_transpose = sums_along(transpose, axis);
   const auto weight = [&](const at::Tensor& side, const at::Tensor& centre) {

@@ -2,6 +2,8 @@
 #include <ATen/ATen.h>
 
 #include <array>
+#include <functional>
+#include <optional>
 #include <vector>
 
 #include "prdp/operators/operator.h"
@@ -9,6 +11,7 @@
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
+#include "prdp/solvers/unseen_numbers.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -54,7 +57,7 @@ class TensorSpace {
   void add(const Vector& d, Vector& x) { x = keep_frozen(x + d, x); }
   void xpby(const Vector& x, const Scalar& beta, Vector& y) {
     if (in_loops_) return batch_loops::xpby(x, beta, y, active_);
-    y = keep_frozen(x + beta * y, y);
+    y = keep_frozen(at::addcmul(x, beta, y), y);
   }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
     xpby(x, beta, y);
@@ -65,8 +68,8 @@ class TensorSpace {
   }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     if (in_loops_ && !system_.a.leaks()) return batch_loops::descend(alpha, p, q, x, r, active_);
-    x = keep_frozen(x + alpha * p, x);
-    const auto left = r - alpha * q;
+    x = keep_frozen(at::addcmul(x, alpha, p), x);
+    const auto left = at::addcmul(r, alpha, q, -1);
     r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
     return dot(r, r);
   }
@@ -120,8 +123,11 @@ class TensorSpace {
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
-  Scalar ratio(const Scalar& num, const Scalar& den) const;
-  void break_down(const Scalar& where) { note_broken(where.detach().ne(0)); }
+  Scalar ratio(const Scalar& num, const Scalar& den);
+  void break_down(const Scalar& where) {
+    if (unseen_) return unseen_->expect_zero(where);
+    note_broken(where.detach().ne(0));
+  }
 
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
   int derivatives() const { return recording_ ? 2 : 0; }
@@ -135,13 +141,13 @@ class TensorSpace {
                               Vector& w) const {
     if (in_loops_) return batch_loops::combine(-1.0, h, v, count, &factor, w, {});
     w = factor * w;
-    for (int64_t i = 0; i < count; ++i) w = w - h[i] * v[i];
+    for (int64_t i = 0; i < count; ++i) w = at::addcmul(w, h[i], v[i], -1);
     return dot(w.detach(), w.detach());
   }
   void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
     if (in_loops_) return void(batch_loops::combine(1.0, y, v, count, nullptr, x, active_));
     auto sum = x;
-    for (int64_t i = 0; i < count; ++i) sum = sum + y[i] * v[i];
+    for (int64_t i = 0; i < count; ++i) sum = at::addcmul(sum, y[i], v[i]);
     x = keep_frozen(sum, x);
   }
   bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
@@ -150,7 +156,8 @@ class TensorSpace {
             Scalar* y) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
-  void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) const {
+  void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) {
+    if (unseen_) return unseen_->expect_zero(where);
     if (in_loops_ && !batch_loops::any(where)) return;
     to = at::where(where.ne(0), from, to);
   }
@@ -177,6 +184,19 @@ class TensorSpace {
   Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
   void run_again();
 
+  /// Iterations that the host does not watch (run_unseen.h): between these two, numbers are logged on the device, and
+  /// what would need a closer look is computed as if it did not.
+  bool is_far() const { return !b_.is_cpu() && !recording_; }
+  void look_away(bool track, double rtol);
+  UnseenLog look_back();
+  /// Ends one of these iterations; with the squares of its residuals, freezes the samples that are done.
+  void end_unseen(const Scalar& residual2 = {});
+  /// What is to be known of the samples before the first look; settle() calls it once.
+  void settle_by(std::function<void(States&)> known) { known_ = std::move(known); }
+  void settle(States& states) {
+    if (known_) std::exchange(known_, {})(states);
+  }
+
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
     return active_mask_.defined() ? at::where(active_mask_, updated, old) : updated;
@@ -199,10 +219,14 @@ class TensorSpace {
   }
   /// Sets the scale that brings the product to the order of v, if it is not known yet.
   void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
-  void note_broken(const at::Tensor& rows) { broken_ = broken_.defined() ? broken_.logical_or(rows) : rows; }
+  void note_broken(const at::Tensor& rows) {
+    const auto now = active_mask_.defined() ? rows.logical_and(active_mask_) : rows;
+    broken_ = broken_.defined() ? broken_.logical_or(now) : now;
+  }
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;
+  void bound_residuals(double rtol);
 
   System& system_;
   at::Tensor b_, b2_, diagonal_;
@@ -216,6 +240,10 @@ class TensorSpace {
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
   bool recording_, in_loops_;
+  std::optional<UnseenNumbers> unseen_;
+  at::Tensor mask_before_;       // active_mask_ at the last look
+  at::Tensor enough_, too_much_;  // bounds of the squares of residuals
+  std::function<void(States&)> known_;
 };
 
 }  // namespace prdp

@@ -42,6 +42,27 @@ at::Tensor points_of_colour(int64_t n, int64_t which, const at::TensorOptions& o
   return at::tensor(mask, at::kDouble).to(options);
 }
 
+/// Drops the neighbours that no point is coupled to. With `find_periodic`, an axis is periodic if its ends are coupled.
+void drop_zeros(TensorStencil& a, bool find_periodic) {
+  std::vector<at::Tensor> couples;  // points at all; and through the end of each axis
+  for (const auto& [offset, coefficient] : a.entries) {
+    couples.push_back(coefficient.ne(0).any());
+    for (int64_t d = 0; d < a.dim(); ++d)
+      couples.push_back(coefficient.select(d - a.dim(), offset[d] > 0 ? -1 : 0).ne(0).any());
+  }
+  const auto host = at::stack(couples).to(at::kCPU);
+  const bool* next = host.const_data_ptr<bool>();
+  std::vector<bool> ends(a.dim());
+  std::vector<TensorStencil::Entry> kept;
+  for (const auto& entry : a.entries) {
+    const bool is_centre = kept.empty();
+    if (*next++ || is_centre) kept.push_back(entry);
+    for (int64_t d = 0; d < a.dim(); ++d, ++next) ends[d] = ends[d] || (entry.offset[d] != 0 && *next);
+  }
+  a.entries = std::move(kept);
+  if (find_periodic) a.periodic = ends;
+}
+
 }  // namespace
 
 at::Tensor neighbours(const at::Tensor& t, const TensorStencil& like, const std::vector<int64_t>& offset) {
@@ -94,22 +115,10 @@ TensorStencil probe(const std::function<at::Tensor(const at::Tensor&)>& product,
     for (auto& [offset, coefficient] : found.entries)
       coefficient = coefficient + made * neighbours(mask, found, offset);
   }
-  for (int64_t d = 0; d < dim; ++d) {
-    if (periodic || shape[d] == 2) {  // two points are a ring
-      found.periodic[d] = shape[d] == 2 || (*periodic)[d];
-      continue;
-    }
-    const auto couples_ends = [&](const TensorStencil::Entry& e) {
-      const auto end = e.coefficient.select(d - dim, e.offset[d] > 0 ? -1 : 0);
-      return e.offset[d] != 0 && end.ne(0).any().item<bool>();
-    };
-    found.periodic[d] = std::any_of(found.entries.begin(), found.entries.end(), couples_ends);
-  }
-  const auto vanishes = [](const TensorStencil::Entry& e) {
-    const bool is_centre = std::all_of(e.offset.begin(), e.offset.end(), [](int64_t o) { return o == 0; });
-    return !is_centre && !e.coefficient.ne(0).any().item<bool>();
-  };
-  std::erase_if(found.entries, vanishes);
+  if (periodic) found.periodic = *periodic;
+  drop_zeros(found, /*find_periodic=*/!periodic);
+  for (int64_t d = 0; d < dim; ++d)
+    if (shape[d] == 2) found.periodic[d] = true;  // two points are a ring
   return found;
 }
 

@@ -1,0 +1,94 @@
+"""A stand-in for a device, where there is none. Its tensors say that they are not on the CPU, though their numbers are.
+Every operation on them is counted, and so is every copy of numbers to the host, on which a GPU would make it wait."""
+
+import collections
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+DEVICE = torch.device("lazy", 0)  # of a kind that autograd takes without its driver
+KEY = torch._C.DispatchKeySet(torch._C.DispatchKey.Lazy)
+COPIES = {"_to_copy", "to", "copy_"}  # they may mix devices
+READS = {"_local_scalar_dense", "item", "equal", "nonzero", "is_nonzero"}
+VIEWS_AND_MEMORY = {
+    "alias", "as_strided", "detach", "empty", "empty_like", "empty_strided", "expand", "new_empty", "permute", "select",
+    "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias", "_unsafe_view",
+}  # fmt: skip
+
+
+def each(change, value):
+    """`value` with the change made to each part of its lists and tuples."""
+    return type(value)(each(change, part) for part in value) if isinstance(value, list | tuple) else change(value)
+
+
+class _There(torch.Tensor):
+    """A tensor on the stand-in."""
+
+    @staticmethod
+    def __new__(cls, numbers):
+        made = torch.Tensor._make_wrapper_subclass(
+            cls, numbers.shape, strides=numbers.stride(), storage_offset=numbers.storage_offset(), dtype=numbers.dtype,
+            device=DEVICE,
+        )  # fmt: skip
+        made.numbers = numbers
+        return made
+
+    @classmethod
+    def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
+        raise AssertionError(f"{function} outside of `with StandIn()`")
+
+
+class StandIn(TorchDispatchMode):
+    """While it is entered, there is the device."""
+
+    def __init__(self):
+        super().__init__()
+        self.operations = collections.Counter()
+        self.copies_to_host = 0
+
+    @staticmethod
+    def send(tensor):
+        return _There(tensor.detach().clone())
+
+    @staticmethod
+    def fetch(tensor):
+        return tensor.numbers if isinstance(tensor, _There) else tensor
+
+    def launched(self):
+        """How many operations there were, but for views and new memory."""
+        return sum(count for name, count in self.operations.items() if name not in VIEWS_AND_MEMORY)
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if function.namespace == "prdp":  # as on a device: its kernel works with operations of torch
+            with self:
+                return function.redispatch(KEY, *args, **kwargs)
+        name = function._schema.name.removeprefix("aten::")
+        given, asked_for = [], []
+
+        def numbers(value):
+            if isinstance(value, _There):
+                given.append(value)
+                return value.numbers
+            if isinstance(value, torch.device):
+                asked_for.append(value)
+                return torch.device("cpu")
+            return value
+
+        here = each(numbers, args)
+        named = {key: each(numbers, value) for key, value in kwargs.items()}
+        there = asked_for[0] == DEVICE if asked_for else bool(given)
+        self.copies_to_host += bool(given) and (not there or name in READS)
+        if not given and not there:
+            return function(*args, **kwargs)
+        strangers = [a for a in args if isinstance(a, torch.Tensor) and not isinstance(a, _There) and a.dim() > 0]
+        assert not strangers or name in COPIES, f"{name}: a tensor on the CPU beside one on the device"
+        self.operations[name] += there
+
+        def back(value):
+            if not isinstance(value, torch.Tensor) or not there:
+                return value
+            written = [t for t in given if t.numbers is value]
+            return written[0] if written else _There(value)
+
+        return each(back, function(*here, **named))
