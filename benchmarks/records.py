@@ -78,7 +78,7 @@ LIST = [
     *(suite(name, 5) for name in ("change_of_k", "training", "memory")),
     *(
         Made(f"mosaic_{task}", f"-m benchmarks.mosaic {task} --limit 150", 60, f"{task}.json", f"flows/{task}.json")
-        for task in ("forward", "cost", "gradient", "conduction")
+        for task in ("forward", "cost", "gradient", "horizon", "conduction")
     ),
     Made("atlas", "-m prdp_torch stability", 3, "*", "stability"),
 ]
