@@ -134,6 +134,19 @@ def test_with_a_tolerance_the_host_looks_once_in_16_iterations(method):
     assert copies(15 + 48) - copies(15) == 3  # 1, 2, 4 and 8 iterations, then 16 each
 
 
+@pytest.mark.parametrize("method, count, products", [("jacobi", 11, 1), ("steepest_descent", 17, 1), ("cg", 24, 1),
+                                                     ("bicgstab", 64, 2)])  # fmt: skip
+def test_operations_of_an_iteration_with_a_tolerance(method, count, products):
+    """Those of docs/performance.md, in the window that begins with iteration 16."""
+    a = operators.Stencil(five_points(4.0)[..., :1, :1].expand(1, 5, 51, 53).contiguous(), OFFSETS, "zero")
+    few, many = [solve_there(noise(4, 1, 51, 53), a, method, k, 1e-12)[2].launched() for k in (17, 27)]
+    device = StandIn()
+    with device:
+        tensors = [device.send(t) for t in a.tensors]
+        torch.ops.prdp.apply(device.send(noise(4, 1, 51, 53)), tensors, a.kind, a.shape, a.parameters, False)
+    assert (many - few) / 10 - products * device.launched() == count
+
+
 @pytest.mark.parametrize(
     "method, at_most, products",
     [("jacobi", 3, 1), ("steepest_descent", 11, 1), ("cg", 17, 1), ("bicgstab", 54, 2)],

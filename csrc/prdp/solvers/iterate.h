@@ -40,8 +40,8 @@ void run(Space& space, Method& method, typename Space::States& states, double rt
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
     int64_t n = 1;
     if constexpr (kMayGoUnseen<Space, Method>) {
-      const bool idle = rtol > 0.0 && std::any_of(states.begin(), states.end(), is_idle<Method>);
-      if (space.is_far() && watched <= 0 && !idle) {
+      if (space.is_far() && watched <= 0 &&
+          (rtol == 0.0 || std::none_of(states.begin(), states.end(), is_idle<Method>))) {
         const int64_t left = stride(states, /*track=*/false), some = std::min(left, track ? unseen : kLongestUntracked);
         unseen = std::min(2 * unseen, kLongestUnseen);
         watched = run_unseen(space, method, states, rtol, track, some) ? 0 : some;

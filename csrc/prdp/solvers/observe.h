@@ -30,6 +30,12 @@ struct SampleState {
   double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
 
+  void note(double fresh2) {
+    residual2 = fresh2;
+    if (!(fresh2 < best2)) return;
+    best2 = fresh2;
+    best = iterations;
+  }
   void stop(SolveStatus why) {
     status = why;
     active = false;
@@ -81,6 +87,13 @@ inline constexpr bool kIsExact = requires { Method::kIsExact; };
 /// Methods whose every iteration takes about the same share off the error.
 template <class Method>
 inline constexpr bool kContracts = requires { Method::kContracts; };
+
+/// Sweeps or cycles without progress for so long may be at their rounding, which takes a closer look.
+template <class Method>
+bool is_idle(const SampleState& s) {
+  constexpr int64_t patience = kContracts<Method> ? 2 : 128;
+  return (kTakesStrides<Method> || kContracts<Method>) && s.active && s.iterations - s.best > patience;
+}
 
 /// Whether a residual asks to be confirmed by the true one.
 inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
@@ -168,11 +181,7 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     auto& s = states[i];
     s.claims = false;
     if (!s.active) continue;
-    s.residual2 = residual2[i];
-    if (s.residual2 < s.best2) {
-      s.best2 = s.residual2;
-      s.best = s.iterations;
-    }
+    s.note(residual2[i]);
     if (broken[i]) {
       s.stop(SolveStatus::kBreakdown);
       --s.iterations;  // the one that broke down changed nothing
@@ -191,10 +200,8 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
   }
   // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
   if constexpr (kTakesStrides<Method> || kContracts<Method>) {
-    constexpr int64_t patience = kContracts<Method> ? 2 : 128;
-    stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
-      return rtol > 0.0 && s.active && !s.claims && s.iterations - s.best > patience;
-    });
+    stop_at_rounding_floor(space, method, states, rtol,
+                           [rtol](const SampleState& s) { return rtol > 0.0 && !s.claims && is_idle<Method>(s); });
   }
   if constexpr (kLeastResidual<Method>)
     stop_at_rounding_floor(space, method, states, rtol,

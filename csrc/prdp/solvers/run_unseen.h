@@ -29,21 +29,11 @@ template <class Space, class Method>
 inline constexpr bool kMayGoUnseen =
     requires(Space& space) { space.look_away(true, 0.0); } && !kLeastResidual<Method> && !kContracts<Method>;
 
-/// Sweeps without progress for so long may be at their rounding, which takes a closer look.
-template <class Method>
-bool is_idle(const SampleState& s) {
-  return kTakesStrides<Method> && s.active && s.iterations - s.best > 128;  // as in observe()
-}
-
 /// What a look after one of these iterations would have said of a sample: whether it goes on or claims to have
 /// converged. False where it is neither.
 template <class Method>
 bool passes(SampleState& s, const Method& method, double residual2, double rtol) {
-  s.residual2 = residual2;
-  if (residual2 < s.best2) {
-    s.best2 = residual2;
-    s.best = s.iterations;
-  }
+  s.note(residual2);
   judge(s, rtol);
   if constexpr (kTakesStrides<Method>) plan_next_look(s, method.residual_is_log_convex(), rtol);
   if (rtol > 0.0 && is_idle<Method>(s)) return false;
