@@ -11,11 +11,9 @@ PEERS = ("torch", "jax", "lineax", "scipy", "pyamg", "phiflow", "jax-cfd", "expo
 
 
 def use_one_thread():
-    """Before any library starts its pool. XLA has no switch that holds, so the process keeps to one core."""
+    """Before any library starts its pool."""
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def peer_versions():
@@ -35,12 +33,13 @@ def main():
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
     use_one_thread()
-    import torch  # only now: it reads the environment
+    import torch  # only now: it reads the environment, and counts the cores for its pool
 
-    from benchmarks import page
+    from benchmarks import measure, page
     from prdp_torch.experiments import cli, records
 
     torch.set_num_threads(1)
+    measure.keep_to_one_core()
     folder = records.prepare_folder(options.out)
     environment = records.environment() | {"peers": peer_versions()}
     environment["command"] = " ".join(["prdp", "bench", *options.suites, *(["--quick"] if options.quick else [])])

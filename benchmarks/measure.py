@@ -1,11 +1,38 @@
 """Times of calls, side by side: all in turn, many rounds, minimum and median. If not said otherwise, it is
 the processor's time, that of all threads, which is the time that passes on one core with nothing else to do."""
 
+import contextlib
+import os
 import statistics
 import time
 
+import torch
+
 ROUNDS = 5
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 SAMPLE_SECONDS = 0.02  # what a reading takes at least; a call is repeated to reach it
+
+
+def keep_to_one_core():
+    """XLA has no switch that holds, so the process keeps to one core, whatever a library's pool does."""
+    if CORES:
+        os.sched_setaffinity(0, {max(CORES)})
+
+
+@contextlib.contextmanager
+def threads(count):
+    """torch's threads within it; more than one may use all cores that the process was given."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    if CORES and count > 1:
+        kept = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, CORES)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        if CORES and count > 1:
+            os.sched_setaffinity(0, kept)
 
 
 def interleaved(calls, rounds=ROUNDS, sample_seconds=SAMPLE_SECONDS, clock=time.process_time):

@@ -207,7 +207,7 @@ def _check_direct(trial: Stepper, sample: Tensor, seconds: float) -> None:
         return
     n = sample[0].numel()
     most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
-    if n > most:
+    if n > most and not _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters):
         raise ValueError(f"{n} unknowns are too many to factorise within the limit; at most {most}")
     set_solver(trial, Direct(1), 1, 0.0)
     # The functions of a step of one's own may hold tensors of the whole batch.

@@ -3,6 +3,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
+#include "prdp/operators/sum_over_axes.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
@@ -207,6 +208,15 @@ void bind_solvers(py::module_& m) {
       py::call_guard<py::gil_scoped_release>(), py::arg("lambda_"), py::arg("v"), py::arg("tensors"), py::arg("kind"),
       py::arg("shape"), py::arg("parameters"));
 
+  m.def(
+      "is_sum_over_axes",
+      [](const at::Tensor& b, std::vector<at::Tensor> tensors, std::string kind, std::vector<int64_t> shape,
+         std::vector<double> parameters) {
+        return is_sum_over_axes(*make_operator(spec(kind, shape, parameters, tensors)), b);
+      },
+      "Whether `Direct` solves with A, axis by axis, without a factorisation of the whole.",
+      py::call_guard<py::gil_scoped_release>(), py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
+      py::arg("parameters"));
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
   m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");
   m.def(

@@ -293,3 +293,16 @@ def test_a_varying_diagonal_is_divided_out():
     stencil = prdp.operators.Stencil(torch.stack([values, off, off])[None], [(0, 0), (0, 1), (0, -1)])
     found = {row.name: row for row in advise(own_step(lambda u: stencil), field((16, 16), batch=2)).rows}
     assert found["CG(diagonal)"].forward.products < 0.5 * found["CG"].forward.products
+
+
+def test_direct_is_tried_on_a_large_grid_whose_operator_is_a_sum_over_the_axes():
+    """As it needs no factorisation of the whole there; with a coefficient that varies it does."""
+    shape = (180, 190)
+    u = field(shape, batch=1, dtype=torch.float32)
+    constant = torch.ones(1, *shape)
+    varying = constant + torch.arange(shape[0])[:, None] % 3
+    for kappa, tried in ((constant, True), (varying, False)):
+        advice = advise(own_step(lambda v, kappa=kappa: prdp.operators.Diffusion(kappa, 1.0)), u, 0.3)
+        assert any(row.name == "Direct" for row in advice.rows) == tried
+        refused = "Direct was not tried: 34200 unknowns are too many to factorise within the limit; at most 32768."
+        assert (refused in advice.notes) == (not tried)

@@ -1,6 +1,7 @@
 """The benchmarks: what they call the truth, the products they count, and that all of it runs."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -141,3 +142,21 @@ def test_an_unknown_suite_is_refused():
     done = subprocess.run([sys.executable, "-m", "prdp_torch", "bench", "speed"], cwd=ROOT, capture_output=True,
                           text=True)  # fmt: skip
     assert done.returncode == 2 and "bench: unknown suite 'speed'; allowed: accuracy, " in done.stderr
+
+
+CORES_OF_TWO_THREADS = """
+import os, torch
+from benchmarks import measure
+torch.set_num_threads(1)
+allowed = os.sched_getaffinity(0)
+measure.keep_to_one_core()
+assert len(os.sched_getaffinity(0)) == 1
+with measure.threads(2):
+    assert os.sched_getaffinity(0) == allowed and torch.get_num_threads() == 2
+assert len(os.sched_getaffinity(0)) == 1 and torch.get_num_threads() == 1
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a system that pins processes")
+def test_two_threads_may_use_two_cores():
+    subprocess.run([sys.executable, "-c", CORES_OF_TWO_THREADS], cwd=ROOT, check=True)

@@ -3,6 +3,9 @@
 #include <cstring>
 #include <memory>
 #include <typeinfo>
+#include <vector>
+
+#include "prdp/kernels/whole_vectors.h"
 
 /// Factorisations of sparse matrices, and hierarchies of grids, that later solves with the same matrix use again: its
 /// adjoint solve, the other steps of a rollout, the next update of a training. They are found by a hash of the numbers
@@ -21,6 +24,15 @@ class FactorKeyMaker {
   template <class T>
   FactorKeyMaker& add(const T* values, int64_t count) {
     return add_bytes(reinterpret_cast<const unsigned char*>(values), count * static_cast<int64_t>(sizeof(T)));
+  }
+  /// The same for many numbers: the hashes of blocks, which several threads may share.
+  template <class T>
+  FactorKeyMaker& add_field(const T* values, int64_t count) {
+    std::vector<FactorKey> of_blocks((count + kBlock - 1) / kBlock);
+    for_each_block_of(count, [&](int64_t i, int64_t end) {
+      of_blocks[i / kBlock] = FactorKeyMaker().add(values + i, end - i).key();
+    });
+    return add(of_blocks.data(), static_cast<int64_t>(of_blocks.size()));
   }
   template <class T>
   FactorKeyMaker& add(T value) {

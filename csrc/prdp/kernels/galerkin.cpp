@@ -2,10 +2,11 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 #include <cmath>
 
 #include "prdp/kernels/loops.h"
-#include "prdp/threads/shared_rows.h"
+#include "prdp/kernels/whole_vectors.h"
 
 namespace prdp::kernels {
 
@@ -25,11 +26,9 @@ struct Ringed {
 /// Calls body(z, y, first point of the row) for all rows, on several threads if there are many.
 template <class Body>
 void for_each_row(const StencilGrid& grid, const Body& body) {
-  const int64_t rows = grid.shape[0] * grid.shape[1], nx = grid.shape[2];
-  const int64_t each = std::max<int64_t>(8192 / nx, 1);
-  shared_rows::for_each((rows + each - 1) / each, [&](int64_t part) {
-    for (int64_t r = part * each; r < std::min(rows, (part + 1) * each); ++r)
-      body(r / grid.shape[1], r % grid.shape[1], r * nx);
+  const int64_t ny = grid.shape[1], nx = grid.shape[2];
+  for_each_run_of_rows(grid.shape[0] * ny, nx, [&](int64_t begin, int64_t end) {
+    for (int64_t r = begin; r < end; ++r) body(r / ny, r % ny, r * nx);
   });
 }
 
@@ -43,14 +42,15 @@ int64_t row_at(const StencilGrid& grid, int64_t z, int64_t y, const Offset& o) {
 
 /// Sums of the coefficients with offset -1, 0 and 1 along the axis: of A, or of Aᵀ.
 template <class T>
-using Sums = std::array<std::vector<T>, 3>;
+using Sums = std::array<Field<T>, 3>;
 
 template <class T>
 Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
   Sums<T> sums;
-  for (auto& s : sums) s.assign(a.points(), T(0));
+  for (auto& s : sums) s.resize(a.points());
   const int64_t nx = a.grid.shape[2];
   for_each_row(a.grid, [&](int64_t z, int64_t y, int64_t at) {
+    for (auto& s : sums) std::fill_n(s.data() + at, nx, T(0));
     for (int k = 0; k < 27; ++k) {
       const Offset o = RawStencil<T>::offset(k);
       const T *own = a.coefficients[k], *of_transpose = a.coefficients[26 - k];
@@ -76,7 +76,7 @@ Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
 template <class T>
 Weights<T> weights_of(const StencilGrid& grid, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
   const Ringed ringed(grid);
-  Weights<T> w{std::vector<T>(Ringed::size(grid), T(0)), std::vector<T>(Ringed::size(grid), T(0))};
+  Weights<T> w{zeros<T>(Ringed::size(grid)), zeros<T>(Ringed::size(grid))};
   const auto& [nz, ny, nx] = grid.shape;
   for_each_row(grid, [&](int64_t z, int64_t y, int64_t at) {
     T *left = w.left.data() + ringed.at(z, y, 0), *right = w.right.data() + ringed.at(z, y, 0);
@@ -146,7 +146,7 @@ class CollapseOf {
       if (!fine_[d]) return has_sides() ? constants_.zeros.data() : nullptr;
       return fine_[d] + (p[0] * a_.grid.shape[1] + p[1]) * a_.grid.shape[2] + p[2];
     };
-    const auto weight = [&](const std::vector<T>& field, const std::array<int64_t, 3>& p, bool of_column) {
+    const auto weight = [&](const Field<T>& field, const std::array<int64_t, 3>& p, bool of_column) {
       const auto& o = offset_.along;
       return field.data() +
              (of_column ? ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]) : ringed_.at(p[0], p[1], p[2]));
@@ -228,21 +228,24 @@ RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& 
 template <class T>
 bool is_symmetric(const RawStencil<T>& a) {
   const int64_t nx = a.grid.shape[2];
+  std::atomic<bool> symmetric = true;
   for (int k = 0; k < RawStencil<T>::kCentre; ++k) {
     const T *one = a.coefficients[k], *other = a.coefficients[26 - k];
     if (!one && !other) continue;
     if (!one || !other) return false;
     const Offset o = RawStencil<T>::offset(k);
-    for (int64_t r = 0; r < a.grid.shape[0] * a.grid.shape[1]; ++r) {
-      const int64_t row = row_at(a.grid, r / a.grid.shape[1], r % a.grid.shape[1], o);
-      if (row < 0) continue;
+    for_each_row(a.grid, [&](int64_t z, int64_t y, int64_t at) {
+      const int64_t row = row_at(a.grid, z, y, o);
+      if (row < 0 || !symmetric) return;
+      bool same = true;
       for (int64_t i = 0; i < nx; ++i) {
         const int64_t j = neighbour(i, o.along[2], nx, a.grid.periodic[2]);
-        if (j >= 0 && one[r * nx + i] != other[row * nx + j]) return false;
+        same &= j < 0 || one[at + i] == other[row * nx + j];
       }
-    }
+      if (!same) symmetric = false;
+    });
   }
-  return true;
+  return symmetric;
 }
 
 template AxisTransfer<float> make_transfer(const RawStencil<float>&, int, bool);

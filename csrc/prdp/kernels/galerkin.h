@@ -13,7 +13,7 @@ namespace prdp::kernels {
 /// coarse points are not used, with a ring of one point around them.
 template <class T>
 struct Weights {
-  std::vector<T> left, right;
+  Field<T> left, right;
 };
 
 /// The interpolation and the restriction along an axis that belong to an operator. Of a symmetric one they are the

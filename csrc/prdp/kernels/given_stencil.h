@@ -41,12 +41,15 @@ StencilRows<T> assemble_rows(std::shared_ptr<const StencilPattern> pattern, cons
             if (y.count == 0 || x.count == 0) continue;
             T* to = a.coefficient((z.to + plane) * ny + y.to, k) + x.to;
             const T* source = coefficients[given] + ((z.from + plane) * ny + y.from) * nx + x.from;
-            if (!holds[k]) {
-              loops.copy_rows(factor, source, nx, to, a.stride(), y.count, x.count);
-            } else {
-              for (int64_t r = 0; r < y.count; ++r)
+            for_each_run_of_rows(y.count, x.count, [&](int64_t begin, int64_t end) {
+              if (!holds[k]) {
+                loops.copy_rows(factor, source + begin * nx, nx, to + begin * a.stride(), a.stride(), end - begin,
+                                x.count);
+                return;
+              }
+              for (int64_t r = begin; r < end; ++r)
                 for (int64_t i = 0; i < x.count; ++i) to[r * a.stride() + i] += factor * source[r * nx + i];
-            }
+            });
           }
     holds[k] = true;
   }
@@ -75,7 +78,7 @@ struct GivenStencil {
     const T factor = scale_of_operator(magnitude);
     auto rows = std::make_shared<StencilRows<T>>(assemble_rows(pattern, fields, factor, transposed));
     const auto key = [given_stencil = *this, from, count = given * points] {
-      return given_stencil.of_matrix().add(from, count).key();
+      return given_stencil.of_matrix().add_field(from, count).key();
     };
     const auto raw = [given_stencil = *this, fields, factor, points] {
       return given_stencil.raw(fields, factor, points);
@@ -118,9 +121,11 @@ struct GivenStencil {
       }
       const T* before = a.coefficients[place];
       T* sum = a.add(place);
-      for (int64_t i = 0; i < points; ++i) sum[i] = (before ? before[i] : T(0)) + factor * fields[given][i];
+      for_each_block_of(points, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) sum[i] = (before ? before[i] : T(0)) + factor * fields[given][i];
+      });
     }
-    if (!a.coefficients[RawStencil<T>::kCentre]) a.add(RawStencil<T>::kCentre);
+    if (!a.coefficients[RawStencil<T>::kCentre]) fill_zero(a.add(RawStencil<T>::kCentre), points);
     return a;
   }
 };

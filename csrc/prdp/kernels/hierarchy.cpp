@@ -14,19 +14,16 @@ namespace {
 /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero.
 template <class T>
 double radius_of(const RawStencil<T>& a) {
-  const int64_t n = a.points();
-  std::vector<T> sums(n, T(0));
-  for (const T* field : a.coefficients)
-    if (field)
-      for (int64_t i = 0; i < n; ++i) sums[i] += std::abs(field[i]);
   const T* diagonal = a.coefficients[RawStencil<T>::kCentre];
-  T largest = 0;
-  for (int64_t i = 0; i < n; ++i) {
-    const T ratio = sums[i] / std::abs(diagonal[i]);
-    if (!std::isfinite(ratio)) return std::numeric_limits<double>::infinity();
-    largest = std::max(largest, ratio);
-  }
-  return static_cast<double>(largest);
+  const T largest = largest_of_blocks<T>(a.points(), [&](int64_t begin, int64_t end) {
+    std::vector<T> ratios(end - begin, T(0));
+    for (const T* field : a.coefficients)
+      if (field)
+        for (int64_t i = begin; i < end; ++i) ratios[i - begin] += std::abs(field[i]);
+    for (int64_t i = begin; i < end; ++i) ratios[i - begin] /= std::abs(diagonal[i]);
+    return loops<T>().largest_magnitude(ratios.data(), end - begin);
+  });
+  return std::isfinite(largest) ? static_cast<double>(largest) : std::numeric_limits<double>::infinity();
 }
 
 /// By a sample of the points.

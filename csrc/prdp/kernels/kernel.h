@@ -26,8 +26,8 @@ class Factors {
 /// factor()·A on one channel of one sample, as a stencil on a grid.
 template <class T>
 struct GridOperator {
-  RawStencil<T> stencil;  // of the operator that is not transposed
-  FactorKey key;          // tells it from others
+  std::function<std::optional<RawStencil<T>>()> make;  // not transposed; nothing if neighbours lie far away
+  FactorKey key;                                       // tells it from others
   bool transposed;
 };
 

@@ -124,21 +124,24 @@ class Laplacian final : public Kernel<T> {
 
 template <class T, int Dim>
 std::optional<GridOperator<T>> Laplacian<T, Dim>::grid_operator() const {
-  RawStencil<T> a({Dim, {1, 1, 1}, {false, false, false}});
-  for (int d = 0; d < Dim; ++d) a.grid.shape[3 - Dim + d] = parameters_.shape[d];
-  const auto add = [&](const Offset& o, double value) {
-    std::fill_n(a.add(RawStencil<T>::place(o)), a.points(), static_cast<T>(value));
+  const auto make = [p = parameters_] {
+    RawStencil<T> a({Dim, {1, 1, 1}, {false, false, false}});
+    for (int d = 0; d < Dim; ++d) a.grid.shape[3 - Dim + d] = p.shape[d];
+    const auto add = [&](const Offset& o, double value) {
+      std::fill_n(a.add(RawStencil<T>::place(o)), a.points(), static_cast<T>(value));
+    };
+    add({{0, 0, 0}}, p.centre);
+    for (int d = 0; d < Dim; ++d)
+      for (const int64_t side : {-1, 1}) {
+        Offset o{{0, 0, 0}};
+        o.along[3 - Dim + d] = side;
+        add(o, p.off[d]);
+      }
+    return std::optional(std::move(a));
   };
-  add({{0, 0, 0}}, parameters_.centre);
-  for (int d = 0; d < Dim; ++d)
-    for (const int64_t side : {-1, 1}) {
-      Offset o{{0, 0, 0}};
-      o.along[3 - Dim + d] = side;
-      add(o, parameters_.off[d]);
-    }
   FactorKeyMaker key;
   key.add(parameters_.dim).add(parameters_.shape.data(), 3).add(parameters_.centre).add(parameters_.off.data(), 3);
-  return GridOperator<T>{std::move(a), key.key(), false};
+  return GridOperator<T>{make, key.key(), false};
 }
 
 /// The same for all samples of a batch.

@@ -24,11 +24,15 @@ struct Layout {
   /// dst = scale·src, from a contiguous sample into padded memory; and back.
   void load(const T* src, T scale, T* dst) const {
     for (int64_t z = 0; z < planes; ++z)
-      loops<T>().copy_rows(scale, src + z * rows * nx, nx, dst + z * plane, row, rows, nx);
+      for_each_run_of_rows(rows, nx, [&](int64_t r, int64_t end) {
+        loops<T>().copy_rows(scale, src + (z * rows + r) * nx, nx, dst + z * plane + r * row, row, end - r, nx);
+      });
   }
   void store(const T* src, T scale, T* dst) const {
     for (int64_t z = 0; z < planes; ++z)
-      loops<T>().copy_rows(scale, src + z * plane, row, dst + z * rows * nx, nx, rows, nx);
+      for_each_run_of_rows(rows, nx, [&](int64_t r, int64_t end) {
+        loops<T>().copy_rows(scale, src + z * plane + r * row, row, dst + (z * rows + r) * nx, nx, end - r, nx);
+      });
   }
 };
 

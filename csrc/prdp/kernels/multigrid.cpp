@@ -7,7 +7,7 @@ namespace prdp::kernels {
 
 template <class T>
 std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing) {
-  auto given = a.grid_operator();
+  const auto given = a.grid_operator();
   if (!given) return nullptr;
   // A hierarchy without levels stands for one that could not be made.
   struct Kept {
@@ -16,8 +16,10 @@ std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kerne
   };
   const int64_t nullity = a.leaks() ? a.null_space()->count() : 0;
   const auto key = FactorKeyMaker().add(given->key).add(nullity).key();
-  const auto kept = factor_cache::find_or_make<Kept>(
-      key, [&] { return std::make_shared<Kept>(Kept{Hierarchy<T>::make(std::move(given->stencil), nullity)}); });
+  const auto kept = factor_cache::find_or_make<Kept>(key, [&] {
+    auto finest = given->make();
+    return std::make_shared<Kept>(Kept{finest ? Hierarchy<T>::make(std::move(*finest), nullity) : nullptr});
+  });
   if (!kept->hierarchy) return nullptr;
   return std::unique_ptr<Multigrid>(new Multigrid(kept->hierarchy, a, transpose, given->transposed, smoothing));
 }

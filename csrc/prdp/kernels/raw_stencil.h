@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/whole_vectors.h"
 
 namespace prdp::kernels {
 
@@ -17,7 +18,7 @@ struct RawStencil {
   StencilGrid grid;
   /// By offset, 9 (z + 1) + 3 (y + 1) + x + 1; null where there is no such neighbour.
   const T* coefficients[27] = {};
-  std::vector<std::vector<T>> memory{};  // of those that are not somebody else's
+  std::vector<Field<T>> memory{};  // of those that are not somebody else's
 
   static int place(const Offset& o) {
     return static_cast<int>(9 * (o.along[0] + 1) + 3 * (o.along[1] + 1) + o.along[2] + 1);
@@ -26,9 +27,9 @@ struct RawStencil {
   static constexpr int kCentre = 13;
 
   int64_t points() const { return grid.shape[0] * grid.shape[1] * grid.shape[2]; }
-  /// A new field of zeros for this offset.
+  /// A new field for this offset, to be filled.
   T* add(int place) {
-    memory.emplace_back(points(), T(0));
+    memory.emplace_back(points());
     coefficients[place] = memory.back().data();
     return memory.back().data();
   }

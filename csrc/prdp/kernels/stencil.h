@@ -90,9 +90,8 @@ class Stencil final : public Kernel<T> {
   }
   std::shared_ptr<const Factors<T>> factorise() const override;
   std::optional<GridOperator<T>> grid_operator() const override {
-    auto raw = source_.raw ? source_.raw() : std::nullopt;
-    if (!raw) return std::nullopt;
-    return GridOperator<T>{std::move(*raw), source_.key(), source_.transposed};
+    if (!source_.raw) return std::nullopt;
+    return GridOperator<T>{source_.raw, source_.key(), source_.transposed};
   }
 
  private:

@@ -23,7 +23,7 @@ class StencilRows {
         coupled_(!pattern_->grid.periodic[2] ? 0
                  : pattern_->nearest         ? 2 * kLanes<T>
                                              : static_cast<int64_t>(pattern_->wraps.size())),
-        memory_(rows() * (count_ * row_ + coupled_) + kLanes<T>, T(0)) {
+        memory_(zeros<T>(rows() * (count_ * row_ + coupled_) + kLanes<T>)) {
     const auto address = reinterpret_cast<std::uintptr_t>(memory_.data());
     coefficients_ = reinterpret_cast<T*>((address + 63) / 64 * 64);
   }
@@ -47,23 +47,9 @@ class StencilRows {
   }
 
   void close() {
-    for (int64_t r = 0; r < rows(); ++r) {
-      T* const to = coupled(r);
-      for (size_t e = 0; e < pattern_->wraps.size(); ++e)
-        to[e] = coefficient(r, pattern_->wraps[e].coefficient)[pattern_->wraps[e].to];
-      if (pattern_->nearest && coupled_) {
-        to[0] = coefficient(r, 1)[0];
-        to[kLanes<T> + (nx_ - 1) % kLanes<T>] = coefficient(r, 2)[nx_ - 1];
-      }
-      if (row_ > nx_) std::fill(coefficient(r, 0) + nx_, coefficient(r, 0) + row_, T(1));
-    }
-    for (int64_t k = 0; k < count_; ++k) {
-      const int64_t x = pattern_->offsets[k].along[2];
-      for (int64_t r = 0; r < rows() && x != 0; ++r) {
-        for (int64_t i = 0; i < -x; ++i) coefficient(r, k)[i] = T(0);
-        for (int64_t i = nx_ - x; i < nx_; ++i) coefficient(r, k)[i] = T(0);
-      }
-    }
+    for_each_run_of_rows(rows(), row_, [&](int64_t begin, int64_t end) {
+      for (int64_t r = begin; r < end; ++r) close_row(r);
+    });
   }
 
   /// On these rows: out = A v; dots += {v·out, ‖out‖²} unless it is null.
@@ -144,6 +130,22 @@ class StencilRows {
   }
 
  private:
+  void close_row(int64_t r) {
+    T* const to = coupled(r);
+    for (size_t e = 0; e < pattern_->wraps.size(); ++e)
+      to[e] = coefficient(r, pattern_->wraps[e].coefficient)[pattern_->wraps[e].to];
+    if (pattern_->nearest && coupled_) {
+      to[0] = coefficient(r, 1)[0];
+      to[kLanes<T> + (nx_ - 1) % kLanes<T>] = coefficient(r, 2)[nx_ - 1];
+    }
+    if (row_ > nx_) std::fill(coefficient(r, 0) + nx_, coefficient(r, 0) + row_, T(1));
+    for (int64_t k = 0; k < count_; ++k) {
+      const int64_t x = pattern_->offsets[k].along[2];
+      for (int64_t i = 0; i < -x; ++i) coefficient(r, k)[i] = T(0);
+      for (int64_t i = nx_ - x; i < nx_; ++i) coefficient(r, k)[i] = T(0);
+    }
+  }
+
   const T* coupled(int64_t r) const { return coefficients_ + rows() * stride() + r * coupled_; }
   T* coupled(int64_t r) { return coefficients_ + rows() * stride() + r * coupled_; }
   OffsetStencil<T> offsets() const {
@@ -165,7 +167,7 @@ class StencilRows {
   std::shared_ptr<const StencilPattern> pattern_;
   int64_t nx_, row_, count_;
   int64_t coupled_;  // values for what leaves a row
-  std::vector<T> memory_;
+  Field<T> memory_;
   T* coefficients_;  // aligned, within memory_, with those values behind them
 };
 

@@ -5,7 +5,7 @@
 #include <limits>
 #include <vector>
 
-#include "prdp/kernels/loops.h"
+#include "prdp/kernels/whole_vectors.h"
 
 /// Scaling, finiteness and memory of the vectors of one sample.
 namespace prdp::kernels {
@@ -13,12 +13,6 @@ namespace prdp::kernels {
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
-}
-
-/// max |x_i|; NaN or Inf if any x_i is not finite.
-template <class T>
-T largest_magnitude(const T* x, int64_t n) {
-  return loops<T>().largest_magnitude(x, n);
 }
 
 /// Power of two s with s·magnitude in [1, 2) (near the subnormals, as close as s and 1/s allow).
@@ -53,7 +47,7 @@ class Workspace {
     for (int64_t i = 0; i < count; ++i) clear(i);
   }
   /// Zeroes a vector with its halos.
-  void clear(int64_t index) { std::memset(vector(index) - halo_, 0, static_cast<size_t>(used_) * sizeof(T)); }
+  void clear(int64_t index) { fill_zero(vector(index) - halo_, used_); }
   int64_t count() const { return count_; }
 
   T* vector(int64_t index) {
@@ -63,7 +57,7 @@ class Workspace {
   }
 
  private:
-  std::vector<T> memory_;
+  Field<T> memory_;
   int64_t stride_ = 0, used_ = 0, halo_ = 0, count_ = 0;  // `used_` of each stride, which ends with a gap
 };
 

@@ -4,6 +4,7 @@
 #include <cstring>
 #include <vector>
 
+#include "prdp/kernels/field.h"
 #include "prdp/kernels/loops.h"
 #include "prdp/threads/shared_rows.h"
 
@@ -18,6 +19,41 @@ template <class Body>
 void for_each_block_of(int64_t n, const Body& body) {
   if (n <= kBlock) return body(int64_t{0}, n);
   shared_rows::for_each((n + kBlock - 1) / kBlock, [&](int64_t i) { body(i * kBlock, std::min(n, (i + 1) * kBlock)); });
+}
+
+/// Calls body(begin, end) for runs of rows with n values each.
+template <class Body>
+void for_each_run_of_rows(int64_t rows, int64_t n, const Body& body) {
+  const int64_t each = std::max<int64_t>(kBlock / n, 1);
+  if (rows <= each) return body(int64_t{0}, rows);
+  shared_rows::for_each((rows + each - 1) / each, [&](int64_t i) { body(i * each, std::min(rows, (i + 1) * each)); });
+}
+
+template <class T>
+void fill_zero(T* x, int64_t n) {
+  for_each_block_of(n, [&](int64_t i, int64_t end) { std::memset(x + i, 0, (end - i) * sizeof(T)); });
+}
+
+template <class T>
+Field<T> zeros(int64_t n) {
+  Field<T> field(n);
+  fill_zero(field.data(), n);
+  return field;
+}
+
+/// The largest of what of_block(begin, end) says of each block; NaN or Inf if that of any block is.
+template <class T, class Body>
+T largest_of_blocks(int64_t n, const Body& of_block) {
+  if (n <= kBlock) return of_block(int64_t{0}, n);
+  std::vector<T> all((n + kBlock - 1) / kBlock);
+  for_each_block_of(n, [&](int64_t i, int64_t end) { all[i / kBlock] = of_block(i, end); });
+  return loops<T>().largest_magnitude(all.data(), static_cast<int64_t>(all.size()));
+}
+
+/// max |x_i|; NaN or Inf if any x_i is not finite.
+template <class T>
+T largest_magnitude(const T* x, int64_t n) {
+  return largest_of_blocks<T>(n, [&](int64_t i, int64_t end) { return loops<T>().largest_magnitude(x + i, end - i); });
 }
 
 /// Sums of several numbers over parts: body(i, sums) adds those of part i to zeros.
@@ -48,9 +84,7 @@ class WholeVectors {
   void copy(const T* from, T* to, int64_t n) const {
     for_each_block_of(n, [&](int64_t i, int64_t end) { std::memcpy(to + i, from + i, (end - i) * sizeof(T)); });
   }
-  void fill_zero(T* x, int64_t n) const {
-    for_each_block_of(n, [&](int64_t i, int64_t end) { std::memset(x + i, 0, (end - i) * sizeof(T)); });
-  }
+  void fill_zero(T* x, int64_t n) const { kernels::fill_zero(x, n); }
   void scale(T factor, const T* x, T* out, int64_t n) const {
     for_each_block_of(n, [&](int64_t i, int64_t end) { loops_.scale(factor, x + i, out + i, end - i); });
   }
@@ -98,7 +132,7 @@ class WholeVectors {
       return loops_.multi_axpy(sign, alpha, moved(v, count, i).data(), count, factor, w + i, end - i);
     });
   }
-  T largest_magnitude(const T* x, int64_t n) const { return loops_.largest_magnitude(x, n); }
+  T largest_magnitude(const T* x, int64_t n) const { return kernels::largest_magnitude(x, n); }
 
  private:
   static std::vector<const T*> moved(const T* const* v, int64_t count, int64_t by) {

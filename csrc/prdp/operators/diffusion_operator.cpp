@@ -114,18 +114,19 @@ double DiffusionOperator::per_cell2(int64_t axis) const {
   return per_cell * per_cell;
 }
 
-at::Tensor DiffusionOperator::mean(const at::Tensor& a, const at::Tensor& b) const {
-  return mean_ == FaceMean::kHarmonic ? 2.0 / (1.0 / a + 1.0 / b) : 0.5 * (a + b);
-}
-
-std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis) const {
+std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) const {
   const int64_t d = 2 + axis;
-  const double scale = per_cell2(axis);
-  const auto inner = scale * mean(above(kappa_, d), below(kappa_, d));
+  const double scale = factor * per_cell2(axis);
+  const bool harmonic = mean_ == FaceMean::kHarmonic;
+  const auto averaged = harmonic ? kappa_.reciprocal() : kappa_;
+  const auto mean = [&](const at::Tensor& a, const at::Tensor& b) {
+    return harmonic ? (a + b).reciprocal() * (2.0 * scale) : (a + b) * (0.5 * scale);
+  };
+  const auto inner = mean(above(averaged, d), below(averaged, d));
   const auto outer = [&](const at::Tensor& cells, Side side) {
     return side == Side::kZero ? 2.0 * scale * cells : at::zeros_like(cells);
   };
-  const auto around = is_periodic(axis) ? scale * mean(first(kappa_, d), last(kappa_, d)) : at::Tensor();
+  const auto around = is_periodic(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
   const auto low = around.defined() ? around : outer(first(kappa_, d), sides_[axis][0]);
   const auto high = around.defined() ? around : outer(last(kappa_, d), sides_[axis][1]);
   return {at::cat({low, inner}, d), at::cat({inner, high}, d)};
@@ -178,9 +179,9 @@ at::Tensor DiffusionOperator::coefficients() const {
   auto diagonal = shift_ + 0.0 * kappa_;  // NaN where kappa is not finite, which a harmonic mean would lose
   std::vector<at::Tensor> all{at::Tensor()};
   for (int64_t axis = 0; axis < dim(); ++axis)
-    for (const auto& face : faces(axis)) {
-      diagonal = diagonal + face;
-      all.push_back(-face);
+    for (const auto& coupling : faces(axis, -1.0)) {
+      diagonal = diagonal - coupling;
+      all.push_back(coupling);
     }
   all[0] = diagonal;
   for (auto& field : all) field = field.expand_as(diagonal);

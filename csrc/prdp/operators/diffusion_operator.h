@@ -49,10 +49,9 @@ class DiffusionOperator final : public Operator {
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   bool is_periodic(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic; }
   double per_cell2(int64_t axis) const;  // 1/h²
-  /// Coefficients of the faces below and above each cell along an axis, times 1/h²; of a side with u = 0 twice that of
-  /// its cell, as it is half as far away.
-  std::array<at::Tensor, 2> faces(int64_t axis) const;
-  at::Tensor mean(const at::Tensor& a, const at::Tensor& b) const;
+  /// Coefficients of the faces below and above each cell along an axis, times factor/h²; of a side with u = 0 twice
+  /// that of its cell, as it is half as far away.
+  std::array<at::Tensor, 2> faces(int64_t axis, double factor = 1.0) const;
   /// The same operator as a stencil: the diagonal, and for each axis what couples a cell to those below and above.
   at::Tensor coefficients() const;
   OperatorSpec as_stencil() const;
