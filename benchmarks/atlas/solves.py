@@ -232,8 +232,8 @@ def known_matrices(quick):
     status = [[outcome(a, b, solver).status for solver in solvers.values()] for a, b in cases.values()]
     solved = {name: sum(row[i].startswith("CONV") for row in status) for i, name in enumerate(solvers)}
     most = max(solved.values())
-    best = " and ".join(name for name, count in solved.items() if count == most)
-    answer = f"the status of each; {best} solve {most} of {len(cases)}"
+    best = [name for name, count in solved.items() if count == most]
+    answer = f"the status of each; {' and '.join(best)} solve{'s' * (len(best) == 1)} {most} of {len(cases)}"
     return {"x": list(solvers), "rows": list(cases), "status": status, "answer": answer}
 
 

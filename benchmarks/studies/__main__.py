@@ -6,7 +6,7 @@ import importlib
 import sys
 from pathlib import Path
 
-STUDIES = ("cycles", "data", "inference", "loss", "precision", "residuals", "unroll", "updates", "widths")
+STUDIES = ("data", "inference", "loss", "precision", "residuals", "unroll", "updates", "widths")
 
 
 def main():

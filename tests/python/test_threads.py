@@ -67,6 +67,50 @@ print(cases, "cases")
 """)
 
 
+def test_threads_do_not_change_a_bit_of_one_large_sample():
+    """They share its rows, and the set-up: coarse grids, factors and the coefficients of the faces."""
+    assert "18 cases" in run("""
+from prdp_torch import _C
+from prdp_torch.operators import Diffusion, Poisson, Stencil
+kappa = torch.exp(torch.randn(1, 190, 201, dtype=torch.float64))
+wind = torch.rand(1, 190, 201, dtype=torch.float64)
+five = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+operators = {
+    "poisson 2D": ((190, 201), lambda k, w: Poisson((190, 201))),
+    "poisson 3D": ((34, 31, 35), lambda k, w: Poisson((34, 31, 35))),
+    "constant": ((190, 201), lambda k, w: Diffusion(torch.ones_like(k), 1.0, boundary=("flux", "periodic"))),
+    "varying": ((190, 201), lambda k, w: Diffusion(k, 1e-3, boundary="flux")),
+    "wind": ((190, 201), lambda k, w: Stencil(torch.stack([4 + w, -1 - w, -k / k, -k / k, -k / k], 1), five)),
+}
+solvers = {
+    "poisson 2D": [prdp.Direct(), prdp.CG(9, preconditioner="multigrid")],
+    "poisson 3D": [prdp.Direct(), prdp.Multigrid(5)],
+    "constant": [prdp.Direct()],
+    "varying": [prdp.CG(9), prdp.CG(9, preconditioner="multigrid")],
+    "wind": [prdp.GMRES(2, restart=8, preconditioner="multigrid"), prdp.BiCGStab(9)],
+}
+cases = 0
+for name, (shape, make) in operators.items():
+    for solver in solvers[name]:
+        for dtype in (torch.float32, torch.float64):
+            k, w, b, g = (t.to(dtype) for t in (kappa, wind, torch.randn(1, 1, *shape), torch.randn(1, 1, *shape)))
+            results = []
+            for count in (1, 2, 3):
+                _C.clear_factorisations()
+                leaves = [t.clone().requires_grad_() for t in (b, k)]
+                def both():
+                    u, _ = prdp.linear_solve(make(leaves[1], w), leaves[0], solver, on_failure="return")
+                    return u.detach(), *torch.autograd.grad(u, leaves, g, allow_unused=True)
+                results.append(with_threads(count, both)[0])
+            for other in results[1:]:
+                for mine, theirs in zip(other, results[0]):
+                    assert (mine is None) == (theirs is None), name
+                    assert mine is None or torch.equal(mine, theirs), (name, solver, dtype)
+            cases += 1
+print(cases, "cases")
+""")
+
+
 def test_two_threads_share_a_batch():
     """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
     one, two = map(

@@ -200,7 +200,9 @@ void FastDiagonalisation<T>::solve(std::vector<T>& field) const {
   static thread_local std::vector<T> other;
   other.resize(field.size());
   eigenvectors.apply(field, other, /*transposed=*/true);
-  for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse[i];
+  for_each_block_of(std::ssize(field), [&, inverse = &inverse](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) field[i] *= (*inverse)[i];
+  });
   eigenvectors.apply(field, other, /*transposed=*/false);
 }
 

@@ -63,7 +63,10 @@ class SineTransform final : public Factors<T> {
     other.resize(inverse_.size());
     layout_.store(r, T(1), field.data());
     basis_.apply(field, other, /*transposed=*/false);
-    for (size_t i = 0; i < field.size(); ++i) field[i] *= inverse_[i];
+    T* const values = field.data();  // another thread would see a field of its own
+    for_each_block_of(layout_.unknowns(), [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) values[i] *= inverse_[i];
+    });
     basis_.apply(field, other, /*transposed=*/false);
     layout_.load(field.data(), T(1), d);
     return all_finite(field.data(), static_cast<int64_t>(field.size()));
