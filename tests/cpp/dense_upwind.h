@@ -42,8 +42,9 @@ struct Flow {
   double u(int64_t channel, int64_t j, int64_t i) const {
     return static_cast<double>(values[channel * cells() + at(j, i)]);
   }
-  prdp::kernels::UpwindParameters<T> parameters(bool transposed) const {
-    return {values.data(), shape.ny, shape.nx, kNu, kDt, transposed};
+  prdp::kernels::UpwindParameters<T> parameters(bool transposed, int64_t dim = 2) const {
+    const auto pattern = prdp::kernels::UpwindParameters<T>::of_grid(dim, shape.ny, shape.nx);
+    return {values.data(), shape.ny, shape.nx, kNu, kDt, transposed, 1.0, 1.0, pattern};
   }
 };
 template <class T>

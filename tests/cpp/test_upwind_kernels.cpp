@@ -22,7 +22,7 @@ void expect_burgers(Shape shape) {
   const auto flow = random_flow<T>(shape);
   const Matrix a = dense_burgers<T, Dim>(flow);
   for (const bool transposed : {false, true}) {
-    const auto made = burgers<T>(flow.parameters(transposed), Dim);
+    const auto made = burgers<T>(flow.parameters(transposed, Dim), Dim);
     const Kernel<T>& kernel = *made;
     const Matrix applied = transposed ? Matrix(a.transpose()) : a;
     expect_matrix(kernel, applied);
@@ -30,7 +30,7 @@ void expect_burgers(Shape shape) {
     const auto lu = applied.partialPivLu();
     expect_solution(kernel, [&](const Vector& r) -> Vector { return lu.solve(r); });
   }
-  expect_adjoint(*burgers<T>(flow.parameters(false), Dim), *burgers<T>(flow.parameters(true), Dim));
+  expect_adjoint(*burgers<T>(flow.parameters(false, Dim), Dim), *burgers<T>(flow.parameters(true, Dim), Dim));
 }
 
 template <class T>

@@ -31,7 +31,7 @@ std::unique_ptr<Kernel<T>> burgers(const UpwindParameters<T>& p, int64_t dim) {
     return {scratch, scratch + 1, scratch + 2};
   };
   UpwindTerms terms{factor, p.dt * factor, p.nu * p.dt * factor, p.transposed, p.length_y, p.length_x};
-  auto rows = std::make_shared<StencilRows<T>>(upwind_rows<T>(p.pattern(dim), terms, winds));
+  auto rows = std::make_shared<StencilRows<T>>(upwind_rows<T>(p.pattern, terms, winds));
   const auto raw = [p, dim]() -> std::optional<RawStencil<T>> {
     auto untransposed = p;
     untransposed.transposed = false;

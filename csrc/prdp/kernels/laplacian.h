@@ -50,7 +50,7 @@ class Laplacian final : public Kernel<T> {
     });
     return centre_ * centre_ * change2[0];
   }
-  std::optional<double> radius() const override { return jacobi_radius(parameters_); }
+  std::optional<double> radius() const override { return radius_; }
   void smooth(const T* b, const T* x, T* y, T p, T q) const override {
     shared_rows::for_each(parts(), [&](int64_t i) {
       const auto [a, at] = part(i, apply_weights_);
@@ -72,6 +72,7 @@ class Laplacian final : public Kernel<T> {
     for (auto& off : parameters_.off) off *= factor;
     centre_ = static_cast<T>(parameters_.centre);
     norm_ = std::abs(parameters_.centre);
+    radius_ = jacobi_radius(parameters_);
     const int64_t row = layout().row, nx = layout().nx;
     apply_weights_.assign(Dim * row, T(0));
     sweep_weights_.assign(Dim * row, T(0));
@@ -118,7 +119,7 @@ class Laplacian final : public Kernel<T> {
   const Loops<T>& loops_ = loops<T>();
   LaplacianParameters parameters_;
   T centre_;
-  double norm_;
+  double norm_, radius_;
   std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: x, y, z
 };
 

@@ -107,7 +107,7 @@ class NavierStokes final : public Kernel<T> {
     return sum;
   }
   static StencilRows<T> c1(const UpwindParameters<T>& p, double factor) {
-    return upwind_rows<T>(p.pattern(2), terms(p, factor), [&](int axis, int64_t j, T* mean) {
+    return upwind_rows<T>(p.pattern, terms(p, factor), [&](int axis, int64_t j, T* mean) {
       if (axis == 0) return at_point(wind(p, 0, j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i + 1] = wind(p, 1, j)[i] + wind(p, 1, j + 1)[i];
       mean[0] = mean[p.nx];
@@ -115,7 +115,7 @@ class NavierStokes final : public Kernel<T> {
     });
   }
   static StencilRows<T> c2(const UpwindParameters<T>& p, double factor) {
-    return upwind_rows<T>(p.pattern(2), terms(p, factor), [&](int axis, int64_t j, T* mean) {
+    return upwind_rows<T>(p.pattern, terms(p, factor), [&](int axis, int64_t j, T* mean) {
       if (axis == 1) return at_point(wind(p, 1, j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i] = wind(p, 0, j - 1)[i] + wind(p, 0, j)[i];
       mean[p.nx] = mean[0];

@@ -66,7 +66,7 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
   static std::unique_ptr<Stencil<T>> laplacian_of(const UpwindParameters<T>& p, const Spacing& of) {
     const T y = static_cast<T>(-of.y / of.largest), x = static_cast<T>(-of.x / of.largest);
     const T along[] = {static_cast<T>(2 * (of.x + of.y) / of.largest), x, x, y, y};
-    auto rows = std::make_shared<StencilRows<T>>(p.pattern(2));
+    auto rows = std::make_shared<StencilRows<T>>(p.pattern);
     for (int64_t j = 0; j < p.ny; ++j)
       for (int64_t k = 0; k < 5; ++k) std::fill_n(rows->coefficient(j, k), p.nx, along[k]);
     rows->close();

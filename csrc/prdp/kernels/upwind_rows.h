@@ -14,8 +14,13 @@ struct UpwindParameters {
   int64_t ny, nx;
   double nu, dt;
   bool transposed;
-  double length_y = 1.0, length_x = 1.0;  // of the domain
+  double length_y = 1.0, length_x = 1.0;         // of the domain
+  std::shared_ptr<const StencilPattern> pattern;  // of_grid(), made once for a batch
 
+  static std::shared_ptr<const StencilPattern> of_grid(int64_t dim, int64_t ny, int64_t nx) {
+    return std::make_shared<StencilPattern>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
+                                            StencilPattern::nearest_neighbours(dim));
+  }
   /// NaN or Inf where a wind is: max(w, 0) would lose it.
   T largest_wind(int64_t channels) const { return largest_magnitude(winds, channels * ny * nx); }
   /// A bound of the entries of shift·I + advection·Γ - diffusion·L, up to a factor of some ten.
@@ -28,10 +33,6 @@ struct UpwindParameters {
   FactorKey key(int64_t channels) const {
     FactorKeyMaker key;
     return key.add(ny).add(nx).add(nu).add(dt).add(length_y).add(length_x).add(winds, channels * ny * nx).key();
-  }
-  std::shared_ptr<const StencilPattern> pattern(int64_t dim) const {
-    return std::make_shared<StencilPattern>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
-                                            StencilPattern::nearest_neighbours(dim));
   }
 };
 

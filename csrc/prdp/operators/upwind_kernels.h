@@ -19,9 +19,11 @@ std::shared_ptr<const kernels::Kernels> FlowOperator::upwind_kernels(const at::T
                            dt = step_.dt]<class T>(T) -> kernels::KernelBatch<T> {
     const bool shared = winds.size(0) == 1;
     const int64_t stride = shared ? 0 : winds.stride(0);
+    using Parameters = kernels::UpwindParameters<T>;
+    const auto pattern = Parameters::of_grid(static_cast<int64_t>(dim), extent[0], extent[1]);
     return {shared, [=](int64_t s) {
-              return make(kernels::UpwindParameters<T>{winds.const_data_ptr<T>() + s * stride, extent[0], extent[1], nu,
-                                                       dt, transposed, length[0], length[1]});
+              return make(Parameters{winds.const_data_ptr<T>() + s * stride, extent[0], extent[1], nu, dt, transposed,
+                                     length[0], length[1], pattern});
             }};
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
