@@ -196,14 +196,14 @@ FastDiagonalisation<T>::FastDiagonalisation(const SumOverAxes& a, int64_t null_v
 template <class T>
 void FastDiagonalisation<T>::solve(std::vector<T>& field) const {
   if (const auto* waves = std::get_if<FourierMultiplier<T>>(&made_)) return waves->apply(field);
-  const auto& [eigenvectors, inverse] = std::get<Products>(made_);
+  const auto& products = std::get<Products>(made_);
   static thread_local std::vector<T> other;
   other.resize(field.size());
-  eigenvectors.apply(field, other, /*transposed=*/true);
-  for_each_block_of(std::ssize(field), [&, inverse = &inverse](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) field[i] *= (*inverse)[i];
+  products.eigenvectors.apply(field, other, /*transposed=*/true);
+  for_each_block_of(std::ssize(field), [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) field[i] *= products.inverse[i];
   });
-  eigenvectors.apply(field, other, /*transposed=*/false);
+  products.eigenvectors.apply(field, other, /*transposed=*/false);
 }
 
 template <class T>

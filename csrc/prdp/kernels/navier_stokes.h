@@ -31,10 +31,8 @@ class NavierStokes final : public Kernel<T> {
 
   void apply(const T* v, T* out) const override {
     const StaggeredStencil<T> a{{velocity_[0]->neighbours(), velocity_[1]->neighbours()}, weights_.data()};
-    const int64_t each = std::max<int64_t>(kBlock / layout().row, 1), rows = layout().rows;
-    shared_rows::for_each((rows + each - 1) / each, [&](int64_t p) {
-      loops<T>().apply_staggered(a, {p * each, std::min(rows, (p + 1) * each)}, v, out);
-    });
+    for_each_run_of_rows(layout().rows, layout().row,
+                         [&](int64_t begin, int64_t end) { loops<T>().apply_staggered(a, {begin, end}, v, out); });
   }
   std::shared_ptr<const Factors<T>> factorise() const override;
   std::unique_ptr<Preconditioner<T>> multigrid(const Kernel<T>* transpose, int64_t smoothing) const override;

@@ -75,13 +75,9 @@ typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights
 template <class T>
 template <class Body>
 void Transfer<T>::for_each_row(const PaddedGrid& grid, const Body& body) const {
-  const int64_t rows = grid.fields * grid.shape[0] * grid.shape[1];
-  const int64_t each = std::max<int64_t>(kBlock / grid.row, 1);
-  shared_rows::for_each((rows + each - 1) / each, [&](int64_t part) {
-    for (int64_t r = part * each; r < std::min(rows, (part + 1) * each); ++r) {
-      const int64_t of_field = grid.shape[0] * grid.shape[1];
-      body(r / of_field, r % of_field / grid.shape[1], r % grid.shape[1]);
-    }
+  const int64_t of_field = grid.shape[0] * grid.shape[1];
+  for_each_run_of_rows(grid.fields * of_field, grid.row, [&](int64_t begin, int64_t end) {
+    for (int64_t r = begin; r < end; ++r) body(r / of_field, r % of_field / grid.shape[1], r % grid.shape[1]);
   });
 }
 
