@@ -5,6 +5,7 @@
 #include <tuple>
 #include <vector>
 
+#include "prdp/solvers/hessenberg_problem.h"
 #include "prdp/solvers/space.h"
 
 namespace prdp {
@@ -35,8 +36,7 @@ class GmresMethod {
         z_(space.is_preconditioned() ? space.vector() : r_),
         sum_(space.is_preconditioned() ? space.vector() : r_),
         u_(m_ + 1),
-        h_(m_ * (m_ + 1)),
-        columns_(m_ + 1),
+        problem_(space, m_),
         again_(m_ + 1),
         weights_(m_ + 1) {
     for (int64_t j = 1; j <= m_; ++j) u_[j] = space.vector();
@@ -47,9 +47,7 @@ class GmresMethod {
     space_.fill_zero(x);
     space_.copy(space_.b(), r_);
     residual2_ = space_.b2();
-    exhausted_ = space_.is_zero(residual2_);
-    scale_ = residual2_ * 0;
-    one_ = space_.is_zero(scale_);
+    one_ = problem_.start(residual2_);
     ready_ = true;
     confirmed_ = !space_.started();
   }
@@ -82,10 +80,10 @@ class GmresMethod {
     return residual2_ = space_.residual(x, r_);
   }
   /// Not zero where the last cycle's Krylov space could not be extended: it holds all that A reaches.
-  const Scalar& exhausted() const { return exhausted_; }
+  const Scalar& exhausted() const { return problem_.exhausted(); }
 
   /// What the next cycle starts from once residual2() is known; resume() once it has been put back.
-  auto carried() { return std::tie(x, scale_); }
+  auto carried() { return std::tie(x, problem_.scale()); }
   void resume(int64_t done) {
     if (done == 0) return start();
     residual2_ = space_.b2() / 0;  // no cycle before to take back
@@ -95,36 +93,17 @@ class GmresMethod {
   Vector x;
 
  protected:
-  /// What belongs to number j of the basis. Numbers that are computed alike lie apart: compilers would combine
-  /// neighbours in a vector load, which has to wait for the stores of each.
-  struct Column {
-    Scalar cos{};
-    Scalar inverse_length{};  // 1/‖u_j‖, or zero
-    Scalar sin{};
-    Scalar inverse{};  // 1/R_jj, or zero
-    Scalar g{}, y{};
-  };
-  Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
-
   /// v₀ = r/‖r‖ and A v_j = Σ h_ij v_i, the h rotated into R as they come. Returns how many columns there are.
   int64_t extend_basis() {
     using std::sqrt;
-    const Scalar length = space_.constant(sqrt(residual2_));
-    columns_[0].g = length;
-    columns_[0].inverse_length = space_.inverse(length, length);
-    exhausted_ = space_.is_zero(length);
+    problem_.begin(space_.constant(sqrt(residual2_)));
     loss_ = Scalar{};
     for (int64_t j = 0; j < m_; ++j) {
       if (space_.is_preconditioned()) space_.precondition(u_[j], z_);
       space_.apply(space_.is_preconditioned() ? z_ : u_[j], u_[j + 1]);
       if (space_.derivatives() > 0) products_[j] = u_[j + 1];
-      scale_ = space_.larger(scale_, orthogonalise(j));
-      const Scalar inverse = space_.inverse(h(j + 1, j), scale_);
-      h(j + 1, j) = h(j + 1, j) * space_.is_not_zero(inverse);
-      exhausted_ = exhausted_ + space_.is_zero(inverse);
-      columns_[j + 1].inverse_length = inverse;
-      rotate(j);
-      if (space_.surely_all(exhausted_)) return j + 1;
+      problem_.add_column(j, orthogonalise(j));
+      if (space_.surely_all(problem_.exhausted())) return j + 1;
     }
     return m_;
   }
@@ -132,8 +111,8 @@ class GmresMethod {
   /// u_{j+1} = A v_j - Σ h_ij v_i, where A u_j was; fills column j of h. Returns the length of A v_j.
   Scalar orthogonalise(int64_t j) {
     using std::sqrt;
-    Scalar* column = &h(0, j);
-    auto [left2, taken2] = take_off_basis(columns_[j].inverse_length, j, column);
+    Scalar* column = problem_.column(j);
+    auto [left2, taken2] = take_off_basis(problem_.inverse_length(j), j, column);
     const Scalar length = sqrt(taken2 + left2);
     if (space_.lost_orthogonality(left2, taken2, loss_)) {
       left2 = take_off_basis(one_, j, again_.data())[0];
@@ -149,8 +128,8 @@ class GmresMethod {
     space_.dots(u_, j + 1, factor, u_[j + 1], along);
     Scalar taken2{};
     for (int64_t i = 0; i <= j; ++i) {
-      along[i] = along[i] * columns_[i].inverse_length;
-      weights_[i] = along[i] * columns_[i].inverse_length;
+      along[i] = along[i] * problem_.inverse_length(i);
+      weights_[i] = along[i] * problem_.inverse_length(i);
       taken2 = i == 0 ? along[i] * along[i] : taken2 + along[i] * along[i];
     }
     return {space_.subtract_combination(weights_.data(), u_, j + 1, factor, u_[j + 1]), taken2};
@@ -165,87 +144,33 @@ class GmresMethod {
   }
   /// The weights of the u_j that belong to y.
   void weigh(int64_t columns) {
-    for (int64_t j = 0; j < columns; ++j) weights_[j] = columns_[j].y * columns_[j].inverse_length;
+    for (int64_t j = 0; j < columns; ++j) weights_[j] = problem_.y(j) * problem_.inverse_length(j);
   }
 
-  /// Turns column j of h into one of R, and g along with it.
-  void rotate(int64_t j) {
-    using std::sqrt;
-    for (int64_t i = 0; i < j; ++i) {
-      const Column& c = columns_[i];
-      const Scalar upper = c.cos * h(i, j) + c.sin * h(i + 1, j);
-      h(i + 1, j) = c.cos * h(i + 1, j) - c.sin * h(i, j);
-      h(i, j) = upper;
-    }
-    Column& c = columns_[j];
-    const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
-    c.inverse = space_.inverse(diagonal, scale_);  // 0 where A is singular on the space
-    c.cos = h(j, j) * c.inverse;
-    c.sin = h(j + 1, j) * c.inverse;
-    h(j, j) = diagonal;
-    columns_[j + 1].g = -(c.sin * c.g);
-    c.g = c.cos * c.g;
-  }
-
-  /// y = argmin ‖r - A V y‖. Where that takes a step so long that its rounding exceeds r, A is singular to the dtype,
-  /// and y is damped; its derivative is that of a constant there.
+  /// y = argmin ‖r - A V y‖; its derivative is that of a constant where it is damped.
   void minimise(int64_t columns) {
     using std::sqrt;
-    const Scalar size = space_.constant(sqrt(residual2_));
-    Scalar short_enough = one_;
-    for (int64_t j = columns - 1; j >= 0; --j) {
-      Column& c = columns_[j];
-      c.y = c.g;
-      for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
-      c.y = c.y * c.inverse;
-      short_enough = short_enough * space_.is_not_zero(space_.inverse(size, scale_ * c.y));
-    }
-    if (!space_.surely_all(short_enough)) damp(columns, short_enough);
+    problem_.minimise(columns, space_.constant(sqrt(residual2_)), one_);
     for (int derivative = 1; derivative <= space_.derivatives(); ++derivative) {
       Vector e = kept_r_;
       weigh(columns);
       space_.subtract_combination(weights_.data(), products_, columns, one_, e);
       std::vector<Scalar> change(columns);
-      for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e) * columns_[j].inverse_length;
-      solve_normal(change);
-      for (int64_t j = 0; j < columns; ++j) columns_[j].y = columns_[j].y + change[j];
+      for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e) * problem_.inverse_length(j);
+      problem_.solve_normal(change);
+      for (int64_t j = 0; j < columns; ++j) problem_.y(j) = problem_.y(j) + change[j];
     }
     weigh(columns);
-  }
-
-  /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being the rounding errors of A.
-  void damp(int64_t columns, const Scalar& short_enough) {
-    std::vector<Scalar> g(columns), y(columns);
-    for (int64_t j = 0; j < columns; ++j) g[j] = columns_[j].g, y[j] = columns_[j].y;
-    space_.damp(h_.data(), m_ + 1, g.data(), columns, scale_, short_enough, y.data());
-    for (int64_t j = 0; j < columns; ++j) {
-      columns_[j].y = y[j];
-      columns_[j].inverse = columns_[j].inverse * short_enough;
-    }
-  }
-  /// z ← (RᵀR)⁻¹ z
-  void solve_normal(std::vector<Scalar>& z) {
-    const auto columns = static_cast<int64_t>(z.size());
-    for (int64_t j = 0; j < columns; ++j) {
-      for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
-      z[j] = z[j] * columns_[j].inverse;
-    }
-    for (int64_t j = columns - 1; j >= 0; --j) {
-      for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
-      z[j] = z[j] * columns_[j].inverse;
-    }
   }
 
   Space& space_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_, z_, sum_;
   std::vector<Vector> u_, products_;  // orthogonal basis; A u_j, kept while recording
-  std::vector<Scalar> h_;             // by columns, R once rotated
-  std::vector<Column> columns_;
+  HessenbergProblem<Space> problem_;
   std::vector<Scalar> again_, weights_;  // of a second pass; of the u_j
-  Scalar residual2_{}, exhausted_{}, grew_{};
-  Scalar loss_{};   // of orthogonality, in units of rounding
-  Scalar scale_{};  // largest ‖A v‖ so far: what is rounding beside it is zero
+  Scalar residual2_{}, grew_{};
+  Scalar loss_{};  // of orthogonality, in units of rounding
   Scalar one_{};
   bool ready_ = false;     // r_ and residual2_ belong to x
   bool confirmed_ = true;  // and were computed from it: those of a start were not

@@ -9,6 +9,7 @@
 
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_system.h"
+#include "prdp/solvers/solve_damped.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -213,34 +214,8 @@ class SampleSpace {
   Scalar inverse(Scalar value, Scalar scale) const {
     return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
   }
-  /// Rotates the rows of ε scale I into R, one by one, and then solves with R.
   void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
-    if (keep != 0) return;
-    std::vector<T> a(n * n), rhs(g, g + n), row(n);
-    for (int64_t j = 0; j < n; ++j)
-      for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
-    for (int64_t k = 0; k < n; ++k) {
-      std::fill(row.begin(), row.end(), T(0));
-      row[k] = std::numeric_limits<T>::epsilon() * scale;
-      T of_row = 0;
-      for (int64_t i = k; i < n; ++i) {
-        const T length = std::hypot(a[i * n + i], row[i]);
-        if (length == T(0)) continue;
-        const T cos = a[i * n + i] / length, sin = row[i] / length;
-        const auto rotate = [&](T& upper, T& lower) {
-          const T rotated = cos * upper + sin * lower;
-          lower = cos * lower - sin * upper;
-          upper = rotated;
-        };
-        for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
-        rotate(rhs[i], of_row);
-      }
-    }
-    for (int64_t i = n - 1; i >= 0; --i) {
-      T sum = rhs[i];
-      for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
-      y[i] = a[i * n + i] == T(0) ? T(0) : sum / a[i * n + i];
-    }
+    if (keep == 0) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, y);
   }
   Scalar larger(Scalar a, Scalar b) const { return a > b ? a : b; }
   Scalar is_larger(Scalar a, Scalar b) const { return a > b; }

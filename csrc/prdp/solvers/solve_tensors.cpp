@@ -4,6 +4,7 @@
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/tensor_gmres.h"
 #include "prdp/solvers/tensor_space.h"
 
 namespace prdp {
@@ -190,10 +191,13 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   if (looks_late) space.settle_by([&](auto& samples) { beforehand.tell(samples); });
   else beforehand.tell(states);
 
-  auto u = with_method(solver.method, solver.restart, space, [&](auto method) {
+  const auto run = [&](auto method) {
     iterate(space, method, states, solver.rtol, request.guarded);
     return a.project_solution(space.solution(method.x));
-  });
+  };
+  const bool in_batches = solver.method == Method::kGmres && space.is_far();
+  auto u =
+      in_batches ? run(TensorGmres(space, solver.restart)) : with_method(solver.method, solver.restart, space, run);
   u = at::where(per_sample(takes_part, b), u / scale, at::zeros_like(b));
   const auto finite = u.isfinite().flatten(1).all(1);
   const auto rows = at::stack({beforehand.inconsistent, finite}).to(at::kCPU);

@@ -44,6 +44,8 @@ class TensorSpace {
   const Scalar& b2() const { return b2_; }
   int64_t unknowns() const { return b_.numel() / std::max<int64_t>(b_.size(0), 1); }
   double epsilon() const;
+  /// Numbers below this are zero to the dtype.
+  double negligible() const { return negligible_; }
 
   void fill_zero(Vector& v) { v = at::zeros_like(b_); }
   void copy(const Vector& from, Vector& to) { to = keep_frozen(from, to); }

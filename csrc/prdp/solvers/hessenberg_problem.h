@@ -1,0 +1,122 @@
+#pragma once
+#include <cstdint>
+#include <vector>
+
+namespace prdp {
+
+/// The small problem of a cycle of GMRES: y = argmin ‖‖r‖ e₁ - H y‖ for the Hessenberg matrix H of A v_j = Σ h_ij v_i,
+/// which Givens rotations turn into a triangle R as its columns come. `Numbers` has what space.h asks of numbers that
+/// may vanish.
+template <class Numbers>
+class HessenbergProblem {
+ public:
+  using Scalar = typename Numbers::Scalar;
+
+  /// For at most m columns.
+  HessenbergProblem(const Numbers& numbers, int64_t m) : numbers_(numbers), m_(m), h_(m * (m + 1)), columns_(m + 1) {}
+
+  /// Before the first cycle, where ‖r‖² is given; returns 1.
+  Scalar start(const Scalar& residual2) {
+    exhausted_ = numbers_.is_zero(residual2);
+    scale_ = residual2 * 0;
+    return numbers_.is_zero(scale_);
+  }
+  /// Begins a cycle with v₀ = r/‖r‖.
+  void begin(const Scalar& length) {
+    columns_[0].g = length;
+    columns_[0].inverse_length = numbers_.inverse(length, length);
+    exhausted_ = numbers_.is_zero(length);
+  }
+  /// Where h_0j … h_{j+1,j} go.
+  Scalar* column(int64_t j) { return &h(0, j); }
+  /// Takes column j, once it is filled; `length` is ‖A v_j‖.
+  void add_column(int64_t j, const Scalar& length) {
+    scale_ = numbers_.larger(scale_, length);
+    const Scalar inverse = numbers_.inverse(h(j + 1, j), scale_);
+    h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(inverse);
+    exhausted_ = exhausted_ + numbers_.is_zero(inverse);
+    columns_[j + 1].inverse_length = inverse;
+    rotate(j);
+  }
+  /// Where y takes a step so long that its rounding exceeds ‖r‖ = size, A is singular to the dtype, and y is damped.
+  void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
+    Scalar short_enough = one;
+    for (int64_t j = columns - 1; j >= 0; --j) {
+      Column& c = columns_[j];
+      c.y = c.g;
+      for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
+      c.y = c.y * c.inverse;
+      short_enough = short_enough * numbers_.is_not_zero(numbers_.inverse(size, scale_ * c.y));
+    }
+    if (!numbers_.surely_all(short_enough)) damp(columns, short_enough);
+  }
+  /// z ← (RᵀR)⁻¹ z
+  void solve_normal(std::vector<Scalar>& z) {
+    const auto columns = static_cast<int64_t>(z.size());
+    for (int64_t j = 0; j < columns; ++j) {
+      for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
+      z[j] = z[j] * columns_[j].inverse;
+    }
+    for (int64_t j = columns - 1; j >= 0; --j) {
+      for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
+      z[j] = z[j] * columns_[j].inverse;
+    }
+  }
+
+  Scalar& y(int64_t j) { return columns_[j].y; }
+  /// 1 over the length of what v_j was before it was scaled; 0 where that was rounding.
+  const Scalar& inverse_length(int64_t j) const { return columns_[j].inverse_length; }
+  /// Not zero where the Krylov space could not be extended: it holds all that A reaches.
+  const Scalar& exhausted() const { return exhausted_; }
+  /// The largest ‖A v‖ so far: what is rounding beside it is zero.
+  Scalar& scale() { return scale_; }
+
+ private:
+  /// What belongs to number j of the basis. Numbers that are computed alike lie apart: compilers would combine
+  /// neighbours in a vector load, which has to wait for the stores of each.
+  struct Column {
+    Scalar cos{};
+    Scalar inverse_length{};
+    Scalar sin{};
+    Scalar inverse{};  // 1/R_jj, or zero
+    Scalar g{}, y{};
+  };
+  Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
+
+  /// Turns column j of h into one of R, and g along with it.
+  void rotate(int64_t j) {
+    using std::sqrt;
+    for (int64_t i = 0; i < j; ++i) {
+      const Column& c = columns_[i];
+      const Scalar upper = c.cos * h(i, j) + c.sin * h(i + 1, j);
+      h(i + 1, j) = c.cos * h(i + 1, j) - c.sin * h(i, j);
+      h(i, j) = upper;
+    }
+    Column& c = columns_[j];
+    const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
+    c.inverse = numbers_.inverse(diagonal, scale_);  // 0 where A is singular on the space
+    c.cos = h(j, j) * c.inverse;
+    c.sin = h(j + 1, j) * c.inverse;
+    h(j, j) = diagonal;
+    columns_[j + 1].g = -(c.sin * c.g);
+    c.g = c.cos * c.g;
+  }
+  /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being the rounding errors of A.
+  void damp(int64_t columns, const Scalar& short_enough) {
+    std::vector<Scalar> g(columns), y(columns);
+    for (int64_t j = 0; j < columns; ++j) g[j] = columns_[j].g, y[j] = columns_[j].y;
+    numbers_.damp(h_.data(), m_ + 1, g.data(), columns, scale_, short_enough, y.data());
+    for (int64_t j = 0; j < columns; ++j) {
+      columns_[j].y = y[j];
+      columns_[j].inverse = columns_[j].inverse * short_enough;
+    }
+  }
+
+  const Numbers& numbers_;
+  int64_t m_;
+  std::vector<Scalar> h_;  // by columns, R once rotated
+  std::vector<Column> columns_;
+  Scalar exhausted_{}, scale_{};
+};
+
+}  // namespace prdp

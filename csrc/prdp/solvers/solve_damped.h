@@ -1,0 +1,40 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+namespace prdp {
+
+/// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of r, which lie `stride` entries
+/// apart: the rows of τ I are rotated into R, one by one.
+template <class T>
+void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y) {
+  std::vector<T> a(n * n), rhs(g, g + n), row(n);
+  for (int64_t j = 0; j < n; ++j)
+    for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+  for (int64_t k = 0; k < n; ++k) {
+    std::fill(row.begin(), row.end(), T(0));
+    row[k] = tau;
+    T of_row = 0;
+    for (int64_t i = k; i < n; ++i) {
+      const T length = std::hypot(a[i * n + i], row[i]);
+      if (length == T(0)) continue;
+      const T cos = a[i * n + i] / length, sin = row[i] / length;
+      const auto rotate = [&](T& upper, T& lower) {
+        const T rotated = cos * upper + sin * lower;
+        lower = cos * lower - sin * upper;
+        upper = rotated;
+      };
+      for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
+      rotate(rhs[i], of_row);
+    }
+  }
+  for (int64_t i = n - 1; i >= 0; --i) {
+    T sum = rhs[i];
+    for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
+    y[i] = a[i * n + i] == T(0) ? T(0) : sum / a[i * n + i];
+  }
+}
+
+}  // namespace prdp
