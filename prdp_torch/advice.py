@@ -14,6 +14,7 @@ from prdp_torch.steppers import EquationStepper
 from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
 
 WORTH_REFINING = 0.1  # of an update
+NOISE = 0.1  # of the seconds of a solve
 
 
 @dataclass
@@ -66,6 +67,14 @@ class Update:
     def fastest(self, rows: Sequence[Row], rtol: float) -> Row | None:
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
 
+    def choice(self, rows: Sequence[Row], rtol: float) -> Row | None:
+        """The fastest, or the direct solver if that is as fast to within the noise: it has nothing to set."""
+        best = self.fastest(rows, rtol)
+        direct = self.fastest([row for row in rows if isinstance(row.solver, Direct)], rtol)
+        if best is None or direct is None or self.physics(direct) > (1 + NOISE) * self.physics(best):
+            return best
+        return direct
+
 
 def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence[torch.dtype] | None = None) -> Advice:
     """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
@@ -95,7 +104,8 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
     if type(step).operator is Stepper.operator:
         raise TypeError(
-            f"advise: {type(step).__name__} must define operator(u), the one equation of a step, to try solvers on"
+            f"advise: a step of {type(step).__name__} is not one equation A(u) u_next = b(u), as it has no "
+            "operator(u); time its steps with each solver instead"
         )
     _check.dense("advise", "sample", sample)
     if sample.dim() < 2 or sample.numel() == 0 or sample.dtype not in (torch.float32, torch.float64):
@@ -123,10 +133,10 @@ def advise_on(
     step: Stepper, sample: Tensor, seconds: float, update: Update, other_dtypes: Sequence[torch.dtype]
 ) -> Advice:
     """Advise on a step that is a part of `update`, an `Update`."""
-    rows, refused = measure(step, sample, candidates(step), seconds)
-    best = update.fastest(rows, TOLERANCES[-1])
+    rows, sentences = measure(step, sample, candidates(step), seconds)
+    best = update.choice(rows, TOLERANCES[-1])
     threads = f"threads: {torch.get_num_threads()}"
-    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}; {threads}.", *update.notes, *refused]
+    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}; {threads}.", *update.notes, *sentences]
     others = []
     for other in other_dtypes:
         try:
@@ -167,7 +177,11 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     most = max(solve.iterations for solve in best.solves)
     if isinstance(best.solver, Direct):
         rough = update.fastest(rows, TOLERANCES[0]) or best
+        if isinstance(rough.solver, Direct):
+            rough = best
         least, cheapest = update.physics(rough), f"{rough.name} to {_power(rough.rtol)}"
+    elif most == 1:
+        least, cheapest = physics, ""
     else:
         least = update.physics(measure_one_iteration(step, sample, best.solver))
         cheapest = "a single iteration"
@@ -189,9 +203,12 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
         limit = f"Refinement can save {limit}."
     elif saving > 0.0:
         limit = f"Refinement has nothing to save: {limit}."
+    elif most == 1 and not isinstance(best.solver, Direct):
+        limit = "Refinement has nothing to save: one iteration is enough."
     else:
         limit = f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."
-    return f"{choice}: it is the fastest to {_power(best.rtol)}, and {reason}. {limit}"
+    fastest = "the fastest" if best is update.fastest(rows, best.rtol) else "as fast as any"
+    return f"{choice}: it is {fastest} to {_power(best.rtol)}, and {reason}. {limit}"
 
 
 def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:

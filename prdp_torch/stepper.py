@@ -10,6 +10,7 @@ from prdp_torch.batching import outlive_transforms
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
+    GMRES,
     Kept,
     Preconditioner,
     Solver,
@@ -51,12 +52,10 @@ class Stepper(torch.nn.Module):
     """
 
     method: str
-    rtol: float
     restart: int
     preconditioner: Preconditioner
     backward: Backward
     adjoint_max_iter: int | None
-    adjoint_rtol: float | None
     on_failure: OnFailure
     checkpoint_every: CheckpointEvery
     info: SolveInfo | None
@@ -84,12 +83,12 @@ class Stepper(torch.nn.Module):
             )
         check_options(who, solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every, start)
         self.method = solver.method
-        self.rtol = float(solver.rtol)
+        self._rtol = float(solver.rtol)
         self.restart = solver.restart
         self.preconditioner = solver.preconditioner
         self.backward = backward
         self.adjoint_max_iter = adjoint_max_iter
-        self.adjoint_rtol = adjoint_rtol
+        self._adjoint_rtol = adjoint_rtol
         self.on_failure = on_failure
         self.checkpoint_every = checkpoint_every
         self.start = start
@@ -185,18 +184,18 @@ class Stepper(torch.nn.Module):
 
     def _options_kept(self) -> _C.SolveOptions:
         """The options as the compiled library takes them past the dispatcher."""
-        solver = self.method, self.rtol, self.restart, self.preconditioner, tensors_of(self.preconditioner)
+        solver = self.method, self._rtol, self.restart, self.preconditioner, tensors_of(self.preconditioner)
         every = checkpoint_number(self.checkpoint_every)
         return self._kept_options.of(*solver, *self._settings(), every, self.start == "state")
 
     def _options(self, log_number: int) -> tuple[object, ...]:
         compiling = torch.compiler.is_dynamo_compiling()
         k = torch_private.number_as_graph_input(self, "_max_iter") if compiling else self._max_iter
-        solver = self.method, k, self.rtol, self.restart, *flat_preconditioner(self.preconditioner)
+        solver = self.method, k, self._rtol, self.restart, *flat_preconditioner(self.preconditioner)
         return *solver, *self._settings(), log_number, checkpoint_number(self.checkpoint_every)
 
     def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure]:
-        return self.backward, self.adjoint_max_iter, self.adjoint_rtol, self.on_failure
+        return self.backward, self.adjoint_max_iter, self._adjoint_rtol, self.on_failure
 
     @property
     def max_iter(self) -> int:
@@ -208,6 +207,26 @@ class Stepper(torch.nn.Module):
         k = _check.whole(who, "max_iter", k)
         _C.check_solver(who, self.method, k, self.rtol, self.restart, flat_preconditioner(self.preconditioner)[0])
         self._max_iter = k
+
+    @property
+    def rtol(self) -> float:
+        return self._rtol
+
+    @rtol.setter
+    def rtol(self, rtol: float) -> None:
+        who = type(self).__name__
+        rtol = _check.real(who, "rtol", rtol)
+        _C.check_solver(who, "gmres", 1, rtol, 1, "")
+        self._rtol = rtol
+
+    @property
+    def adjoint_rtol(self) -> float | None:
+        return self._adjoint_rtol
+
+    @adjoint_rtol.setter
+    def adjoint_rtol(self, rtol: float | None) -> None:
+        check_options(type(self).__name__, GMRES(1), "implicit", None, rtol, "raise", None)
+        self._adjoint_rtol = rtol
 
     @property
     def start(self) -> Start:

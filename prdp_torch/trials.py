@@ -67,6 +67,17 @@ class Row:
         return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
 
 
+@dataclass
+class Trial:
+    """A step on which solvers are tried, and what it steps from."""
+
+    step: Stepper
+    sample: Tensor
+    cotangent: Tensor
+    renewed: bool
+    """Whether A is another one in every update: what is kept of it, factors and grids, is made anew for each run."""
+
+
 def name_of(solver: Solver) -> str:
     settings = [str(solver.restart)] if isinstance(solver, GMRES) else []
     if getattr(solver, "preconditioner", None) is not None:
@@ -87,89 +98,106 @@ def candidates(step: Stepper) -> list[Solver]:
 
 
 def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: float) -> tuple[list[Row], list[str]]:
-    """Try the solvers on a step, `seconds` each. Returns the rows of all that the operator allows, and a sentence
-    for each of the others. Raises TypeError or ValueError where step and sample do not fit each other."""
-    trial = _copy(step)
+    """Try the solvers on a step, `seconds` each. Returns the rows of all that the operator allows, and sentences: what
+    is counted, and why the others were not tried. Raises TypeError or ValueError where step and sample do not fit each
+    other."""
+    copied = _copy(step)
     any_solver = GMRES(1, restart=1)
-    set_solver(trial, any_solver, 1, 0.0)
-    trial(sample)  # what does not fit is refused here
-    cotangent = random_cotangent(trial, sample)
-    run(trial, sample, cotangent, any_solver)  # the first backward pass of a process starts its threads
-    symmetric = _symmetric(trial, sample, cotangent)
+    set_solver(copied, any_solver, 1, 0.0)
+    copied(sample)  # what does not fit is refused here
+    trial = trial_of(copied, sample)
+    run(trial, any_solver)  # the first backward pass of a process starts its threads
+    symmetric = _symmetric(trial)
     rows, refused = [], []
     for solver in solvers:
         try:
             if isinstance(solver, CG) and not symmetric:
                 raise ValueError("A is not symmetric")
             if isinstance(solver, Direct):
-                _check_direct(trial, sample, seconds)
-            rows += _measure_one(trial, sample, cotangent, solver, seconds)
+                _check_direct(trial, seconds)
+            rows += _measure_one(trial, solver, seconds)
         except ValueError as error:
             why = _C.sentence(str(error)).removeprefix(f"{type(solver).__name__}: ")
             refused.append((type(solver), f"{name_of(solver)} was not tried: {why}."))
     tried = {type(row.solver) for row in rows}
     # One sentence is enough where a method is refused with and without a preconditioner.
     first = {method: sentence for method, sentence in reversed(refused) if method not in tried}
-    return rows, [sentence for method, sentence in refused if method in tried or sentence == first[method]]
+    sentences = [sentence for method, sentence in refused if method in tried or sentence == first[method]]
+    counted = (
+        "A depends on the state or is trained, so each forward solve makes its factors or grids anew."
+        if trial.renewed
+        else "A is the same in every update, so its factors and grids are made once and not counted."
+    )
+    return rows, [counted, *sentences]
 
 
 def measure_one_iteration(step: Stepper, sample: Tensor, solver: Solver) -> Row:
     """The row of a single iteration."""
-    trial = _copy(step)
-    set_solver(trial, solver, 1, 0.0)
-    return run(trial, sample, random_cotangent(trial, sample), solver, RUNS)
+    trial = trial_of(_copy(step), sample)
+    set_solver(trial.step, solver, 1, 0.0)
+    return run(trial, solver, RUNS)
 
 
 def measure_with_start(step: Stepper, sample: Tensor, row: Row) -> Row:
     """The same solve as `row`, from the state."""
-    trial = _copy(step)
-    trial.start = "state"
-    set_solver(trial, row.solver, 2 * max(solve.iterations for solve in row.solves), row.rtol)
-    return run(trial, sample, random_cotangent(trial, sample), row.solver, RUNS)
+    trial = trial_of(_copy(step), sample)
+    trial.step.start = "state"
+    set_solver(trial.step, row.solver, 2 * max(solve.iterations for solve in row.solves), row.rtol)
+    return run(trial, row.solver, RUNS)
 
 
-def _measure_one(trial: Stepper, sample: Tensor, cotangent: Tensor, solver: Solver, seconds: float) -> list[Row]:
+def trial_of(step: Stepper, sample: Tensor) -> Trial:
+    cotangent = random_cotangent(step, sample)
+    return Trial(step, sample, cotangent, is_renewed(step, sample, cotangent))
+
+
+def is_renewed(step: Stepper, sample: Tensor, v: Tensor) -> bool:
+    """Whether A depends on the state or is trained: whether its tensors have a gradient, or A v changes with u."""
+    with torch.enable_grad():
+        a = _operator(step, sample)
+    if any(t.requires_grad for t in a.tensors):
+        return True
+    with torch.no_grad():
+        return not torch.equal(a.apply(v), _operator(step, 0.99 * sample).apply(v))
+
+
+def _measure_one(trial: Trial, solver: Solver, seconds: float) -> list[Row]:
     """K doubles until the tolerance is met or the time is spent; a finer one is not tried after a failure."""
     rows: list[Row] = []
     k, deadline = 1, time.perf_counter() + seconds
     for rtol in TOLERANCES:
         while True:
-            set_solver(trial, solver, k, rtol)
-            row = run(trial, sample, cotangent, solver)
+            set_solver(trial.step, solver, k, rtol)
+            row = run(trial, solver)
             # The next run takes about as long as all that were before it.
             if row.status != "MAX_ITER" or time.perf_counter() > deadline - seconds / 2:
                 break
             k *= 2
         if not row.solved:
             return [*rows, row]
-        rows.append(run(trial, sample, cotangent, solver, RUNS, time.perf_counter() + seconds / 10))
+        rows.append(run(trial, solver, RUNS, time.perf_counter() + seconds / 10))
     return rows
 
 
-def run(
-    trial: Stepper,
-    sample: Tensor,
-    cotangent: Tensor,
-    solver: Solver,
-    max_runs: int = 1,
-    deadline: float = float("inf"),
-) -> Row:
+def run(trial: Trial, solver: Solver, max_runs: int = 1, deadline: float = float("inf")) -> Row:
     """The row of a step and its adjoint as they are set; no run starts after the deadline but the first."""
-    u = sample.clone().requires_grad_()
-    inputs = [u, *(p for p in trial.parameters() if p.requires_grad)]
+    step, u = trial.step, trial.sample.clone().requires_grad_()
+    inputs = [u, *(p for p in step.parameters() if p.requires_grad)]
     forward: list[float] = []
     adjoint: list[float] = []
     while not forward or (len(forward) < max_runs and time.perf_counter() < deadline):
+        if trial.renewed:
+            _C.clear_factorisations()
         started = now(u)
-        u_next = trial(u)
+        u_next = step(u)
         between = now(u)
         forward.append(between - started)
         if u_next.requires_grad:
-            torch.autograd.grad(u_next, inputs, cotangent, allow_unused=True)
+            torch.autograd.grad(u_next, inputs, trial.cotangent, allow_unused=True)
             adjoint.append(now(u) - between)
-    assert trial.info is not None
-    backward = _solve(trial.adjoint_info, adjoint) if adjoint and trial.adjoint_info is not None else None
-    return Row(solver, u.dtype, trial.rtol, _solve(trial.info, forward), backward)
+    assert step.info is not None
+    backward = _solve(step.adjoint_info, adjoint) if adjoint and step.adjoint_info is not None else None
+    return Row(solver, u.dtype, step.rtol, _solve(step.info, forward), backward)
 
 
 def _solve(info: SolveInfo, seconds: list[float]) -> Solve:
@@ -194,28 +222,31 @@ def _copy(step: Stepper) -> Stepper:
     return trial
 
 
-def set_solver(trial: Stepper, solver: Solver, max_iter: int, rtol: float) -> None:
-    trial.method, trial.restart, trial.rtol = solver.method, solver.restart, rtol
-    trial.preconditioner = solver.preconditioner
-    trial.max_iter = max_iter
+def set_solver(step: Stepper, solver: Solver, max_iter: int, rtol: float) -> None:
+    step.method, step.restart, step.rtol = solver.method, solver.restart, rtol
+    step.preconditioner = solver.preconditioner
+    step.max_iter = max_iter
 
 
-def _check_direct(trial: Stepper, sample: Tensor, seconds: float) -> None:
+def _check_direct(trial: Trial, seconds: float) -> None:
     """ValueError where a factorisation would take too much time or memory."""
-    a = _operator(trial, sample)
+    step, sample = trial.step, trial.sample
+    a = _operator(step, sample)
     if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
         return
     n = sample[0].numel()
     most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
     if n > most and not _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters):
         raise ValueError(f"{n} unknowns are too many to factorise within the limit; at most {most}")
-    set_solver(trial, Direct(1), 1, 0.0)
+    set_solver(step, Direct(1), 1, 0.0)
     # The functions of a step of one's own may hold tensors of the whole batch.
-    probe = sample[:1] if isinstance(trial, EquationStepper) else sample
+    probe = sample[:1] if isinstance(step, EquationStepper) else sample
     with torch.no_grad():
         times = [now(sample)]
         while len(times) < 3 and times[-1] - times[0] <= seconds:
-            trial(probe)
+            if trial.renewed:
+                _C.clear_factorisations()
+            step(probe)
             times.append(now(sample))
     whole = min(after - before for before, after in pairwise(times)) * len(sample) / len(probe)
     if 2 * whole > seconds:
@@ -226,10 +257,11 @@ def _operator(step: Stepper, sample: Tensor) -> operators.Operator:
     return as_operator("advise", "operator(u)", step.operator(sample))
 
 
-def _symmetric(trial: Stepper, sample: Tensor, v: Tensor) -> bool:
+def _symmetric(trial: Trial) -> bool:
     """Whether A v and Aᵀ v agree to rounding, entry by entry."""
+    v = trial.cotangent
     with torch.no_grad():
-        a = _operator(trial, sample)
+        a = _operator(trial.step, trial.sample)
         product, transposed = a.apply(v), a.apply_transpose(v)
     return float((product - transposed).abs().max()) <= _rounding(product)
 

@@ -160,7 +160,8 @@ def train(
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
             def show(interval: Interval, task: TaskID = task) -> None:
-                note = f"metric {interval.metric:.3e}  K {interval.max_iter}"
+                budget = f"rtol {interval.rtol:.1e}" if auto else f"K {interval.max_iter}"
+                note = f"metric {interval.metric:.3e}  {budget}"
                 progress.update(task, completed=interval.number, note=note)
 
             callbacks: list[Callback] = [show]

@@ -9,7 +9,7 @@ from prdp_torch.advice import Advice, Update, advise_on, checked_limit, millisec
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_solver, make_stepper
-from prdp_torch.trials import RUNS, now, random_cotangent, run
+from prdp_torch.trials import RUNS, now, run, trial_of
 
 
 def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
@@ -33,10 +33,9 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
         adjoints = 0 if scene.backward == "none" else 1
         update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
     other = torch.float64 if sample.dtype == torch.float32 else torch.float32
-    cotangent = random_cotangent(step, sample)
-    solver = make_solver(scene, scene.max_iter)
-    run(step, sample, cotangent, solver)  # to warm up
-    physics = update.physics(run(step, sample, cotangent, solver, RUNS))
+    trial, solver = trial_of(step, sample), make_solver(scene, scene.max_iter)
+    run(trial, solver)  # to warm up
+    physics = update.physics(run(trial, solver, RUNS))
     update.notes.append(
         f"As the scene sets it, with {scene.method}, K = {scene.max_iter}, {scene.backward}, physics is "
         f"{update.share(physics)}."

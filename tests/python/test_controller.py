@@ -351,6 +351,18 @@ def test_a_controller_warns_while_the_residual_makes_up_the_error():
     assert controller.warning is None
 
 
+def test_a_tolerance_that_was_asked_for_is_no_warning():
+    """Before its first step the controller asks for rtol = .1, whatever the error then is."""
+    heat = heat_step()
+    controller = prdp.ToleranceController([heat])
+    heat(field((30,)))
+    assert 1e-2 < heat.info.residual.mean() <= 0.1
+    controller.step(0.01)
+    assert controller.warning is None
+    controller.step(0.01)  # the solves still have the residual of then
+    assert "the solves stop at a residual of" in controller.warning
+
+
 def test_without_an_error_prdp_warns_of_a_stalled_metric():
     heat = heat_step()
     controller = prdp.PRDPController([heat], delta=2, window=1)

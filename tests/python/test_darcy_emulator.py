@@ -75,12 +75,12 @@ def test_there_are_no_trajectories_to_show(tmp_path):
 @pytest.mark.parametrize(
     "before, after, where, message",
     [
-        ('equation = "darcy"', 'equation = "darcy"\ndt = 0.1', "dt =", "unknown name 'physics.dt'"),
-        ("modes = 1", "modes = 1\nvalid_steps = 2", "valid_steps", "unknown name 'data.valid_steps'"),
-        ("modes = 1", 'modes = 1\nfile = "x.npz"', "file =", "unknown name 'data.file'"),
+        ('equation = "darcy"', 'equation = "darcy"\ndt = 0.1', "dt =", "physics.dt: not for `poisson` and `darcy`"),
+        ("modes = 1", "modes = 1\nvalid_steps = 2", "valid_steps", "data.valid_steps: not for `darcy`"),
+        ("modes = 1", 'modes = 1\nfile = "x.npz"', "file =", "data.file: not for `darcy`"),
         ('"multigrid"', '"ilu"', "preconditioner", "unknown name 'ilu'; allowed: none, diagonal, multigrid"),
-        ('"cg"', '"jacobi"', "preconditioner", "unknown name 'solver.preconditioner'"),
-        ('"cg"', '"chebyshev"', "method", "solver.method: unknown name 'chebyshev'; allowed: jacobi, steepest"),
+        ('"cg"', '"jacobi"', "preconditioner", "solver.preconditioner: only for `cg`, `bicgstab` and `gmres`"),
+        ('"cg"', '"chebyshev"', "method", "solver.method: 'chebyshev' is only for `heat` and `poisson`"),
     ],
 )
 def test_mistakes_are_named_with_file_and_line(tmp_path, before, after, where, message):

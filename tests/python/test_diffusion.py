@@ -180,8 +180,10 @@ def test_arguments_are_checked():
             Diffusion(kappa, **arguments)
     with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1"):
         prdp.linear_solve(Diffusion(-torch.ones(1, 4, 4)), torch.ones(1, 1, 4, 4), prdp.CG(3))
-    with pytest.raises(ValueError, match=r"Diffusion: expected \(batch, channel, \*shape\)"):
-        prdp.linear_solve(Diffusion(kappa), torch.ones(1, 1, 4, 5, dtype=F64), prdp.CG(3))
+    for wrong, b, got in ((kappa, (4, 5), r"\[1, 4, 4\] and b \[1, 1, 4, 5\]"), (kappa[0], (4, 4), r"\[4, 4\] and b")):
+        expected = r"Diffusion: expected kappa \(batch or 1, \*shape\) and b \(batch, channel, \*shape\), got kappa "
+        with pytest.raises(ValueError, match=expected + got):
+            prdp.linear_solve(Diffusion(wrong), torch.ones(1, 1, *b, dtype=F64), prdp.CG(3))
     bad = kappa.clone()
     bad[0, 1, 2] = torch.nan
     with pytest.raises(torch.linalg.LinAlgError, match="NONFINITE_OPERATOR"):

@@ -125,6 +125,16 @@ def test_k_must_stay_a_number_of_iterations():
     assert step.max_iter == 3
 
 
+def test_tolerances_are_checked_when_they_are_set():
+    step = heat()
+    for wrong, error, message in (("x", TypeError, "must be a real number, got 'x'"), (-1, ValueError, "must be >= 0")):
+        for name in ("rtol", "adjoint_rtol"):
+            with pytest.raises(error, match=f"Heat: {name} {message}"):
+                setattr(step, name, wrong)
+    step.rtol, step.adjoint_rtol = 1, None
+    assert step.rtol == 1.0 and step.adjoint_rtol is None
+
+
 def test_wrong_kinds_of_arguments():
     with pytest.raises(TypeError, match=r"solver must be a Solver such as Jacobi\(10\), got 'jacobi'"):
         prdp.linear_solve(torch.eye(2), torch.ones(2), "jacobi")

@@ -131,6 +131,23 @@ def test_nan_stays_with_its_sample():
     np.testing.assert_allclose(u[:1], alone, rtol=1e-14)
 
 
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_tensor_with_nan_stays_with_its_sample(backward):
+    """Not known beforehand is which sample a tensor belongs to: the products tell."""
+    k, s = tensors()
+    b, solver = right_hand_side(), prdp.GMRES(3)
+    alone, _ = prdp.linear_solve(operators.Function(shifted, shifted_transpose, (k[:1], s)), b[:1], solver)
+    k[1] = torch.nan
+    a = operators.Function(shifted, shifted_transpose, (k, s.clone().requires_grad_()))
+    u, info = prdp.linear_solve(a, b, solver, backward=backward, on_failure="return")
+    assert statuses(info)[1] == "NONFINITE_OPERATOR" and torch.isfinite(u).all() and info.status[0] > -2
+    np.testing.assert_allclose(u[:1].detach(), alone, rtol=1e-14)
+    with pytest.raises(
+        torch.linalg.LinAlgError, match=r"sample 1 NONFINITE_OPERATOR, GMRES\(10\) on Function: A is made"
+    ):
+        prdp.linear_solve(a, b, solver)
+
+
 @pytest.mark.parametrize(
     "call, error, message",
     [
@@ -288,3 +305,13 @@ def test_copies_and_pickles():
         torch.testing.assert_close(clone.apply(v), diagonal(*clone.tensors) * v)
         torch.testing.assert_close(clone.diagonal(), a.diagonal())
     assert a.tensors[1] == 0.7
+
+
+@pytest.mark.parametrize("size, dtype", [(1e25, torch.float32), (1e-25, torch.float32), (2.0**600, torch.float64)])
+def test_unrolled_iterations_refuse_an_operator_whose_size_squared_underflows(size, dtype):
+    """Their derivative would be off by more than itself in silence."""
+    b = torch.randn(1, 1, 16, dtype=dtype, requires_grad=True)
+    q = torch.tensor(size, dtype=dtype)
+    a = operators.Function(lambda v, q: (3 * v - v.roll(1, -1) - v.roll(-1, -1)) * q, tensors=(q,), symmetric=True)
+    with pytest.raises(ValueError, match=r"unrolled in \w+, A may change the size of a vector by a factor of 2\^"):
+        prdp.linear_solve(a, b, prdp.SteepestDescent(8), backward="unrolled")[0].sum().backward()

@@ -113,3 +113,58 @@ def test_direct_on_singular_matrices_breaks_down(dtype):
             m, torch.arange(1.0, len(m) + 1, dtype=dtype).flip(0) ** 2, prdp.Direct(), on_failure="return"
         )
         assert prdp.SolveStatus(int(info.status)).name == "BREAKDOWN" and info.residual <= 1 and u.isfinite().all()
+
+
+def test_direct_says_that_a_matrix_is_singular_to_its_dtype():
+    """Not exactly singular: rounded to float32, or with a last pivot just above what counts as zero."""
+    rank_2 = torch.tensor([[-34.0, 13.0, -1.0], [-76.0, 30.0, -38.0], [-74.0, 29.0, -29.0]], dtype=torch.float64)
+    cases = [(rank_2, torch.tensor([[5.0, -5.0, 2.0]], dtype=torch.float64))]
+    for n in (3, 5, 10, 30):
+        for seed in range(12):
+            g = torch.Generator().manual_seed(seed)
+            left, right = (torch.randn(*shape, dtype=torch.float64, generator=g) for shape in ((n, n - 1), (n - 1, n)))
+            cases.append(((left @ right).float(), torch.randn(1, n, generator=g)))
+    for m, b in cases:
+        for a in (m, operators.Matrix(m.to_sparse_csr())):
+            for k in (1, 3):
+                u, info = prdp.linear_solve(a, b, prdp.Direct(k), on_failure="return")
+                rounding = torch.finfo(m.dtype).eps / 2 * torch.linalg.matrix_norm(m, torch.inf) * u.norm()
+                assert rounding <= 0.5 * b.norm() or info.status < -2, (m, info)
+                residual = (b - (m.double() @ u.double().T).T).norm() / b.norm()
+                assert abs(residual - info.residual) <= 1.0, (m, info)
+
+
+@pytest.mark.parametrize("exponent", [-600, -530, 0, 506, 600, 900])
+@pytest.mark.parametrize("method", ["jacobi", "cg", "bicgstab", "gmres"])
+def test_a_regular_operator_of_any_size_is_not_called_singular(method, exponent):
+    c = torch.tensor([2.001, -1.0, -1.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 400) * 2.0**exponent
+    b = torch.randn(1, 1, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    a = operators.Stencil(c, [(0,), (-1,), (1,)])
+    info = prdp.linear_solve(a, b, METHODS[method](60 if method == "gmres" else 300))[1]
+    assert prdp.SolveStatus(int(info.status)).name in ("MAX_ITER", "CONVERGED", "STAGNATED")
+
+
+@pytest.mark.parametrize("solver", [prdp.Direct(), prdp.CG(5), prdp.GMRES(3), prdp.Jacobi(5), prdp.BiCGStab(5)])
+@pytest.mark.parametrize("form", ["dense", "function"])
+def test_a_solution_below_the_smallest_number_is_not_called_converged(form, solver):
+    m = torch.eye(3) * 1e30
+    function = operators.Function(lambda v: v * 1e30, symmetric=True, diagonal=lambda: torch.tensor(1e30))
+    a = m if form == "dense" else function
+    b = torch.tensor([1e-20, 2e-15, 1.0]).view(3, 1).expand(3, 3)
+    u, info = prdp.linear_solve(a, b, solver)
+    residual = (b.double() - 1e30 * u.double()).norm(dim=1) / b.double().norm(dim=1)
+    assert (residual <= info.residual + 1e-6).all() and info.residual[0] == 1 and info.solved.all()
+    assert [prdp.SolveStatus(s).name == "STAGNATED" for s in info.status.tolist()][:2] == [True, True]
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_few_iterations_on_an_indefinite_matrix_seldom_hand_out_what_is_worse_than_zero(k):
+    """They see A on the plane of u and the residual alone; a quarter did before they looked at all of it."""
+    g = torch.Generator().manual_seed(2)
+    silent = 0
+    for _ in range(300):
+        m, b = (torch.randn(n, 6, dtype=torch.float64, generator=g) for n in (6, 1))
+        for solver in (prdp.CG(k), prdp.SteepestDescent(k)):
+            info = prdp.linear_solve(m + m.T, b, solver, on_failure="return")[1]
+            silent += int(info.status[0] > -3 and info.residual[0] > 1)
+    assert silent <= 10  # of 600

@@ -78,7 +78,7 @@ TABLE = [
      r"at index \(0, 0\), Chebyshev on Heat: the right-hand side is NaN or Inf there; look at the state"),
     ("NONFINITE_INPUT", operators.Poisson((8,)), GRID * torch.nan, prdp.CG(9), "CG on Poisson: the right-hand side"),
     ("NONFINITE_OPERATOR", operators.Burgers(GRID / 0.0, 1e-3, 0.1), GRID, prdp.GMRES(9),
-     r"at index \(0, 0\), GMRES\(10\) on Burgers: A is made of a NaN or Inf there"),
+     r"at index \(0, 0\), GMRES\(10\) on Burgers: A is made of a NaN or Inf;"),
 ]  # fmt: skip
 
 

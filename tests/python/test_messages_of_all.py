@@ -98,7 +98,7 @@ KRYLOV = r"A is (not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ .*\)|sym
 WAYS = {
     "nan": ("NONFINITE_INPUT", r" at index \((0, )*1\), ",
             "the (right-hand side|cotangent) is NaN or Inf there; look at", PAIRS),
-    "inf": ("NONFINITE_OPERATOR", r" at index \([\d, ]+\), ", "A is made of a NaN or Inf there; look at the state",
+    "inf": ("NONFINITE_OPERATOR", r" at index \([\d, ]+\), ", "A is made of a NaN or Inf; look at the state",
             [(m, o) for m, o in PAIRS if o in ("Burgers", "NavierStokes", "Stencil", "Matrix", "CSR")]),
     "zero diagonal": ("ZERO_DIAGONAL", r" in row \([\d, ]+\), ",
                       "(the pressure rows have a|it divides by the diagonal of A, which has a) zero.*; take GMRES",

@@ -330,3 +330,13 @@ def test_arguments_are_checked():
     again = dataclasses.replace(cg(3), max_iter=4)
     assert (again.preconditioner, again.max_iter) == ("diagonal", 4)
     assert dataclasses.replace(again, preconditioner=None).preconditioner is None
+
+
+@pytest.mark.parametrize("solver", [prdp.CG, prdp.GMRES, prdp.BiCGStab])
+def test_a_preconditioner_without_values_is_refused(solver):
+    scale = torch.ones(8, device="meta")
+    inverse = operators.Function(lambda v, t: v * t, tensors=(scale,), symmetric=True)
+    with pytest.raises(
+        ValueError, match="Function: a tensor of it is on meta but the vector is on cpu; it has no values"
+    ):
+        prdp.linear_solve(operators.Heat((8,), 1e-3, 0.1), torch.ones(2, 1, 8), solver(5, preconditioner=inverse))

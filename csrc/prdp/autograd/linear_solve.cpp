@@ -69,6 +69,7 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
   auto a = make_operator(spec);
   a->check_vector(b);
   check_devices(spec, b);
+  if (options.solver.preconditioner.is_operator()) check_devices(options.solver.preconditioner.spec(), b);
   check_multigrid(*a, spec, options.solver);
   TORCH_CHECK_VALUE(
       !x0.defined() ||

@@ -86,7 +86,7 @@ std::string Controller::about_residual() const {
   if (history.empty() || !history.back().residual) return {};
   const auto& last = history.back();
   const double residual = *last.residual;
-  if (residual <= kSmallResidual) return {};
+  if (residual <= std::max(kSmallResidual, asked_for())) return {};
   std::ostringstream text;
   text << std::scientific << std::setprecision(1) << name() << ": the solves stop at a residual of " << residual
        << " (K = " << last.max_iter << "), ";

@@ -78,6 +78,8 @@ class Controller {
   virtual const char* remedy() const = 0;
   /// Whether the metric no longer falls.
   virtual bool stalled() const = 0;
+  /// The residual that the solves before the last step() were asked for, which is no cause for a warning.
+  virtual double asked_for() const { return 0.0; }
 
  private:
   std::string about_metric() const;

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace prdp {
 
@@ -39,6 +40,11 @@ bool ToleranceController::step(double error, const Solves& solves) {
   const bool tightened = rtol() < before;
   state_.history.push_back({error, state_.checkpoint, state_.max_iter, tightened, error, solves.residual});
   return tightened;
+}
+
+double ToleranceController::asked_for() const {
+  const auto& history = state_.history;
+  return rtol_for(history.size() > 1 ? history[history.size() - 2].smoothed : std::numeric_limits<double>::infinity());
 }
 
 void ToleranceController::load_state(State state) {

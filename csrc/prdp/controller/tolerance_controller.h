@@ -43,6 +43,7 @@ class ToleranceController final : public Controller {
     return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\"";
   }
   bool stalled() const override { return true; }  // not used: its metric is the error
+  double asked_for() const override;
 
   ToleranceSettings settings_;
   State state_;

@@ -88,8 +88,8 @@ DiffusionOperator::DiffusionOperator(const OperatorSpec& spec) : shape_(spec.sha
 
 void DiffusionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(b.dim() == dim() + 2 && b.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2) && b.sym_size(1) != 0,
-                    "Diffusion: expected (batch, channel, *shape) with the shape of kappa, ",
-                    kappa_.sym_sizes().slice(2), ", got ", b.sym_sizes());
+                    "Diffusion: expected kappa (batch or 1, *shape) and b (batch, channel, *shape), got kappa ",
+                    kappa_.squeeze(1).sym_sizes(), " and b ", b.sym_sizes());
   for (const auto& [name, t] : {std::pair("kappa", kappa_), std::pair("shift", shift_)})
     TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
                       " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));

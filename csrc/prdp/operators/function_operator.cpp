@@ -236,4 +236,11 @@ at::Tensor FunctionOperator::norm() const {
   return at::scalar_tensor(0.0, at::kDouble);
 }
 
+at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {
+  const auto some = Operator::nonfinite_samples(b);
+  if (!some.item<bool>()) return some;
+  const auto rows = apply(at::ones_like(b)).isfinite().flatten(1).all(1).logical_not();
+  return at::where(rows.any(), rows, some);
+}
+
 }  // namespace prdp

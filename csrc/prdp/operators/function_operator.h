@@ -71,6 +71,8 @@ class FunctionOperator final : public Operator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   /// Not known: 0, or NaN if a tensor is not finite.
   at::Tensor norm() const override;
+  /// The samples whose product with a vector of ones is not finite, if a tensor is not; all if no product is.
+  at::Tensor nonfinite_samples(const at::Tensor& b) const override;
   bool may_be_singular() const override { return static_cast<bool>(registered_->products().apply_transpose); }
   /// Null, because it is not known which tensors have a batch axis.
   std::unique_ptr<Operator> select(const at::Tensor&) const override { return nullptr; }

@@ -71,6 +71,7 @@ class Transposed final : public Operator {
     auto chosen = a_->select(index);
     return chosen ? std::make_unique<Transposed>(std::move(chosen)) : nullptr;
   }
+  at::Tensor nonfinite_samples(const at::Tensor& b) const override { return a_->nonfinite_samples(b); }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
   bool has_coarse_grids() const override { return a_->has_coarse_grids(); }
   bool has_multigrid_preconditioner() const override { return a_->has_multigrid_preconditioner(); }

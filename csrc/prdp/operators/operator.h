@@ -60,7 +60,10 @@ class Operator {
   /// ValueError if it is not known.
   virtual at::Tensor jacobi_radius() const;
   virtual bool knows_jacobi_radius() const { return false; }
-  /// The index of the first NaN or Inf in the tensors of A: (i, j) in a matrix, (channel, *grid) in winds.
+  /// Which samples of b have an A that holds a NaN or Inf: (batch,), or one for all.
+  virtual at::Tensor nonfinite_samples(const at::Tensor& /*b*/) const { return norm().isfinite().logical_not(); }
+  /// The index of the first NaN or Inf in the tensors of A: (i, j) in a matrix, (channel, *grid) in winds. Empty where
+  /// an index would say nothing.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator for the samples `index` (int64) alone, differentiable in the same tensors; null if that is not
   /// possible.

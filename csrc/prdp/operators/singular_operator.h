@@ -33,6 +33,7 @@ class SingularOperator final : public Operator {
   at::Tensor solve_directly(const at::Tensor& b) const override;
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
+  at::Tensor nonfinite_samples(const at::Tensor& b) const override { return a_->nonfinite_samples(b); }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }

@@ -137,7 +137,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
                               : "the right-hand side is NaN or Inf there; look at the state that it is made of";
         return "the start is NaN or Inf there; take another one, or none";
       case SolveStatus::kNonfiniteOperator:
-        return "A is made of a NaN or Inf there; look at the state, the weights or the file that it comes from";
+        return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

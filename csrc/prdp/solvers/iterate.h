@@ -96,9 +96,9 @@ auto worse_than_zero(Space& space, const typename Space::States& states) {
 }
 
 /// Whether the iterates of a method for definite operators do what they are made for, for each sample: A is symmetric,
-/// judged by x·A r and r·A x; x·A x and r·A r have the same sign; and x is nearer to the solution than zero in the norm
-/// of A, which is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in
-/// the null space of A, and says nothing. One product.
+/// judged by x·A r and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the
+/// norm of A, which is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies
+/// almost in the null space of A, and says nothing. One product.
 template <class Space, class Method>
 auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
   const auto& x = method.x;
@@ -115,10 +115,27 @@ auto energy_falls(Space& space, Method& method, const typename Space::States& st
     const double scale = std::sqrt(rr[i]) * std::sqrt(std::max(ax2, 0.0)) + std::sqrt(xx[i]) * std::sqrt(ar2[i]);
     const bool symmetric = std::abs(rb[i] - rr[i] - x_ar[i]) <= 2e3 * space.epsilon() * scale;
     const double energy = xb[i] - xr[i], rounding = 2e3 * space.epsilon() * std::abs(xb[i]);
-    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i] && std::abs(energy) > rounding, definite = r_ar[i] * energy > 0;
+    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i] && std::abs(energy) > rounding;
+    const double across = std::max(std::abs(x_ar[i]) - 2e3 * space.epsilon() * scale, 0.0);
+    const bool definite = r_ar[i] * energy > across * across;
     ++i;
     return symmetric && definite && nearer;
   });
+}
+
+/// Which samples a method that solves in one iteration leaves with a u so large that its rounding, ε ‖A‖ ‖u‖, is of the
+/// order of b: A is singular to the dtype. A small residual says that it is not.
+template <class Space, class Method>
+auto lost_in_rounding(Space& space, const Method& method, const typename Space::States& states) {
+  const auto doubtful = [](const SampleState& s) {
+    return (s.status == SolveStatus::kMaxIter || s.status == SolveStatus::kStagnated) && s.residual2 > 1e-4 * s.b2;
+  };
+  auto found = space.map(states, doubtful);
+  if (std::none_of(states.begin(), states.end(), doubtful)) return found;
+  const auto norm_a = space.operator_norm(), u2 = space.lanes(space.solution2(method.x));
+  for (size_t i = 0; i < states.size(); ++i)
+    found[i] = found[i] && space.epsilon() * norm_a[i] * std::sqrt(u2[i]) > 0.25 * std::sqrt(states[i].b2);
+  return found;
 }
 
 }  // namespace detail
@@ -137,6 +154,11 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   conclude(space, method, states, rtol);
   if (!guarded) return;
   auto worse = worse_than_zero(space, states);
+  auto useless = space.map(states, [](const SampleState&) { return false; });  // zero takes their place
+  if constexpr (kIsExact<Method>) {
+    useless = lost_in_rounding(space, method, states);
+    for (size_t i = 0; i < states.size(); ++i) worse[i] = worse[i] || useless[i];
+  }
   if (any(worse)) {
     if constexpr (kDescendsEnergy<Method>) {
       const auto before = states;
@@ -174,7 +196,10 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
     run(space, method, states, rtol, track);
     conclude(space, method, states, rtol);
   };
-  remake([&](size_t i) { return lost(first[i]) || worse[i] ? watched[i].best : watched[i].iterations; });
+  remake([&](size_t i) {
+    if (useless[i]) return int64_t{0};
+    return lost(first[i]) || worse[i] ? watched[i].best : watched[i].iterations;
+  });
   const auto still_worse = worse_than_zero(space, states);
   for (size_t i = 0; i < states.size(); ++i) worse[i] = worse[i] && still_worse[i];
   if (any(worse)) {  // a recursive residual had said otherwise

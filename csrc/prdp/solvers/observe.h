@@ -61,6 +61,16 @@ T consistency_bound(double rtol) {
   return static_cast<T>(std::max(rtol, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon())));
 }
 
+/// Where u, of this largest entry, consists of the smallest numbers of its dtype, its residual is their rounding.
+template <class T>
+void note_underflow(SampleState& s, double largest) {
+  if (largest >= std::numeric_limits<T>::min()) return;
+  const double lost = largest == 0.0 ? 1.0 : std::numeric_limits<T>::denorm_min() / largest;
+  if (s.residual2 >= lost * lost * s.b2) return;
+  s.residual2 = s.floor2 = lost * lost * s.b2;
+  if (static_cast<int64_t>(s.status) > 0) s.status = SolveStatus::kStagnated;
+}
+
 namespace detail {
 
 /// GMRES and its like: each iteration takes the least residual over a space, which may be exhausted.

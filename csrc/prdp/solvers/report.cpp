@@ -35,7 +35,8 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor
   }
   if (status == SolveStatus::kZeroDiagonal)
     text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
-  else if (status == SolveStatus::kNonfiniteOperator) text << " at index " << position(a.first_nonfinite(sample));
+  if (status == SolveStatus::kNonfiniteOperator)
+    if (const auto index = a.first_nonfinite(sample); !index.empty()) text << " at index " << position(index);
   return text.str();
 }
 

@@ -51,16 +51,16 @@ bool settled_beforehand(const SampleBatch<T>& batch, int64_t s, const kernels::K
   return false;
 }
 
-/// Stores 2^exponent x; false if a number leaves the range of T.
+/// Stores 2^exponent x and returns the largest magnitude, which is not finite if a number leaves the range of T.
 template <class T>
-bool store_scaled(const kernels::Kernel<T>& a, int exponent, T* x, T* u) {
+T store_scaled(const kernels::Kernel<T>& a, int exponent, T* x, T* u) {
   int in_place = 0;
   if (std::abs(exponent) > std::numeric_limits<T>::max_exponent - 2) {  // no number of T
     in_place = exponent / 2;
     kernels::WholeVectors<T>().scale(std::ldexp(T(1), in_place), x, x, a.length());
   }
   a.layout().store(x, std::ldexp(T(1), exponent - in_place), u);
-  return std::isfinite(kernels::largest_magnitude(u, a.unknowns()));
+  return kernels::largest_magnitude(u, a.unknowns());
 }
 
 /// Solves a sample. b is scaled by a power of two to the order of one, so that no square over- or
@@ -89,12 +89,16 @@ void solve_sample(const kernels::Kernel<T>& a, SampleSpace<T>& space, Iteration&
   space.project_solution(method.x);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
   // With A' = factor A and b' = scale b, u = factor/scale u'.
-  const bool in_range =
-      store_scaled(a, std::ilogb(a.factor()) - std::ilogb(scale), method.x, batch.u + s * batch.unknowns);
-  if (batch.guarded && !in_range) hand_out_zeros(batch, s, SolveStatus::kOverflow, 1.0, state.applications);
-  else
+  const T largest = store_scaled(a, std::ilogb(a.factor()) - std::ilogb(scale), method.x, batch.u + s * batch.unknowns);
+  if (batch.guarded && !std::isfinite(largest)) {
+    hand_out_zeros(batch, s, SolveStatus::kOverflow, 1.0, state.applications);
+  } else {
+    const bool tiny = largest < std::numeric_limits<T>::min();
+    if (tiny && kernels::WholeVectors<T>().largest_magnitude(method.x, a.length()) > T(0))
+      note_underflow<T>(state, static_cast<double>(largest));
     report(batch, s, state.status, state.iterations, std::sqrt(state.residual2 / state.b2), state.applications,
            std::sqrt(state.floor2 / state.b2));
+  }
   // Whatever a failure left in the padding must not reach the next sample.
   if (is_failure(static_cast<SolveStatus>(batch.status[s]))) space.clear();
 }

@@ -37,7 +37,7 @@ struct Beforehand {
 };
 
 /// The status of each sample that is settled before iterating, and MAX_ITER of the others.
-at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& magnitude,
+at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& magnitude,
                              const at::Tensor& start_magnitude) {
   const int64_t batch = magnitude.size(0);
   auto status = at::full({batch}, static_cast<int64_t>(SolveStatus::kMaxIter), magnitude.options().dtype(at::kLong));
@@ -50,7 +50,7 @@ at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::
     const auto zero = a.diagonal().eq(0);
     mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
   }
-  mark(a.norm().isfinite().logical_not(), SolveStatus::kNonfiniteOperator);
+  mark(a.nonfinite_samples(b), SolveStatus::kNonfiniteOperator);
   if (start_magnitude.defined()) mark(start_magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
   mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
   return status;
@@ -168,7 +168,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto magnitude = largest_magnitude(b);
   const auto& solver = request.solver;
   const bool starts = takes_start(solver.method, request.x0);
-  const auto status = settle_beforehand(a, solver, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
+  const auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
   const auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
   std::vector<SampleState> states(b.size(0));
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
@@ -198,16 +198,22 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const bool in_batches = solver.method == Method::kGmres && space.is_far();
   auto u =
       in_batches ? run(TensorGmres(space, solver.restart)) : with_method(solver.method, solver.restart, space, run);
+  const auto before = largest_magnitude(u);
   u = at::where(per_sample(takes_part, b), u / scale, at::zeros_like(b));
-  const auto finite = u.isfinite().flatten(1).all(1);
-  const auto rows = at::stack({beforehand.inconsistent, finite}).to(at::kCPU);
-  const bool *inconsistent = rows.const_data_ptr<bool>(), *finite_rows = inconsistent + states.size();
-  for (size_t i = 0; i < states.size(); ++i)
-    if (inconsistent[i] && !is_failure(states[i].status)) states[i].status = SolveStatus::kInconsistent;
-  if (!request.guarded) return {u.contiguous(), info_of(states, b.options())};
-  u = at::where(per_sample(finite, b), u, at::zeros_like(u));
+  const auto largest = largest_magnitude(u);
+  const auto host = at::stack({beforehand.inconsistent.to(u.scalar_type()), before, largest}).to(at::kCPU, at::kDouble);
+  const auto rows = host.accessor<double, 2>();
   for (size_t i = 0; i < states.size(); ++i) {
-    if (finite_rows[i]) continue;
+    auto& s = states[i];
+    if (rows[0][i] != 0.0 && !is_failure(s.status)) s.status = SolveStatus::kInconsistent;
+    if (is_refused(s.status) || !(rows[1][i] > 0.0)) continue;
+    if (u.scalar_type() == at::kFloat) note_underflow<float>(s, rows[2][i]);
+    else note_underflow<double>(s, rows[2][i]);
+  }
+  if (!request.guarded) return {u.contiguous(), info_of(states, b.options())};
+  u = at::where(per_sample(largest.isfinite(), b), u, at::zeros_like(u));
+  for (size_t i = 0; i < states.size(); ++i) {
+    if (std::isfinite(rows[2][i])) continue;
     states[i].status = SolveStatus::kOverflow;
     states[i].iterations = 0;
     states[i].residual2 = states[i].b2;

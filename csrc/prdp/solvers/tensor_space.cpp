@@ -57,6 +57,16 @@ void TensorSpace::define_scale(const Vector& product, const Vector& v, at::Tenso
   const auto usable = of_product.gt(0).logical_and(of_product.isfinite()).logical_and(of_v.gt(0));
   const auto one = at::ones_like(of_v);
   scale = power_of_two_scale(at::where(usable, of_product, one)) / power_of_two_scale(at::where(usable, of_v, one));
+  if (recording_) check_scale(scale);
+}
+
+/// A derivative meets the square of the scale, which must not underflow.
+void TensorSpace::check_scale(const at::Tensor& scale) const {
+  const auto exponent = scale.detach().log2().abs().amax().item<double>();
+  const double most = b_.scalar_type() == at::kFloat ? 60.0 : 500.0;
+  TORCH_CHECK_VALUE(exponent <= most, "linear_solve: unrolled in ", b_.scalar_type(),
+                    ", A may change the size of a vector by a factor of 2^", most, ", got 2^", exponent,
+                    "; scale A and b, or take backward=\"implicit\"");
 }
 
 TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {

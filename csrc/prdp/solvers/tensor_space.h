@@ -221,6 +221,7 @@ class TensorSpace {
   }
   /// Sets the scale that brings the product to the order of v, if it is not known yet.
   void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
+  void check_scale(const at::Tensor& scale) const;
   void note_broken(const at::Tensor& rows) {
     const auto now = active_mask_.defined() ? rows.logical_and(active_mask_) : rows;
     broken_ = broken_.defined() ? broken_.logical_or(now) : now;

@@ -13,7 +13,12 @@ namespace prdp {
 
 namespace {
 
-at::Tensor norm_of_samples(const at::Tensor& v) { return v.to(at::kDouble).flatten(1).norm(2, 1); }
+/// The norm of each sample, whatever its order of magnitude.
+at::Tensor norm_of_samples(const at::Tensor& v) {
+  const auto rows = v.to(at::kDouble).flatten(1);
+  const auto largest = rows.abs().amax(1, /*keepdim=*/true), unit = at::where(largest.gt(0), largest, 1.0);
+  return unit.squeeze(1) * (rows / unit).norm(2, 1);
+}
 
 /// The share of each sample of v that is constant in a channel, on the host.
 std::vector<double> constant_shares(const at::Tensor& v) {

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <optional>
 #include <set>
 #include <sstream>
@@ -71,11 +72,12 @@ class TomlSection {
     const auto chosen = value<std::string>(key.name, "a string");
     std::ostringstream allowed;
     for (const auto& [name, when] : choices) {
-      if (!when.holds) continue;
       if (name == chosen) {
+        if (!when.holds) fail(key.name, "'" + chosen + "' is " + when.words);
         target = from_name(chosen);
         return;
       }
+      if (!when.holds) continue;
       allowed << (allowed.tellp() > 0 ? ", " : "") << name;
     }
     fail(key.name, "unknown name '" + chosen + "'; allowed: " + allowed.str());
@@ -142,6 +144,8 @@ class TomlSection {
   void finish() const {
     for (const auto& [key, node] : table_) {
       if (asked_.count(std::string(key.str()))) continue;
+      if (const auto other = not_here_.find(std::string(key.str())); other != not_here_.end())
+        fail(other->first.c_str(), other->second);
       std::ostringstream allowed;
       for (const auto& name : asked_) allowed << (allowed.tellp() > 0 ? ", " : "") << name;
       TORCH_CHECK_VALUE(false, file_, ":", key.source().begin.line, ": unknown name '", full(std::string(key.str())),
@@ -159,7 +163,10 @@ class TomlSection {
   /// Whether there is a value to read. Raises if the key applies, is not optional and is missing.
   template <class T = void>
   bool given(const Key& key) {
-    if (!key.when.holds) return false;
+    if (!key.when.holds) {
+      not_here_.emplace(key.name, key.when.words);
+      return false;
+    }
     asked_.insert(key.name);
     if (table_.contains(key.name)) return true;
     if (key.optional || is_optional<T>) return false;
@@ -185,7 +192,7 @@ class TomlSection {
   template <class T>
   std::vector<T> values(const char* key, const char* expected) const {
     const auto* array = table_[key].as_array();
-    if (!array) fail(key, std::string("expected a list of ") + expected);
+    if (!array) fail(key, std::string("expected a list of ") + expected + got(*table_.get(key)));
     std::vector<T> all;
     for (const auto& node : *array) all.push_back(read<T>(key, node, std::string("expected a list of ") + expected));
     return all;
@@ -193,13 +200,24 @@ class TomlSection {
   template <class T>
   T read(const char* key, const toml::node& node, const std::string& expected) const {
     const auto x = node.value<T>();
-    if (!x || node.is_boolean()) fail(key, expected);  // toml++ takes true for 1
+    if (!x || node.is_boolean()) fail(key, expected + got(node));  // toml++ takes true for 1
     return *x;
+  }
+
+  /// ", got 2.5"; nothing for tables and dates.
+  static std::string got(const toml::node& node) {
+    std::ostringstream text;
+    if (const auto* word = node.as_string()) text << ", got '" << word->get() << "'";
+    else if (const auto* flag = node.as_boolean()) text << ", got " << (flag->get() ? "true" : "false");
+    else if (node.is_number()) text << ", got " << *node.value<double>();
+    else if (node.is_array()) text << ", got a list";
+    return text.str();
   }
 
   const toml::table& table_;
   std::string file_, name_;
   std::set<std::string> asked_;
+  std::map<std::string, std::string> not_here_;  // keys of other scenes, and of which
 };
 
 }  // namespace prdp
