@@ -55,13 +55,13 @@ def test_the_scene_holds_the_papers_settings():
 @pytest.mark.parametrize(
     "before, after, where, message",
     [
-        ('"navier_stokes"', '"burgers"', "equation =", "unknown name 'burgers'; allowed: navier_stokes"),
+        ('"navier_stokes"', '"burgers"', "equation =", "'burgers' is only for `emulator` and `parameters`"),
         ("shape = [48, 48]", "shape = [48]", "shape = [48]", "physics.shape: expected 2 extents"),
         ("[97, 97]", "[97, 96]", "reference_shape", "data.reference_shape: expected 2 N + 1 for each N of"),
         ("valid_max_iter = 120", "valid_max_iter = 0", "valid_max_iter", "data.valid_max_iter: must be >= 1, got 0"),
-        ("seed = 0", "seed = 0\nmodes = 5", "modes", "unknown name 'data.modes'; allowed: file, fresh, reference_"),
+        ("seed = 0", "seed = 0\nmodes = 5", "modes", "data.modes: only for `emulator`, not with `file`"),
         ("cosine_updates = 800", "cosine_updates = 0", "cosine_up", "training.cosine_updates: must be >= 1, got 0"),
-        ("cosine_updates = 800", "cosine_updates = 8\ndecay = 0.9", "decay = ", "unknown name 'training.decay'"),
+        ("cosine_updates = 800", "cosine_updates = 8\ndecay = 0.9", "decay = ", "training.decay: not for `parameters`"),
         ("cosine_updates = 800", "", "[training]", "training.decay: missing; the table holds:"),
         ('"implicit"', '"jfb"', "backward", "unknown name 'jfb'; allowed: implicit, unrolled, none"),
         ('"corrector"', '"fixer"', "task =", "task: unknown name 'fixer'; allowed: emulator, corrector, parameters"),

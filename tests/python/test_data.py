@@ -103,7 +103,7 @@ def test_the_cpp_trainer_refuses_a_file(tmp_path):
 
 
 def test_keys_of_made_data_do_not_go_with_a_file(tmp_path):
-    with pytest.raises(ValueError, match=r"unknown name 'data.modes'; allowed: file, train, valid, valid_steps"):
+    with pytest.raises(ValueError, match=r"data\.modes: only for `emulator`, not with `file`"):
         scenes.load(written(tmp_path, ("modes = 5 ", 'file = "x.h5"\nmodes = 5 '), ("seed = 0\n", "")))
 
 

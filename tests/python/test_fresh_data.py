@@ -89,6 +89,6 @@ def test_both_languages_train_alike(tmp_path):
 def test_what_does_not_go_together_is_refused(tmp_path):
     path = written(tmp_path, ("modes = 5               # sines and cosines 2πn, n = 1 … 5", 'file = "x.h5"'),
                    ("seed = 0\n", "fresh = true\n"))  # fmt: skip
-    assert_refused(path, "fresh", "unknown name 'data.fresh'")
+    assert_refused(path, "fresh", "data.fresh: ")
     with pytest.raises(ValueError, match=r"a scene with data\.fresh makes its own data in every epoch"):
         train(fresh_scene(tmp_path), Refinement.auto(), data=torch.randn(300, 4, 1, 30))

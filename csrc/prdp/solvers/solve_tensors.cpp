@@ -198,7 +198,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const bool in_batches = solver.method == Method::kGmres && space.is_far();
   auto u =
       in_batches ? run(TensorGmres(space, solver.restart)) : with_method(solver.method, solver.restart, space, run);
-  const auto before = largest_magnitude(u);
+  const auto before = largest_magnitude(u) * takes_part;
   u = at::where(per_sample(takes_part, b), u / scale, at::zeros_like(b));
   const auto largest = largest_magnitude(u);
   const auto host = at::stack({beforehand.inconsistent.to(u.scalar_type()), before, largest}).to(at::kCPU, at::kDouble);
