@@ -77,6 +77,11 @@ class Trial:
     renewed: bool
     """Whether A is another one in every update: what is kept of it, factors and grids, is made anew for each run."""
 
+    def forget(self) -> None:
+        """Before a solve: frees what an update would not find."""
+        if self.renewed:
+            _C.clear_factorisations()
+
 
 def name_of(solver: Solver) -> str:
     settings = [str(solver.restart)] if isinstance(solver, GMRES) else []
@@ -186,8 +191,7 @@ def run(trial: Trial, solver: Solver, max_runs: int = 1, deadline: float = float
     forward: list[float] = []
     adjoint: list[float] = []
     while not forward or (len(forward) < max_runs and time.perf_counter() < deadline):
-        if trial.renewed:
-            _C.clear_factorisations()
+        trial.forget()
         started = now(u)
         u_next = step(u)
         between = now(u)
@@ -244,8 +248,7 @@ def _check_direct(trial: Trial, seconds: float) -> None:
     with torch.no_grad():
         times = [now(sample)]
         while len(times) < 3 and times[-1] - times[0] <= seconds:
-            if trial.renewed:
-                _C.clear_factorisations()
+            trial.forget()
             step(probe)
             times.append(now(sample))
     whole = min(after - before for before, after in pairwise(times)) * len(sample) / len(probe)
