@@ -10,7 +10,7 @@ from prdp_torch import _C, _check
 from prdp_torch.operators import Operator
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import linear_solve
-from prdp_torch.solvers import CG, Solver
+from prdp_torch.solvers import CG, GMRES, Solver
 
 _UNIT_VECTORS = 256
 
@@ -31,7 +31,7 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     - every tensor that requires grad is among the tensors of the operator;
     - ⟨A v, w⟩ = ⟨v, Aᵀ w⟩;
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
-    - A does not map the constant to zero, unless that is its `nullspace`;
+    - A maps its `nullspace` to zero, and the constant only if that is its `nullspace`;
     - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction;
     - an operator that preconditions is linear and fits its transpose, and that of `CG` is symmetric and definite.
 
@@ -101,6 +101,10 @@ def _products(A: Operator, v: Tensor, w: Tensor, name: str = "A") -> Iterator[st
 
 def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
     if A.kind.startswith("singular_"):
+        try:  # the first solve looks
+            linear_solve(A, v, GMRES(1, restart=1), backward="none", on_failure="return")
+        except ValueError as error:
+            yield str(error).removeprefix(f"{type(A).__name__}: ")
         return
     constant = torch.ones_like(v)
     left = _norm(A.apply(constant)) / _norm(constant)

@@ -88,6 +88,8 @@ class SolveInfo(NamedTuple):
     log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self) -> str:
+        if self.status.is_meta:
+            return f"SolveInfo({self.status.numel()} samples on meta)"
         found = Counter(SolveStatus(s).name for s in self.status.flatten().tolist())
         statuses = ", ".join(f"{count} {name}" for name, count in found.items())
         ranges = ", ".join(

@@ -67,7 +67,7 @@ class Diffusion(Operator):
         self.boundary = _sides(boundary, dim)
         self.length = _check.lengths("Diffusion", length, dim) or [1.0] * dim
         self.kappa = kappa
-        if isinstance(shift, torch.Tensor) and shift.dim() > 0:
+        if isinstance(shift, Tensor) and shift.dim() > 0:
             if shift.dim() != kappa.dim():
                 raise ValueError(
                     f"Diffusion: shift must be a number or have the shape of kappa, {tuple(kappa.shape)}, got "
@@ -75,7 +75,7 @@ class Diffusion(Operator):
                 )
             shift, is_held = shift.unsqueeze(1), True
         else:
-            is_held = isinstance(shift, torch.Tensor) or shift != 0
+            is_held = isinstance(shift, Tensor) or shift != 0
             shift = real_tensor("Diffusion", "shift", shift)
         is_held = is_held or any("zero" in sides for sides in self.boundary)
         codes = [float(("zero", "flux", "periodic").index(side)) for sides in self.boundary for side in sides]
@@ -91,9 +91,11 @@ class Diffusion(Operator):
             fluxes: what flows in, κ ∂u/∂n with the normal n pointing outwards, on the sides that are "flux".
                 Each is one number for all sides, or a pair (low, high) for each axis; a number, or a tensor that
                 broadcasts to (batch or 1, *side), where side is shape without the axis.
+
+        Raises:
+            ValueError: one of them stands where no side takes it.
         """
-        dim = len(self.shape)
-        values, fluxes = (_of_sides(name, given, dim) for name, given in (("values", values), ("fluxes", fluxes)))
+        values, fluxes = self._of_sides("values", values, "zero"), self._of_sides("fluxes", fluxes, "flux")
         b = torch.zeros_like(self.kappa)
         for axis, sides in enumerate(self.boundary):
             h = self.length[axis] / self.shape[axis]
@@ -107,8 +109,32 @@ class Diffusion(Operator):
                     b = b.expand(added.shape[0], *b.shape[1:])
                 place = torch.zeros(self.shape[axis], dtype=b.dtype, device=b.device)
                 place[-end] = 1.0
-                b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (dim - axis - 1))
+                b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (len(self.shape) - axis - 1))
         return b.unsqueeze(1)
+
+    def _of_sides(self, name: str, given: OfSides, kind: Side) -> Sequence[Sequence[Number]]:
+        """A value for each side, (low, high) for each axis; only sides of this kind take one that is not zero."""
+        dim = len(self.shape)
+        if isinstance(given, (int, float, Tensor)):
+            pairs: Sequence[Sequence[Number]] = [(given, given)] * dim
+            stray = _is_given(given) and not any(kind in sides for sides in self.boundary)
+        else:
+            pairs = given
+            if len(given) != dim or any(len(pair) != 2 for pair in given):
+                raise ValueError(
+                    f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes"
+                )
+            stray = any(
+                _is_given(value) and side != kind
+                for sides, pair in zip(self.boundary, pairs, strict=True)
+                for side, value in zip(sides, pair, strict=True)
+            )
+        if stray:
+            raise ValueError(
+                f"Diffusion: {name} belong to sides that are {kind!r}; the boundary is {self.boundary}, in pairs "
+                f"(low, high), and {name} are {given!r:.80}"
+            )
+        return pairs
 
 
 def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
@@ -128,10 +154,5 @@ def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
     return pairs
 
 
-def _of_sides(name: str, given: OfSides, dim: int) -> Sequence[Sequence[Number]]:
-    """A value for each side: (low, high) for each axis."""
-    if isinstance(given, (int, float, torch.Tensor)):
-        return [(given, given)] * dim
-    if len(given) != dim or any(len(pair) != 2 for pair in given):
-        raise ValueError(f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes")
-    return given
+def _is_given(value: Number) -> bool:
+    return isinstance(value, Tensor) or value != 0

@@ -154,6 +154,17 @@ def test_values_and_fluxes_at_the_sides():
     torch.testing.assert_close(slope, 0.5 * 4 * x[-1], rtol=1e-10, atol=1e-10)
 
 
+def test_values_and_fluxes_that_no_side_takes_are_refused():
+    a = Diffusion(torch.ones(1, 4, 3), boundary="flux")
+    with pytest.raises(ValueError, match="Diffusion: values belong to sides that are 'zero'; the boundary is"):
+        a.boundary_rhs(values=1.0)
+    with pytest.raises(ValueError, match="Diffusion: values belong to sides that are 'zero'"):
+        Diffusion(torch.ones(1, 4), boundary=[("flux", "zero")]).boundary_rhs(values=[(1.0, 0.0)])
+    with pytest.raises(ValueError, match="Diffusion: fluxes belong to sides that are 'flux'"):
+        Diffusion(torch.ones(1, 4), boundary="zero").boundary_rhs(fluxes=torch.ones(()))
+    assert not a.boundary_rhs(values=0.0).any()
+
+
 def test_it_is_second_order_and_a_step_of_diffusion():
     errors = []
     for n in (16, 32):

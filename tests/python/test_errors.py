@@ -62,6 +62,11 @@ def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
                 call()
 
 
+def test_a_report_without_values_says_so():
+    _, info = prdp.linear_solve(torch.empty(4, 4, device="meta"), torch.empty(2, 4, device="meta"), prdp.GMRES(2))
+    assert repr(info) == "SolveInfo(2 samples on meta)"
+
+
 @pytest.mark.parametrize(
     "make, message",
     [

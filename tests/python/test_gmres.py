@@ -111,6 +111,20 @@ def test_a_singular_inconsistent_system_breaks_down_with_the_least_residual():
         prdp.linear_solve(a, torch.ones(3, dtype=torch.float64), prdp.GMRES(50, restart=3))
 
 
+@pytest.mark.parametrize("tensors", [False, True], ids=["loops", "tensors"])
+def test_a_matrix_of_condition_2e6_is_solved_as_far_as_float32_goes(tensors):
+    """Nonnormal, with ε ‖A‖ ‖u‖ a tenth of ‖b‖ and more, where Direct reaches 1e-2."""
+    for seed in range(50):
+        generator = torch.Generator().manual_seed(seed)
+        left, right = (torch.linalg.qr(torch.randn(8, 8, generator=generator, dtype=torch.float64))[0] for _ in "ab")
+        matrix = (left @ torch.diag(torch.logspace(0, -6.3, 8, dtype=torch.float64)) @ right).float()
+        a = operators.Function(lambda v, m: v @ m.mT, tensors=matrix) if tensors else operators.Matrix(matrix)
+        b = torch.randn(1, 8, generator=generator)
+        u, info = prdp.linear_solve(a, b, prdp.GMRES(20, restart=8, rtol=1e-6), on_failure="return")
+        true = (b.double() - u.double() @ matrix.double().mT).norm() / b.norm()
+        assert info.residual.item() < 0.2 and true < 0.2, (seed, info.residual.item(), true.item())
+
+
 def test_exactly_k_cycles_past_exact_convergence():
     a, b = nonsymmetric(2, 6), right_hand_sides(2, 6)
     u, info = prdp.linear_solve(a, b, prdp.GMRES(40, restart=6, rtol=0.0))

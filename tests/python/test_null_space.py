@@ -1,5 +1,7 @@
 """Singular operators of one's own whose null space is named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -91,6 +93,21 @@ def test_a_right_hand_side_outside_the_range_is_told(kind, solver):
     np.testing.assert_allclose(u.flatten(1), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("rtol", [0.0, 1e-6])
+@pytest.mark.parametrize("solver", [s for s in SOLVERS if s != "direct"])
+def test_nothing_is_iterated_where_all_of_b_lies_outside_the_range(solver, rtol):
+    """The rounding that is left of b is no right-hand side; the other sample is solved as alone."""
+    a, shape = SYMMETRIC["function"]()
+    b = field(shape[2:], 2)
+    b -= b.mean(-1, keepdim=True)
+    b[0] = 1 / 3
+    short = replace(SOLVERS[solver], max_iter=3, rtol=rtol)
+    u, info = prdp.linear_solve(a, b, short, on_failure="return")
+    alone, _ = prdp.linear_solve(a, b[1:], short, on_failure="return")
+    assert statuses(info)[0] == "INCONSISTENT" and info.residual[0] == 1 and info.operator_applications[0] == 0
+    assert not u[0].any() and torch.equal(u[1], alone[0])
+
+
 def test_left_and_right_null_spaces_differ():
     generator = torch.Generator().manual_seed(5)
     q, p = (torch.linalg.qr(torch.randn(8, 8, dtype=F64, generator=generator))[0] for _ in range(2))
@@ -169,6 +186,10 @@ def test_check_operator_finds_a_constant_that_nobody_named():
     assert prdp.check_operator(periodic_stencil(), example)
     with pytest.raises(ValueError, match="A maps the constant to zero, so it is singular: give nullspace='constant'"):
         prdp.check_operator(periodic_stencil(nullspace=None), example)
+    with pytest.raises(ValueError, match="check_operator: Matrix: vector 0 of nullspace is not in the null space of A"):
+        prdp.check_operator(
+            operators.Matrix(torch.eye(4, dtype=F64), nullspace="constant"), torch.ones(2, 4, dtype=F64)
+        )
 
 
 @pytest.mark.parametrize("preconditioner", [None, "diagonal", "multigrid"])

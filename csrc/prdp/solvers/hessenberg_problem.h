@@ -94,18 +94,21 @@ class HessenbergProblem {
     }
     Column& c = columns_[j];
     const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
-    c.inverse = numbers_.inverse(diagonal, scale_);  // 0 where A is singular on the space
+    // 0 where A is singular on the space. One unit of rounding, not the sixteen of a vector that vanishes: what is left
+    // of R_jj is all that a nearly singular A has, and minimise() sees to it that y stays short.
+    c.inverse = numbers_.inverse(diagonal, scale_ * 0.0625);
     c.cos = h(j, j) * c.inverse;
     c.sin = h(j + 1, j) * c.inverse;
     h(j, j) = diagonal;
     columns_[j + 1].g = -(c.sin * c.g);
     c.g = c.cos * c.g;
   }
-  /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being the rounding errors of A.
+  /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being a few rounding errors of A: the next cycles
+  /// recover what that holds back of a regular A, and along the null space of a singular one y stays short.
   void damp(int64_t columns, const Scalar& short_enough) {
     std::vector<Scalar> g(columns), y(columns);
     for (int64_t j = 0; j < columns; ++j) g[j] = columns_[j].g, y[j] = columns_[j].y;
-    numbers_.damp(h_.data(), m_ + 1, g.data(), columns, scale_, short_enough, y.data());
+    numbers_.damp(h_.data(), m_ + 1, g.data(), columns, scale_ * 4, short_enough, y.data());
     for (int64_t j = 0; j < columns; ++j) {
       columns_[j].y = y[j];
       columns_[j].inverse = columns_[j].inverse * short_enough;

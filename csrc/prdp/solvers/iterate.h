@@ -90,8 +90,7 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
 template <class Space>
 auto worse_than_zero(Space& space, const typename Space::States& states) {
   return space.map(states, [&](const SampleState& s) {
-    const bool ended = s.status == SolveStatus::kMaxIter || s.status == SolveStatus::kStagnated;
-    return ended && s.residual2 > (1.0 + 256.0 * space.epsilon()) * s.b2;
+    return is_unsolved(s.status) && s.residual2 > (1.0 + 256.0 * space.epsilon()) * s.b2;
   });
 }
 
@@ -127,9 +126,7 @@ auto energy_falls(Space& space, Method& method, const typename Space::States& st
 /// order of b: A is singular to the dtype. A small residual says that it is not.
 template <class Space, class Method>
 auto lost_in_rounding(Space& space, const Method& method, const typename Space::States& states) {
-  const auto doubtful = [](const SampleState& s) {
-    return (s.status == SolveStatus::kMaxIter || s.status == SolveStatus::kStagnated) && s.residual2 > 1e-4 * s.b2;
-  };
+  const auto doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   auto found = space.map(states, doubtful);
   if (std::none_of(states.begin(), states.end(), doubtful)) return found;
   const auto norm_a = space.operator_norm(), u2 = space.lanes(space.solution2(method.x));

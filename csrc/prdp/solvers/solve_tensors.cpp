@@ -12,7 +12,8 @@ namespace prdp {
 namespace {
 
 /// What is known of the samples before they are iterated, (batch,) each, on their device: the status, which is MAX_ITER
-/// of those that are not settled yet; ‖b‖²; whether b lies outside the range of A; whether the start took a product.
+/// of those that are not settled yet; ‖b‖²; whether b lies outside the range of A, beyond rtol; whether the start took
+/// a product.
 struct Beforehand {
   at::Tensor status, b2, inconsistent, applied;
 
@@ -32,6 +33,7 @@ struct Beforehand {
       s.active = false;
       s.settled = true;
       s.iterations = s.applications = 0;
+      if (s.status == SolveStatus::kInconsistent) s.residual2 = s.b2 = 1.0;
     }
   }
 };
@@ -127,11 +129,15 @@ at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& sta
 
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
-/// Which samples' right-hand sides lie outside the range of a singular operator, beyond rtol.
-at::Tensor is_inconsistent(const at::Tensor& b, const at::Tensor& projected, double rtol) {
+/// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol; all.
+struct OutsideRange {
+  at::Tensor some, all;
+};
+OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, double rtol) {
   const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
   const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
-  return norm(b - projected) > bound * norm(b);
+  const auto whole = norm(b);
+  return {norm(b - projected) > bound * whole, norm(projected) <= epsilon_of(b) * whole};
 }
 
 /// Where a method's own residual claims convergence, in vain as the samples are `wanted` further.
@@ -168,8 +174,8 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto magnitude = largest_magnitude(b);
   const auto& solver = request.solver;
   const bool starts = takes_start(solver.method, request.x0);
-  const auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
-  const auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
+  auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
+  auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
   std::vector<SampleState> states(b.size(0));
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
   for (size_t i = 0; i < states.size(); ++i)
@@ -178,11 +184,14 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const bool looks_late = solver.rtol == 0.0 && !b.is_cpu();
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, looks_late ? alternating(b) : at::zeros_like(b));
   const auto rhs = a.project(whole);
+  const auto outside = outside_range(whole, rhs, solver.rtol);
+  const auto inconsistent = outside.some.logical_and(takes_part), hopeless = outside.all.logical_and(takes_part);
+  status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
+  takes_part = takes_part.logical_and(hopeless.logical_not());
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, rhs, states);
-  Beforehand beforehand{status, space.b2().flatten(), is_inconsistent(whole, rhs, solver.rtol).logical_and(takes_part),
-                        at::zeros_like(takes_part)};
+  Beforehand beforehand{status, space.b2().flatten(), inconsistent, at::zeros_like(takes_part)};
   if (starts) {
     const auto made = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
     beforehand.applied = made.applied.flatten();

@@ -33,6 +33,10 @@ const char* name(SolveStatus status);
 inline bool is_failure(SolveStatus status) {
   return static_cast<int64_t>(status) < static_cast<int64_t>(SolveStatus::kStagnated);
 }
+/// Whether the iterations ended with a usable iterate and no solution.
+inline bool is_unsolved(SolveStatus status) {
+  return status == SolveStatus::kMaxIter || status == SolveStatus::kStagnated;
+}
 /// Whether the input was refused before any iteration: u is zero and carries no gradient.
 inline bool is_refused(SolveStatus status) {
   return status == SolveStatus::kZeroDiagonal || status == SolveStatus::kNonfiniteInput ||

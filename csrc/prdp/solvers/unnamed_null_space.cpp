@@ -31,8 +31,6 @@ std::vector<double> constant_shares(const at::Tensor& v) {
 
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
-bool is_unsolved(SolveStatus status) { return status == SolveStatus::kMaxIter || status == SolveStatus::kStagnated; }
-
 /// Whether rounding may have grown, after so many products.
 bool worked_for_long(const Solver& solver, int64_t products) {
   const auto& m = solver.preconditioner;
