@@ -3,9 +3,9 @@
 
 #include "bindings.h"
 #include "prdp/autograd/flat_options.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/steppers/equation.h"
-#include "prdp/steppers/memory.h"
+#include "prdp/steppers/memory_check.h"
 
 /// The ops step and linear_solve without the arguments that they are flattened into: a call of an op with twenty of
 /// them costs more than a small solve. None where somebody watches; then the op is to be called.
@@ -18,7 +18,7 @@ namespace {
 bool is_exact(py::handle t) { return THPVariable_CheckExact(t.ptr()); }
 
 bool nobody_in_python_watches(const py::object& b, const std::vector<py::object>& tensors) {
-  return nobody_watches() && !at::impl::torch_function_mode_enabled() && is_exact(b) &&
+  return no_mode_is_on() && !at::impl::torch_function_mode_enabled() && is_exact(b) &&
          std::all_of(tensors.begin(), tensors.end(), is_exact);
 }
 

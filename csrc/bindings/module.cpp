@@ -1,6 +1,6 @@
 #include "bindings.h"
 #include "convert.h"
-#include "prdp/sentence.h"
+#include "prdp/error_text.h"
 
 namespace py = pybind11;
 

@@ -154,6 +154,12 @@ def test_values_and_fluxes_at_the_sides():
     torch.testing.assert_close(slope, 0.5 * 4 * x[-1], rtol=1e-10, atol=1e-10)
 
 
+def test_on_meta_it_has_shapes_alone():
+    a = Diffusion(torch.ones(1, 4, 3, device="meta"))
+    u, _ = prdp.linear_solve(a, torch.ones(2, 1, 4, 3, device="meta"), prdp.CG(3))
+    assert u.is_meta and u.shape == (2, 1, 4, 3)
+
+
 def test_values_and_fluxes_that_no_side_takes_are_refused():
     a = Diffusion(torch.ones(1, 4, 3), boundary="flux")
     with pytest.raises(ValueError, match="Diffusion: values belong to sides that are 'zero'; the boundary is"):
@@ -191,6 +197,10 @@ def test_arguments_are_checked():
             Diffusion(kappa, **arguments)
     with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1"):
         prdp.linear_solve(Diffusion(-torch.ones(1, 4, 4)), torch.ones(1, 1, 4, 4), prdp.CG(3))
+    hole = torch.ones(3, 4, 4)
+    hole[1, 2, 3] = 0
+    with pytest.raises(ValueError, match=r"kappa must be > 0, got 0 in sample 1 at index \[2, 3\]"):
+        prdp.linear_solve(Diffusion(hole), torch.ones(3, 1, 4, 4), prdp.CG(3))
     for wrong, b, got in ((kappa, (4, 5), r"\[1, 4, 4\] and b \[1, 1, 4, 5\]"), (kappa[0], (4, 4), r"\[4, 4\] and b")):
         expected = r"Diffusion: expected kappa \(batch or 1, \*shape\) and b \(batch, channel, \*shape\), got kappa "
         with pytest.raises(ValueError, match=expected + got):

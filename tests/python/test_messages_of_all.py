@@ -113,7 +113,7 @@ WAYS = {
                  [(m, o) for m in ("CG", "BiCGStab", "GMRES(3)", "Direct") for o in ("Function", "Matrix", "CSR")]
                  + [(m, o) for m in DIVIDING if m != "Jacobi" for o in ("Matrix", "CSR")]),
     "strong": ("DIVERGED", r" \(the iterate .*\), ",
-               "the residual grew beyond 1e13 ‖b‖"
+               "the residual grew beyond (1e13 )?‖b‖"
                f"(, as an eigenvalue of I - D⁻¹A is larger than 1.*; take GMRES|: {KRYLOV})",
                [("Jacobi", "Stencil"), ("Jacobi", "Matrix"), ("Jacobi", "CSR"), ("SteepestDescent", "Stencil"),
                 ('CG with preconditioner="diagonal"', "Burgers")]),

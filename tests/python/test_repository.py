@@ -84,7 +84,7 @@ def test_pre_commit_runs_the_linters_of_make_test():
         program, *options = hook["entry"].removeprefix(".venv/bin/").split()
         assert f"$(BIN)/{program}" in recipe
         assert set(options) - {"--force-exclude"} <= set(recipe.split())
-        files = {"ruff": "examples/quickstart.py", "clang-format": "csrc/prdp/sentence.cpp"}
+        files = {"ruff": "examples/quickstart.py", "clang-format": "csrc/prdp/error_text.cpp"}
         output(ROOT / ".venv/bin" / program, *options, ROOT / files[program])
 
 

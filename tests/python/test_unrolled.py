@@ -267,3 +267,36 @@ def test_the_op_behind_it_passes_opcheck():
 def test_bad_intervals_are_refused_in_words(options, error, message):
     with pytest.raises(error, match=message):
         prdp.Heat((5,), 1e-3, 1.0, prdp.CG(3), **{"backward": "unrolled", **options})
+
+
+@pytest.mark.parametrize("form", ["loops", "tensors", "recorded", "A alone"])
+@pytest.mark.parametrize(
+    "solver", [prdp.CG(1000), prdp.BiCGStab(1000), prdp.GMRES(40, restart=10), prdp.SteepestDescent(20000)], ids=repr
+)
+def test_of_a_right_hand_side_of_few_eigenvectors_the_iterations_have_no_useful_derivative(solver, form):
+    """A constant b and a layered medium: u is solved along one axis, and the cotangent points at one cell."""
+    n = 10
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    kappa = (1 + 9 * (x > 0.5).double()).expand(1, n, n).contiguous().requires_grad_()
+    diffusion = operators.Diffusion(kappa)
+    a = operators.Function(lambda v, k: operators.Diffusion(k).apply(v), tensors=kappa, symmetric=True)
+    b = torch.ones(2, 1, n, n, dtype=torch.float64)
+    b[1] = field((n, n), 1)[0]  # of all eigenvectors
+    b.requires_grad_(form != "A alone")
+    inputs = [kappa] if form == "A alone" else [b, kappa]
+    gradients = {}
+    for backward in ("implicit", "unrolled"):
+        u, info = prdp.linear_solve(a if form == "tensors" else diffusion, b, solver, backward=backward)
+        assert info.solved.all()
+        found = torch.autograd.grad(u[:, 0, 5, 7].sum(), inputs, create_graph=form == "recorded")
+        gradients[backward] = [g.detach() for g in found]
+    for implicit, unrolled in zip(gradients["implicit"], gradients["unrolled"], strict=True):
+        assert (implicit - unrolled).norm() < 0.2 * implicit.norm()
+    assert info.adjoint.residual[0] < 1e-5
+
+
+def test_truncated_iterations_keep_their_own_derivative():
+    a, b = operators.Poisson((30,)), torch.ones(1, 1, 30, dtype=torch.float64, requires_grad=True)
+    u, info = prdp.linear_solve(a, b, prdp.CG(3, rtol=0.0), backward="unrolled")
+    u[0, 0, 3].backward()
+    assert info.adjoint.residual.isnan().all() and statuses(info) == ["MAX_ITER"]

@@ -8,8 +8,8 @@
 #include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
-#include "prdp/operators/disguises.h"
 #include "prdp/operators/kinds.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 
@@ -141,7 +141,7 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
 Outputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
-  const bool plain = nobody_watches() && is_plain_call(b, a, options, x0);
+  const bool plain = no_mode_is_on() && is_plain_call(b, a, options, x0);
   return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
 }
 

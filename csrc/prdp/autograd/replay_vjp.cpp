@@ -1,6 +1,6 @@
 #include <torch/csrc/autograd/autograd.h>
 
-#include "prdp/autograd/run_back.h"
+#include "prdp/autograd/stored_iterates.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"

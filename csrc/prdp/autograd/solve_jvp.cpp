@@ -1,7 +1,7 @@
 #include "prdp/autograd/solve_jvp.h"
 
 #include "prdp/autograd/unrolled_vjp.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

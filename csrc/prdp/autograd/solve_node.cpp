@@ -1,7 +1,7 @@
 #include "prdp/autograd/solve_node.h"
 
 #include "prdp/operators/autocast.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

@@ -4,9 +4,9 @@
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/autograd/adjoint_log.h"
-#include "prdp/autograd/rows.h"
+#include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/unrolled_vjp.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

@@ -1,6 +1,6 @@
 #include "prdp/autograd/tape_samples.h"
 
-#include "prdp/autograd/run_back.h"
+#include "prdp/autograd/stored_iterates.h"
 #include "prdp/autograd/tape_run.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/sample_space.h"

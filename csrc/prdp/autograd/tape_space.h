@@ -218,7 +218,7 @@ class TapeSpace {
   std::array<double, 1> operator_norm() const { return values_.operator_norm(); }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}
-  void run_again() {}
+  void reset() {}
 
  private:
   using Kind = typename Tape<T>::Kind;

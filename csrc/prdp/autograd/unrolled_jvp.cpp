@@ -6,7 +6,7 @@
 
 #include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/unrolled_vjp.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 
 namespace prdp {
 

@@ -7,8 +7,9 @@
 #include <limits>
 
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/flat_options.h"
-#include "prdp/autograd/rows.h"
+#include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -98,6 +99,19 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
   return rows;
 }
 
+/// ‖ū - Aᵀ b̄‖ / ‖ū‖ of each sample, within the range of Aᵀ, where A is singular; 0 where ū is.
+std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotangent, const at::Tensor& b_bar) {
+  const at::NoGradGuard no_grad;
+  const auto norm = [](const at::Tensor& v) {
+    return to_host<double>(v.flatten(1).to(at::kDouble).norm(2, 1), v.size(0));
+  };
+  const auto product = apply_on_loops(a, b_bar.detach().contiguous(), /*transposed=*/true);
+  const auto left = norm(a.project_solution(cotangent.detach() - product)), whole = norm(cotangent.detach());
+  std::vector<double> residuals(whole.size());
+  for (size_t i = 0; i < whole.size(); ++i) residuals[i] = whole[i] > 0.0 ? left[i] / whole[i] : 0.0;
+  return residuals;
+}
+
 /// Takes the derivative of each sample in its way (unrolled_vjp.h); `of_iterations` is that of the last.
 using OfIterations = UnrolledVjp (*)(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                                      at::IntArrayRef needed);
@@ -115,7 +129,8 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     if (!u.defined()) u = any_solve(spec, solved.b, silent, solved.x0).u;
     return u;
   };
-  const auto exact = solved_to_rounding(*a, solved, options.solver, make_u), sound = finite_rows(cotangent);
+  auto exact = solved_to_rounding(*a, solved, options.solver, make_u);
+  const auto sound = finite_rows(cotangent);
   const bool for_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   const auto bar = only(cotangent, sound);
   const auto counts = to_host<int64_t>(solved.iterations, batch), status = to_host<int64_t>(solved.status, batch);
@@ -175,6 +190,18 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   };
   auto rows = sound;
   SolveVjp found{finite_sum(rows, share), {}};
+  if (found.gradients[0].defined() && !traits(options.solver.method).is_polynomial) {
+    const auto residual = adjoint_residuals(*a, bar, found.gradients[0]);
+    bool any_far = false;
+    for (int64_t i = 0; i < batch; ++i) {
+      const auto s = static_cast<SolveStatus>(status[i]);
+      const bool ended = s == SolveStatus::kConverged || s == SolveStatus::kStagnated;
+      if (!ended || exact[i] || !rows[i] || lost[i]) continue;
+      any_far = any_far || residual[i] > 1.0;
+      exact[i] = residual[i] > 1.0;
+    }
+    if (any_far) found.gradients = finite_sum(rows, share);
+  }
   if (options.on_failure == OnFailure::kZeroGrad) {
     auto good = rows;
     for (int64_t i = 0; i < batch; ++i)
@@ -258,7 +285,9 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
   make_operator(a)->check_parameters();
   const auto [options, x0] = unflatten_with_x0(std::move(flat)...);
-  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
+  auto with_b = needed.vec();  // b̄ tells whether the derivative is one of the solution
+  if (!traits(options.solver.method).is_polynomial) with_b[0] = 1;
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, with_b,
                                     run_iterations_back, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)

@@ -13,6 +13,8 @@ namespace prdp {
 ///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
 ///   solved to rounding                              gets the implicit derivative, because its last iterations, or
 ///                                                   those that it no longer needed, say nothing about that of u
+///   solved, but ‖ū - Aᵀ b̄‖ > ‖ū‖                    the same: b excites few eigenvectors, and the derivative of the
+///                                                   iterations is one in those directions alone
 ///   all others                                      get the derivative of exactly their iterations
 /// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
 /// iterations and the status of the forward solve, and NaN as residual, because no system is solved.

@@ -7,7 +7,7 @@
 #include <limits>
 #include <numeric>
 
-#include "prdp/threads/leavable.h"
+#include "prdp/threads/thread_to_leave.h"
 
 namespace prdp::kernels {
 

@@ -11,7 +11,7 @@
 #include <unordered_map>
 
 #include "prdp/operators/dense.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/with_autograd.h"
 
 namespace prdp {

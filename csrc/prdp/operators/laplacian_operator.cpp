@@ -6,7 +6,7 @@
 
 #include "prdp/kernels/laplacian.h"
 #include "prdp/operators/apply_on_loops.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 
 namespace prdp {
 

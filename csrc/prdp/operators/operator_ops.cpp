@@ -2,7 +2,7 @@
 #include <torch/library.h>
 
 #include "prdp/operators/apply_on_loops.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 
 /// The operators as torch ops, made of plain tensor operations, so that autograd goes through them; without it, of the
@@ -21,7 +21,7 @@ at::Tensor apply(const at::Tensor& v, at::TensorList tensors, c10::string_view k
   const auto a = make_operator(spec(tensors, kind, shape, parameters, transposed));
   a->check_vector(v);
   const bool recorded = at::GradMode::is_enabled() && (v.requires_grad() || any_requires_grad(tensors));
-  if (!recorded && nobody_watches() && is_plain(v) && all_plain(tensors) && !has_tangent(v) && !any_tangent(tensors))
+  if (!recorded && no_mode_is_on() && is_plain(v) && all_plain(tensors) && !has_tangent(v) && !any_tangent(tensors))
     return apply_on_loops(*a, v, /*transposed=*/false);
   return a->apply(v);
 }

@@ -4,8 +4,8 @@
 #include <cstdint>
 #include <limits>
 
-#include "prdp/solvers/observe.h"
 #include "prdp/solvers/run_unseen.h"
+#include "prdp/solvers/stopping.h"
 
 /// The one loop around every method: it counts, checks and decides, per sample. A method (jacobi.h,
 /// …) supplies one iteration; a space says what a vector is: one sample in padded memory
@@ -183,13 +183,13 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   const auto kept = method.x;
   if (!track) {
     for (size_t i = 0; i < states.size(); ++i) states[i].run_again(again[i] ? caps[i] : 0);
-    space.run_again();
+    space.reset();
     run(space, method, states, rtol, /*track=*/true);
   }
   const auto watched = states;
   const auto remake = [&](const auto& wanted) {
     for (size_t i = 0; i < states.size(); ++i) states[i].run_again(again[i] ? wanted(i) : 0);
-    space.run_again();
+    space.reset();
     run(space, method, states, rtol, track);
     conclude(space, method, states, rtol);
   };

@@ -1,7 +1,7 @@
 #include <sstream>
 #include <utility>
 
-#include "prdp/solvers/diagnosis.h"
+#include "prdp/solvers/failure_messages.h"
 #include "prdp/solvers/raise_or_warn.h"
 
 namespace prdp {

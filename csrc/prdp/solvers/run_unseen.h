@@ -3,7 +3,7 @@
 #include <memory>
 #include <vector>
 
-#include "prdp/solvers/observe.h"
+#include "prdp/solvers/stopping.h"
 
 /// Iterations that the host does not watch. A look at a number on a GPU waits for all that was queued before it, and
 /// costs more than an iteration of a small grid. So the host looks after 1, 2, 4, 8 and then every 16 iterations, at

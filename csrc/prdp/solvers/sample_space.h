@@ -237,7 +237,7 @@ class SampleSpace {
     return std::array{f(states[0])};
   }
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
-  void run_again() {
+  void reset() {
     broken_ = false;
     workspace_.clear(1);
     clear(own_);

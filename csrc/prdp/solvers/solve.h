@@ -85,7 +85,7 @@ struct SolveRole {
 };
 
 /// Raises c10::LinAlgError, warns or does nothing about failed samples, as `on_failure` says. The message names the
-/// samples, the operator, the cause and a remedy (diagnosis.h).
+/// samples, the operator, the cause and a remedy (failure_messages.h).
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 

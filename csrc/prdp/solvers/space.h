@@ -140,7 +140,7 @@ concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S
                            /// From here on, operations write to the samples alone that are wanted.
                            s.freeze_unless(states, wanted);
                            /// Forgets breakdowns and frozen samples, before the iterations run again.
-                           s.run_again();
+                           s.reset();
                          };
 
 }  // namespace prdp

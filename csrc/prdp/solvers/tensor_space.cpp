@@ -160,7 +160,7 @@ TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, co
   return at::where(mask_of(remade_rows), remade, kept);
 }
 
-void TensorSpace::run_again() {
+void TensorSpace::reset() {
   broken_ = at::Tensor();
   active_mask_ = at::Tensor();
   active_.clear();

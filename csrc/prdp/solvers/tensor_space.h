@@ -184,7 +184,7 @@ class TensorSpace {
   }
   /// Rows of `remade` where a sample was solved again in the last pass, rows of `kept` elsewhere.
   Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
-  void run_again();
+  void reset();
 
   /// Iterations that the host does not watch (run_unseen.h): between these two, numbers are logged on the device, and
   /// what would need a closer look is computed as if it did not.

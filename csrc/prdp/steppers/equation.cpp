@@ -8,7 +8,7 @@
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/autograd/flat_options.h"
 #include "prdp/steppers/equation_kinds.h"
-#include "prdp/steppers/memory.h"
+#include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/stepper.h"
 
 namespace prdp {

@@ -1,7 +1,7 @@
 #include "prdp/steppers/implicit_step.h"
 
 #include "prdp/solvers/solve.h"
-#include "prdp/steppers/memory.h"
+#include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/rollout_vjp.h"
 
 namespace prdp {

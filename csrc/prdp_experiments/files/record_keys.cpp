@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "prdp/solvers/solver.h"
-#include "prdp_experiments/files/most_counted.h"
+#include "prdp_experiments/files/count_limit.h"
 
 /// Every key of a record is declared here, once.
 namespace prdp {

@@ -6,7 +6,7 @@
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/steppers/steppers.h"
-#include "prdp_experiments/files/most_counted.h"
+#include "prdp_experiments/files/count_limit.h"
 
 namespace prdp {
 

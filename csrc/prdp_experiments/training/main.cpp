@@ -11,7 +11,7 @@
 #include <thread>
 #include <utility>
 
-#include "prdp/sentence.h"
+#include "prdp/error_text.h"
 #include "prdp_experiments/files/record.h"
 #include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/files/whole_files.h"

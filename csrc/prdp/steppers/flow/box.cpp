@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/steppers/flow/fields.h"
+#include "prdp/steppers/flow/boundaries.h"
 
 namespace prdp {
 

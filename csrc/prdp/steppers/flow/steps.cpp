@@ -7,7 +7,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/operators/autocast.h"
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/threads/interruption.h"

@@ -4,7 +4,7 @@
 
 #include <algorithm>
 
-#include "prdp/operators/disguises.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 

@@ -1,4 +1,4 @@
-#include "prdp/steppers/flow/fields.h"
+#include "prdp/steppers/flow/boundaries.h"
 
 #include <ATen/core/grad_mode.h>
 

@@ -3,7 +3,7 @@
 #include <map>
 #include <vector>
 
-#include "prdp/autograd/run_back.h"
+#include "prdp/autograd/stored_iterates.h"
 
 namespace {
 

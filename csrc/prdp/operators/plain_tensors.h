@@ -22,7 +22,7 @@ inline bool all_plain(at::TensorList tensors) { return std::all_of(tensors.begin
 
 /// Whether an op that this thread calls with plain tensors comes to its autograd kernel and nowhere else: no mode,
 /// transform, trace, autocast or profiler is on.
-inline bool nobody_watches() {
+inline bool no_mode_is_on() {
   const auto here = c10::impl::tls_local_dispatch_key_set();
   return here.included_ == c10::default_included_set && here.excluded_ == c10::default_excluded_set &&
          !at::hasCallbacks();

@@ -1,4 +1,4 @@
-#include "prdp/sentence.h"
+#include "prdp/error_text.h"
 
 #include <algorithm>
 

@@ -1,4 +1,4 @@
-#include "prdp/autograd/rows.h"
+#include "prdp/autograd/finite_rows.h"
 
 #include <algorithm>
 

@@ -1,4 +1,4 @@
-#include "prdp/solvers/diagnosis.h"
+#include "prdp/solvers/failure_messages.h"
 
 #include <ATen/core/grad_mode.h>
 
@@ -65,7 +65,7 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDominant)
     return "the residual grew beyond 1e13 ‖b‖, as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES";
-  if (made_for == MadeFor::kDefinite) return "the residual grew beyond 1e13 ‖b‖: " + not_definite(a, b, sample);
+  if (made_for == MadeFor::kDefinite) return "the residual grew beyond ‖b‖: " + not_definite(a, b, sample);
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
 }
 
@@ -103,12 +103,12 @@ std::string zero_diagonal(const SolveRole& role) {
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!knows_null_space(role))
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which A cannot reach, as " +
-           (role.adjoint ? "A" : "Aᵀ") +
-           " maps the constant to zero; give nullspace=\"constant\", which takes that part off";
+           (role.adjoint ? "A" : "Aᵀ") + " maps the constant to zero; " +
+           (role.adjoint ? "" : "take the mean off b, and ") + "give nullspace=\"constant\" to the operator";
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure)
-    return share + "b lie in the null space of A; take a b without that part";
+    return share + "b lies in the null space of A; take a b without that part";
   if (role.adjoint)
     return share +
            "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
