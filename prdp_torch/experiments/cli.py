@@ -238,6 +238,7 @@ def export(
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
     path = out or Path(f"{loaded.name}.h5")
+    records.prepare_folder(path.parent)
     with _progress() as progress:
         samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))
     console.print(f"{samples} trajectories of {states} states: {path}", soft_wrap=True)

@@ -219,6 +219,13 @@ def test_a_folder_in_place_of_a_file_is_refused_in_words(tmp_path, name):
         datasets.export(made(tmp_path), tmp_path / name)
 
 
+def test_an_export_sees_that_it_can_write_before_it_computes(tmp_path):
+    (tmp_path / "file").touch()
+    command = [*PRDP, "export", "navier_stokes", "--out", "file/x.npz"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and "--out: cannot write to 'file'" in done.stderr, done.stderr
+
+
 def test_npz_needs_no_h5py(tmp_path):
     code = "import sys; sys.modules['h5py'] = None; from prdp_torch.experiments.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, "export", "heat_1d", "--out", "x.npz"], cwd=tmp_path,
