@@ -21,6 +21,7 @@ std::string name_of(const Solver& solver) {
   std::ostringstream text;
   text << method.label;
   if (method.counts == Counts::kCycles) text << "(" << solver.restart << ")";
+  if (solver.method == Method::kMultigrid) return text.str();  // its cycles are its preconditioner
   if (solver.preconditioner.is_operator()) text << " with preconditioner " << solver.preconditioner.title();
   else if (solver.preconditioner) text << " with preconditioner=\"" << solver.preconditioner.title() << "\"";
   return text.str();
