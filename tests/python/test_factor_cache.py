@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import statuses
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
@@ -131,3 +132,53 @@ def test_symmetric_matrices_of_either_sign_and_indefinite_ones(sign):
         b = rhs(moved, 2)
         expected = solved(moved.dense(), b)
         torch.testing.assert_close(prdp.linear_solve(moved, b, prdp.Direct())[0].reshape(2, 30), expected)
+
+
+def laplacian(dtype, scale=1.0, nullspace="constant"):
+    """Of a periodic grid, its equations times `scale`, a number or a field: singular."""
+    c = torch.full((5, *SHAPE), -1.0, dtype=dtype)
+    c[1] = -2.0
+    c[0] = -c[1:].sum(0)
+    left = (torch.ones(1, *SHAPE, dtype=dtype) / scale) if torch.is_tensor(scale) else None
+    right = torch.ones(1, *SHAPE, dtype=dtype) if torch.is_tensor(scale) else nullspace
+    return operators.Stencil(c[None] * scale, FIVE, "periodic", nullspace=right, left_nullspace=left)
+
+
+def solved_twice(a, b):
+    """u and the gradient of b, the second time from what the first has kept, and those of a pseudo-inverse."""
+    found = []
+    for _ in range(2):
+        v = b.clone().requires_grad_()
+        u, info = prdp.linear_solve(a, v, prdp.Direct())
+        assert set(statuses(info)) == {"CONVERGED"}
+        found.append((u.detach(), torch.autograd.grad(u, v, b.flip(0))[0]))
+    inverse = torch.linalg.pinv(a.dense().double(), rtol=1e-5)
+    rows = (b.double().reshape(-1, 30), inverse.mT), (b.flip(0).double().reshape(-1, 30), inverse)
+    return *found, [(r @ x).to(b.dtype).reshape(b.shape) for r, x in rows]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_kept_kernel_serves_its_own_operator_alone(dtype):
+    """Not one of other values, null spaces, channels or dtype, and not the transpose."""
+    torch.manual_seed(2)
+    scale = torch.rand(SHAPE, dtype=dtype) + 0.5
+    ones = torch.ones(1, *SHAPE, dtype=dtype)
+    several = [laplacian(dtype), laplacian(dtype, 3.0), laplacian(dtype, nullspace=ones), laplacian(dtype, scale)]
+    for a in several:
+        for channels in (1, 2):
+            b = a.apply(torch.randn(3, channels, *SHAPE, dtype=dtype))
+            first, second, expected = solved_twice(a, b)
+            assert all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
+            torch.testing.assert_close(list(first), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("boundary", ["zero", "periodic"])
+def test_a_kept_kernel_of_diffusion_sees_its_values_change(boundary):
+    torch.manual_seed(2)
+    kappa = torch.rand(1, *SHAPE, dtype=torch.float64) + 0.5
+    a = operators.Diffusion(kappa, boundary=boundary, shift=1.0)
+    b = torch.randn(2, 1, *SHAPE, dtype=torch.float64)
+    for _ in range(3):
+        u, _ = prdp.linear_solve(a, b, prdp.Direct())
+        torch.testing.assert_close(u.reshape(2, 30), solved(a.dense(), b))
+        kappa.data.mul_(1.7)

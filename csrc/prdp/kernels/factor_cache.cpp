@@ -1,9 +1,11 @@
 #include "prdp/kernels/factor_cache.h"
 
-#include <algorithm>
+#include <atomic>
 #include <bit>
 #include <list>
 #include <mutex>
+#include <typeindex>
+#include <unordered_map>
 
 namespace prdp::kernels {
 
@@ -19,22 +21,29 @@ uint64_t mixed(uint64_t h) {
   return h ^ (h >> 32);
 }
 
-uint64_t combined(uint64_t lane, uint64_t word) { return std::rotl(lane ^ word, 29) * kMultiplier; }
+/// The lanes with 32 bytes more.
+std::array<uint64_t, 4> combined(std::array<uint64_t, 4> lanes, const unsigned char* bytes) {
+  for (size_t i = 0; i < lanes.size(); ++i) {
+    uint64_t word;
+    std::memcpy(&word, bytes + 8 * i, sizeof(word));
+    lanes[i] = std::rotl(lanes[i] ^ word, 29) * kMultiplier;
+  }
+  return lanes;
+}
 
 }  // namespace
 
 FactorKeyMaker& FactorKeyMaker::add_bytes(const unsigned char* bytes, int64_t count) {
   count_ = mixed(count_ ^ static_cast<uint64_t>(count));
-  uint64_t words[4];
+  auto lanes = lanes_;  // in registers: `bytes` might point into this object
   int64_t at = 0;
-  for (; at + 32 <= count; at += 32) {
-    std::memcpy(words, bytes + at, 32);
-    for (int i = 0; i < 4; ++i) lanes_[i] = combined(lanes_[i], words[i]);
+  for (; at + 32 <= count; at += 32) lanes = combined(lanes, bytes + at);
+  if (at < count) {
+    unsigned char rest[32] = {};
+    std::memcpy(rest, bytes + at, static_cast<size_t>(count - at));
+    lanes = combined(lanes, rest);
   }
-  if (at == count) return *this;
-  std::memset(words, 0, 32);
-  std::memcpy(words, bytes + at, static_cast<size_t>(count - at));
-  for (int i = 0; i < 4; ++i) lanes_[i] = combined(lanes_[i], words[i]);
+  lanes_ = lanes;
   return *this;
 }
 
@@ -53,16 +62,25 @@ namespace prdp::factor_cache {
 
 namespace {
 
-struct Entry {
+struct Name {
   kernels::FactorKey key;
-  const std::type_info* type;
+  std::type_index type;
+  bool operator==(const Name&) const = default;
+};
+struct HashOfName {
+  size_t operator()(const Name& name) const { return name.key.low ^ name.type.hash_code(); }
+};
+struct Entry {
+  Name name;
   Kept kept;
   int64_t bytes;
 };
 
 std::mutex mutex;
 std::list<Entry> entries;  // the last used first
-int64_t bytes_of_all = 0, made = 0;
+std::unordered_map<Name, std::list<Entry>::iterator, HashOfName> places;
+int64_t bytes_of_all = 0;
+std::atomic<int64_t> made = 0;
 
 }  // namespace
 
@@ -70,36 +88,38 @@ int64_t limit() { return int64_t{1} << 29; }
 
 Kept find(const kernels::FactorKey& key, const std::type_info& type) {
   const std::lock_guard lock(mutex);
-  const auto it =
-      std::find_if(entries.begin(), entries.end(), [&](const Entry& e) { return e.key == key && *e.type == type; });
-  if (it == entries.end()) return nullptr;
-  entries.splice(entries.begin(), entries, it);
-  return it->kept;
+  const auto place = places.find({key, type});
+  if (place == places.end()) return nullptr;
+  entries.splice(entries.begin(), entries, place->second);
+  return entries.front().kept;
 }
 
 void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes) {
   std::list<Entry> gone;  // destroyed without the lock
   const std::lock_guard lock(mutex);
-  ++made;
   if (bytes > limit()) return;
-  entries.push_front({key, &type, std::move(kept), bytes});
+  const auto free = [&gone](std::list<Entry>::iterator entry) {
+    bytes_of_all -= entry->bytes;
+    places.erase(entry->name);
+    gone.splice(gone.begin(), entries, entry);
+  };
+  const Name name{key, type};
+  if (const auto place = places.find(name); place != places.end()) free(place->second);  // another thread made it too
+  entries.push_front({name, std::move(kept), bytes});
+  places[name] = entries.begin();
   bytes_of_all += bytes;
-  while (bytes_of_all > limit()) {
-    bytes_of_all -= entries.back().bytes;
-    gone.splice(gone.begin(), entries, std::prev(entries.end()));
-  }
+  while (bytes_of_all > limit()) free(std::prev(entries.end()));
 }
 
 void clear() {
   std::list<Entry> gone;
   const std::lock_guard lock(mutex);
   gone.swap(entries);
+  places.clear();
   bytes_of_all = 0;
 }
 
-int64_t count_made() {
-  const std::lock_guard lock(mutex);
-  return made;
-}
+void count_one() { ++made; }
+int64_t count_made() { return made; }
 
 }  // namespace prdp::factor_cache

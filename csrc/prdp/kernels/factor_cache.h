@@ -1,4 +1,5 @@
 #pragma once
+#include <array>
 #include <cstdint>
 #include <cstring>
 #include <memory>
@@ -7,9 +8,9 @@
 
 #include "prdp/kernels/whole_vectors.h"
 
-/// Factorisations of sparse matrices, and hierarchies of grids, that later solves with the same matrix use again: its
-/// adjoint solve, the other steps of a rollout, the next update of a training. They are found by a hash of the numbers
-/// that the matrix is made of, so that nobody has to say whether these have changed.
+/// Factorisations, hierarchies of grids and kernels of direct solves, that later solves with the same matrix use again:
+/// its adjoint solve, the other steps of a rollout, the next update of a training. They are found by a hash of the
+/// numbers that the matrix is made of, so that nobody has to say whether these have changed.
 namespace prdp::kernels {
 
 /// 128 bits of hash.
@@ -43,7 +44,7 @@ class FactorKeyMaker {
  private:
   FactorKeyMaker& add_bytes(const unsigned char* bytes, int64_t count);
 
-  uint64_t lanes_[4] = {0x9e3779b97f4a7c15, 0xbf58476d1ce4e5b9, 0x94d049bb133111eb, 0xd6e8feb86659fd93};
+  std::array<uint64_t, 4> lanes_ = {0x9e3779b97f4a7c15, 0xbf58476d1ce4e5b9, 0x94d049bb133111eb, 0xd6e8feb86659fd93};
   uint64_t count_ = 0;
 };
 
@@ -60,8 +61,9 @@ Kept find(const kernels::FactorKey& key, const std::type_info& type);
 void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes);
 /// Frees all of it.
 void clear();
-/// How much was made so far.
+/// How many calls of find_or_make() had to make it.
 int64_t count_made();
+void count_one();
 int64_t limit();
 
 /// The F of the matrix with this key, from the cache or from make(). Any thread may call this.
@@ -69,6 +71,7 @@ template <class F, class Make>
 std::shared_ptr<const F> find_or_make(const kernels::FactorKey& key, const Make& make) {
   if (const auto found = find(key, typeid(F))) return std::static_pointer_cast<const F>(found);
   const std::shared_ptr<const F> made = make();
+  count_one();
   keep(key, typeid(F), made, made->bytes());
   return made;
 }

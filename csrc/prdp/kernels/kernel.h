@@ -87,6 +87,14 @@ class Kernel {
 
   virtual std::shared_ptr<const Factors<T>> factorise() const = 0;
 
+  /// From here on it refers to no memory that it was made of. It has no grid_operator() then.
+  virtual void leave_source() {}
+  /// Of memory, about.
+  virtual int64_t bytes() const {
+    const int64_t vectors = 1 + (null_space_ ? null_space_->count() + left_null_space_->count() : 0);
+    return vectors * length() * static_cast<int64_t>(sizeof(T));
+  }
+
   /// The null space of A, if it was named: what A maps to zero, and what no product with A contains.
   const std::optional<NullSpace<T>>& null_space() const { return null_space_; }
   const std::optional<NullSpace<T>>& left_null_space() const { return left_null_space_; }

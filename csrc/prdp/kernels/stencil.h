@@ -89,6 +89,13 @@ class Stencil final : public Kernel<T> {
     });
   }
   std::shared_ptr<const Factors<T>> factorise() const override;
+  void leave_source() override {
+    source_.key = [key = source_.key()] { return key; };
+    source_.raw = nullptr;
+  }
+  int64_t bytes() const override {
+    return Base::bytes() + layout().rows * coefficients_.stride() * static_cast<int64_t>(sizeof(T));
+  }
   std::optional<GridOperator<T>> grid_operator() const override {
     if (!source_.raw) return std::nullopt;
     return GridOperator<T>{source_.raw, source_.key(), source_.transposed};

@@ -4,6 +4,7 @@
 
 #include <cmath>
 
+#include "prdp/operators/numbers_key.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/tensors.h"
 
@@ -230,6 +231,15 @@ std::vector<int64_t> DiffusionOperator::vector_shape() const {
 std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
   const at::NoGradGuard no_grad;
   return StencilOperator(as_stencil()).kernels(b, /*transposed=*/false);
+}
+
+std::optional<kernels::FactorKey> DiffusionOperator::key(bool /*transposed*/) const {
+  if (kappa_.size(0) != 1 || (shift_.dim() > 0 && shift_.size(0) != 1)) return std::nullopt;
+  kernels::FactorKeyMaker key;
+  key.add(int64_t{-1}).add(static_cast<int64_t>(mean_)).add(shape_.data(), dim()).add(lengths_.data(), dim());
+  for (const auto& sides : sides_)
+    for (const auto side : sides) key.add(static_cast<int64_t>(side));
+  return add_numbers(add_numbers(key, kappa_), shift_).key();
 }
 
 }  // namespace prdp

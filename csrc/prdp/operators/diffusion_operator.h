@@ -44,6 +44,7 @@ class DiffusionOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override;
   bool has_coarse_grids() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<kernels::FactorKey> key(bool transposed) const override;
 
  private:
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }

@@ -78,6 +78,7 @@ class Transposed final : public Operator {
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override {
     return a_->kernels(b, !transposed);
   }
+  std::optional<kernels::FactorKey> key(bool transposed) const override { return a_->key(!transposed); }
 
  private:
   std::unique_ptr<Operator> a_;

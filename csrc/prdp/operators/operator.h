@@ -2,8 +2,11 @@
 #include <ATen/ATen.h>
 
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
+
+#include "prdp/kernels/factor_cache.h"
 
 namespace prdp {
 
@@ -77,6 +80,9 @@ class Operator {
   virtual bool has_multigrid_preconditioner() const { return has_coarse_grids(); }
   /// A, or Aᵀ, for the CPU loops on vectors with the shape and dtype of b; null if there are no such loops.
   virtual std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const;
+  /// Tells a kernel that all samples share from those of other operators; nothing if they do not share it, or if to
+  /// make it takes no longer than to read its numbers.
+  virtual std::optional<kernels::FactorKey> key(bool /*transposed*/) const { return std::nullopt; }
 
   /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.
   at::Tensor dense(const at::TensorOptions& options) const;

@@ -5,6 +5,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/numbers_key.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -181,6 +182,15 @@ std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda,
 std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
   auto chosen = a_->select(index);
   return chosen ? std::make_unique<SingularOperator>(std::move(chosen), spec_, title_) : nullptr;
+}
+
+std::optional<kernels::FactorKey> SingularOperator::key(bool transposed) const {
+  const auto regular = a_->key(transposed);
+  if (!regular) return std::nullopt;
+  kernels::FactorKeyMaker key;
+  key.add(*regular).add(int64_t{transposed});
+  for (const auto* basis : {&right_, &left_}) add_numbers(key, basis->given);
+  return key.key();
 }
 
 std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {

@@ -9,6 +9,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/numbers_key.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/threads/interruption.h"
 
@@ -243,6 +244,15 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
     return {c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
+}
+
+std::optional<kernels::FactorKey> StencilOperator::key(bool transposed) const {
+  if (coefficients_.size(0) != 1) return std::nullopt;
+  kernels::FactorKeyMaker key;
+  key.add(int64_t{transposed});
+  for (int64_t d = 3 - dim(); d < 3; ++d) key.add(grid_.shape[d]).add(int64_t{grid_.periodic[d]});
+  for (const auto& offset : offsets_) key.add(offset.along, 3);
+  return add_numbers(key, coefficients_).key();
 }
 
 }  // namespace prdp

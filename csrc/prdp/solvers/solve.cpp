@@ -23,8 +23,10 @@ SolveInfo empty_info(const at::Tensor& b) {
 /// Whether this solver runs in the CPU loops, if the operator has any.
 bool runs_on_loops(const Solver& solver) { return !solver.preconditioner.is_operator(); }
 
+/// `shared`: null if the samples have an operator each, of `kernels`.
 template <class T>
-SolveResult solve_on_cpu(const kernels::KernelBatch<T>& kernels, const at::Tensor& b, const SolveRequest& request) {
+SolveResult solve_samples_of(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>* shared, const at::Tensor& b,
+                             const SolveRequest& request) {
   const auto rhs = b.contiguous();
   SolveResult result{empty(rhs.sizes(), rhs.scalar_type()), empty_info(rhs)};
   const auto& solver = request.solver;
@@ -44,11 +46,33 @@ SolveResult solve_on_cpu(const kernels::KernelBatch<T>& kernels, const at::Tenso
                              result.info.status.mutable_data_ptr<int64_t>(),
                              result.info.operator_applications.mutable_data_ptr<int64_t>(),
                              result.info.floor.mutable_data_ptr<T>()};
-  if (size == 0) return result;
-  const auto shared = shared_system(kernels, solver);
-  const auto solve_range = [&](int64_t begin, int64_t end) { solve_samples(kernels, shared.get(), batch, begin, end); };
+  const auto solve_range = [&](int64_t begin, int64_t end) { solve_samples(kernels, shared, batch, begin, end); };
   share_samples(size, unknowns, grain_size(solver.method, size, unknowns, batch.max_iter, solver.restart), solve_range);
   return result;
+}
+
+/// What the kernel of a direct solve is kept by: it takes longer to make than to find by its numbers.
+std::optional<kernels::FactorKey> key_of_kernel(const Operator& a, const at::Tensor& b, const Solver& solver) {
+  const auto of_a = traits(solver.method).is_direct ? a.key(/*transposed=*/false) : std::nullopt;
+  return of_a ? std::optional(kernels::FactorKeyMaker().add(*of_a).add(b.size(1)).key()) : std::nullopt;
+}
+
+/// Nothing if A has no loops.
+template <class T>
+std::optional<SolveResult> solve_on_loops(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  using Kernel = kernels::Kernel<T>;
+  const auto& solver = request.solver;
+  const auto key = key_of_kernel(a, b, solver);
+  if (const auto kept = key ? factor_cache::find(*key, typeid(Kernel)) : nullptr) {
+    const auto system = system_of<T>(std::static_pointer_cast<const Kernel>(kept), solver);
+    return solve_samples_of<T>({/*is_shared=*/true, {}}, system.get(), b, request);
+  }
+  const auto kernels = a.kernels(b, false);
+  if (!kernels) return std::nullopt;
+  const auto& batch = std::get<kernels::KernelBatch<T>>(kernels->of_dtype);
+  const auto shared = b.size(0) > 0 ? shared_system(batch, solver) : nullptr;
+  if (key && shared && shared->a) factor_cache::keep(*key, typeid(Kernel), shared->a, shared->a->bytes());
+  return solve_samples_of(batch, shared.get(), b, request);
 }
 
 }  // namespace
@@ -65,10 +89,11 @@ int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t ite
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
-  const auto kernels = b.is_cpu() && runs_on_loops(request.solver) ? a.kernels(b, false) : nullptr;
-  auto result = kernels
-                    ? std::visit([&](const auto& batch) { return solve_on_cpu(batch, b, request); }, kernels->of_dtype)
-                    : solve_with_tensors(a, b, request);
+  std::optional<SolveResult> on_loops;
+  if (b.is_cpu() && runs_on_loops(request.solver))
+    on_loops =
+        b.scalar_type() == at::kFloat ? solve_on_loops<float>(a, b, request) : solve_on_loops<double>(a, b, request);
+  auto result = on_loops ? *std::move(on_loops) : solve_with_tensors(a, b, request);
   find_inconsistent_constants(a, b, request, result);
   return result;
 }

@@ -113,10 +113,14 @@ std::shared_ptr<const kernels::Factors<T>> factors_of(const kernels::Kernel<T>& 
 template <class T>
 std::unique_ptr<SharedSystem<T>> shared_system(const kernels::KernelBatch<T>& kernels, const Solver& solver) {
   if (!kernels.is_shared) return nullptr;
-  auto system = std::make_unique<SharedSystem<T>>();
-  system->a = kernels.make(0);
-  if (system->a) system->factors = factors_of(*system->a, solver);
-  return system;
+  auto a = kernels.make(0);
+  if (a && traits(solver.method).is_direct) a->leave_source();
+  return system_of<T>(std::move(a), solver);
+}
+template <class T>
+std::unique_ptr<SharedSystem<T>> system_of(std::shared_ptr<const kernels::Kernel<T>> a, const Solver& solver) {
+  auto factors = a ? factors_of(*a, solver) : nullptr;
+  return std::make_unique<SharedSystem<T>>(SharedSystem<T>{std::move(a), std::move(factors)});
 }
 
 template <class T>
@@ -165,6 +169,8 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
 
 template std::unique_ptr<SharedSystem<float>> shared_system(const kernels::KernelBatch<float>&, const Solver&);
 template std::unique_ptr<SharedSystem<double>> shared_system(const kernels::KernelBatch<double>&, const Solver&);
+template std::unique_ptr<SharedSystem<float>> system_of(std::shared_ptr<const kernels::Kernel<float>>, const Solver&);
+template std::unique_ptr<SharedSystem<double>> system_of(std::shared_ptr<const kernels::Kernel<double>>, const Solver&);
 template void solve_samples(const kernels::KernelBatch<float>&, const SharedSystem<float>*, const SampleBatch<float>&,
                             int64_t, int64_t);
 template void solve_samples(const kernels::KernelBatch<double>&, const SharedSystem<double>*,

@@ -29,12 +29,15 @@ struct SampleBatch {
 /// A that all samples of a batch share, with what is made of it once. Without a kernel A is not finite.
 template <class T>
 struct SharedSystem {
-  std::unique_ptr<const kernels::Kernel<T>> a;
+  std::shared_ptr<const kernels::Kernel<T>> a;
   std::shared_ptr<const kernels::Factors<T>> factors;  // of a direct method
 };
 /// Null if the samples have an operator each.
 template <class T>
 std::unique_ptr<SharedSystem<T>> shared_system(const kernels::KernelBatch<T>& kernels, const Solver& solver);
+/// Of a kernel that was kept. In what shared_system() makes for a direct solver, the kernel may be kept.
+template <class T>
+std::unique_ptr<SharedSystem<T>> system_of(std::shared_ptr<const kernels::Kernel<T>> kernel, const Solver& solver);
 
 /// Solves the samples [begin, end) on this thread.
 template <class T>
