@@ -2,6 +2,7 @@
 
 #include <numeric>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/kinds.h"
 
 namespace prdp {
@@ -35,6 +36,7 @@ at::Tensor Operator::dense(const at::TensorOptions& options) const {
 }
 
 std::shared_ptr<const kernels::Kernels> Operator::kernels(const at::Tensor&, bool) const { return nullptr; }
+std::optional<kernels::FactorKey> Operator::key(bool) const { return std::nullopt; }
 
 at::Tensor Operator::jacobi_radius() const {
   TORCH_CHECK_VALUE(false,

@@ -6,8 +6,6 @@
 #include <string>
 #include <vector>
 
-#include "prdp/kernels/factor_cache.h"
-
 namespace prdp {
 
 /// An operator as plain numbers and tensors, so that it can pass through torch's dispatcher.
@@ -20,8 +18,9 @@ struct OperatorSpec {
 };
 
 namespace kernels {
+struct FactorKey;
 struct Kernels;
-}
+}  // namespace kernels
 
 /// A linear operator A(g) on batches of vectors: (batch, channel, *shape) on grids, (batch, n) for matrices. It is
 /// immutable.
@@ -82,7 +81,7 @@ class Operator {
   virtual std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const;
   /// Tells a kernel that all samples share from those of other operators; nothing if they do not share it, or if to
   /// make it takes no longer than to read its numbers.
-  virtual std::optional<kernels::FactorKey> key(bool /*transposed*/) const { return std::nullopt; }
+  virtual std::optional<kernels::FactorKey> key(bool transposed) const;
 
   /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.
   at::Tensor dense(const at::TensorOptions& options) const;

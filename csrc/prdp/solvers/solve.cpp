@@ -2,6 +2,7 @@
 
 #include <ATen/EmptyTensor.h>
 
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_samples.h"
