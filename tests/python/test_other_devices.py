@@ -102,6 +102,28 @@ def test_a_device_looked_at_seldom_gives_the_same_bits_and_reports(method, preco
                 assert torch.equal(mine.nan_to_num(-7.0), other.nan_to_num(-7.0)), (case, k, rtol)
 
 
+ON, OFF = torch.tensor([1.0, 0.0] * 4, dtype=F64), torch.tensor([0.0, 1.0] * 4, dtype=F64)
+
+
+@pytest.mark.parametrize(
+    "method, preconditioner, diagonal, before, b",
+    [
+        ("cg", "diagonal", ON - OFF, 0 * ON, ON + OFF),  # r·M⁻¹ r = 0
+        ("cg", "", ON - OFF, 0 * ON, ON + OFF),  # p·Ap = 0
+        ("bicgstab", "", ON, OFF, ON),  # the residual between the two steps is in the null space of A: t = 0
+    ],
+)
+@pytest.mark.parametrize("k", range(5))
+def test_a_number_that_vanishes_exactly_is_noticed_later(method, preconditioner, diagonal, before, b, k):
+    a = operators.Stencil(torch.stack([diagonal, before])[None], [(0,), (-1,)], "zero")
+    settings = (method, k, 0.0, 4, None, preconditioner)
+    b = b.expand(3, 1, 8) * torch.tensor([1.0, 0.0, 3.0], dtype=F64).reshape(3, 1, 1)
+    u, info = _C.solve_with_tensors(b, a.tensors, a.kind, a.shape, a.parameters, False, *settings)
+    v, report, _ = solve_there(b, a, *settings)
+    assert torch.equal(u, v) and all(torch.equal(x, y) for x, y in zip(info, report, strict=True)), (info, report)
+    assert v.isfinite().all() and v[0].abs().max() < 4
+
+
 @pytest.mark.parametrize("dtype", [F32, F64])
 @pytest.mark.parametrize("preconditioner", ["", "diagonal"])
 @pytest.mark.parametrize("name", [name for name in OPERATORS if name != "singular"])  # there u is what its rounding is
@@ -159,8 +181,8 @@ def test_with_a_tolerance_the_host_looks_once_in_16_iterations(method):
     assert copies(15 + 48) - copies(15) == 3  # 1, 2, 4 and 8 iterations, then 16 each
 
 
-@pytest.mark.parametrize("method, count, products", [("jacobi", 11, 1), ("steepest_descent", 17, 1), ("cg", 24, 1),
-                                                     ("bicgstab", 64, 2)])  # fmt: skip
+@pytest.mark.parametrize("method, count, products", [("jacobi", 11, 1), ("steepest_descent", 15, 1), ("cg", 19, 1),
+                                                     ("bicgstab", 42, 2)])  # fmt: skip
 def test_operations_of_an_iteration_with_a_tolerance(method, count, products):
     """Those of docs/performance.md, in the window that begins with iteration 16."""
     a = operators.Stencil(five_points(4.0)[..., :1, :1].expand(1, 5, 51, 53).contiguous(), OFFSETS, "zero")
@@ -181,7 +203,7 @@ def test_gmres_looks_once_a_cycle_and_twice_with_a_tolerance(rtol, looks):
 
 @pytest.mark.parametrize(
     "method, at_most, products",
-    [("jacobi", 3, 1), ("steepest_descent", 11, 1), ("cg", 17, 1), ("bicgstab", 54, 2), ("gmres", 8 * 12, 9)],
+    [("jacobi", 3, 1), ("steepest_descent", 9, 1), ("cg", 12, 1), ("bicgstab", 32, 2), ("gmres", 8 * 12, 9)],
 )
 def test_operations_of_an_iteration_beside_its_products(method, at_most, products):
     a = operators.Stencil(five_points(4.3), OFFSETS, "periodic")

@@ -116,6 +116,13 @@ class TapeSpace {
     const auto first = number(Kind::kDot, dots[0], of, out.version);
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
+  std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
+    const auto dots = apply_with_dots(v, out);
+    return {v.version == w.version ? dots[0] : dot(w, out), dots[1]};
+  }
+  Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) const {
+    return values_.sum_of_squares(rr.value, beta.value, pp.value);
+  }
   bool is_preconditioned() const { return values_.is_preconditioned(); }
   void correct(const Vector& v, Vector& out) { precondition(v, out); }
   Scalar precondition(const Vector& v, Vector& out) {
@@ -170,7 +177,15 @@ class TapeSpace {
     const T value = values_.ratio(num.value, den.value);
     return value == T(0) ? Scalar(value) : num / den;
   }
-  void break_down(const Scalar& where) { values_.break_down(where.value); }
+  void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
+    values_.break_down_unless_positive(a.value, r2.value);
+  }
+  Scalar is_rounding(const Scalar& a, const Scalar& b2, const Scalar& c2, double factor) const {
+    return values_.is_rounding(a.value, b2.value, c2.value, factor);
+  }
+  Scalar unless_zero(const Scalar& value, const Scalar& a, const Scalar& b) const {
+    return a.value != 0 && b.value != 0 ? value : Scalar(0);
+  }
 
   Scalar constant(const Scalar& a) const { return a.value; }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) {

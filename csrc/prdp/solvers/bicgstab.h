@@ -36,29 +36,27 @@ class BiCGStabMethod {
     space_.copy(space_.b(), r_);
     space_.copy(space_.b(), hat_);
     rr_ = hh_ = ss_ = st_ = tt_ = space_.b2();
-    inverse_ = rr_ * 0;
+    inverse_ = zero_ = rr_ * 0;
   }
   void step() {
-    using std::sqrt;
     Scalar rho = space_.dot(hat_, r_);
-    const Scalar rounding = sqrt(hh_) * sqrt(rr_) * (200 * space_.epsilon());
-    const Scalar lost = space_.is_larger(rounding, rho) * space_.is_larger(rounding, -rho);
+    const Scalar lost = space_.is_rounding(rho, hh_, rr_, 200 * space_.epsilon());
     space_.restore(lost, r_, hat_);
     space_.restore(lost, rr_, hh_);
     space_.restore(lost, rr_, rho);
-    space_.restore(lost, rr_ * 0, inverse_);
+    space_.restore(lost, zero_, inverse_);
 
     const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
     space_.xpby(v_, -over_omega, p_);
     space_.xpby(r_, -rho * inverse_, p_);
-    const Scalar vv = apply_to(p_, v_)[1], hv = space_.dot(hat_, v_);
+    const auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
     inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
-    const Scalar moves = space_.is_not_zero(over_omega) * space_.is_not_zero(inverse_);
-    ss_ = space_.descend(rho * inverse_ * moves, space_.is_preconditioned() ? z_ : p_, v_, x, r_);
+    const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_); };
+    ss_ = space_.descend(moves(rho * inverse_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
     const auto [st, tt] = apply_to(r_, t_);
     st_ = st;
     tt_ = tt;
-    rr_ = space_.descend(space_.ratio(st, tt) * moves, space_.is_preconditioned() ? z_ : r_, t_, x, r_);
+    rr_ = space_.descend(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x, r_);
   }
   auto residual2() const { return rr_; }
   /// From the true residual it starts anew.
@@ -80,14 +78,20 @@ class BiCGStabMethod {
   /// out = A v, or A M⁻¹ v with M⁻¹ v in z_; returns v·out and ‖out‖².
   std::array<Scalar, 2> apply_to(typename Space::Vector& v, typename Space::Vector& out) {
     if (!space_.is_preconditioned()) return space_.apply_with_dots(v, out);
-    space_.precondition(v, z_);
-    const Scalar out2 = space_.apply_with_dots(z_, out)[1];
+    const Scalar out2 = space_.apply_with_dots(preconditioned(v), out)[1];
     return {space_.dot(v, out), out2};
+  }
+  /// v, or M⁻¹ v in z_.
+  typename Space::Vector& preconditioned(typename Space::Vector& v) {
+    if (!space_.is_preconditioned()) return v;
+    space_.precondition(v, z_);
+    return z_;
   }
 
   Space& space_;
   typename Space::Vector r_, hat_, p_, v_, t_, z_;   // r, and s between; r̂; A p; A s; M⁻¹ p, or of s
   Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
+  Scalar zero_{};
 };
 
 }  // namespace prdp

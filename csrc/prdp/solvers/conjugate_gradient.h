@@ -29,14 +29,14 @@ class ConjugateGradientMethod {
     begin_along(space_.b2());
   }
   void step() {
-    if (space_.is_preconditioned()) refuse_indefinite();
-    const auto [pq, qq] = space_.apply_with_dots(p_, q_);
+    if (space_.is_preconditioned()) space_.break_down_unless_positive(rz_, rr_);  // r·M⁻¹ r has changed its sign
+    const auto [pq, qq] = space_.apply_along(p_, p_, q_);
     alpha_ = space_.step_length(rz_, pq, pp_, qq);  // 0 where r·z has changed its sign
     if (!space_.is_preconditioned()) {
       const auto rr = space_.descend(alpha_, p_, q_, x, r_);
       beta_ = space_.ratio(rr, rz_);
       space_.xpby(r_, beta_, p_);
-      pp_ = rr + beta_ * beta_ * pp_;  // r and p are orthogonal
+      pp_ = space_.sum_of_squares(rr, beta_, pp_);
       rr_ = rz_ = rr;
       return;
     }
@@ -58,14 +58,14 @@ class ConjugateGradientMethod {
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, p_, rr_, rz_, pp_, sign_); }
   void resume(int64_t) {}
+  /// After iterations that nobody watched.
+  void end_unseen() {
+    if (!space_.is_preconditioned()) pp_ = space_.dot(p_, p_);
+  }
 
   typename Space::Vector x;
 
  private:
-  /// A breakdown where r·M⁻¹r is zero or has another sign than at first, and r is not zero.
-  void refuse_indefinite() {
-    space_.break_down((1 - space_.is_larger(rz_, rz_ * 0)) * space_.is_not_zero(space_.ratio(rr_, rr_)));
-  }
   /// Starts anew along the residual, which is in r and whose square is given.
   void begin_along(const Scalar& rr) {
     space_.assign(rr, rr_);

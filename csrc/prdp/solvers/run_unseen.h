@@ -27,7 +27,7 @@ namespace detail {
 /// Spaces on another device, and methods whose iterations are many and cheap.
 template <class Space, class Method>
 inline constexpr bool kMayGoUnseen =
-    requires(Space& space) { space.look_away(true, 0.0); } && !kLeastResidual<Method> && !kContracts<Method>;
+    requires(Space& space) { space.look_back(); } && !kLeastResidual<Method> && !kContracts<Method>;
 
 /// What a look after one of these iterations would have said of a sample: whether it goes on or claims to have
 /// converged. False where it is neither.
@@ -74,7 +74,8 @@ bool confirm_claims(Space& space, Method& method, typename Space::States& states
 template <class Space, class Method>
 bool run_unseen(Space& space, Method& method, typename Space::States& states, double rtol, bool track, int64_t n) {
   const Method kept = method;  // handles of vectors that nobody writes to
-  space.look_away(track, rtol);
+  if constexpr (kHasRecursiveResidual<Method>) space.look_away(track, rtol, method.residual2());
+  else space.look_away(track, rtol, {});
   for (int64_t k = 0; k < n; ++k) {
     if constexpr (kTakesStrides<Method>) method.step(1);
     else method.step();
@@ -82,6 +83,7 @@ bool run_unseen(Space& space, Method& method, typename Space::States& states, do
     else space.end_unseen();
   }
   const UnseenLog log = space.look_back();
+  if constexpr (requires { method.end_unseen(); }) method.end_unseen();
   space.settle(states);
   const auto before = states;
   for (auto& s : states) s.claims = false;

@@ -111,6 +111,11 @@ class SampleSpace {
     count(1);
     return system_.a().apply_with_dots(v, out);
   }
+  std::array<Scalar, 2> apply_along(const T* v, const T* w, Vector out) {
+    const auto found = apply_with_dots(v, out);
+    return {v == w ? found[0] : dot(w, out), found[1]};
+  }
+  static Scalar sum_of_squares(Scalar rr, Scalar beta, Scalar pp) { return rr + beta * beta * pp; }
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
@@ -187,7 +192,11 @@ class SampleSpace {
     return num / den;
   }
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
-  void break_down(Scalar where) { broken_ = broken_ || where != 0; }
+  void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
+  static Scalar is_rounding(Scalar a, Scalar b2, Scalar c2, double factor) {
+    return std::abs(a) < std::sqrt(b2) * std::sqrt(c2) * static_cast<T>(factor);
+  }
+  static Scalar unless_zero(Scalar value, Scalar a, Scalar b) { return a != 0 && b != 0 ? value : 0; }
 
   /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
   static constexpr int derivatives() { return 0; }

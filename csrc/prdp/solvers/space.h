@@ -45,6 +45,10 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   s.apply(x, y);
   /// y = A x; returns x·y and ‖y‖².
   { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+  /// y = A x; returns p·y and, for a step_length() whose step the next descend() takes, ‖y‖².
+  { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+  /// a + b² c, the square of the norm of r + b p for orthogonal r and p, for step_length() alone.
+  { s.sum_of_squares(a, b, a) } -> std::same_as<typename S::Scalar>;
   /// Whether there is a preconditioner M; y = M⁻¹ x, which returns x·y.
   { s.is_preconditioned() } -> std::same_as<bool>;
   { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
@@ -57,8 +61,12 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   { s.step_length(a, b, a, b) } -> std::same_as<typename S::Scalar>;
   /// a/b for b >= 0; 0 where b is negligible.
   { s.ratio(a, b) } -> std::same_as<typename S::Scalar>;
-  /// A breakdown of the samples where a is not zero.
-  s.break_down(a);
+  /// A breakdown of the samples where a is not positive, and b not negligible.
+  s.break_down_unless_positive(a, b);
+  /// 1 where a is less than the number times the root of b c, else 0; for restore() alone.
+  { s.is_rounding(a, b, a, 0.0) } -> std::same_as<typename S::Scalar>;
+  /// a where b and the last are not zero, else 0.
+  { s.unless_zero(a, b, b) } -> std::same_as<typename S::Scalar>;
   /// 1 where a is not zero, else 0; and the other way round.
   { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
   { s.is_zero(a) } -> std::same_as<typename S::Scalar>;

@@ -21,7 +21,7 @@ class SteepestDescentMethod {
     rr_ = space_.b2();
   }
   void step() {
-    const auto [rq, qq] = space_.apply_with_dots(r_, q_);
+    const auto [rq, qq] = space_.apply_along(r_, r_, q_);
     alpha_ = space_.step_length(rr_, rq, rr_, qq);
     rr_ = space_.descend(alpha_, r_, q_, x, r_);
   }

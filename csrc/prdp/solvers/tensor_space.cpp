@@ -173,9 +173,9 @@ void TensorSpace::set_active(const std::vector<bool>& active) {
   active_mask_ = all ? at::Tensor() : mask_of(active);
 }
 
-void TensorSpace::look_away(bool track, double rtol) {
+void TensorSpace::look_away(bool track, double rtol, const Scalar& residual2) {
   if (track && !enough_.defined()) bound_residuals(rtol);
-  unseen_.emplace(limits_of(b_).epsilon, negligible_);
+  unseen_.emplace(limits_of(b_).epsilon, negligible_, residual2);
   mask_before_ = active_mask_;
 }
 

@@ -73,7 +73,9 @@ class TensorSpace {
     x = keep_frozen(at::addcmul(x, alpha, p), x);
     const auto left = at::addcmul(r, alpha, q, -1);
     r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
-    return dot(r, r);
+    const auto rr = dot(r, r);
+    if (unseen_) unseen_->descend(alpha, rr);
+    return rr;
   }
 
   void apply(const Vector& v, Vector& out) {
@@ -85,6 +87,13 @@ class TensorSpace {
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
     apply(v, out);
     return {dot(v, out), dot(out, out)};
+  }
+  std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
+    apply(v, out);
+    return {dot(w, out), unseen_ ? Scalar() : dot(out, out)};
+  }
+  Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) {
+    return unseen_ ? unseen_->sum_of_squares(rr, beta) : rr + beta * beta * pp;
   }
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
   Scalar precondition(const Vector& v, Vector& out);
@@ -126,9 +135,17 @@ class TensorSpace {
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
   Scalar ratio(const Scalar& num, const Scalar& den);
-  void break_down(const Scalar& where) {
-    if (unseen_) return unseen_->expect_zero(where);
-    note_broken(where.detach().ne(0));
+  void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
+    if (unseen_) return unseen_->expect_positive(a, r2);
+    note_broken(a.detach().gt(0).logical_or(r2.detach().lt(negligible_)).logical_not());
+  }
+  Scalar is_rounding(const Scalar& a, const Scalar& b2, const Scalar& c2, double factor) {
+    if (unseen_) return unseen_->expect_above_rounding(a, b2, c2, factor);
+    return is_larger(b2.detach().sqrt() * c2.detach().sqrt() * factor, a.detach().abs());
+  }
+  Scalar unless_zero(const Scalar& value, const Scalar& a, const Scalar& b) {
+    if (unseen_) return value;  // a quotient that vanishes was noticed by step_length(), ratio() or is_rounding()
+    return value * (is_not_zero(a) * is_not_zero(b));
   }
 
   /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
@@ -159,7 +176,7 @@ class TensorSpace {
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
   void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) {
-    if (unseen_) return unseen_->expect_zero(where);
+    if (unseen_) return;  // nowhere, or is_rounding() tells
     if (in_loops_ && !batch_loops::any(where)) return;
     to = at::where(where.ne(0), from, to);
   }
@@ -189,7 +206,7 @@ class TensorSpace {
   /// Iterations that the host does not watch (run_unseen.h): between these two, numbers are logged on the device, and
   /// what would need a closer look is computed as if it did not.
   bool is_far() const { return !b_.is_cpu() && !recording_; }
-  void look_away(bool track, double rtol);
+  void look_away(bool track, double rtol, const Scalar& residual2);
   UnseenLog look_back();
   /// Ends one of these iterations; with the squares of its residuals, freezes the samples that are done.
   void end_unseen(const Scalar& residual2 = {});
