@@ -48,6 +48,19 @@ def used(name, all_inputs):
 @pytest.mark.parametrize("advection", ["central", "upwind"])
 @pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
 @pytest.mark.parametrize("name", CASES)
+def test_loops_and_tensor_operations_make_the_same_step(name, diffusion, advection):
+    u, nu, force, inflow = inputs(name, batch=3)
+    flow = make(name, nu, force, inflow, diffusion=diffusion, advection=advection)
+    recorded = make(name, nu, force, inflow, diffusion=diffusion, advection=advection, backward="unrolled")
+    strided = u.detach().transpose(-1, -2).contiguous().transpose(-1, -2)
+    with torch.no_grad():
+        by_loops = flow(strided)
+    torch.testing.assert_close(by_loops, recorded(u).detach(), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("advection", ["central", "upwind"])
+@pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
+@pytest.mark.parametrize("name", CASES)
 def test_a_step_has_the_gradients_of_finite_differences(name, diffusion, advection):
     def step(u, nu, force, inflow=None):
         if diffusion == "explicit":

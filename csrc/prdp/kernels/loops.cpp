@@ -2,6 +2,7 @@
 // internal linkage, and nothing of the standard library is instantiated: no code for one processor can
 // be linked in the place of another's.
 #include "prdp/kernels/dense_loops.h"
+#include "prdp/kernels/flow_loops.h"
 #include "prdp/kernels/laplacian_loops.h"
 #include "prdp/kernels/multigrid_loops.h"
 #include "prdp/kernels/stencil_loops.h"
@@ -45,7 +46,9 @@ constexpr Loops<T> table(const char* level) {
           split<T>,
           add_merged<T>,
           collapse<T>,
-          multiply<T>};
+          multiply<T>,
+          advect_row<T>,
+          advect_row_back<T>};
 }
 
 }  // namespace

@@ -85,6 +85,16 @@ struct DenseProduct {
   int64_t rows, inner, columns;
 };
 
+/// Advection and diffusion of a component c of a velocity along an axis, whose own component is w, on a staggered grid:
+/// ν ∂²c - (w ∂)c. Neighbours lie `step` apart along the axis, and `own_step` along the axis of c.
+template <class T>
+struct AdvectionTerm {
+  bool own;  // w is c
+  bool upwind;
+  int64_t own_step, step;
+  T quarter_dx, diffusion;  // 1/(4 dx), ν/dx²
+};
+
 /// Rows of a field from `begin` to `end`, counted over all planes.
 struct Lines {
   int64_t begin, end;
@@ -160,6 +170,12 @@ struct Loops {
   void (*collapse)(const Collapse<T>& c, int64_t step, int64_t n);
 
   void (*multiply)(const DenseProduct<T>& p);
+
+  /// out += the term, for a row of any n.
+  void (*advect_row)(const AdvectionTerm<T>& t, const T* c, const T* w, T* out, int64_t n);
+  /// From the cotangents g of a row: those of what each point reads, a row of n each: c before, here and after; twice
+  /// the velocity through the low and the high edge. Adds g (c before - 2 c here + c after) to a sixth row.
+  void (*advect_row_back)(const AdvectionTerm<T>& t, const T* c, const T* w, const T* g, T* bars, int64_t n);
 };
 
 /// The loops for this processor; the environment variable PRDP_CPU_LEVEL asks for a lower level by its

@@ -35,7 +35,7 @@ RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
 
 void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,
                     OnFailure on_failure) {
-  if (!refused.mask.defined() || on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
+  if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
   const auto courant = courant_numbers(equation, u);
   std::ostringstream text;
   const auto failed = refused.mask.nonzero().flatten();

@@ -1,5 +1,7 @@
 #include "prdp/steppers/flow/projection.h"
 
+#include "prdp/steppers/flow/explicit_loops.h"
+#include "prdp/steppers/flow/projection_loops.h"
 #include "prdp/steppers/flow/stencil_of.h"
 
 namespace prdp {
@@ -42,26 +44,31 @@ at::Tensor differences(const FlowBox& box, const at::Tensor& p) {
   return at::stack(components, 1);
 }
 
+/// u + factor · grad p on the faces that `free` marks with 1; undefined, on all.
+at::Tensor add_gradient(const FlowBox& box, const at::Tensor& u, const at::Tensor& p, double factor,
+                        const at::Tensor& free) {
+  if (flow_has_loops(u)) return add_gradient_by_loops(box, u, p, factor, free);
+  return u.add(masked(differences(box, p), free), factor);
+}
+
 }  // namespace
 
-at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u) {
+at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double factor) {
+  const auto& cells = box.fields(u.options()).cells;
+  if (flow_has_loops(u)) return masked(divergence_by_loops(box, u, factor), cells);
   at::Tensor sum;
   for (int64_t axis = 0; axis < box.dim(); ++axis) {
     const auto low = u.select(1, box.channel_of(axis));
-    const auto of_axis = (neighbour(box, low, axis, 1, 0.0) - low) * (1.0 / box.dx(axis));
+    const auto of_axis = (neighbour(box, low, axis, 1, 0.0) - low) * (factor / box.dx(axis));
     sum = sum.defined() ? sum + of_axis : of_axis;
   }
-  return masked(sum.unsqueeze(1), box.fields(u.options()).cells);
-}
-
-at::Tensor flow_gradient(const FlowBox& box, const at::Tensor& p) {
-  return masked(differences(box, p), box.fields(p.options()).free);
+  return masked(sum.unsqueeze(1), cells);
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
-  const auto b = without_means(box, flow_divergence(box, u) * -scale_of(box));
+  const auto b = without_means(box, flow_divergence(box, u, -scale_of(box)));
   const auto phi = without_means(box, solve(pressure_operator(box, u, options), b, options, info));
-  return {u - flow_gradient(box, phi), phi};
+  return {add_gradient(box, u, phi, -1.0, box.fields(u.options()).free), phi};
 }
 
 at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const SolveOptions& options,
@@ -70,7 +77,7 @@ at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const So
   const auto phi_bar = without_means(box, flow_divergence(box, masked(cotangent, fields.free)));
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
-  return cotangent + differences(box, masked(b_bar, fields.cells)) * scale_of(box);
+  return add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of(box), {});
 }
 
 }  // namespace prdp

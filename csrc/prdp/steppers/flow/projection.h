@@ -3,10 +3,9 @@
 
 namespace prdp {
 
-/// div u in the cells whose pressure is unknown, zero in the others: (batch, 1, *shape). u has its boundary values.
-at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u);
-/// Minus its transpose on the faces that carry a velocity.
-at::Tensor flow_gradient(const FlowBox& box, const at::Tensor& p);
+/// factor · div u in the cells whose pressure is unknown, zero in the others: (batch, 1, *shape). u has its boundary
+/// values.
+at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double factor = 1.0);
 
 /// The velocity without divergence that is nearest to u: u - grad φ, where div grad φ = div u; and φ. u has its
 /// boundary values. Differentiable.

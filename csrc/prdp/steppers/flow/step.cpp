@@ -7,6 +7,7 @@
 
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/diffusion.h"
+#include "prdp/steppers/flow/explicit_loops.h"
 #include "prdp/steppers/flow/limits.h"
 #include "prdp/steppers/flow/projection.h"
 #include "prdp/steppers/flow/tendency.h"
@@ -25,7 +26,8 @@ struct ExplicitPart {
 };
 ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& u, const at::Tensor& refused) {
   const auto velocity = cleared(with_boundary_values(e, u), refused);
-  return {velocity, tendency(e, velocity) * e.dt};
+  const auto change = tendency(e, velocity);
+  return {velocity, flow_has_loops(u) ? change.mul_(e.dt) : change * e.dt};
 }
 
 bool is_implicit(const FlowEquation& e) { return e.diffusion == FlowDiffusion::kImplicit; }
@@ -105,7 +107,8 @@ std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Ten
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
   const auto e = equation.for_state(u);
   const auto refused = find_refused(e, with_boundary_values(e, u).detach());
-  if (reported) report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
+  if (reported && refused.mask.defined())
+    report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
   const auto [velocity, change] = explicit_part(e, u, refused.mask);
   CombinedInfo info;
   const auto diffused = is_implicit(e) ? diffuse(e, change, options, info) : change;
@@ -134,7 +137,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
     back = diffuse_vjp(e, back.change, diffused, options, adjoint);
   }
   info = adjoint.info();
-  const auto by_loops = tendency_has_loops(u);
+  const auto by_loops = flow_has_loops(u);
   return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar, back, needed);
 }
 

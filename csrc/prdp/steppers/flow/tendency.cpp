@@ -4,7 +4,6 @@
 
 #include <algorithm>
 
-#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 
@@ -144,13 +143,11 @@ at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
   return padded;
 }
 
-bool tendency_has_loops(const at::Tensor& u) { return u.is_cpu() && is_plain(u) && !at::GradMode::is_enabled(); }
-
 at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u) {
   const auto& fields = equation.box->fields(u.options());
   const auto padded = with_ghosts(equation, u);
-  auto all = tendency_has_loops(u) ? advect_and_diffuse(equation, padded.contiguous())
-                                   : advect_and_diffuse_tensors(equation, padded);
+  auto all = flow_has_loops(u) ? advect_and_diffuse(equation, padded.contiguous())
+                               : advect_and_diffuse_tensors(equation, padded);
   if (fields.friction.defined()) all = all - equation.nu * fields.friction * u;
   if (equation.force.defined()) all = all + equation.force;
   return fields.free.defined() ? all * fields.free : all;
@@ -173,6 +170,7 @@ TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, cons
 
 at::Tensor courant_numbers(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;
+  if (flow_has_loops(u)) return courant_numbers_by_loops(equation, u);
   const auto& box = *equation.box;
   at::Tensor sum;
   for (int64_t axis = 0; axis < box.dim(); ++axis) {

@@ -12,9 +12,7 @@ at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u);
 /// -(u·∇)u + ν Δu + f on the free faces, zero on all others; u has its boundary values. Differentiable.
 at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u);
 
-/// Whether loops compute it, and the cotangents below: for plain tensors on the CPU where autograd does not record.
-bool tendency_has_loops(const at::Tensor& u);
-/// The cotangents of u and of what the equation is made of from that of the tendency. With all their axes.
+/// The cotangents of u and of what the equation is made of from that of the tendency, by loops. With all their axes.
 struct TendencyVjp {
   at::Tensor u, nu, force, inflow;
 };
