@@ -60,7 +60,7 @@ LIST = [
     *(refinement(f"poisson_{which}", 1, 1) for which in ("1p", "3p", "3p_sd")),
     refinement("heat_1d", 10, 3),
     refinement("burgers_1d", 10, 90),
-    refinement("burgers_2d", 3, 20),
+    refinement("burgers_2d", 3, 55),
     refinement("heat_2d", 3, 60),
     refinement("diffusion_inverse", 10, 5),
     refinement("benchmarks/scenes/diffusion_inverse_256.toml", 1, 40, name="diffusion_inverse_256"),
