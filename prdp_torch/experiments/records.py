@@ -41,12 +41,14 @@ def _program() -> str:
 
 
 def _processor() -> str:
+    """With family and model where Linux knows them: the name alone is often the same for several generations."""
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    lines = info.read_text().split("\n\n")[0].splitlines() if info.exists() else []
+    of_first = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    if "model name" not in of_first:
+        return platform.processor() or platform.machine()
+    numbers = [f"{key.split()[-1]} {of_first[key]}" for key in ("cpu family", "model") if key in of_first]
+    return ", ".join([of_first["model name"], *numbers])
 
 
 def _commit() -> str | None:

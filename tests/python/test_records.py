@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import records
+from prdp_torch.experiments import records as of_trainings
 
 DOCS = Path(records.__file__).parents[1] / "docs"
 # Made by commands of their own: three seeds of nine hours, other machines, and tests that are not run every time.
@@ -55,3 +56,10 @@ def test_the_list_can_be_printed():
     done = subprocess.run([sys.executable, "-m", "benchmarks.records", "--list"], cwd=DOCS.parent, capture_output=True,
                           text=True)  # fmt: skip
     assert done.returncode == 0 and len(done.stdout.splitlines()) == len(records.LIST)
+
+
+def test_a_record_names_the_family_of_the_processor(monkeypatch):
+    text = "processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\n\nprocessor\t: 1\nmodel\t\t: 18\n"
+    monkeypatch.setattr(Path, "exists", lambda self: True)
+    monkeypatch.setattr(Path, "read_text", lambda self: text)
+    assert of_trainings._processor() == "AMD EPYC, family 25, model 17"
