@@ -10,6 +10,7 @@ from benchmarks.mosaic import solvers
 STYLES = {
     "ours": ("#D55E00", "-", "o"),
     "ours_direct": ("#D55E00", "--", "o"),
+    "ours_recomputed": ("#D55E00", ":", "o"),
     "jax_cfd": ("#0072B2", "--", "^"),
     "jax_cfd_central": ("#0072B2", "-", "^"),
     "jax_cfd_cg": ("#0072B2", ":", "^"),

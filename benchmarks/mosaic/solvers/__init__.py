@@ -48,6 +48,7 @@ class Entry(NamedTuple):
 FLOWS = {
     "ours": Entry("ours", "Ours", "prdp_torch", "prdp_torch, CG and multigrid"),
     "ours_direct": Entry("ours", "Direct", "prdp_torch", "prdp_torch, FFT", ("forward", "cost", "gradient")),
+    "ours_recomputed": Entry("ours", "Recomputed", "prdp_torch", "prdp_torch, FFT, recomputed", ("cost", "gradient")),
     "jax_cfd": Entry("jax_cfd_projection", "VanLeer", "jax_cfd", "JAX-CFD, FFT, van Leer"),
     "jax_cfd_central": Entry("jax_cfd_projection", "Central", "jax_cfd", "JAX-CFD, FFT, central"),
     "jax_cfd_cg": Entry(

@@ -4,6 +4,7 @@ Components are on the low faces, component 0 along the last axis: nothing is con
 is stable, as in the other libraries, else implicit."""
 
 import torch
+from torch.utils.checkpoint import checkpoint
 
 import prdp_torch as prdp
 from benchmarks.mosaic import fields
@@ -83,3 +84,16 @@ class Direct(Ours):
     @staticmethod
     def solver(box):
         return prdp.Direct()
+
+
+class Recomputed(Direct):
+    """The same, with the states of `BLOCK` steps at a time: the backward pass computes them again."""
+
+    BLOCK = 16
+
+    def _advance(self, u, steps):
+        if not u.requires_grad:
+            return super()._advance(u, steps)
+        for done in range(0, steps, self.BLOCK):
+            u = checkpoint(super()._advance, u, min(self.BLOCK, steps - done), use_reentrant=False)
+        return u
