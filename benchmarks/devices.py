@@ -1,7 +1,7 @@
 """This library on any device beside an eager torch loop there: `python -m benchmarks.devices --device cuda`.
 
-The problems are those of the suites. A call is a solve of K iterations with its gradient for b, and ends when the device
-has. One JSON record a line; the time is that which passes.
+The problems are those of the suites. A call is a solve of K iterations with its gradient for b, and ends when the
+device has. One JSON record a line; the time is that which passes.
 """
 
 import argparse

@@ -1,5 +1,5 @@
-"""The tensor path on a GPU. `make cuda` runs these there; without a GPU the CPU takes its place, so that what they say of
-themselves is tested everywhere, and what they say of CUDA nowhere else."""
+"""The tensor path on a GPU, as `make cuda` runs it. Without a GPU the CPU takes its place: then these tests are tried
+themselves, and CUDA is not."""
 
 import contextlib
 
