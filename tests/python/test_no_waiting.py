@@ -162,10 +162,9 @@ def test_a_rollout_of_fixed_k_with_its_gradient_could_be_captured(solver, start)
 
 
 def test_a_network_around_an_own_step_could_be_captured():
-    make, weight = OPERATORS["function"]
-    step = prdp.ImplicitStep(
-        lambda u: make(u[:, :1].square()), lambda u: u, solver=prdp.CG(9, 0.0), on_failure="return"
-    )
+    make, _ = OPERATORS["function"]
+    cg = prdp.CG(9, 0.0)
+    step = prdp.ImplicitStep(lambda u: make(u[:, :1].square()), lambda u: u, solver=cg, on_failure="return")
     device = StandIn()
     with device:
         u, theta = device.send(noise(3, 1, *SHAPE)), device.send(torch.tensor(0.7, dtype=F64)).requires_grad_()
