@@ -13,7 +13,8 @@ COPIES = {"_to_copy", "to", "copy_"}  # they may mix devices
 READS = {"_local_scalar_dense", "item", "equal", "nonzero", "is_nonzero", "masked_select", "_unique2"}
 VIEWS_AND_MEMORY = {
     "alias", "as_strided", "detach", "empty", "empty_like", "empty_strided", "expand", "narrow", "new_empty", "permute",
-    "select", "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias", "_unsafe_view",
+    "select", "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias",
+    "_unsafe_view",
 }  # fmt: skip
 
 
