@@ -5,6 +5,7 @@
 # make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make records  the records of the documentation again, with its pictures and tables: a day on one core, and it goes on where it stopped
+# make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -15,7 +16,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs tidy sanitize fuzz bench-peers records clean
+.PHONY: demo test docs tidy sanitize fuzz cuda bench-peers records clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -43,6 +44,23 @@ records: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/python -m benchmarks.records
+
+# An environment of its own, which sees the torch of PYTHON, whatever its version. The modules take the place of those of
+# `make test` in prdp_torch, until that is called again.
+DEVICE ?= cuda
+CUDA_NEEDS := cmake|cmeel-eigen|ninja|numpy|pytest|hypothesis|matplotlib|jinja2|rich|typer|h5py
+cuda: $(STAMPS)/system
+	@$(PYTHON) -c 'import torch' || { echo "prdp: $(PYTHON) has no torch; make cuda PYTHON=/path/to/python"; exit 1; }
+	@$(PYTHON) -c 'import torch; torch.ones(1, device="$(DEVICE)")' || { echo "prdp: the torch of $(PYTHON) has no device $(DEVICE)"; exit 1; }
+	[ -x .venv-cuda/bin/python ] || $(PYTHON) -m venv .venv-cuda
+	$(PYTHON) -c 'import sysconfig; print(sysconfig.get_path("purelib"))' > "$$(ls -d .venv-cuda/lib/python*/site-packages)/prdp.pth"
+	grep -E '^($(CUDA_NEEDS))==' requirements.txt | .venv-cuda/bin/python -m pip install --quiet --disable-pip-version-check -r /dev/stdin
+	mkdir -p build-cuda
+	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/.venv-cuda/bin/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF > build-cuda/configure.log
+	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake --build build-cuda --parallel $$(nproc) --target python
+	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
+	.venv-cuda/bin/python -m pytest -m cuda tests/python/test_cuda.py
+	.venv-cuda/bin/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
 
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)
@@ -118,4 +136,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-docs .venv-peers .stamps build build-address build-thread build-fuzz build-tidy runs site prdp_torch/*.so prdp_torch/experiments/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-docs .venv-peers .venv-cuda .stamps build build-cuda build-address build-thread build-fuzz build-tidy runs site prdp_torch/*.so prdp_torch/experiments/*.so prdp_torch/built_for_torch.txt *.egg-info

@@ -1,5 +1,6 @@
 """A stand-in for a device, where there is none. Its tensors say that they are not on the CPU, though their numbers are.
-Every operation on them is counted, and so is every copy of numbers to the host, on which a GPU would make it wait."""
+Every operation on them is counted, and so is every copy of numbers to the host, on which a GPU would make it wait, and
+from the host, which no CUDA graph could repeat."""
 
 import collections
 
@@ -9,16 +10,21 @@ from torch.utils._python_dispatch import TorchDispatchMode
 DEVICE = torch.device("lazy", 0)  # of a kind that autograd takes without its driver
 KEY = torch._C.DispatchKeySet(torch._C.DispatchKey.Lazy)
 COPIES = {"_to_copy", "to", "copy_"}  # they may mix devices
-READS = {"_local_scalar_dense", "item", "equal", "nonzero", "is_nonzero"}
+READS = {"_local_scalar_dense", "item", "equal", "nonzero", "is_nonzero", "masked_select", "_unique2"}
 VIEWS_AND_MEMORY = {
-    "alias", "as_strided", "detach", "empty", "empty_like", "empty_strided", "expand", "new_empty", "permute", "select",
-    "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias", "_unsafe_view",
+    "alias", "as_strided", "detach", "empty", "empty_like", "empty_strided", "expand", "narrow", "new_empty", "permute",
+    "select", "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias",
+    "_unsafe_view",
 }  # fmt: skip
 
 
 def each(change, value):
     """`value` with the change made to each part of its lists and tuples."""
     return type(value)(each(change, part) for part in value) if isinstance(value, list | tuple) else change(value)
+
+
+def tensors_in(args):
+    return [a for a in args if isinstance(a, torch.Tensor)]
 
 
 class _There(torch.Tensor):
@@ -44,7 +50,7 @@ class StandIn(TorchDispatchMode):
     def __init__(self):
         super().__init__()
         self.operations = collections.Counter()
-        self.copies_to_host = 0
+        self.copies_to_host = self.copies_from_host = 0
 
     @staticmethod
     def send(tensor):
@@ -81,7 +87,8 @@ class StandIn(TorchDispatchMode):
         self.copies_to_host += bool(given) and (not there or name in READS)
         if not given and not there:
             return function(*args, **kwargs)
-        strangers = [a for a in args if isinstance(a, torch.Tensor) and not isinstance(a, _There) and a.dim() > 0]
+        self.copies_from_host += name in COPIES and there and not all(isinstance(a, _There) for a in tensors_in(args))
+        strangers = [a for a in tensors_in(args) if not isinstance(a, _There) and a.dim() > 0]
         assert not strangers or name in COPIES, f"{name}: a tensor on the CPU beside one on the device"
         self.operations[name] += there
 

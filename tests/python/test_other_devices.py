@@ -165,7 +165,7 @@ def test_a_product_meets_no_nan_of_a_sample_that_is_solved():
 def test_with_rtol_0_the_host_waits_for_the_report_alone(method):
     a = operators.Stencil(five_points(4.3), OFFSETS, "periodic")
     few, many = [solve_there(noise(4, 1, *SHAPE), a, method, k, 0.0)[2] for k in (3, 50)]
-    assert few.copies_to_host == many.copies_to_host <= 4  # they lie behind the last iteration
+    assert few.copies_to_host == many.copies_to_host == 1
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -181,8 +181,8 @@ def test_with_a_tolerance_the_host_looks_once_in_16_iterations(method):
     assert copies(15 + 48) - copies(15) == 3  # 1, 2, 4 and 8 iterations, then 16 each
 
 
-@pytest.mark.parametrize("method, count, products", [("jacobi", 11, 1), ("steepest_descent", 15, 1), ("cg", 19, 1),
-                                                     ("bicgstab", 42, 2)])  # fmt: skip
+@pytest.mark.parametrize("method, count, products", [("jacobi", 10, 1), ("steepest_descent", 15, 1), ("cg", 19, 1),
+                                                     ("bicgstab", 40, 2)])  # fmt: skip
 def test_operations_of_an_iteration_with_a_tolerance(method, count, products):
     """Those of docs/performance.md, in the window that begins with iteration 16."""
     a = operators.Stencil(five_points(4.0)[..., :1, :1].expand(1, 5, 51, 53).contiguous(), OFFSETS, "zero")
@@ -203,7 +203,7 @@ def test_gmres_looks_once_a_cycle_and_twice_with_a_tolerance(rtol, looks):
 
 @pytest.mark.parametrize(
     "method, at_most, products",
-    [("jacobi", 3, 1), ("steepest_descent", 9, 1), ("cg", 12, 1), ("bicgstab", 32, 2), ("gmres", 8 * 12, 9)],
+    [("jacobi", 2, 1), ("steepest_descent", 9, 1), ("cg", 12, 1), ("bicgstab", 30, 2), ("gmres", 8 * 12, 9)],
 )
 def test_operations_of_an_iteration_beside_its_products(method, at_most, products):
     a = operators.Stencil(five_points(4.3), OFFSETS, "periodic")
@@ -213,6 +213,20 @@ def test_operations_of_an_iteration_beside_its_products(method, at_most, product
         tensors = [device.send(t) for t in a.tensors]
         torch.ops.prdp.apply(device.send(noise(4, 1, *SHAPE)), tensors, a.kind, a.shape, a.parameters, False)
     assert (many - few) / 10 - products * device.launched() <= at_most
+
+
+def test_operations_of_an_iteration_of_chebyshev():
+    """With nu as a number; one on the device takes six more, on single numbers, for the weights."""
+    a, b = operators.Heat(SHAPE, 0.3, 1.0), noise(4, 1, *SHAPE)
+
+    def launched(run):
+        device = StandIn()
+        with device:
+            run(device.send(b))
+        return device.launched()
+
+    few, many = [launched(lambda b, k=k: prdp.linear_solve(a, b, prdp.Chebyshev(k, 0.0))) for k in (10, 20)]
+    assert (many - few) / 10 - launched(a.apply) <= 4
 
 
 CASES = {
@@ -286,10 +300,18 @@ def test_steps_and_rollouts(name):
 
 
 def test_a_network_in_half_precision_around_a_solve():
-    """The solve stays in float32 under autocast, on the device as on the CPU."""
-    b = noise(3, 1, *SHAPE).to(F32)
+    """The solve and its adjoint stay in float32 under autocast, on the device as on the CPU."""
+    b, weight = noise(3, 1, *SHAPE).to(F32), torch.tensor(0.7)
+
+    def train(b, weight):
+        rhs = (weight.bfloat16() * b.bfloat16()).float()
+        u, _ = prdp.linear_solve(function(), rhs, prdp.CG(8, 0.0))
+        return u, torch.autograd.grad((u.bfloat16() * u.bfloat16()).float().sum(), weight)[0]
+
+    u, gradient = train(b, weight.requires_grad_())
     device = StandIn()
     with device, torch.autocast("cpu", dtype=torch.bfloat16):
-        u, _ = prdp.linear_solve(function(), device.send(b), prdp.CG(8, 0.0))
-    assert device.fetch(u).dtype == F32
-    torch.testing.assert_close(device.fetch(u), prdp.linear_solve(function(), b, prdp.CG(8, 0.0))[0])
+        v, found = train(device.send(b), device.send(weight).requires_grad_())
+    assert v.dtype == found.dtype == F32
+    torch.testing.assert_close(device.fetch(v), u)
+    torch.testing.assert_close(device.fetch(found), gradient)

@@ -28,6 +28,10 @@ at::Tensor only(const at::Tensor& t, const Rows& rows) {
 }
 
 Rows finite_rows(const at::Tensor& t) {
+  if (!t.is_cpu()) {
+    const auto rows = t.detach().isfinite().flatten(1).all(1).to(at::kCPU);
+    return Rows(rows.const_data_ptr<bool>(), rows.const_data_ptr<bool>() + rows.numel());
+  }
   return with_numbers(t, [&](const auto* values, int64_t count) {
     Rows rows(t.size(0));
     const int64_t each = count / std::max<int64_t>(t.size(0), 1);
@@ -38,8 +42,12 @@ Rows finite_rows(const at::Tensor& t) {
 }
 
 bool all_finite(const std::vector<at::Tensor>& tensors) {
+  std::vector<at::Tensor> elsewhere;  // flags, which one copy tells
+  for (const auto& t : tensors)
+    if (t.defined() && !t.is_cpu()) elsewhere.push_back(t.detach().isfinite().all());
+  if (!elsewhere.empty() && !at::stack(elsewhere).all().item<bool>()) return false;
   return std::all_of(tensors.begin(), tensors.end(), [](const at::Tensor& t) {
-    return !t.defined() || with_numbers(t, [](const auto* values, int64_t count) {
+    return !t.defined() || !t.is_cpu() || with_numbers(t, [](const auto* values, int64_t count) {
       return std::isfinite(kernels::largest_magnitude(values, count));
     });
   });

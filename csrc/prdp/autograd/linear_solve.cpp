@@ -176,7 +176,8 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   const auto& s = options.solver;
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
-  auto result = solve(*a, rhs, {s, {}, true, x0});
+  const bool may_wait = waits_for_report(options);
+  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);

@@ -3,11 +3,14 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/solve_unseen.h"
 
 namespace prdp {
 
@@ -30,6 +33,14 @@ at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, 
 }
 
 namespace {
+
+/// Samples whose share of ḡ may leave the range of the dtype, told by the largest numbers of λ and u.
+at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
+  const auto largest = [](const at::Tensor& v) { return v.detach().abs().flatten(1).amax(1).to(at::kDouble); };
+  const double most =
+      lambda.scalar_type() == at::kFloat ? std::numeric_limits<float>::max() : std::numeric_limits<double>::max();
+  return largest(lambda) * largest(u) > 1e-3 * most / static_cast<double>(lambda.numel());
+}
 
 /// The report where ḡ of the samples that are not in `rows` left the range of the dtype.
 void report_overflow(SolveInfo& info, const Rows& rows, const OperatorSpec& transpose, const at::Tensor& cotangent,
@@ -68,7 +79,16 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
-  if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
+  if (!waits_for_report(o) && never_waits(cotangent, o.solver) && !in_torch_func()) {
+    const auto rows = may_overflow(lambda, u);
+    lambda = lambda.masked_fill(per_sample(rows, lambda), 0.0);
+    if (needed[0]) found.gradients[0] = lambda;
+    auto& status = found.info.status;
+    status = status.masked_fill(rows & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
+                                static_cast<int64_t>(SolveStatus::kOverflow));
+    if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
+    products = of_tensors(lambda);
+  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
     products = of_tensors(lambda);
   } else {
     Rows rows(cotangent.size(0), true);

@@ -74,6 +74,7 @@ class TapeSpace {
           .factor_node = beta.node,
           .factor = beta.value});
   }
+  void xmby(const Vector& x, const Scalar& beta, Vector& y) { xpby(x, -beta, y); }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
     xpby(x, beta, y);
     return number(Kind::kSquare, values_.dot(value(y), value(y)), y.version);

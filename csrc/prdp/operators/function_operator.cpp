@@ -237,10 +237,17 @@ at::Tensor FunctionOperator::norm() const {
 }
 
 at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {
-  const auto some = Operator::nonfinite_samples(b);
-  if (!some.item<bool>()) return some;
-  const auto rows = apply(at::ones_like(b)).isfinite().flatten(1).all(1).logical_not();
-  return at::where(rows.any(), rows, some);
+  auto some = at::zeros({}, b.options().dtype(at::kBool));
+  bool any_real = false;
+  for (const auto& t : tensors_) {
+    if (!at::isFloatingType(t.scalar_type())) continue;
+    some = some.logical_or(nonfinite(t.detach()).any());
+    any_real = true;
+  }
+  // Another device is not looked at: there the product is taken in any case.
+  if (!any_real || (b.is_cpu() && !some.item<bool>())) return some;
+  const auto rows = nonfinite(apply(at::ones_like(b))).flatten(1).any(1);
+  return some.logical_and(rows.logical_or(rows.any().logical_not()));
 }
 
 }  // namespace prdp

@@ -47,8 +47,8 @@ class BiCGStabMethod {
     space_.restore(lost, zero_, inverse_);
 
     const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
-    space_.xpby(v_, -over_omega, p_);
-    space_.xpby(r_, -rho * inverse_, p_);
+    space_.xmby(v_, over_omega, p_);
+    space_.xmby(r_, rho * inverse_, p_);
     const auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
     inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
     const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_); };

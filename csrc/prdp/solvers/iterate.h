@@ -40,11 +40,11 @@ void run(Space& space, Method& method, typename Space::States& states, double rt
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
     int64_t n = 1;
     if constexpr (kMayGoUnseen<Space, Method>) {
-      if (space.is_far() && watched <= 0 &&
+      if (space.is_far() && track && watched <= 0 &&
           (rtol == 0.0 || std::none_of(states.begin(), states.end(), is_idle<Method>))) {
-        const int64_t left = stride(states, /*track=*/false), some = std::min(left, track ? unseen : kLongestUntracked);
+        const int64_t some = std::min(stride(states, /*track=*/false), unseen);
         unseen = std::min(2 * unseen, kLongestUnseen);
-        watched = run_unseen(space, method, states, rtol, track, some) ? 0 : some;
+        watched = run_unseen(space, method, states, rtol, some) ? 0 : some;
         continue;
       }
       --watched;
@@ -94,31 +94,54 @@ auto worse_than_zero(Space& space, const typename Space::States& states) {
   });
 }
 
-/// Whether the iterates of a method for definite operators do what they are made for, for each sample: A is symmetric,
-/// judged by x·A r and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the
-/// norm of A, which is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies
-/// almost in the null space of A, and says nothing. One product.
-template <class Space, class Method>
-auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
+/// What energy_falls() is told by: products of two of u, x; b; r, its residual; and A r. One per sample, or all.
+template <class Number>
+struct Energies {
+  Number xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2;
+};
+
+/// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
+/// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
+/// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in the null
+/// space of A, and says nothing.
+template <class Number>
+auto energy_falls(const Energies<Number>& e, double epsilon) {
+  using std::abs;
+  using std::sqrt;
+  const auto positive = [](const Number& v) -> Number { return 0.5 * (v + abs(v)); };
+  const Number scale = sqrt(e.rr) * sqrt(positive(e.bb - 2 * e.rb + e.rr)) + sqrt(e.xx) * sqrt(e.ar2);
+  const Number energy = e.xb - e.xr, across = positive(abs(e.x_ar) - 2e3 * epsilon * scale);
+  const auto symmetric = abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
+  const auto nearer = e.xb * e.xb > e.xr * e.xr;
+  const auto not_rounding = abs(energy) > 2e3 * epsilon * abs(e.xb);
+  const auto definite = e.r_ar * energy > across * across;
+  return symmetric & definite & nearer & not_rounding;
+}
+
+/// Takes them with read(number), where the method's residual is the true one. One product.
+template <class Space, class Method, class Read>
+auto energies(Space& space, Method& method, const Read& read) {
   const auto& x = method.x;
   const auto &r = method.residual(), &b = space.b();
   auto ar = space.scratch();
   space.apply(r, ar);
-  const auto number = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
-  const auto xb = number(x, b), xr = number(x, r), rb = number(r, b), rr = number(r, r), bb = number(b, b);
-  const auto x_ar = number(x, ar), r_ar = number(r, ar), xx = number(x, x), ar2 = number(ar, ar);
+  const auto number = [&](const auto& v, const auto& w) { return read(space.dot(v, w)); };
+  Energies<decltype(number(x, x))> found{number(x, b),  number(x, r),  number(r, b), number(r, r),  number(b, b),
+                                         number(x, ar), number(r, ar), number(x, x), number(ar, ar)};
   space.fill_zero(ar);
+  return found;
+}
+
+/// The same for each sample.
+template <class Space, class Method>
+auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
+  const auto e = energies(space, method, [&](const auto& dot) { return space.lanes(dot); });
   size_t i = 0;
   return space.map(states, [&](const SampleState&) {
-    const double ax2 = bb[i] - 2 * rb[i] + rr[i];
-    const double scale = std::sqrt(rr[i]) * std::sqrt(std::max(ax2, 0.0)) + std::sqrt(xx[i]) * std::sqrt(ar2[i]);
-    const bool symmetric = std::abs(rb[i] - rr[i] - x_ar[i]) <= 2e3 * space.epsilon() * scale;
-    const double energy = xb[i] - xr[i], rounding = 2e3 * space.epsilon() * std::abs(xb[i]);
-    const bool nearer = xb[i] * xb[i] > xr[i] * xr[i] && std::abs(energy) > rounding;
-    const double across = std::max(std::abs(x_ar[i]) - 2e3 * space.epsilon() * scale, 0.0);
-    const bool definite = r_ar[i] * energy > across * across;
+    const Energies<double> of_sample{e.xb[i],   e.xr[i],   e.rb[i], e.rr[i], e.bb[i],
+                                     e.x_ar[i], e.r_ar[i], e.xx[i], e.ar2[i]};
     ++i;
-    return symmetric && definite && nearer;
+    return static_cast<bool>(energy_falls(of_sample, space.epsilon()));
   });
 }
 
@@ -147,7 +170,6 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   const auto caps = space.map(states, [](const SampleState& s) { return s.cap; });
   const auto any = [](const auto& rows) { return std::find(rows.begin(), rows.end(), true) != rows.end(); };
   run(space, method, states, rtol, track);
-  if constexpr (requires { space.settle(states); }) space.settle(states);
   conclude(space, method, states, rtol);
   if (!guarded) return;
   auto worse = worse_than_zero(space, states);

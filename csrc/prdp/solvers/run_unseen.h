@@ -14,13 +14,13 @@ namespace prdp {
 
 /// What unseen iterations left, on the host.
 struct UnseenLog {
-  std::vector<std::vector<double>> residual2;  // of each iteration and sample; empty if nobody asked for it
+  std::vector<std::vector<double>> residual2;  // of each iteration and sample
   std::vector<std::vector<bool>> odd;          // where an iteration needs a closer look
   std::vector<int64_t> products;               // of each iteration
 };
 
-/// Iterations between two looks, at most: with a tolerance, and without one, where the numbers of all are kept.
-inline constexpr int64_t kLongestUnseen = 16, kLongestUntracked = 256;
+/// Iterations between two looks, at most.
+inline constexpr int64_t kLongestUnseen = 16;
 
 namespace detail {
 
@@ -48,7 +48,7 @@ bool read_log(SampleState& s, size_t sample, const Method& method, const UnseenL
     if (log.odd[k][sample]) return false;
     ++s.iterations;
     s.applications += log.products[k];
-    if (!log.residual2.empty() && !passes(s, method, log.residual2[k][sample], rtol)) return false;
+    if (!passes(s, method, log.residual2[k][sample], rtol)) return false;
   }
   return true;
 }
@@ -70,10 +70,9 @@ bool confirm_claims(Space& space, Method& method, typename Space::States& states
   return true;
 }
 
-/// n iterations of the active samples; false if they have been taken back. `track` as in run().
+/// n iterations, which the space logs; with `track`, their residuals as well.
 template <class Space, class Method>
-bool run_unseen(Space& space, Method& method, typename Space::States& states, double rtol, bool track, int64_t n) {
-  const Method kept = method;  // handles of vectors that nobody writes to
+void iterate_unseen(Space& space, Method& method, double rtol, bool track, int64_t n) {
   if constexpr (kHasRecursiveResidual<Method>) space.look_away(track, rtol, method.residual2());
   else space.look_away(track, rtol, {});
   for (int64_t k = 0; k < n; ++k) {
@@ -82,9 +81,15 @@ bool run_unseen(Space& space, Method& method, typename Space::States& states, do
     if (track) space.end_unseen(method.residual2());
     else space.end_unseen();
   }
+}
+
+/// n iterations of the active samples, whose residuals are looked at; false if they have been taken back.
+template <class Space, class Method>
+bool run_unseen(Space& space, Method& method, typename Space::States& states, double rtol, int64_t n) {
+  const Method kept = method;  // handles of vectors that nobody writes to
+  iterate_unseen(space, method, rtol, /*track=*/true, n);
   const UnseenLog log = space.look_back();
   if constexpr (requires { method.end_unseen(); }) method.end_unseen();
-  space.settle(states);
   const auto before = states;
   for (auto& s : states) s.claims = false;
   bool regular = true;

@@ -94,6 +94,7 @@ class SampleSpace {
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
   void add(const T* d, Vector x) { vectors_.axpy(T(1), d, x, length()); }
   void xpby(const T* x, Scalar beta, Vector y) { vectors_.xpby(x, beta, y, length()); }
+  void xmby(const T* x, Scalar beta, Vector y) { xpby(x, -beta, y); }
   Scalar xpby_with_square(const T* x, Scalar beta, Vector y) { return vectors_.xpby_with_square(x, beta, y, length()); }
   Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
   Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {

@@ -20,6 +20,8 @@ struct SolveRequest {
   std::optional<at::Tensor> caps{};
   bool guarded = true;
   at::Tensor x0{};
+  /// Whether the host may wait for another device to read the report there; solve_unseen.h says what this costs.
+  bool may_wait = true;
 };
 
 /// Solves A u = b by the CPU loops, or by plain tensor operations if the operator or the device has no such loops.

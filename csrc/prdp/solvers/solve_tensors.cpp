@@ -3,60 +3,14 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/solve.h"
+#include "prdp/solvers/prepared_batch.h"
+#include "prdp/solvers/solve_unseen.h"
 #include "prdp/solvers/tensor_gmres.h"
 #include "prdp/solvers/tensor_space.h"
 
 namespace prdp {
 
 namespace {
-
-/// What is known of the samples before they are iterated, (batch,) each, on their device: the status, which is MAX_ITER
-/// of those that are not settled yet; ‖b‖²; whether b lies outside the range of A, beyond rtol; whether the start took
-/// a product.
-struct Beforehand {
-  at::Tensor status, b2, inconsistent, applied;
-
-  /// One copy.
-  void tell(std::vector<SampleState>& states) const {
-    const auto host =
-        at::stack({status.to(b2.scalar_type()), b2, applied.to(b2.scalar_type())}).to(at::kCPU, at::kDouble);
-    const auto rows = host.accessor<double, 2>();
-    for (size_t i = 0; i < states.size(); ++i) {
-      auto& s = states[i];
-      s.status = static_cast<SolveStatus>(static_cast<int64_t>(rows[0][i]));
-      s.b2 = rows[1][i];
-      if (s.status == SolveStatus::kMaxIter) {
-        s.applications += static_cast<int64_t>(rows[2][i]);
-        continue;
-      }
-      s.active = false;
-      s.settled = true;
-      s.iterations = s.applications = 0;
-      if (s.status == SolveStatus::kInconsistent) s.residual2 = s.b2 = 1.0;
-    }
-  }
-};
-
-/// The status of each sample that is settled before iterating, and MAX_ITER of the others.
-at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& magnitude,
-                             const at::Tensor& start_magnitude) {
-  const int64_t batch = magnitude.size(0);
-  auto status = at::full({batch}, static_cast<int64_t>(SolveStatus::kMaxIter), magnitude.options().dtype(at::kLong));
-  const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
-    status = status.masked_fill(rows.reshape({-1}).expand({batch}).to(status.device()), static_cast<int64_t>(why));
-  };
-  // The last mark holds: the order is that of the CPU loops, from the end.
-  mark(magnitude.eq(0), SolveStatus::kConverged);
-  if (divides_by_diagonal(solver)) {
-    const auto zero = a.diagonal().eq(0);
-    mark(zero.dim() > 1 ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
-  }
-  mark(a.nonfinite_samples(b), SolveStatus::kNonfiniteOperator);
-  if (start_magnitude.defined()) mark(start_magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
-  mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
-  return status;
-}
 
 SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOptions& real) {
   const auto batch = static_cast<int64_t>(states.size());
@@ -78,66 +32,41 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
   return info;
 }
 
-/// b with its rows scaled, and `others` in place of the rows that do not take part.
+/// The states as they are before the first iteration. One copy.
+void tell(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2) {
+  const auto& applied = batch.start.applied;
+  const auto number = [&](const at::Tensor& t) { return t.flatten().to(b2.scalar_type()); };
+  const auto host =
+      at::stack({number(batch.status), number(b2), applied.defined() ? number(applied) : at::zeros_like(number(b2))})
+          .to(at::kCPU, at::kDouble);
+  const auto rows = host.accessor<double, 2>();
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    s.status = static_cast<SolveStatus>(static_cast<int64_t>(rows[0][i]));
+    s.b2 = rows[1][i];
+    if (s.status == SolveStatus::kMaxIter) {
+      s.applications += static_cast<int64_t>(rows[2][i]);
+      continue;
+    }
+    s.active = false;
+    s.settled = true;
+    s.iterations = s.applications = 0;
+    if (s.status == SolveStatus::kInconsistent) s.residual2 = s.b2 = 1.0;
+  }
+}
+
+/// b with its rows scaled.
 struct ScaledRhs {
   at::Tensor b, scale;
 };
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part,
-                    const at::Tensor& others) {
-  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
-  const auto scale = per_sample(power_of_two_scale(safe), b);
-  const auto rows = per_sample(takes_part, b);
-  return {at::where(rows, b, others) * scale, scale};
-}
-
-at::Tensor largest_magnitude(const at::Tensor& b) { return b.detach().abs().flatten(1).amax(1); }
-
 ScaledRhs scale_whole(const at::Tensor& b) {
   const auto scale = per_sample(power_of_two_scale(largest_magnitude(b)), b);
   return {b * scale, scale};
 }
 
-/// Where the iterations of a batch start, and whether that took a product.
-struct TensorStart {
-  at::Tensor x, r;     // r = b - A x
-  at::Tensor applied;  // (batch, 1, …)
-};
-
-/// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
-/// operator keeps what it computes first, for later products as well.
-TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
-  const auto of_order_one = [](const at::Tensor& v) {
-    const auto magnitude = largest_magnitude(v);
-    const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
-    return scale_rhs(v, magnitude, usable, at::zeros_like(v));
-  };
-  const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
-  const auto y = of_order_one(x0.detach()).b;
-  const auto [product, scale] = of_order_one(a.project(a.apply(a.project_solution(y))));
-  const auto product2 = dot(product, product);
-  const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
-  const auto x = a.project_solution(y) * scale * alpha, r = b - alpha * product;
-  const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
-  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
-          per_sample(y.flatten(1).ne(0).any(1), b)};
-}
-
 /// The same recorded, of b and the tensors of A, for a start that is a constant.
 at::Tensor rest_of(const Operator& a, const at::Tensor& b, const at::Tensor& start) {
   return start.defined() ? b - a.project(a.apply(start)) : b;
-}
-
-bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
-
-/// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol; all.
-struct OutsideRange {
-  at::Tensor some, all;
-};
-OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, double rtol) {
-  const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
-  const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
-  const auto whole = norm(b);
-  return {norm(b - projected) > bound * whole, norm(projected) <= epsilon_of(b) * whole};
 }
 
 /// Where a method's own residual claims convergence, in vain as the samples are `wanted` further.
@@ -171,34 +100,18 @@ void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& stat
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
-  const auto magnitude = largest_magnitude(b);
+  if (auto unseen = solve_unseen(a, b, request)) return *std::move(unseen);
   const auto& solver = request.solver;
-  const bool starts = takes_start(solver.method, request.x0);
-  auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
-  auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
+  const auto batch = prepare_batch(a, b, request, at::zeros_like(b));
   std::vector<SampleState> states(b.size(0));
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
   for (size_t i = 0; i < states.size(); ++i)
     states[i].cap = caps.defined() ? caps.const_data_ptr<int64_t>()[i] : solver.max_iter.expect_int();
-  // A device that nobody has to look at iterates all samples, with something to do for those that need no iterations.
-  const bool looks_late = solver.rtol == 0.0 && !b.is_cpu();
-  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, looks_late ? alternating(b) : at::zeros_like(b));
-  const auto rhs = a.project(whole);
-  const auto outside = outside_range(whole, rhs, solver.rtol);
-  const auto inconsistent = outside.some.logical_and(takes_part), hopeless = outside.all.logical_and(takes_part);
-  status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
-  takes_part = takes_part.logical_and(hopeless.logical_not());
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
-  TensorSpace space(system, rhs, states);
-  Beforehand beforehand{status, space.b2().flatten(), inconsistent, at::zeros_like(takes_part)};
-  if (starts) {
-    const auto made = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
-    beforehand.applied = made.applied.flatten();
-    space.start_from(made.x, made.r);
-  }
-  if (looks_late) space.settle_by([&](auto& samples) { beforehand.tell(samples); });
-  else beforehand.tell(states);
+  TensorSpace space(system, batch.rhs, states);
+  tell(states, batch, space.b2());
+  if (batch.start.x.defined()) space.start_from(batch.start.x, batch.start.r);
 
   const auto run = [&](auto method) {
     iterate(space, method, states, solver.rtol, request.guarded);
@@ -207,10 +120,10 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const bool in_batches = solver.method == Method::kGmres && space.is_far();
   auto u =
       in_batches ? run(TensorGmres(space, solver.restart)) : with_method(solver.method, solver.restart, space, run);
-  const auto before = largest_magnitude(u) * takes_part;
-  u = at::where(per_sample(takes_part, b), u / scale, at::zeros_like(b));
+  const auto before = largest_magnitude(u) * batch.takes_part;
+  u = at::where(per_sample(batch.takes_part, b), u / batch.scale, at::zeros_like(b));
   const auto largest = largest_magnitude(u);
-  const auto host = at::stack({beforehand.inconsistent.to(u.scalar_type()), before, largest}).to(at::kCPU, at::kDouble);
+  const auto host = at::stack({batch.inconsistent.to(u.scalar_type()), before, largest}).to(at::kCPU, at::kDouble);
   const auto rows = host.accessor<double, 2>();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];

@@ -181,4 +181,10 @@ struct SolveOptions {
   void check(const char* who) const;
 };
 
+/// Whether the host needs the report of a solve at once: to raise or to warn, or to take its iterations back.
+inline bool waits_for_report(const SolveOptions& options) {
+  const bool says_nothing = options.on_failure == OnFailure::kReturn || options.on_failure == OnFailure::kZeroGrad;
+  return !says_nothing || options.backward == Backward::kUnrolled;
+}
+
 }  // namespace prdp

@@ -36,6 +36,8 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   s.add(x, y);
   /// y = x + a y; and the same, returning ‖y‖².
   s.xpby(x, a, y);
+  /// y = x - a y
+  s.xmby(x, a, y);
   { s.xpby_with_square(x, a, y) } -> std::same_as<typename S::Scalar>;
   /// x·y
   { s.dot(x, y) } -> std::same_as<typename S::Scalar>;

@@ -44,7 +44,9 @@ double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
 
 const at::Tensor& TensorSpace::diagonal() {
   if (!diagonal_.defined()) {
-    const auto d = system_.a.diagonal().to(b_.options());
+    auto d = system_.a.diagonal();
+    const bool number_of_host = is_far() && d.is_cpu() && d.dim() == 0;  // as a plain nu leaves: to be filled, not sent
+    d = number_of_host ? at::full({}, d.item(), b_.options()) : d.to(b_.options());
     diagonal_ = at::where(d.eq(0), at::ones_like(d), d);
   }
   return diagonal_;
@@ -201,9 +203,15 @@ void TensorSpace::end_unseen(const Scalar& residual2) {
   active_mask_ = active_mask_.defined() ? active_mask_.logical_and(goes_on) : goes_on;
 }
 
-UnseenLog TensorSpace::look_back() {
+UnseenNumbers TensorSpace::take_log() {
   active_mask_ = std::exchange(mask_before_, {});
-  return std::exchange(unseen_, {})->read(static_cast<int64_t>(states_.size()));
+  return *std::exchange(unseen_, {});
+}
+
+UnseenLog TensorSpace::look_back() {
+  const auto log = take_log();
+  const auto host = log.numbers().to(at::kCPU, at::kDouble);
+  return log.read(host.const_data_ptr<double>(), static_cast<int64_t>(states_.size()));
 }
 
 void TensorSpace::count() {

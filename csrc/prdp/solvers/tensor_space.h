@@ -2,7 +2,6 @@
 #include <ATen/ATen.h>
 
 #include <array>
-#include <functional>
 #include <optional>
 #include <vector>
 
@@ -60,6 +59,10 @@ class TensorSpace {
   void xpby(const Vector& x, const Scalar& beta, Vector& y) {
     if (in_loops_) return batch_loops::xpby(x, beta, y, active_);
     y = keep_frozen(at::addcmul(x, beta, y), y);
+  }
+  void xmby(const Vector& x, const Scalar& beta, Vector& y) {
+    if (in_loops_) return batch_loops::xpby(x, -beta, y, active_);
+    y = keep_frozen(at::addcmul(x, beta, y, -1), y);
   }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
     xpby(x, beta, y);
@@ -208,13 +211,10 @@ class TensorSpace {
   bool is_far() const { return !b_.is_cpu() && !recording_; }
   void look_away(bool track, double rtol, const Scalar& residual2);
   UnseenLog look_back();
+  /// Instead of look_back(), by who does not wait.
+  UnseenNumbers take_log();
   /// Ends one of these iterations; with the squares of its residuals, freezes the samples that are done.
   void end_unseen(const Scalar& residual2 = {});
-  /// What is to be known of the samples before the first look; settle() calls it once.
-  void settle_by(std::function<void(States&)> known) { known_ = std::move(known); }
-  void settle(States& states) {
-    if (known_) std::exchange(known_, {})(states);
-  }
 
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
@@ -223,12 +223,9 @@ class TensorSpace {
   /// As batch_loops take it.
   Vector laid_out(const Vector& v) const { return in_loops_ ? v.contiguous() : v; }
   static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
-    return omega ? before + *omega * (x + change - before) : x + change;
+    return omega ? at::addcmul(before, *omega, x + change - before) : x + change;
   }
-  Vector jacobi_change(const Vector& c, const Vector& x) {
-    auto change = product(x) / diagonal();
-    return in_loops_ ? at::sub_out(change, c, change) : c - change;
-  }
+  Vector jacobi_change(const Vector& c, const Vector& x) { return at::addcdiv(c, product(x), diagonal(), -1); }
   /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
   const at::Tensor& diagonal();
   /// A v, not scaled.
@@ -263,7 +260,6 @@ class TensorSpace {
   std::optional<UnseenNumbers> unseen_;
   at::Tensor mask_before_;       // active_mask_ at the last look
   at::Tensor enough_, too_much_;  // bounds of the squares of residuals
-  std::function<void(States&)> known_;
 };
 
 }  // namespace prdp

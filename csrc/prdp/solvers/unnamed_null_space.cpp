@@ -20,13 +20,12 @@ at::Tensor norm_of_samples(const at::Tensor& v) {
   return unit.squeeze(1) * (rows / unit).norm(2, 1);
 }
 
-/// The share of each sample of v that is constant in a channel, on the host.
-std::vector<double> constant_shares(const at::Tensor& v) {
+/// The share of each sample of v that is constant in a channel, (batch,) in double.
+at::Tensor constant_shares(const at::Tensor& v) {
   const auto channels = by_channel(v);
   const auto sums = channels.sum(-1, /*keepdim=*/false, at::kDouble).view({v.size(0), -1}).norm(2, 1);
   const auto whole = at::linalg_vector_norm(v.flatten(1), 2, 1, /*keepdim=*/false, at::kDouble);
-  const auto shares = (sums / (whole * std::sqrt(static_cast<double>(channels.size(-1))))).to(at::kCPU);
-  return {shares.const_data_ptr<double>(), shares.const_data_ptr<double>() + v.size(0)};
+  return sums / (whole * std::sqrt(static_cast<double>(channels.size(-1))));
 }
 
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
@@ -45,10 +44,34 @@ at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool tr
   return product(at::ones_like(b)) <= 16.0 * epsilon_of(b) * product(alternating(b));
 }
 
+namespace {
+
+/// What is found of a report on the host, at the end of the next function, as tensor operations on its device.
+void find_inconsistent_constants_there(const Operator& a, const at::Tensor& b, const Solver& solver,
+                                       SolveResult& result) {
+  // Every sample takes as many products, and a few more.
+  const int64_t products = solver.max_iter.expect_int() * traits(solver.method).products;
+  if (!worked_for_long(solver, products)) return;
+  const at::NoGradGuard no_grad;
+  auto& info = result.info;
+  const auto residual = info.residual.to(at::kDouble), of_b = constant_shares(b.detach());
+  auto suspects = info.status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
+                      .logical_or(info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)));
+  suspects = suspects & (of_b > 64.0 * epsilon_of(b)) & (residual >= 0.5 * of_b);
+  if (products < kManyProducts)
+    suspects = suspects & (info.status.eq(static_cast<int64_t>(SolveStatus::kStagnated)) | (residual > 1.0) |
+                           (constant_shares(result.u) > 0.9));
+  const auto found = suspects & maps_constant_to_zero(a, b, /*transposed=*/true);
+  info.status = info.status.masked_fill(found, static_cast<int64_t>(SolveStatus::kInconsistent));
+}
+
+}  // namespace
+
 void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,
                                  SolveResult& result) {
   if (!request.guarded || !a.may_be_singular()) return;
   const auto& solver = request.solver;
+  if (!result.info.status.is_cpu()) return find_inconsistent_constants_there(a, b, solver, result);
   const auto& info = result.info;
   auto* status = info.status.mutable_data_ptr<int64_t>();
   const auto* products = info.operator_applications.const_data_ptr<int64_t>();
@@ -59,7 +82,8 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   if (suspects.empty()) return;
 
   const at::NoGradGuard no_grad;
-  const auto of_b = constant_shares(b.detach()), of_u = constant_shares(result.u);
+  const auto shares = at::stack({constant_shares(b.detach()), constant_shares(result.u)}).to(at::kCPU);
+  const auto *of_b = shares.const_data_ptr<double>(), *of_u = of_b + b.size(0);
   const auto residuals = info.residual.to(at::kCPU, at::kDouble);
   const auto is_clear = [&](int64_t i) {
     const double residual = residuals.const_data_ptr<double>()[i];

@@ -2,6 +2,7 @@
 
 #include <array>
 #include <cmath>
+#include <numeric>
 #include <utility>
 
 namespace prdp {
@@ -88,10 +89,37 @@ bool UnseenNumbers::is_odd(const Entry& entry, const std::array<double, 4>& x, F
   }
 }
 
-UnseenLog UnseenNumbers::read(int64_t batch) const {
+at::Tensor UnseenNumbers::broken() const {
+  std::vector<at::Tensor> num, den, positive, residual2;
+  auto next = numbers_.begin();
+  for (const auto& entry : entries_) {
+    if (entry.kind == Kind::kStep || entry.kind == Kind::kStepToDescend || entry.kind == Kind::kStepOfSquares) {
+      num.push_back(next[0]);
+      den.push_back(next[1]);
+    } else if (entry.kind == Kind::kPositive) {
+      positive.push_back(next[0]);
+      residual2.push_back(next[1]);
+    }
+    next += entry.count;
+  }
+  if (num.empty()) return {};
+  const auto above = at::stack(num), below = at::stack(den);
+  const auto has_length = below.ne(0).logical_and((above / below).isfinite());
+  auto rows = above.gt(negligible_).logical_and(has_length.logical_not()).any(0);
+  if (!positive.empty()) {
+    const auto wrong = at::stack(positive).gt(0).logical_not().logical_and(at::stack(residual2).gt(negligible_));
+    rows = rows.logical_or(wrong.any(0));
+  }
+  return rows.flatten();
+}
+
+int64_t UnseenNumbers::products() const {
+  return std::accumulate(entries_.begin(), entries_.end(), products_,
+                         [](int64_t sum, const Entry& entry) { return sum + entry.products; });
+}
+
+UnseenLog UnseenNumbers::read(const double* next, int64_t batch) const {
   UnseenLog log;
-  const auto host = numbers_.empty() ? at::empty({0}, at::kDouble) : at::cat(numbers_).to(at::kCPU, at::kDouble);
-  const double* next = host.const_data_ptr<double>();
   std::vector<bool> odd(batch);
   std::vector<Followed> samples(batch);
   for (const auto& entry : entries_) {

@@ -31,8 +31,15 @@ class UnseenNumbers {
   void count() { ++products_; }
   /// `residual2` may be undefined.
   void end_iteration(const at::Tensor& residual2);
-  /// All of it, in one copy.
-  UnseenLog read(int64_t batch) const;
+  /// All of them in a row, on the device; undefined if there are none.
+  at::Tensor numbers() const { return numbers_.empty() ? at::Tensor() : at::cat(numbers_).flatten(); }
+  /// What they say, from a copy of numbers().
+  UnseenLog read(const double* numbers, int64_t batch) const;
+  /// Where a step had no length though a residual was left, or a number that must be positive was not: (batch,), on the
+  /// device; undefined if nothing can break down.
+  at::Tensor broken() const;
+  /// Since the beginning.
+  int64_t products() const;
 
  private:
   enum class Kind {

@@ -1,0 +1,98 @@
+#include "prdp/solvers/prepared_batch.h"
+
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/stopping.h"
+
+namespace prdp {
+
+namespace {
+
+/// The status of each sample that is settled before iterating, and MAX_ITER of the others.
+at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& magnitude,
+                             const at::Tensor& start_magnitude) {
+  const int64_t batch = magnitude.size(0);
+  auto status = at::full({batch}, static_cast<int64_t>(SolveStatus::kMaxIter), magnitude.options().dtype(at::kLong));
+  const auto nowhere = at::zeros_like(status, at::kBool);
+  const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
+    // A single number of the CPU, as a plain nu leaves, is an argument there and no copy.
+    const auto which = rows.numel() == 1 ? rows.reshape({}) : rows.reshape({-1});
+    status = status.masked_fill(nowhere.logical_or(which), static_cast<int64_t>(why));
+  };
+  // The last mark holds: the order is that of the CPU loops, from the end.
+  mark(magnitude.eq(0), SolveStatus::kConverged);
+  if (divides_by_diagonal(solver)) {
+    const auto zero = a.diagonal().eq(0);
+    mark(zero.dim() == b.dim() ? zero.flatten(1).any(1) : zero.any(), SolveStatus::kZeroDiagonal);
+  }
+  mark(a.nonfinite_samples(b), SolveStatus::kNonfiniteOperator);
+  if (start_magnitude.defined()) mark(start_magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
+  mark(magnitude.isfinite().logical_not(), SolveStatus::kNonfiniteInput);
+  return status;
+}
+
+/// b with its rows scaled, and `others` in place of the rows that do not take part.
+struct ScaledRhs {
+  at::Tensor b, scale;
+};
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part,
+                    const at::Tensor& others) {
+  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
+  const auto scale = per_sample(power_of_two_scale(safe), b);
+  const auto rows = per_sample(takes_part, b);
+  return {at::where(rows, b, others) * scale, scale};
+}
+
+/// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol; all.
+struct OutsideRange {
+  at::Tensor some, all;
+};
+OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, double rtol) {
+  const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
+  const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
+  const auto whole = norm(b);
+  return {norm(b - projected) > bound * whole, norm(projected) <= epsilon_of(b) * whole};
+}
+
+}  // namespace
+
+at::Tensor largest_magnitude(const at::Tensor& b) { return b.detach().abs().flatten(1).amax(1); }
+
+bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
+
+TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
+  const auto of_order_one = [](const at::Tensor& v) {
+    const auto magnitude = largest_magnitude(v);
+    const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
+    return scale_rhs(v, magnitude, usable, at::zeros_like(v));
+  };
+  const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
+  const auto y = of_order_one(x0.detach()).b;
+  const auto [product, scale] = of_order_one(a.project(a.apply(a.project_solution(y))));
+  const auto product2 = dot(product, product);
+  const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
+  const auto x = a.project_solution(y) * scale * alpha, r = b - alpha * product;
+  const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
+  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
+          per_sample(y.flatten(1).ne(0).any(1), b)};
+}
+
+PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+                            const at::Tensor& others) {
+  const auto& solver = request.solver;
+  const bool starts = takes_start(solver.method, request.x0);
+  const auto magnitude = largest_magnitude(b);
+  auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
+  auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
+  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, others);
+  const auto rhs = a.project(whole);
+  const auto outside = outside_range(whole, rhs, solver.rtol);
+  const auto inconsistent = outside.some.logical_and(takes_part), hopeless = outside.all.logical_and(takes_part);
+  status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
+  takes_part = takes_part.logical_and(hopeless.logical_not());
+  TensorStart start;
+  if (starts) start = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
+  return {status, takes_part, inconsistent, rhs, scale, start};
+}
+
+}  // namespace prdp

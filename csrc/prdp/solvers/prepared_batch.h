@@ -1,0 +1,32 @@
+#pragma once
+#include "prdp/solvers/solve.h"
+
+/// A batch of systems before its first iteration, in plain tensor operations that read nothing back.
+namespace prdp {
+
+/// Where the iterations of a batch start, and whether that took a product. All undefined: at zero.
+struct TensorStart {
+  at::Tensor x, r;     // r = b - A x
+  at::Tensor applied;  // (batch, 1, …)
+};
+
+struct PreparedBatch {
+  at::Tensor status;        // (batch,): MAX_ITER of the samples that are not settled yet
+  at::Tensor takes_part;    // (batch,): those
+  at::Tensor inconsistent;  // (batch,): those of them whose b lies outside the range of A, beyond rtol
+  at::Tensor rhs, scale;    // b, scaled and within the range of A; its scale, (batch, 1, …)
+  TensorStart start;
+};
+
+/// `others`, of the shape of b, takes the place of the right-hand sides that do not take part.
+PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+                            const at::Tensor& others);
+
+bool takes_start(Method method, const at::Tensor& x0);
+/// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
+/// operator keeps what it computes first, for later products as well.
+TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0);
+/// max |b| of each sample, (batch,).
+at::Tensor largest_magnitude(const at::Tensor& b);
+
+}  // namespace prdp

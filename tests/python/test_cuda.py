@@ -1,0 +1,144 @@
+"""The tensor path on a GPU, as `make cuda` runs it. Without a GPU the CPU takes its place: then these tests are tried
+themselves, and CUDA is not."""
+
+import contextlib
+
+import pytest
+import torch
+from test_no_waiting import OPERATORS, SOLVERS
+from test_other_devices import SHAPE, noise
+
+import prdp_torch as prdp
+
+CUDA = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if CUDA else "cpu")
+pytestmark = pytest.mark.cuda
+
+FIXED = {**SOLVERS, "bicgstab": prdp.BiCGStab(15, 0.0), "gmres": prdp.GMRES(5, 0.0, restart=4)}
+TOLERANT = {
+    "cg, rtol": prdp.CG(60, 1e-9),
+    "jacobi, rtol": prdp.Jacobi(900, 1e-9),
+    "bicgstab, rtol": prdp.BiCGStab(60, 1e-9),
+    "gmres, rtol": prdp.GMRES(60, 1e-9, restart=8),
+    "cg, multigrid": prdp.CG(20, 1e-9, preconditioner="multigrid"),
+    "multigrid": prdp.Multigrid(40, 1e-9),
+    "direct": prdp.Direct(),
+}
+
+
+@contextlib.contextmanager
+def no_waiting():
+    """An error where the host waits for the GPU."""
+    if CUDA:
+        torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        if CUDA:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def solve_and_gradients(device, name, solver, **options):
+    make, g = OPERATORS[name]
+    leaves = [g.to(device).requires_grad_(), noise(3, 1, *SHAPE).to(device).requires_grad_()]
+    u, info = prdp.linear_solve(make(leaves[0]), leaves[1], solver, **options)
+    return u, torch.autograd.grad(u.square().sum(), leaves), info
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("solver", {**FIXED, **TOLERANT})
+@pytest.mark.parametrize("name", OPERATORS)
+def test_solutions_and_gradients_are_those_of_the_cpu(name, solver, backward):
+    if name == "function" and "multigrid" in solver:
+        solver = "cg, rtol"  # a function has no coarse grids
+    of = {**FIXED, **TOLERANT}[solver]
+    (u, gradients, info), (v, others, report) = (
+        solve_and_gradients(device, name, of, backward=backward) for device in (DEVICE, "cpu")
+    )
+    torch.testing.assert_close(u.cpu(), v, rtol=1e-7, atol=1e-9)
+    for mine, other in zip(gradients, others, strict=True):
+        torch.testing.assert_close(mine.cpu(), other, rtol=1e-6, atol=1e-8)
+    assert torch.equal(info.status.cpu(), report.status)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_solve_that_nobody_reads_does_not_wait(name, solver):
+    options = {"on_failure": "zero_grad"}
+    expected, gradients, _ = solve_and_gradients("cpu", name, SOLVERS[solver])
+    make, g = OPERATORS[name]
+    leaves = [g.to(DEVICE).requires_grad_(), noise(3, 1, *SHAPE).to(DEVICE).requires_grad_()]
+    with no_waiting():
+        u, info = prdp.linear_solve(make(leaves[0]), leaves[1], SOLVERS[solver], **options)
+        found = torch.autograd.grad(u.square().sum(), leaves)
+    torch.testing.assert_close(u.cpu(), expected, rtol=1e-7, atol=1e-9)
+    for mine, other in zip(found, gradients, strict=True):
+        torch.testing.assert_close(mine.cpu(), other, rtol=1e-6, atol=1e-8)
+    assert (info.status.cpu() == prdp.SolveStatus.MAX_ITER).all()
+
+
+def captured(function, example):
+    """function as a CUDA graph; on the CPU the function itself."""
+    if not CUDA:
+        return function
+    given = example.clone()
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            function(given)
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = function(given)
+
+    def replay(b):
+        given.copy_(b)
+        graph.replay()
+        return result.clone()
+
+    return replay
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_solve_with_its_gradient_in_a_cuda_graph(name, solver):
+    make, g = OPERATORS[name]
+
+    def gradient(b, device=DEVICE):
+        leaf = b.detach().requires_grad_()
+        u, _ = prdp.linear_solve(make(g.to(device)), leaf, SOLVERS[solver], on_failure="return")
+        return torch.autograd.grad(u.square().sum(), leaf)[0]
+
+    g = g.to(DEVICE)
+    replay = captured(gradient, noise(3, 1, *SHAPE).to(DEVICE))
+    for seed in (1, 2):
+        b = noise(3, 1, *SHAPE, seed=seed)
+        torch.testing.assert_close(replay(b.to(DEVICE)).cpu(), gradient(b, "cpu"), rtol=1e-7, atol=1e-9)
+
+
+def test_a_rollout_with_its_gradient_in_a_cuda_graph():
+    step = prdp.Heat((9,), 1e-2, 1.0, solver=prdp.CG(6, 0.0), on_failure="return")
+
+    def gradient(u):
+        leaf = u.detach().requires_grad_()
+        return torch.autograd.grad(step.rollout(leaf, 3)[:, -1].square().sum(), leaf)[0]
+
+    replay = captured(gradient, noise(3, 1, 9).to(DEVICE))
+    u = noise(3, 1, 9, seed=1)
+    torch.testing.assert_close(replay(u.to(DEVICE)).cpu(), gradient(u), rtol=1e-7, atol=1e-9)
+
+
+def test_a_network_in_half_precision_around_a_solve():
+    make, g = OPERATORS["stencil"]
+    a = make(g.float().to(DEVICE))
+    network = torch.nn.Conv2d(1, 1, 3, padding=1).to(DEVICE)
+    with torch.autocast(DEVICE.type, dtype=torch.bfloat16):
+        b = network(noise(3, 1, *SHAPE).float().to(DEVICE))
+        u, _ = prdp.linear_solve(a, b, prdp.CG(8, 0.0))
+        loss = network(u).float().square().sum()
+    loss.backward()
+    assert b.dtype == torch.bfloat16 and u.dtype == torch.float32
+    full, _ = prdp.linear_solve(a, b.float(), prdp.CG(8, 0.0))
+    torch.testing.assert_close(u, full)
+    assert all(p.grad.dtype == torch.float32 and p.grad.isfinite().all() for p in network.parameters())
