@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
+from prdp_torch.solver_trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
 from prdp_torch.solvers import GMRES, Direct, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
-from prdp_torch.trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
 
 WORTH_REFINING = 0.1  # of an update
 NOISE = 0.1  # of the seconds of a solve

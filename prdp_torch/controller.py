@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, _check, processes
+from prdp_torch import _C, _check, data_parallel
 from prdp_torch.solve import SolveInfo
 from prdp_torch.types import Number, Refinable, Steppers
 
@@ -84,7 +84,7 @@ class _Attached(_Compiled):
 
     def _take(self, steppers: Steppers, process_group: "ProcessGroup | None") -> None:
         who = type(self).__name__
-        if process_group is not None and processes.rank(who, process_group) < 0:
+        if process_group is not None and data_parallel.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
         if not isinstance(steppers, Iterable):
@@ -117,12 +117,12 @@ class _Attached(_Compiled):
         residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
         ended = [getattr(stepper, "info", None) for stepper in self.steppers]
         residuals = [torch.zeros(0) if info is None else _beyond_rounding(info) for info in ended]
-        many = processes.count(self.process_group)
+        many = data_parallel.count(self.process_group)
         if many > 1:
             # One that is refused must be refused in every process.
             numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
             numbers += [converged, error is not None]
-            metric, error_sum, agree, known, *of_steppers = processes.sums(
+            metric, error_sum, agree, known, *of_steppers = data_parallel.sums(
                 [*numbers, *(n for r in residuals for n in (float(r.sum()), r.numel()))], self.process_group
             )
             metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None

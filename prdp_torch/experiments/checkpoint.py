@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch.experiments import _C
 
 Found: TypeAlias = list[tuple[Path, bytes, str]]
@@ -28,29 +28,29 @@ class Checkpoint(_C.Checkpoint):
         super().__init__(path, json.dumps({"trainer": "Python", **settings}))
 
     def due(self) -> bool:
-        return processes.is_first() and super().due()
+        return data_parallel.is_first() and super().due()
 
     def remove(self) -> None:
-        if processes.is_first():
+        if data_parallel.is_first():
             super().remove()
 
     def save(self, tensors: Mapping[str, Tensor], curves: dict[str, Any], controller: dict[str, Any]) -> None:
         """Save named tensors, the curves of `training.train` and the `state_dict` of a controller. ValueError if the
         file cannot be written."""
-        if processes.is_first():
+        if data_parallel.is_first():
             self.write(_C.pack_state(tensors, curves, **controller))  # type: ignore[arg-type]  # it takes bytes
 
     def found(self) -> Found:
         """Return what `restore` takes, the same in all processes: the files that are there, the last one first.
         ValueError if all of them are damaged."""
-        return processes.from_first(self.find)
+        return data_parallel.from_first(self.find)
 
     def restore(self, found: Found, load: Callable[[_C.Saved], None]) -> bool:  # type: ignore[override]
         """Call load(saved) with the tensors that were saved last, a `_C.Saved`. Where they are damaged, or load raises
         ValueError, warn and go on with those saved before. Return whether there were any. ValueError if all of them
         are refused."""
         there = super().restore(found, load)
-        if self.notice and processes.is_first():
+        if self.notice and data_parallel.is_first():
             warnings.warn(self.notice, stacklevel=5)
         return there
 

@@ -25,7 +25,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch._C import VERSION, sentence
 from prdp_torch.experiments import _C, datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import compare as comparison
@@ -85,9 +85,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(function)
     def guarded(*args: Any, **kwargs: Any) -> None:
         try:
-            if processes.launched() > 1 and function.__name__ != "train":
+            if data_parallel.launched() > 1 and function.__name__ != "train":
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
-            with processes.joined(), warnings.catch_warnings():
+            with data_parallel.joined(), warnings.catch_warnings():
                 warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
                 function(*args, **kwargs)
         except KeyboardInterrupt:
@@ -165,7 +165,7 @@ def train(
                 progress.update(task, completed=interval.number, note=note)
 
             callbacks: list[Callback] = [show]
-            if tensorboard and processes.is_first():
+            if tensorboard and data_parallel.is_first():
                 callbacks.append(TensorBoard(folder / refinement.label / f"seed_{seed}.tensorboard"))
             curves = comparison.run_one(
                 loaded,

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch.experiments import _C, records
 from prdp_torch.experiments.checkpoint import Checkpoint
 from prdp_torch.experiments.datasets import OnData
@@ -163,7 +163,7 @@ def run_one(
     a record of the same settings and another number of intervals, which would be lost."""
     path = folder / label / f"seed_{seed}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    if processes.is_first():
+    if data_parallel.is_first():
         _C.settle_weights(path)
     versions = environment["versions"]
     checkpoint = Checkpoint(
@@ -171,7 +171,7 @@ def run_one(
     )
     if not resume:
         checkpoint.remove()
-    curves = processes.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
+    curves = data_parallel.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
     if curves is not None:
         return curves
     network = make_network(scene, seed) if scene.trains_network else None

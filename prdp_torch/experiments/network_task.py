@@ -7,7 +7,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from prdp_torch import fields, processes
+from prdp_torch import data_parallel, fields
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.checkpoint import load_optimiser, state_of
 from prdp_torch.experiments.networks import make_network
@@ -24,13 +24,13 @@ Loss: TypeAlias = Callable[[Tensor], Tensor]
 def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torch.nn.Module | None, data: Data) -> Task:
     """An interval is an epoch, the metric that of validation."""
     train = _TrainingSamples(scene, data)
-    processes.check_batches(train.count, scene.training.batch)
+    data_parallel.check_batches(train.count, scene.training.batch)
     if network is None:
         network = make_network(scene, seed)
     else:
         datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = processes.shared_loss(network, objective(scene, steppers, train, network))
+    loss_of = data_parallel.shared_loss(network, objective(scene, steppers, train, network))
     optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
     generator = torch.Generator().manual_seed(seed)
 
@@ -44,7 +44,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torc
             loss, part = loss_of(batch)
             part.backward()
             optimiser.step()
-            yield float(loss.detach()), processes.share(batch)
+            yield float(loss.detach()), data_parallel.share(batch)
 
     def state() -> dict[str, Tensor]:
         weights = {f"network.{name}": value for name, value in network.state_dict().items()}
@@ -89,14 +89,14 @@ class _TrainingSamples:
 
 def _metric(scene: _C.Scene, data: Data, network: torch.nn.Module) -> Callable[[], float]:
     step = propagator(scene, network)
-    start, end = processes.share(data.valid_start), processes.share(data.valid_end)
+    start, end = data_parallel.share(data.valid_start), data_parallel.share(data.valid_end)
 
     def metric() -> float:
         mine = math.nan  # of a process without a sample
         if len(start):
             with datasets.evaluating(network):
                 mine = error(scene, fields.rollout(step, start, scene.data.valid_steps)[:, -1], end)
-        return processes.mean([mine], len(start))[0]
+        return data_parallel.mean([mine], len(start))[0]
 
     return metric
 

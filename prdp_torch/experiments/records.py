@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch._C import VERSION
 from prdp_torch.experiments import _C, datasets, own_networks
 
@@ -27,7 +27,7 @@ def environment() -> dict[str, Any]:
             "processor": _processor(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
-            "processes": processes.count(),
+            "processes": data_parallel.count(),
         },
         "commit": _commit(),
         "command": " ".join([_program(), *sys.argv[1:]]),
@@ -86,7 +86,7 @@ def alone_in(folders: Sequence[Path]) -> Iterator[None]:
     processes that train together, the first one does so."""
     locks = []
     try:
-        for folder in folders if processes.is_first() else ():
+        for folder in folders if data_parallel.is_first() else ():
             folder.mkdir(parents=True, exist_ok=True)
             locks.append(_C.FolderLock(folder))
         yield
@@ -105,7 +105,7 @@ def write_training(path: Path, record: dict[str, Any], network: torch.nn.Module 
     """Write the record of a training, and the `state_dict` of its network (if it has one) beside it: both, each whole,
     or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier record is
     then still there, with its weights. Of several processes the first one writes."""
-    if not processes.is_first():
+    if not data_parallel.is_first():
         return
     weights = b""
     if network is not None:
@@ -193,7 +193,7 @@ def _null_for_nan(content: object) -> object:
 def prepare_folder(path: str | Path) -> Path:
     """Make the folder and see that it can be written to, before any work. ValueError if not."""
     path = Path(path)
-    if not processes.is_first():
+    if not data_parallel.is_first():
         return path
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from prdp_torch.advice import Advice, Update, advise_on, checked_limit, millisec
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_solver, make_stepper
-from prdp_torch.trials import RUNS, now, run, trial_of
+from prdp_torch.solver_trials import RUNS, now, run, trial_of
 
 
 def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 import torch
 from torch import Tensor
 
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
 from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors
@@ -131,7 +131,7 @@ def train(
     one keeps the checkpoint. ValueError for a task without a network, and if a batch has fewer samples than there are
     processes.
     """
-    if processes.count() > 1 and not scene.trains_network:
+    if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     callbacks = list(callbacks)
     for callback in callbacks:
@@ -145,7 +145,7 @@ def train(
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
     run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
-        data = processes.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
+        data = data_parallel.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
         task = network_task.make_task(scene, steppers, seed, network, data)
     else:
         task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
@@ -221,7 +221,7 @@ class _Run:
             **costs,
         )
         stopped = any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
-        return processes.sums([stopped])[0] > 0
+        return data_parallel.sums([stopped])[0] > 0
 
     def _done(self) -> int:
         return len(self.curves["seconds"])
@@ -252,14 +252,14 @@ class _Run:
         failures = _C.Failures()
         for loss, samples in task.updates(len(self.curves["update_loss"])):
             solves += sum(report.iterations[0].numel() for report in self._reports())
-            loss, refused, *spent = processes.mean([loss, self._refused(), *self._spent()], self._samples())
+            loss, refused, *spent = data_parallel.mean([loss, self._refused(), *self._spent()], self._samples())
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
             iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
             adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
             failures.take([report.status for report in self._reports()], adjoints, samples)
         seconds = time.perf_counter() - started
-        failed = int(processes.sums([failures.count])[0])
+        failed = int(data_parallel.sums([failures.count])[0])
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
         if failures.count:
             print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)

@@ -10,10 +10,10 @@ import torch
 from helpers import field
 
 import prdp_torch as prdp
-from prdp_torch import _C, operators, trials
+from prdp_torch import _C, operators, solver_trials
 from prdp_torch import advice as module
 from prdp_torch.experiments import scene_advice, scenes
-from prdp_torch.trials import Row, Solve, measure_with_start, random_cotangent
+from prdp_torch.solver_trials import Row, Solve, measure_with_start, random_cotangent
 
 
 def advise(step, sample, seconds=1.0, **options):
@@ -249,13 +249,13 @@ def test_factors_are_made_anew_where_a_training_makes_them_anew(kind, made):
     """One for the batch, or for its only sample: each run makes what an update would have to make."""
     step, u = stepper_with(kind), torch.rand(1, 1, 12, 12, dtype=torch.float64)
     _C.clear_factorisations()
-    trial = trials.trial_of(step, u)
-    trials.set_solver(trial.step, prdp.Direct(), 1, 0.0)
+    trial = solver_trials.trial_of(step, u)
+    solver_trials.set_solver(trial.step, prdp.Direct(), 1, 0.0)
     before = _C.count_factorisations()
-    trials.run(trial, prdp.Direct(), 3)
+    solver_trials.run(trial, prdp.Direct(), 3)
     assert _C.count_factorisations() - before == made
     told = "makes its factors or grids anew" if made == 3 else "made once and not counted"
-    assert told in "".join(trials.measure(step, u, [prdp.CG(1)], 0.1)[1])
+    assert told in "".join(solver_trials.measure(step, u, [prdp.CG(1)], 0.1)[1])
 
 
 def test_a_scene_says_what_share_its_physics_has():

@@ -46,3 +46,15 @@ def test_the_files_of_the_page_exist():
         if "NAME" not in name and not any((home / name).exists() or list(home.glob(f"*/{name}")) for home in homes)
     }
     assert not missing
+
+
+def named_in(section):
+    text = PAGE.split(f"\n## {section}\n")[1].split("\n## ")[0]
+    return {file for row in re.findall(r"^\| (`.*?) \|", text, re.MULTILINE) for file in re.findall(r"`(.*?)`", row)}
+
+
+@pytest.mark.parametrize("section, word", [("How to add a network", "resnet"), ("How to add a method", "bicgstab")])
+def test_whoever_adds_something_is_told_every_file_that_names_the_example(section, word):
+    sources = [*(ROOT / "csrc").rglob("*.*"), *(ROOT / "prdp_torch").rglob("*.py"), ROOT / "CMakeLists.txt"]
+    naming = {str(path.relative_to(ROOT)) for path in sources if word in path.read_text().lower()}
+    assert named_in(section) == naming

@@ -40,6 +40,25 @@ def test_project_takes_off_the_gradient_part_alone(dtype, bound, shape):
     assert ((u - v) * v).sum((1, 2, 3)).abs().max() < 1e2 * bound
 
 
+def test_sides_of_unequal_length_are_those_of_the_derivatives():
+    """Of u = (sin kx, cos ly) and its like, up to the error of a difference, dx² / 24 of the third derivative."""
+    (ly, lx), (ny, nx) = (0.5, 3.0), (64, 96)
+    y, x = torch.arange(ny, dtype=torch.float64)[:, None] * ly / ny, torch.arange(nx, dtype=torch.float64) * lx / nx
+    dy, dx, k, m = ly / ny, lx / nx, 2 * math.pi / lx, 4 * math.pi / ly
+    bound = 1.01 * (k**3 * dx**2 + m**3 * dy**2) / 24
+    along = torch.stack([torch.sin(k * x).expand(ny, nx), torch.cos(m * y).expand(ny, nx)])[None]
+    expected = k * torch.cos(k * (x + dx / 2)) - m * torch.sin(m * (y + dy / 2))
+    assert (fields.divergence(along, (ly, lx)) - expected).abs().max() < bound
+    across = along.flip(1)
+    expected = k * torch.cos(k * (x - dx / 2)) + m * torch.sin(m * (y - dy / 2))
+    assert (fields.curl(across, (ly, lx)) - expected).abs().max() < bound
+    # A velocity that flows through no cell stays as it is; a gradient goes as a whole.
+    v = fields.project(field((ny, nx), channels=2), (ly, lx))
+    assert fields.divergence(v, (ly, lx)).abs().max() < 1e-10
+    torch.testing.assert_close(fields.project(along, (ly, lx)), torch.zeros_like(along), rtol=0, atol=1e-12)
+    torch.testing.assert_close(fields.project(across, (ly, lx)), across, rtol=0, atol=1e-12)
+
+
 def test_fields_differentiate():
     u = field((3, 4), channels=2).requires_grad_()
     for f in (fields.divergence, fields.curl, fields.project):

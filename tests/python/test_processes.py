@@ -17,7 +17,7 @@ from helpers import tiny, written
 from torch import distributed
 
 import prdp_torch as prdp
-from prdp_torch import processes
+from prdp_torch import data_parallel
 from prdp_torch.experiments import cli, compare, records, scenes
 from prdp_torch.experiments.refinement import Refinement
 
@@ -219,7 +219,7 @@ def test_a_group_must_be_one():
         TypeError, match=r"PRDPController: process_group must be a group of torch.distributed, got 'all'"
     ):
         prdp.PRDPController(process_group="all")
-    assert processes.count() == 1 and processes.sums([1.5]) == [1.5]
+    assert data_parallel.count() == 1 and data_parallel.sums([1.5]) == [1.5]
 
 
 # ---- programs

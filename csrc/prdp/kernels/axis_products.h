@@ -7,7 +7,7 @@
 
 #include "prdp/kernels/loops.h"
 #include "prdp/threads/interruption.h"
-#include "prdp/threads/shared_rows.h"
+#include "prdp/threads/share_rows.h"
 
 namespace prdp::kernels {
 
@@ -61,7 +61,7 @@ class AxisProducts {
     for (int64_t first = 0; first < items; first += each) {
       const int64_t count = std::min(each, items - first);
       interruption::Watch::local().spend(count * work);
-      shared_rows::for_each((count + of_thread - 1) / of_thread, [&](int64_t part) {
+      share_rows::for_each((count + of_thread - 1) / of_thread, [&](int64_t part) {
         body(first + part * of_thread, std::min(of_thread, count - part * of_thread));
       });
     }

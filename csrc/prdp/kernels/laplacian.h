@@ -52,13 +52,13 @@ class Laplacian final : public Kernel<T> {
   }
   std::optional<double> radius() const override { return radius_; }
   void smooth(const T* b, const T* x, T* y, T p, T q) const override {
-    shared_rows::for_each(parts(), [&](int64_t i) {
+    share_rows::for_each(parts(), [&](int64_t i) {
       const auto [a, at] = part(i, apply_weights_);
       loops_.smooth[Dim - 1](a, b + at, x + at, y + at, p, q, T(1) / centre_);
     });
   }
   void residual(const T* b, const T* x, T* r) const override {
-    shared_rows::for_each(parts(), [&](int64_t i) {
+    share_rows::for_each(parts(), [&](int64_t i) {
       const auto [a, at] = part(i, apply_weights_);
       loops_.residual[Dim - 1](a, b + at, x + at, r + at);
     });

@@ -40,7 +40,7 @@ class MatrixKernel : public Kernel<T> {
   template <class Body>
   void for_each_part(int64_t work, const Body& body) const {
     const int64_t each = std::max<int64_t>(kBlock * n() / std::max<int64_t>(work, 1), 1);
-    shared_rows::for_each((n() + each - 1) / each, [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
+    share_rows::for_each((n() + each - 1) / each, [&](int64_t p) { body(p * each, std::min(n(), (p + 1) * each)); });
   }
 
   std::vector<T> diagonal_;

@@ -3,7 +3,7 @@
 
 #include "prdp/kernels/whole_vectors.h"
 #include "prdp/threads/interruption.h"
-#include "prdp/threads/shared_rows.h"
+#include "prdp/threads/share_rows.h"
 
 namespace prdp {
 
@@ -12,7 +12,7 @@ namespace prdp {
 template <class Body>
 void share_samples(int64_t size, int64_t unknowns, int64_t grain, const Body& body) {
   const bool by_rows = size < at::get_num_threads() && unknowns >= 4 * kernels::kBlock && !at::in_parallel_region();
-  const shared_rows::Scope rows(by_rows);
+  const share_rows::Scope rows(by_rows);
   if (by_rows) body(0, size);
   else interruption::parallel_for(0, size, grain, body);
 }

@@ -34,7 +34,7 @@ class Stencil final : public Kernel<T> {
   double norm() const override { return coefficients_.norm(); }
 
   void apply(const T* v, T* out) const override {
-    shared_rows::for_each(parts(), [&](int64_t p) {
+    share_rows::for_each(parts(), [&](int64_t p) {
       const auto [lines, at] = part(p);
       coefficients_.apply(lines, v + at, out + at, nullptr);
     });
@@ -55,7 +55,7 @@ class Stencil final : public Kernel<T> {
   }
   void divide_by_diagonal(const T* b, T* c) const override {
     const int64_t row = layout().row;
-    shared_rows::for_each(parts(), [&](int64_t p) {
+    share_rows::for_each(parts(), [&](int64_t p) {
       const auto [lines, at] = part(p);
       for (int64_t r = lines.begin; r < lines.end; ++r) {
         const T* d = coefficients_.coefficient(r, 0);
@@ -65,7 +65,7 @@ class Stencil final : public Kernel<T> {
   }
   void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T*) const override {
     for (; n > 0; --n, std::swap(x, y))
-      shared_rows::for_each(parts(), [&](int64_t p) {
+      share_rows::for_each(parts(), [&](int64_t p) {
         const auto [lines, at] = part(p);
         coefficients_.sweep(lines, c + at, x + at, y + at, nullptr);
       });
@@ -77,13 +77,13 @@ class Stencil final : public Kernel<T> {
     })[0];
   }
   void smooth(const T* b, const T* x, T* y, T p, T q) const override {
-    shared_rows::for_each(parts(), [&](int64_t i) {
+    share_rows::for_each(parts(), [&](int64_t i) {
       const auto [lines, at] = part(i);
       coefficients_.smooth(lines, b + at, x + at, y + at, p, q);
     });
   }
   void residual(const T* b, const T* x, T* r) const override {
-    shared_rows::for_each(parts(), [&](int64_t i) {
+    share_rows::for_each(parts(), [&](int64_t i) {
       const auto [lines, at] = part(i);
       coefficients_.residual(lines, b + at, x + at, r + at);
     });

@@ -6,7 +6,7 @@
 
 #include "prdp/kernels/field.h"
 #include "prdp/kernels/loops.h"
-#include "prdp/threads/shared_rows.h"
+#include "prdp/threads/share_rows.h"
 
 namespace prdp::kernels {
 
@@ -18,7 +18,7 @@ inline constexpr int64_t kBlock = 8192;
 template <class Body>
 void for_each_block_of(int64_t n, const Body& body) {
   if (n <= kBlock) return body(int64_t{0}, n);
-  shared_rows::for_each((n + kBlock - 1) / kBlock, [&](int64_t i) { body(i * kBlock, std::min(n, (i + 1) * kBlock)); });
+  share_rows::for_each((n + kBlock - 1) / kBlock, [&](int64_t i) { body(i * kBlock, std::min(n, (i + 1) * kBlock)); });
 }
 
 /// Calls body(begin, end) for runs of rows with n values each.
@@ -26,7 +26,7 @@ template <class Body>
 void for_each_run_of_rows(int64_t rows, int64_t n, const Body& body) {
   const int64_t each = std::max<int64_t>(kBlock / n, 1);
   if (rows <= each) return body(int64_t{0}, rows);
-  shared_rows::for_each((rows + each - 1) / each, [&](int64_t i) { body(i * each, std::min(rows, (i + 1) * each)); });
+  share_rows::for_each((rows + each - 1) / each, [&](int64_t i) { body(i * each, std::min(rows, (i + 1) * each)); });
 }
 
 template <class T>
@@ -68,7 +68,7 @@ std::array<T, Count> sums_over(int64_t parts, const Body& body) {
   T of_few[few * count] = {};
   std::vector<T> of_many(parts > few ? parts * count : 0);
   T* const of_parts = parts > few ? of_many.data() : of_few;
-  shared_rows::for_each(parts, [&](int64_t i) { body(i, of_parts + i * count); });
+  share_rows::for_each(parts, [&](int64_t i) { body(i, of_parts + i * count); });
   for (int64_t c = 0; c < count; ++c) {
     double sum = 0;
     for (int64_t i = 0; i < parts; ++i) sum += static_cast<double>(of_parts[i * count + c]);
@@ -114,7 +114,7 @@ class WholeVectors {
     if (n <= kBlock) return loops_.multi_dot(v, count, factor, w, h, n);
     const int64_t parts = (n + kBlock - 1) / kBlock;
     std::vector<T> of_parts(parts * count);
-    shared_rows::for_each(parts, [&](int64_t p) {
+    share_rows::for_each(parts, [&](int64_t p) {
       const int64_t i = p * kBlock;
       loops_.multi_dot(moved(v, count, i).data(), count, factor, w + i, of_parts.data() + p * count,
                        std::min(n - i, kBlock));

@@ -4,8 +4,8 @@
 
 #include <cmath>
 
-#include "prdp/operators/numbers_key.h"
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

@@ -5,7 +5,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
-#include "prdp/operators/numbers_key.h"
+#include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {

@@ -9,7 +9,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
-#include "prdp/operators/numbers_key.h"
+#include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/threads/interruption.h"
 

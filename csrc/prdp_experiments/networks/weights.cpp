@@ -60,11 +60,6 @@ void unpack_weights(const std::string& bytes, torch::nn::Module& network) {
   for (size_t i = 0; i < tensors.size(); ++i) weights[i].value().detach().copy_(tensors[i]);
 }
 
-void save_weights(const std::filesystem::path& path, const torch::nn::Module& network) {
-  const auto bytes = pack_weights(network);
-  write_whole({path, bytes});
-}
-
 void load_weights(const std::filesystem::path& path, torch::nn::Module& network) {
   const auto bytes = read_whole("weights", path);
   try {

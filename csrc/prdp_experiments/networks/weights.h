@@ -14,8 +14,7 @@ std::string pack_weights(const torch::nn::Module& network);
 /// whose names, sizes or dtype differ from those of the network, and for values that are not finite.
 void unpack_weights(const std::string& bytes, torch::nn::Module& network);
 
-/// The same with a file. Raise ValueError, naming the file, if it cannot be written or read.
-void save_weights(const std::filesystem::path& path, const torch::nn::Module& network);
+/// The same with a file. Raises ValueError, naming the file, if it cannot be read.
 void load_weights(const std::filesystem::path& path, torch::nn::Module& network);
 
 }  // namespace prdp

@@ -1,6 +1,6 @@
-#include "prdp/threads/shared_rows.h"
+#include "prdp/threads/share_rows.h"
 
-namespace prdp::shared_rows {
+namespace prdp::share_rows {
 
 namespace {
 thread_local bool wanted_here = false;
@@ -11,4 +11,4 @@ bool wanted() { return wanted_here; }
 Scope::Scope(bool wanted) : before_(std::exchange(wanted_here, wanted)) {}
 Scope::~Scope() { wanted_here = before_; }
 
-}  // namespace prdp::shared_rows
+}  // namespace prdp::share_rows

@@ -4,7 +4,7 @@
 #include "prdp/threads/interruption.h"
 
 /// Shares the work on one sample among threads, where a batch has fewer samples than there are threads.
-namespace prdp::shared_rows {
+namespace prdp::share_rows {
 
 /// Whether this thread shares its loops. Threads that help never do.
 bool wanted();
@@ -30,4 +30,4 @@ void for_each(int64_t count, const Body& body) {
   else some(0, count);
 }
 
-}  // namespace prdp::shared_rows
+}  // namespace prdp::share_rows
