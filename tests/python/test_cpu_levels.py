@@ -23,7 +23,7 @@ STENCILS = [
 SOLVE_ALL = """
 import sys; sys.path.insert(0, {folder!r})
 import io, torch
-from test_cpu_levels import solve_all
+from test_cpu_levels import long_double_works, solve_all
 buffer = io.BytesIO(); torch.save(solve_all(), buffer)
 assert long_double_works(), "long double"
 sys.stdout.buffer.write(buffer.getvalue())
