@@ -63,7 +63,7 @@ LIST = [
     refinement("burgers_2d", 3, 55),
     refinement("heat_2d", 3, 60),
     refinement("diffusion_inverse", 10, 5),
-    refinement("benchmarks/scenes/diffusion_inverse_256.toml", 1, 40, name="diffusion_inverse_256"),
+    refinement("benchmarks/scenes/diffusion_inverse_256.toml", 3, 90, name="diffusion_inverse_256"),
     refinement("kolmogorov", 3, 20),
     refinement("navier_stokes", 3, 300, "--rows converged prdp auto none"),
     study("data", "--seeds 5", 60),
@@ -78,7 +78,7 @@ LIST = [
     *(suite(name, 5) for name in ("change_of_k", "training", "memory")),
     *(
         Made(f"mosaic_{task}", f"-m benchmarks.mosaic {task} --limit 150", 60, f"{task}.json", f"flows/{task}.json")
-        for task in ("forward", "cost", "gradient", "horizon", "conduction")
+        for task in ("forward", "cost", "gradient", "horizon", "design", "recovery", "conduction")
     ),
     Made("atlas", "-m prdp_torch stability", 3, "*", "stability"),
 ]
