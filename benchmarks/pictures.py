@@ -34,7 +34,7 @@ def all_of_them():
         yield stability / f"{name}.png", 110, partial(atlas, name, stability / f"{name}.json")
     for part in page.sections(performance()):
         yield DOCS / "performance" / f"{part['name']}.png", 130, partial(as_it_is, part["figure"])
-    for task in ("cost", "conduction"):
+    for task in ("cost", "design", "recovery", "conduction"):
         for name, figure in mosaic_charts.of(task, read(DOCS / "flows" / f"{task}.json")["rows"]).items():
             yield DOCS / "flows" / f"{name}.png", 110, partial(as_it_is, figure)
 
