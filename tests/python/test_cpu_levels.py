@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 import torch
 from helpers import SOLVERS, field
 
@@ -76,6 +77,17 @@ def test_every_level_gives_the_same_results_to_rounding():
             rtol, atol = (1e-4, 1e-6) if u.dtype == torch.float32 else (1e-11, 1e-13)
             torch.testing.assert_close(results[case], u, rtol=rtol, atol=atol)
     assert "baseline" in ran
+
+
+@pytest.mark.parametrize("level", ["baseline", "x86-64-v3"])
+def test_hard_systems_are_solved_on_lower_levels_too(level):
+    """What ends at rounding, as these systems do, ends elsewhere with other instructions."""
+    folder = os.path.dirname(__file__)
+    files = [os.path.join(folder, name) for name in ("test_gmres.py", "test_stability.py")]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
+    done = subprocess.run(command, env={**os.environ, "PRDP_CPU_LEVEL": level}, capture_output=True, text=True)
+    missing = level != "baseline" and f"this processor has no level '{level}'" in done.stdout
+    assert done.returncode == 0 or missing, done.stdout
 
 
 def test_an_unknown_level_is_named_with_those_that_exist():

@@ -114,7 +114,7 @@ def test_a_singular_inconsistent_system_breaks_down_with_the_least_residual():
 @pytest.mark.parametrize("tensors", [False, True], ids=["loops", "tensors"])
 def test_a_matrix_of_condition_2e6_is_solved_as_far_as_float32_goes(tensors):
     """Nonnormal, with ε ‖A‖ ‖u‖ a tenth of ‖b‖ and more, where Direct reaches 1e-2."""
-    for seed in range(50):
+    for seed in range(150):
         generator = torch.Generator().manual_seed(seed)
         left, right = (torch.linalg.qr(torch.randn(8, 8, generator=generator, dtype=torch.float64))[0] for _ in "ab")
         matrix = (left @ torch.diag(torch.logspace(0, -6.3, 8, dtype=torch.float64)) @ right).float()

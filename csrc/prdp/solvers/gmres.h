@@ -103,7 +103,7 @@ class GmresMethod {
       space_.apply(space_.is_preconditioned() ? z_ : u_[j], u_[j + 1]);
       if (space_.derivatives() > 0) products_[j] = u_[j + 1];
       problem_.add_column(j, orthogonalise(j));
-      if (space_.surely_all(problem_.exhausted())) return j + 1;
+      if (space_.surely_all(problem_.ended(j))) return j + 1;
     }
     return m_;
   }

@@ -24,6 +24,7 @@ class HessenbergProblem {
   /// Begins a cycle with v₀ = r/‖r‖.
   void begin(const Scalar& length) {
     columns_[0].g = length;
+    solved2_ = length * length * 1e-6;
     columns_[0].inverse_length = numbers_.inverse(length, length);
     exhausted_ = numbers_.is_zero(length);
   }
@@ -32,11 +33,11 @@ class HessenbergProblem {
   /// Takes column j, once it is filled; `length` is ‖A v_j‖.
   void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
-    const Scalar inverse = numbers_.inverse(h(j + 1, j), scale_);
-    h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(inverse);
-    exhausted_ = exhausted_ + numbers_.is_zero(inverse);
-    columns_[j + 1].inverse_length = inverse;
+    exhausted_ = exhausted_ + numbers_.is_zero(numbers_.inverse(h(j + 1, j), scale_));
+    h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(numbers_.inverse(h(j + 1, j), scale_ * kOneUnit));
+    const Scalar next = h(j + 1, j);
     rotate(j);
+    columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(columns_[j + 1].g));
   }
   /// Where y takes a step so long that its rounding exceeds ‖r‖ = size, A is singular to the dtype, and y is damped.
   void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
@@ -66,8 +67,10 @@ class HessenbergProblem {
   Scalar& y(int64_t j) { return columns_[j].y; }
   /// 1 over the length of what v_j was before it was scaled; 0 where that was rounding.
   const Scalar& inverse_length(int64_t j) const { return columns_[j].inverse_length; }
-  /// Not zero where the Krylov space could not be extended: it holds all that A reaches.
+  /// Not zero where the Krylov space could hardly be extended: it holds all that A reaches, but for rounding.
   const Scalar& exhausted() const { return exhausted_; }
+  /// Not zero where column j is the last.
+  Scalar ended(int64_t j) const { return numbers_.is_zero(columns_[j + 1].inverse_length); }
   /// The largest ‖A v‖ so far: what is rounding beside it is zero.
   Scalar& scale() { return scale_; }
 
@@ -81,8 +84,16 @@ class HessenbergProblem {
     Scalar inverse{};  // 1/R_jj, or zero
     Scalar g{}, y{};
   };
+  static constexpr double kOneUnit = 1.0 / 16;  // numbers vanish at sixteen units of rounding
+
   Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
 
+  /// What a number that belongs to residual g has to exceed: sixteen units of rounding, where a singular A and an
+  /// exhausted space leave noise, but one unit while the residual is not solved for: what is left of a nearly singular
+  /// A is in these numbers, and minimise() sees to it that y stays short.
+  Scalar rounding(const Scalar& g) const {
+    return scale_ - numbers_.is_larger(g * g, solved2_) * scale_ * (1 - kOneUnit);
+  }
   /// Turns column j of h into one of R, and g along with it.
   void rotate(int64_t j) {
     using std::sqrt;
@@ -94,9 +105,7 @@ class HessenbergProblem {
     }
     Column& c = columns_[j];
     const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
-    // 0 where A is singular on the space. One unit of rounding, not the sixteen of a vector that vanishes: what is left
-    // of R_jj is all that a nearly singular A has, and minimise() sees to it that y stays short.
-    c.inverse = numbers_.inverse(diagonal, scale_ * 0.0625);
+    c.inverse = numbers_.inverse(diagonal, rounding(c.g));  // 0 where A is singular on the space
     c.cos = h(j, j) * c.inverse;
     c.sin = h(j + 1, j) * c.inverse;
     h(j, j) = diagonal;
@@ -120,6 +129,7 @@ class HessenbergProblem {
   std::vector<Scalar> h_;  // by columns, R once rotated
   std::vector<Column> columns_;
   Scalar exhausted_{}, scale_{};
+  Scalar solved2_{};  // ‖r‖² of a cycle that solves
 };
 
 }  // namespace prdp

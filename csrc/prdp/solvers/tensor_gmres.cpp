@@ -21,6 +21,7 @@ struct HostNumbers {
     return value <= 16 * epsilon * std::abs(scale) || value < negligible ? 0.0 : 1.0 / value;
   }
   double larger(double a, double b) const { return std::max(a, b); }
+  double is_larger(double a, double b) const { return a > b; }
   double is_zero(double value) const { return value == 0.0; }
   double is_not_zero(double value) const { return value != 0.0; }
   bool surely_all(double value) const { return value != 0.0; }
@@ -120,7 +121,7 @@ at::Tensor TensorGmres::minimise() {
     problem.scale() = scale_[sample];
     problem.begin(length);
     int64_t columns = 0;
-    while (columns < m_ && !(columns > 0 && problem.exhausted() != 0.0)) {
+    while (columns < m_ && !(columns > 0 && problem.ended(columns - 1) != 0.0)) {
       double* column = problem.column(columns);
       double square = 0.0;
       for (int64_t i = 0; i <= columns + 1; ++i) {
