@@ -120,7 +120,7 @@ std::optional<SolveInfo> look(const UnseenReport& report, const UnseenNumbers& l
 }  // namespace
 
 bool never_waits(const at::Tensor& b, const Solver& solver) {
-  return goes_unseen(b, solver) && solver.method != Method::kBiCGStab;
+  return goes_unseen(b, solver) && !traits(solver.method).starts_anew;
 }
 
 std::optional<SolveResult> solve_unseen(const Operator& a, const at::Tensor& b, const SolveRequest& request) {

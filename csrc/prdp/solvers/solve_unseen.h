@@ -11,7 +11,7 @@ namespace prdp {
 /// than zero.
 ///
 /// Unless request.may_wait, the host never waits. The report then lies on the device. Samples that ran away or ended
-/// worse than zero are zero, with 0 iterations. BiCGStab may have to start anew, and waits all the same.
+/// worse than zero are zero, with 0 iterations. A method that may start anew waits all the same.
 std::optional<SolveResult> solve_unseen(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
 /// Whether the host never waits for such a solve if it need not.

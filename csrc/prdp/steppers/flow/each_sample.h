@@ -1,7 +1,9 @@
 #pragma once
-#include <ATen/Parallel.h>
+#include <ATen/ATen.h>
 
 #include <algorithm>
+
+#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -10,10 +12,10 @@ template <class F>
 void for_each_sample(const at::Tensor& batch, const F& f) {
   constexpr int64_t values_of_thread = 32768;
   const int64_t samples = batch.size(0), values = samples ? batch.numel() / samples : 0;
-  at::parallel_for(0, samples, std::max<int64_t>(1, values_of_thread / std::max<int64_t>(1, values)),
-                   [&](int64_t begin, int64_t end) {
-                     for (int64_t s = begin; s < end; ++s) f(s);
-                   });
+  const int64_t grain = std::max<int64_t>(1, values_of_thread / std::max<int64_t>(1, values));
+  interruption::parallel_for(0, samples, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t s = begin; s < end; ++s) f(s);
+  });
 }
 
 }  // namespace prdp
