@@ -174,3 +174,29 @@ def test_a_network_around_an_own_step_could_be_captured():
     theta = torch.tensor(0.7, dtype=F64, requires_grad=True)
     (expected,) = torch.autograd.grad(step.rollout(theta * noise(3, 1, *SHAPE), 2).square().sum(), theta)
     torch.testing.assert_close(device.fetch(found), expected, rtol=rounding(F64), atol=0)
+
+
+@pytest.mark.parametrize("solver", [prdp.Multigrid, lambda k, rtol: prdp.CG(k, rtol, preconditioner="multigrid")])
+def test_multigrid_waits_for_its_grids_alone(solver):
+    """Once to see the shape of A, once for each of three grids: however many cycles there are."""
+    make, c = OPERATORS["stencil"]
+    b = noise(4, 1, *SHAPE)
+    for k in (2, 5):
+        run = Run(make, c, b, solver(k, 0.0), on_failure="return")
+        assert (run.forward, run.backward, run.from_host) == (4, 4, 0)
+        u, info = prdp.linear_solve(make(c), b, solver(k, 0.0), on_failure="return")
+        torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
+        assert torch.equal(run.device.fetch(run.info.status), info.status)
+
+
+def test_operations_of_a_cycle_and_of_its_grids():
+    """On 64² cells, with five grids. What A is, sixteen products tell."""
+    coefficients = torch.tensor([4.3, -1, -1, -1, -1], dtype=F64).view(1, 5, 1, 1).expand(1, 5, 64, 64).contiguous()
+    launched = {}
+    for k in (1, 2):
+        with StandIn() as device:
+            a = operators.Stencil(device.send(coefficients), OFFSETS, "periodic")
+            prdp.linear_solve(a, device.send(noise(1, 1, 64, 64)), prdp.Multigrid(k, 0.0), on_failure="return")
+            launched[k] = device.launched()
+    cycle = launched[2] - launched[1]
+    assert cycle <= 300 and launched[1] - cycle <= 2000, launched

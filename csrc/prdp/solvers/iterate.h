@@ -39,7 +39,7 @@ void run(Space& space, Method& method, typename Space::States& states, double rt
     if (!any_active) return;
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
     int64_t n = 1;
-    if constexpr (kMayGoUnseen<Space, Method>) {
+    if constexpr (kMayGoUnseen<Space, Method> && !kContracts<Method>) {  // whose iterations are many and cheap
       if (space.is_far() && track && watched <= 0 &&
           (rtol == 0.0 || std::none_of(states.begin(), states.end(), is_idle<Method>))) {
         const int64_t some = std::min(stride(states, /*track=*/false), unseen);

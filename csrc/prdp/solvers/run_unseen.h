@@ -24,10 +24,9 @@ inline constexpr int64_t kLongestUnseen = 16;
 
 namespace detail {
 
-/// Spaces on another device, and methods whose iterations are many and cheap.
+/// Spaces on another device, and methods whose host takes no part.
 template <class Space, class Method>
-inline constexpr bool kMayGoUnseen =
-    requires(Space& space) { space.look_back(); } && !kLeastResidual<Method> && !kContracts<Method>;
+inline constexpr bool kMayGoUnseen = requires(Space& space) { space.look_back(); } && !kLeastResidual<Method>;
 
 /// What a look after one of these iterations would have said of a sample: whether it goes on or claims to have
 /// converged. False where it is neither.

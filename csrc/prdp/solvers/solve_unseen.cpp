@@ -19,7 +19,7 @@ constexpr int64_t kMostUnseen = 4096;
 bool goes_unseen(const at::Tensor& b, const Solver& solver) {
   const auto& method = traits(solver.method);
   return !b.is_cpu() && solver.rtol == 0.0 && !method.is_direct && method.counts == Counts::kIterations &&
-         solver.method != Method::kMultigrid && solver.max_iter.maybe_as_int().value_or(kMostUnseen + 1) <= kMostUnseen;
+         solver.max_iter.maybe_as_int().value_or(kMostUnseen + 1) <= kMostUnseen;
 }
 
 constexpr int64_t code(SolveStatus status) { return static_cast<int64_t>(status); }

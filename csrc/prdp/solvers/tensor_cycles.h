@@ -4,11 +4,13 @@
 
 #include "prdp/operators/operator.h"
 #include "prdp/solvers/tensor_stencil.h"
+#include "prdp/solvers/tensor_transfer.h"
 
 namespace prdp {
 
-/// The V-cycle of kernels/multigrid.h in plain tensor operations, for devices without loops. Coarse operators are
-/// probed: products with vectors that are one on every third point tell their stencils.
+/// The V-cycle of kernels/multigrid.h in plain tensor operations, for devices without loops. Products with vectors that
+/// are one on every third point tell the stencil of A. The host looks at the device once to see its shape, and once for
+/// each coarser grid, to choose the axes.
 class TensorCycles {
  public:
   /// For `a` on a grid, or for Aᵀ, and vectors like b, with `smoothing` steps before and after each coarse grid.
@@ -18,26 +20,17 @@ class TensorCycles {
   at::Tensor apply(const at::Tensor& v, bool transposed) const { return cycle(0, v, transposed); }
 
  private:
-  /// One axis with every second point dropped. Weights are those of the points between, for the coarse point before
-  /// and for the one after.
-  struct Transfer {
-    int64_t axis, fine, coarse;  // the axis from the end; points along it
-    bool periodic;
-    at::Tensor order;  // of the coarse points and those between, as they lie on the fine axis
-    struct {
-      at::Tensor before, after;
-    } interpolation, restriction;
+  /// x ← x + p (x - x₋) + w (b - A x)
+  struct Smoothing {
+    double p;
+    at::Tensor w;  // q D⁻¹, (batch or 1, 1, *shape)
   };
   struct Level {
     TensorStencil a, transpose;
-    at::Tensor inverse_diagonal;                    // (batch or 1, 1, *shape)
-    std::vector<std::array<at::Tensor, 2>> steps;   // p and q of each smoothing step, (batch or 1, 1, …)
-    std::vector<Transfer> transfers;                // to the next level; empty on the last
+    std::vector<Smoothing> steps;
+    std::vector<TensorTransfer> transfers;  // to the next level; empty on the last
   };
 
-  static Transfer make_transfer(const TensorStencil& a, const TensorStencil& transpose, int64_t axis);
-  static at::Tensor interpolate(const Transfer& t, const at::Tensor& coarse, bool transposed);
-  static at::Tensor restrict(const Transfer& t, const at::Tensor& fine, bool transposed);
   at::Tensor cycle(size_t l, const at::Tensor& b, bool transposed) const;
 
   std::vector<Level> levels_;

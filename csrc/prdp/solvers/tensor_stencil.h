@@ -20,18 +20,20 @@ struct TensorStencil {
 
   int64_t dim() const { return static_cast<int64_t>(shape.size()); }
   at::Tensor apply(const at::Tensor& v) const;
+  /// b - A v
+  at::Tensor residual(const at::Tensor& b, const at::Tensor& v) const;
   TensorStencil transposed() const;
   const at::Tensor& diagonal() const { return entries[0].coefficient; }
+  /// All coefficients, (entry, batch or 1, *shape).
+  at::Tensor coefficients() const;
 };
 
 /// At i, what t (…, *shape) holds at i + offset; zeros beyond the ends of an axis that is not periodic.
 at::Tensor neighbours(const at::Tensor& t, const TensorStencil& like, const std::vector<int64_t>& offset);
 
 /// The stencil that a product consists of, by products with vectors that are one on every third point. `product`
-/// takes (batch, 1, *shape) with the batch of the operator to the same. Without `periodic`, an axis is periodic if its
-/// ends couple.
+/// takes (batch, 1, *shape) with the batch of the operator to the same. An axis is periodic if its ends couple.
 TensorStencil probe(const std::function<at::Tensor(const at::Tensor&)>& product, int64_t batch,
-                    const std::vector<int64_t>& shape, const at::TensorOptions& options,
-                    const std::vector<bool>* periodic = nullptr);
+                    const std::vector<int64_t>& shape, const at::TensorOptions& options);
 
 }  // namespace prdp
