@@ -77,8 +77,9 @@ struct Entry {
 };
 
 std::mutex mutex;
-std::list<Entry> entries;  // the last used first
-std::unordered_map<Name, std::list<Entry>::iterator, HashOfName> places;
+// Never destroyed: at the end of a process, memory of a device can no longer be freed.
+auto& entries = *new std::list<Entry>;  // the last used first
+auto& places = *new std::unordered_map<Name, std::list<Entry>::iterator, HashOfName>;
 int64_t bytes_of_all = 0;
 std::atomic<int64_t> made = 0;
 

@@ -108,7 +108,7 @@ Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, co
                               "linear_solve: this operator has a multigrid preconditioner on the ",
                               "CPU alone, got vectors on ", b.device(), "; take GMRES without it");
   const bool transposed = preconditioner.spec().transposed;
-  const auto cycles = std::make_shared<TensorCycles>(a, transposed, preconditioner.smoothing(), like);
+  const auto cycles = TensorCycles::find_or_make(a, transposed, preconditioner.smoothing(), like);
   return [cycles, transposed](const at::Tensor& v) { return cycles->apply(v, transposed); };
 }
 

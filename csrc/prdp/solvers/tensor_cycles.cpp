@@ -3,6 +3,7 @@
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/kernels/coarsening.h"
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -18,19 +19,59 @@ std::vector<int> axes_to_coarsen(const TensorStencil& a, const at::Tensor& magni
   return kernels::axes_to_coarsen(a.shape, coupling);
 }
 
+/// A v, or Aᵀ v, for v (batch, 1, *shape) that every channel takes; its first channel.
+at::Tensor product(const Operator& a, bool of_transpose, int64_t channels, const at::Tensor& v) {
+  auto sizes = v.sizes().vec();
+  sizes[1] = channels;
+  const auto wide = v.expand(sizes);
+  return (of_transpose ? a.apply_transpose(wide) : a.apply(wide)).narrow(1, 0, 1).detach();
+}
+
+int64_t batch_of(const Operator& a) {
+  const auto norm = a.norm();
+  return norm.dim() == 0 ? 1 : norm.size(0);
+}
+
+/// Sums of the bits of a tensor, each times a number that belongs to its place.
+at::Tensor fingerprint(const at::Tensor& t) {
+  const auto bits = t.contiguous().view(t.scalar_type() == at::kFloat ? at::kInt : at::kLong).flatten().to(at::kLong);
+  auto places = at::arange(1, bits.numel() + 1, bits.options()) * 0x1e3779b97f4a7c15;
+  places = places.bitwise_xor(places.bitwise_right_shift(29)) * 0x3f58476d1ce4e5b9;
+  return at::stack({(bits * places).sum(), (bits.bitwise_xor(places) * places).sum()});
+}
+
+/// Tells A by its product with a vector that has no pattern.
+kernels::FactorKey key_of(const Operator& a, bool of_transpose, int64_t smoothing, const at::Tensor& b) {
+  const auto shape = b.sizes().slice(2);
+  auto sizes = shape.vec();
+  sizes.insert(sizes.begin(), {batch_of(a), 1});
+  const auto places = at::arange(b[0][0].numel(), b.options().dtype(at::kDouble));
+  const auto v = places.square().sin().to(b.scalar_type()).view(shape).expand(sizes);
+  const auto told = fingerprint(product(a, of_transpose, b.size(1), v)).to(at::kCPU);
+  return kernels::FactorKeyMaker()
+      .add(told.const_data_ptr<int64_t>(), 2)
+      .add(sizes.data(), static_cast<int64_t>(sizes.size()))
+      .add(smoothing)
+      .add(static_cast<int64_t>(b.scalar_type()))
+      .add(static_cast<int64_t>(b.device().index()))
+      .add(static_cast<int64_t>(b.device().type()))
+      .key();
+}
+
 }  // namespace
+
+std::shared_ptr<const TensorCycles> TensorCycles::find_or_make(const Operator& a, bool of_transpose, int64_t smoothing,
+                                                               const at::Tensor& b) {
+  const at::NoGradGuard no_grad;
+  return factor_cache::find_or_make<TensorCycles>(key_of(a, of_transpose, smoothing, b), [&] {
+    return std::make_shared<TensorCycles>(a, of_transpose, smoothing, b);
+  });
+}
 
 TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothing, const at::Tensor& b) {
   const at::NoGradGuard no_grad;
-  const auto norm = a.norm();
-  const int64_t batch = norm.dim() == 0 ? 1 : norm.size(0), channels = b.size(1);
-  const auto product = [&](const at::Tensor& v) {
-    auto sizes = v.sizes().vec();
-    sizes[1] = channels;
-    const auto wide = v.expand(sizes);
-    return (of_transpose ? a.apply_transpose(wide) : a.apply(wide)).narrow(1, 0, 1).detach();
-  };
-  auto stencil = probe(product, batch, b.sizes().slice(2).vec(), b.options());
+  const auto apply = [&](const at::Tensor& v) { return product(a, of_transpose, b.size(1), v); };
+  auto stencil = probe(apply, batch_of(a), b.sizes().slice(2).vec(), b.options());
   for (;;) {
     auto& level = levels_.emplace_back();
     level.a = stencil;
@@ -57,6 +98,17 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
   const auto columns = last.apply(at::eye(n, b.options()).view(unit)).flatten(2).mT();
   const double tiny = 10.0 * static_cast<double>(n) * epsilon_of(b);
   coarsest_inverse_ = at::linalg_pinv(columns.to(at::kDouble).nan_to_num(0.0, 0.0, 0.0), tiny).to(b.scalar_type());
+}
+
+int64_t TensorCycles::bytes() const {
+  auto sum = static_cast<int64_t>(coarsest_inverse_.nbytes());
+  for (const auto& level : levels_) {
+    const auto field = static_cast<int64_t>(level.a.diagonal().nbytes());
+    const auto coefficients = static_cast<int64_t>(level.a.entries.size());
+    // Those of the transpose, and of the operators between two axes, are as many again.
+    sum += field * (3 * coefficients + static_cast<int64_t>(level.steps.size()));
+  }
+  return sum;
 }
 
 at::Tensor TensorCycles::cycle(size_t l, const at::Tensor& b, bool transposed) const {
