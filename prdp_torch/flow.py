@@ -116,6 +116,15 @@ class Flow(Stepper):
         self._keep(found[1:], self._adjoint_log)
         return found[0]
 
+    def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
+        _check.dense("Flow", "u", u)
+        log = self._adjoint_log.number
+        found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
+        self._keep(found[1:], self._adjoint_log)
+        d = len(self.shape)
+        return found[0][:, :d], found[0][:, d:]
+
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
 

@@ -65,6 +65,12 @@ void bind_flow(py::module_& m) {
           },
           py::arg("u"), py::arg("options"), py::arg("max_iter"), py::arg("adjoint_log"))
       .def(
+          "step_and_pressure",
+          [](const FlowEquation& e, const at::Tensor& u, const SolveOptions& options, int64_t k, int64_t log) {
+            return report([&] { return flow_next_and_pressure(e, u, with(options, k, log)); });
+          },
+          py::arg("u"), py::arg("options"), py::arg("max_iter"), py::arg("adjoint_log"))
+      .def(
           "rollout",
           [](const FlowEquation& e, const at::Tensor& u, int64_t steps, const SolveOptions& options, int64_t k,
              int64_t log) { return report([&] { return flow_rollout(e, u, steps, with(options, k, log)); }); },

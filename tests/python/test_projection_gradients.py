@@ -87,6 +87,54 @@ def test_project_and_pressure_have_them_too(name):
     assert gradcheck(both, used(name, inputs(name)))
 
 
+@pytest.mark.parametrize("diffusion", ["implicit", "explicit"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_and_its_pressure_at_once(name, diffusion):
+    def both(u, nu, force, inflow=None):
+        if diffusion == "explicit":
+            nu = 0.05 * nu
+        return make(name, nu, force, inflow, diffusion=diffusion).step_and_pressure(u)
+
+    u, nu, force, inflow = inputs(name)
+    flow = make(name, nu, force, inflow, diffusion=diffusion) if diffusion == "implicit" else None
+    if flow is not None:
+        found = flow.step_and_pressure(u)
+        assert torch.equal(found[0], flow(u)) and torch.equal(found[1], flow.pressure(u))
+        assert found[1].shape == (2, 1, *CASES[name]["shape"])
+        grads = torch.autograd.grad(found[0].square().sum() + found[1].square().sum(), u)
+        assert flow.adjoint_info.iterations.shape == (2,) and grads[0].isfinite().all()
+    assert gradcheck(both, used(name, inputs(name)))
+
+
+def test_second_derivatives_with_the_pressure():
+    def both(u, nu, force):
+        return make("walls", nu, force, None).step_and_pressure(u)
+
+    assert gradgradcheck(both, inputs("walls", batch=1)[:3])
+
+
+def test_unrolled_gradients_with_the_pressure():
+    few = prdp.CG(2, rtol=0.0, preconditioner="diagonal")
+
+    def both(u, nu, force):
+        return make("walls", nu, force, None, solver=few, backward="unrolled", adjoint_rtol=None).step_and_pressure(u)
+
+    assert gradcheck(both, inputs("walls", batch=1)[:3])
+
+
+def test_a_failed_sample_has_a_state_and_a_pressure_of_zero_and_no_gradient():
+    u, nu, force, _ = inputs("walls")
+    flow = make("walls", nu, force, None, on_failure="zero_grad")
+    broken = u.detach().clone()
+    broken[1, 0, 2, 2] = torch.nan
+    broken.requires_grad_()
+    state, pressure = flow.step_and_pressure(broken)
+    assert (state[1] == 0).all() and (pressure[1] == 0).all()
+    torch.testing.assert_close(pressure[:1], flow.pressure(u)[:1])
+    (found,) = torch.autograd.grad(state.square().sum() + pressure.square().sum(), broken)
+    assert found.isfinite().all() and (found[1] == 0).all() and (found[0] != 0).any()
+
+
 def test_second_derivatives():
     def states(u, nu, force):
         return make("walls", nu, force, None).rollout(u, 2)

@@ -60,7 +60,7 @@ class Ours:
             for _ in range(cylinder.steps):
                 inflow = u.clone()
                 inflow[:, 0, :, 0], inflow[:, 1, :, 0] = profile, 0.0
-                u, pressure = self.flow(inflow), self.flow.pressure(inflow)
+                u, pressure = self.flow.step_and_pressure(inflow)
                 drags.append(cylinder.drag(0.5 * (u[0, 0] + u[0, 0].roll(-1, -1)), pressure[0, 0]))
             mean = torch.stack(drags[cylinder.steps // 2 :]).mean()
             mean.backward()

@@ -27,8 +27,7 @@ at::Tensor flow_project(const FlowEquation& equation, const at::Tensor& u, const
 }
 
 at::Tensor flow_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  equation.check(u);
-  return flow_step(equation, u, without_log(options)).potential / equation.dt;
+  return flow_next_and_pressure(equation, u, without_log(options)).u.narrow(1, equation.box->dim(), 1);
 }
 
 at::Tensor flow_divergence_of_state(const FlowEquation& equation, const at::Tensor& u) {
@@ -50,6 +49,13 @@ at::Tensor Flow::operator()(const at::Tensor& u) {
   auto [next, info] = flow_next(equation_, u, options_);
   info_ = std::move(info);
   return next;
+}
+
+std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
+  auto [both, info] = flow_next_and_pressure(equation_, u, options_);
+  info_ = std::move(info);
+  const int64_t d = equation_.box->dim();
+  return {both.narrow(1, 0, d), both.narrow(1, d, 1)};
 }
 
 at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {

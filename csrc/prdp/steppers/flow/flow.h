@@ -1,4 +1,6 @@
 #pragma once
+#include <utility>
+
 #include "prdp/steppers/flow/equation.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/steppers/steppers.h"
@@ -27,6 +29,8 @@ class Flow : public StepperBase {
   Flow(FlowEquation equation, SolveOptions options);
 
   at::Tensor operator()(const at::Tensor& u);
+  /// The next state and the pressure of the step, (batch, 1, *shape).
+  std::pair<at::Tensor, at::Tensor> step_and_pressure(const at::Tensor& u);
   /// Returns all states, u included: (batch, steps + 1, d, *shape). info() and adjoint_info() then hold tensors
   /// (batch, steps). It keeps one state per step for the backward pass.
   at::Tensor rollout(const at::Tensor& u, int64_t steps);

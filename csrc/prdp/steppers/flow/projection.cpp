@@ -71,10 +71,12 @@ Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& o
   return {add_gradient(box, u, phi, -1.0, box.fields(u.options()).free), phi};
 }
 
-at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const SolveOptions& options,
-                       CombinedInfo& info) {
+at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at::Tensor& of_potential,
+                       const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
-  const auto phi_bar = without_means(box, flow_divergence(box, masked(cotangent, fields.free)));
+  auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
+  if (of_potential.defined()) phi_bar = phi_bar + masked(of_potential, fields.cells);
+  phi_bar = without_means(box, phi_bar);
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
   return add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of(box), {});

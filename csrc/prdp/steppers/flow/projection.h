@@ -13,8 +13,9 @@ struct Projected {
   at::Tensor u, potential;
 };
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info);
-/// The cotangent of u from that of the projected one: the same projection, by one adjoint solve.
-at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const SolveOptions& options,
-                       CombinedInfo& info);
+/// The cotangent of u from that of the projected one, the same projection, and from that of φ, if it is defined: by one
+/// adjoint solve.
+at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at::Tensor& of_potential,
+                       const SolveOptions& options, CombinedInfo& info);
 
 }  // namespace prdp

@@ -58,14 +58,14 @@ std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<a
 }
 
 /// The same by differentiating the step as it is written; for derivatives of derivatives.
-std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
+std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                      SolveOptions options, at::IntArrayRef needed) {
   options.adjoint_log = 0;
   const auto given = equation.tensors();
   std::vector<at::Tensor> inputs{input_of(u, needed[0])};
   for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
   const auto step = flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, false);
-  return gradients({step.u}, {cotangent}, inputs, needed, /*create_graph=*/true);
+  return gradients({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed, /*create_graph=*/true);
 }
 
 /// The gradients of u, ν, force and inflow from the cotangents of the velocity with its boundary values, of its change,
@@ -113,7 +113,7 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   CombinedInfo info;
   const auto diffused = is_implicit(e) ? diffuse(e, change, options, info) : change;
   const auto [next, potential] = project(*e.box, velocity + diffused, options, info);
-  FlowStep step{cleared(next, refused.mask), potential, info.info()};
+  FlowStep step{cleared(next, refused.mask), cleared(potential, refused.mask), info.info()};
   if (refused.mask.defined()) {
     step.info.status = at::where(refused.mask, refused.status, step.info.status);
     step.info.residual = step.info.residual.masked_fill(refused.mask, std::numeric_limits<double>::infinity());
@@ -121,14 +121,17 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   return step;
 }
 
-std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent,
+std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
   if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
   const auto e = equation.for_state(u);
   const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
   const auto& box = *e.box;
   CombinedInfo adjoint;
-  const auto velocity_bar = project_vjp(box, cleared(cotangent, refused), options, adjoint);
+  const auto& of_potential = cotangent.potential;
+  const auto velocity_bar =
+      project_vjp(box, cleared(cotangent.u, refused),
+                  of_potential.defined() ? cleared(of_potential, refused) : of_potential, options, adjoint);
   const auto& free = box.fields(u.options()).free;
   DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
   if (is_implicit(e)) {

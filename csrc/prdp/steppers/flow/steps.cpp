@@ -19,11 +19,13 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
+enum class Returned { kNext, kNextAndPressure, kStates };
+
 /// What travels from the forward to the backward pass beside tensors.
 struct Call : torch::CustomClassHolder {
   FlowEquation equation;
   int64_t steps;
-  bool all_states;
+  Returned returned;
   SolveOptions options;
 };
 
@@ -31,12 +33,14 @@ struct Call : torch::CustomClassHolder {
 at::Tensor or_empty(const at::Tensor& t, const at::Tensor& u) { return t.defined() ? t : at::empty({0}, u.options()); }
 at::Tensor or_undefined(const at::Tensor& t) { return t.numel() == 0 ? at::Tensor() : t; }
 
-/// The states u, …, and the reports of the steps.
-SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps, bool all_states,
+at::Tensor with_pressure(const FlowStep& step, double dt) { return at::cat({step.u, step.potential / dt}, 1); }
+
+/// What is to be returned, and the reports of the steps.
+SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Returned returned,
                 const SolveOptions& options) {
-  if (!all_states) {
+  if (returned != Returned::kStates) {
     auto step = flow_step(equation, u, options);
-    return {step.u, step.info};
+    return {returned == Returned::kNext ? step.u : with_pressure(step, equation.dt), step.info};
   }
   auto sizes = u.sizes().vec();
   sizes.insert(sizes.begin() + 1, steps + 1);
@@ -61,12 +65,12 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                                const at::Tensor& inflow, const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
     const auto equation = call->equation.with_tensors({nu, or_undefined(force), or_undefined(inflow)});
-    const auto [out, info] = run(equation, u, call->steps, call->all_states, call->options);
+    const auto [out, info] = run(equation, u, call->steps, call->returned, call->options);
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
-    ctx->save_for_backward(
-        {call->all_states ? out : u, nu, force, inflow, may_have_failed ? info.status : at::Tensor()});
+    ctx->save_for_backward({call->returned == Returned::kStates ? out : u, nu, force, inflow,
+                            may_have_failed ? info.status : at::Tensor()});
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {out, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
   }
@@ -80,8 +84,9 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     std::vector<int64_t> needed(4);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
-      return call->all_states ? back_through_all(equation, saved[0], saved[4], cotangent, *call, needed)
-                              : back(equation, saved[0], saved[4], cotangent, *call, needed);
+      return call->returned == Returned::kStates
+                 ? back_through_all(equation, saved[0], saved[4], cotangent, *call, needed)
+                 : back(equation, saved[0], saved[4], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
     const auto found =
@@ -94,7 +99,12 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   static std::vector<at::Tensor> back(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& status,
                                       const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
     SolveInfo info;
-    auto found = flow_step_vjp(equation, u, without_lost_of(cotangent, status, call), call.options, needed, info);
+    FlowCotangent of_step{without_lost_of(cotangent, status, call)};
+    if (call.returned == Returned::kNextAndPressure) {
+      const int64_t d = u.size(1);
+      of_step = {of_step.u.narrow(1, 0, d), of_step.u.narrow(1, d, 1) / equation.dt};
+    }
+    auto found = flow_step_vjp(equation, u, of_step, call.options, needed, info);
     if (call.options.adjoint_log != 0 && info.status.defined()) adjoint_log::write(call.options.adjoint_log, info);
     return found;
   }
@@ -112,7 +122,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
       std::vector<int64_t> wanted = needed.vec();
       wanted[0] = needed[0] || s > 0;
       SolveInfo info;
-      const auto found = flow_step_vjp(equation, states.select(1, s), without_lost_of(bar, status_of_step, call),
+      const auto found = flow_step_vjp(equation, states.select(1, s), {without_lost_of(bar, status_of_step, call)},
                                        call.options, wanted, info);
       bar = cotangent.select(1, s);
       add_to(bar, found[0]);
@@ -131,7 +141,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   }
 };
 
-SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t steps, bool all_states,
+SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Returned returned,
                    const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
@@ -141,22 +151,30 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
     differentiable = differentiable || (at::GradMode::is_enabled() && t.defined() && t.requires_grad());
   if (!differentiable || options.backward == Backward::kNone) {
     const at::NoGradGuard no_grad;
-    return run(equation, u.detach(), steps, all_states, options);
+    return run(equation, u.detach(), steps, returned, options);
   }
   auto call = c10::make_intrusive<Call>();
   call->equation = equation.with_tensors({at::Tensor(), at::Tensor(), at::Tensor()});
   call->steps = steps;
-  call->all_states = all_states;
+  call->returned = returned;
   call->options = options;
   const auto out = FlowSteps::apply(u, equation.nu, or_empty(equation.force, u), or_empty(equation.inflow, u), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
 }
 
 /// A step whose solves have nodes of their own.
-SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  auto step = flow_step(equation, u, options);
-  if (options.on_failure == OnFailure::kZeroGrad) step.u = detach_failed(step.u, step.info.status);
-  return {step.u, step.info};
+SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options,
+                          Returned returned = Returned::kNext) {
+  const auto step = flow_step(equation, u, options);
+  const auto out = returned == Returned::kNext ? step.u : with_pressure(step, equation.dt);
+  return {options.on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
+}
+
+SolveResult next(const FlowEquation& equation, const at::Tensor& u, Returned returned, const SolveOptions& options) {
+  if (options.backward != Backward::kUnrolled) return record(equation, u, 1, returned, options);
+  options.check("Flow");
+  equation.check(u);
+  return unrolled_step(equation, u, options, returned);
 }
 
 SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
@@ -168,17 +186,18 @@ SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t 
 }  // namespace
 
 SolveResult flow_next(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  if (options.backward != Backward::kUnrolled) return record(equation, u, 1, false, options);
-  options.check("Flow");
-  equation.check(u);
-  return unrolled_step(equation, u, options);
+  return next(equation, u, Returned::kNext, options);
+}
+
+SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
+  return next(equation, u, Returned::kNextAndPressure, options);
 }
 
 SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
                          const SolveOptions& options) {
   TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
   if (options.backward == Backward::kUnrolled) return unrolled(equation, u, steps, options);
-  return record(equation, u, steps, true, options);
+  return record(equation, u, steps, Returned::kStates, options);
 }
 
 }  // namespace prdp
