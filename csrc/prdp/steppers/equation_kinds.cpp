@@ -22,7 +22,7 @@ at::Tensor flow_rhs(const Equation& equation, const at::Tensor& u) {
 
 const std::vector<EquationKind> kKinds{
     {"poisson", /*periodic=*/false, /*channels=*/1, /*linearised=*/false, negative, negative},
-    {"heat", false, 1, false},
+    {"heat", false, 1, false},  // b is the state
     {"burgers", true, kPerAxis, true},
     {"navier_stokes", true, 3, true, flow_rhs, velocity_over_dt},
     {"diffusion", true, 1, false},  // these three of scenes alone, which make their steps
