@@ -20,7 +20,10 @@ from prdp_torch.experiments.refinement import Refinement
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
-MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update
+MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update; and for Poisson
+    "poisson_1p": 'method = "cg"\nmax_iter = 100',
+    "poisson_3p": 'method = "cg"\nmax_iter = 100',
+    "poisson_3p_sd": 'method = "cg"\nmax_iter = 100',
     "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
     "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
     "diffusion_inverse_256": 'method = "cg"\nmax_iter = 100',
