@@ -187,7 +187,7 @@ def seconds():
         found = rows(f"refinement_{name}")
         base, auto, prdp = (found[label] for label in ("converged", "auto", "prdp"))
         own = DOCS / "results" / f"{name}.json"
-        exact = rows(name).get("direct") if own.exists() else None
+        exact = found.get("direct") or (rows(name).get("direct") if own.exists() else None)
         cells = [_seconds(base), _seconds(exact) if exact else "–", _seconds_claimed(auto), _seconds_claimed(prdp)]
         body.append([name, what, *cells, _time_saved(auto, base)])
     head = ["scene", "most of an update", "converged, s", "`Direct`, s", "auto, s", "PRDP, tuned, s", "auto saves"]
