@@ -25,7 +25,7 @@ at::Tensor vectors(const OperatorSpec& a, int64_t batch, int64_t channels) {
 }  // namespace
 
 TEST(TensorCycles, EqualThoseOfTheLoopsInWindsAndRings) {
-  for (const auto& shape : std::vector<std::vector<int64_t>>{{14}, {17}, {8, 11}, {6, 13}, {6, 5, 9}}) {
+  for (const auto& shape : std::vector<std::vector<int64_t>>{{14}, {17}, {8, 11}, {6, 13}}) {
     const auto dim = static_cast<int64_t>(shape.size());
     auto sizes = shape;
     sizes.insert(sizes.begin(), {3, dim});

@@ -1,5 +1,7 @@
 """Solves of exactly K iterations on another device: how often the host waits for it, and that it need not."""
 
+import itertools
+
 import pytest
 import torch
 from stand_in_device import StandIn
@@ -188,6 +190,21 @@ def test_multigrid_looks_at_an_operator_once_and_at_its_grids_if_it_is_new(solve
         u, info = prdp.linear_solve(make(scale * c), b, solver(k, 0.0), on_failure="return")
         torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
         assert torch.equal(run.device.fetch(run.info.status), info.status)
+
+
+@pytest.mark.parametrize("shape", [(6, 5, 9), (8, 7, 6), (11, 10), (5, 12), (13,), (10,)])
+def test_cycles_are_those_of_the_loops(shape):
+    """Every neighbour, each with a coefficient of its own; even and odd rings."""
+    offsets = list(itertools.product((0, -1, 1), repeat=len(shape)))
+    generator = torch.Generator().manual_seed(sum(shape))
+    c = -1 - 0.5 * torch.rand(2, len(offsets), *shape, generator=generator, dtype=F64)
+    c[:, 0] = 1.3 * c[:, 1:].abs().sum(1)
+    b = noise(2, 1, *shape)
+    run = Run(lambda c: operators.Stencil(c, offsets, "periodic"), c, b, prdp.Multigrid(2, 0.0), on_failure="return")
+    a = operators.Stencil(c, offsets, "periodic")
+    u, info = prdp.linear_solve(a, b, prdp.Multigrid(2, 0.0), on_failure="return")
+    assert (info.residual < 0.5).all()
+    torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.parametrize("dtype", [F32, F64])
