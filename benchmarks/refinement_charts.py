@@ -138,8 +138,11 @@ def time_against_products(found):
             if row is None:
                 continue
             products, seconds = (100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds"))
-            axes.plot([seconds, products], [at + shift] * 2, color=colour, lw=1, alpha=0.6, zorder=1)
-            for saved, marker in ((products, "o"), (seconds, "D")):
+            marks = [(products, "o")]
+            if row["seeds"] == base["seeds"]:  # rows of fewer seeds are older, and of another machine
+                marks.append((seconds, "D"))
+                axes.plot([seconds, products], [at + shift] * 2, color=colour, lw=1, alpha=0.6, zorder=1)
+            for saved, marker in marks:
                 # White inside, so that the line does not run through a hollow one.
                 fill = colour if _claims(row) else "white"
                 axes.scatter(saved, at + shift, marker=marker, s=36, facecolors=fill, edgecolors=colour, zorder=2)

@@ -87,7 +87,7 @@ def test_the_seconds_of_the_first_pages_are_those_of_the_records():
     b, d = "refinement_burgers_2d", "refinement_diffusion_inverse"
     trained = f"{seconds(b, 'auto')} s instead of {seconds(b, 'converged')} s"
     found = f"{seconds(d, 'auto')} s instead of {seconds(d, 'converged')} s"
-    exact = f"{seconds('diffusion_inverse', 'direct')} s with `Direct`"
+    exact = f"{seconds(d, 'direct')} s with `Direct`"
     first, results, readme = ((DOCS / name).read_text() for name in ("index.md", "results.md", "../README.md"))
     assert all(said in first for said in (trained, found, exact))
     assert f"{seconds(b, 'converged')} to {seconds(b, 'auto')} s" in results
