@@ -285,3 +285,38 @@ def test_it_compiles():
     for eager, compiled in zip(*grads, strict=True):
         torch.testing.assert_close(eager, compiled)
     assert not grads[0][0][1].any() and grads[0][0][0].any() and torch.isfinite(grads[0][1])
+
+
+def of_field(v, k):
+    return 4 * v * k.sqrt() - 0.5 * (v.roll(1, -1) + v.roll(-1, -1))
+
+
+FIELDS = {  # operators of a field with one row per sample
+    "diffusion": lambda k: operators.Diffusion(k[:, 0], shift=1.0, boundary="flux"),
+    "function": lambda k: operators.Function(
+        of_field, tensors=[k], symmetric=True, diagonal=lambda k: (4 * k.sqrt()).expand_as(k)
+    ),
+}
+
+
+@pytest.mark.parametrize("on_failure", ["zero_grad", "return"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize(
+    "solver", [prdp.Jacobi(60), prdp.CG(60), prdp.GMRES(9, restart=9), prdp.BiCGStab(30), prdp.Direct()]
+)
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_field_that_is_not_finite_leaves_the_others_their_gradients(name, solver, backward, bad, on_failure):
+    """The derivative of the field's sample is NaN whatever λ, and all of them were lost with it."""
+    generator = torch.Generator().manual_seed(4)
+    field = torch.rand(3, 1, 12, generator=generator, dtype=torch.float64) + 0.5
+    field[1, 0, 2] = bad
+    loads = torch.randn(3, 1, 12, generator=generator, dtype=torch.float64)
+    found = []
+    for rows in ([0, 1, 2], [0, 2]):
+        k, b = (t[rows].clone().requires_grad_() for t in (field, loads))
+        u, _ = prdp.linear_solve(FIELDS[name](k), b, solver, backward=backward, on_failure=on_failure)
+        found.append(torch.autograd.grad(u[:, :, 3:].square().sum(), (b, k)))
+    for all_of_them, healthy in zip(*found, strict=True):
+        assert (healthy != 0).any() and (all_of_them[1] == 0).all()
+        torch.testing.assert_close(all_of_them[[0, 2]], healthy, rtol=1e-9, atol=1e-12)

@@ -53,4 +53,10 @@ bool all_finite(const std::vector<at::Tensor>& tensors) {
   });
 }
 
+void clear_where_not_finite(std::vector<at::Tensor>& tensors, const std::vector<at::Tensor>& of_none) {
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (tensors[i].defined() && of_none[i].defined())
+      tensors[i] = tensors[i].masked_fill(of_none[i].isfinite().logical_not(), 0.0);
+}
+
 }  // namespace prdp

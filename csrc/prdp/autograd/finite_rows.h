@@ -22,21 +22,31 @@ at::Tensor only(const at::Tensor& t, const Rows& rows);
 Rows finite_rows(const at::Tensor& t);
 bool all_finite(const std::vector<at::Tensor>& tensors);
 
+/// Zeros where `of_none`, the share of no sample, is not finite.
+void clear_where_not_finite(std::vector<at::Tensor>& tensors, const std::vector<at::Tensor>& of_none);
+
 /// share(rows), a vector of tensors, is a sum over these samples. If it is not finite, the samples that cause this are
-/// removed from `rows`. The others keep their shares, unaffected by numbers outside the range of the dtype.
+/// removed from `rows`. The others keep their shares, unaffected by numbers outside the range of the dtype. Where even
+/// the share of no sample is not finite, as of an A that holds a NaN in another sample, the sum is zero.
 template <class Share>
 std::vector<at::Tensor> finite_sum(Rows& rows, const Share& share) {
   auto sum = share(rows);
   if (all_finite(sum)) return sum;
+  const auto of_none = share(Rows(rows.size(), false));
+  const auto cleared = [&](const Rows& some) {
+    auto found = share(some);
+    clear_where_not_finite(found, of_none);
+    return found;
+  };
   const auto before = rows;
   for (size_t i = 0; i < rows.size(); ++i) {
     Rows alone(rows.size(), false);
     alone[i] = true;
-    if (before[i]) rows[i] = all_finite(share(alone));
+    if (before[i]) rows[i] = all_finite(cleared(alone));
   }
-  sum = share(rows);
+  sum = cleared(rows);
   if (all_finite(sum)) return sum;
-  rows.assign(rows.size(), false);  // each is finite and their sum is not, or it is not even of none
+  rows.assign(rows.size(), false);  // each is finite and their sum is not
   for (auto& t : sum)
     if (t.defined()) t = at::zeros_like(t);
   return sum;

@@ -157,12 +157,13 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
   const auto share = [&](const Rows& rows) {
     std::vector<at::Tensor> sum(needed.size());
     auto caps = at::zeros({batch}, at::kLong);
+    const bool of_none = !any(rows);  // what the iterations make of no cotangent, finite or not
     for (int64_t i = 0; i < batch; ++i)
-      if (rows[i] && !exact[i] && !lost[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
+      if ((rows[i] || of_none) && !exact[i] && !lost[i]) caps.mutable_data_ptr<int64_t>()[i] = counts[i];
     std::vector<int64_t> applications(batch, 0);
     if (caps.any().item<bool>()) {
       auto found = of_iterations(
-          bar, solved.b,
+          of_none ? at::zeros_like(bar) : bar, solved.b,
           {spec, solved.x0, options.solver, caps.to(solved.iterations.device()), options.checkpoint_every}, needed);
       sum = std::move(found.gradients);
       applications = to_host<int64_t>(found.operator_applications, batch);
@@ -209,7 +210,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     if (good != rows) {  // their adjoint solve failed
       auto said = info;
       for (auto* part : said.parts()) *part = part->clone();
-      found.gradients = share(good);
+      found.gradients = finite_sum(good, share);
       info = said;
     }
   }

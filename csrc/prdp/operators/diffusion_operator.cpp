@@ -152,9 +152,9 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const int64_t d = 2 + axis;
     const double scale = per_cell2(axis);
-    // ∂ mean(a, b)/∂a
+    // ∂ mean(a, b)/∂a; 0 in a sample whose κ is not finite, which was refused, so that its λ of 0 gives 0.
     const auto derivative = [&](const at::Tensor& a, const at::Tensor& b) {
-      return mean_ == FaceMean::kHarmonic ? 2.0 * (b / (a + b)).square() : at::full_like(a, 0.5);
+      return mean_ == FaceMean::kHarmonic ? 2.0 * (b / (a + b)).square().nan_to_num(0.0) : at::full_like(a, 0.5);
     };
     const auto couple = [&](const at::Tensor& du, const at::Tensor& dl) {
       return scale * (du * dl).sum(1, /*keepdim=*/true);
