@@ -84,7 +84,8 @@ class SolveInfo(NamedTuple):
     """Number of products with A (int64)."""
     floor: Tensor
     """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖; 0 elsewhere.
-    Such a sample is STAGNATED, and u is as accurate as the dtype allows. For a smaller residual take float64."""
+    Such a sample is STAGNATED: its residual is as small as the dtype allows. u may be further off where A is badly
+    conditioned; float64 tells."""
     log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self) -> str:

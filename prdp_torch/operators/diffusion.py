@@ -29,7 +29,8 @@ class Diffusion(Operator):
             3 axes. Gets a gradient, which is formed from fluxes: in float32 it keeps digits that the gradient of a
             `Stencil`'s coefficients loses.
         shift: a number, or a tensor like kappa, which gets a gradient. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by
-            implicit Euler, with b = u/dt.
+            implicit Euler, with b = u/dt. In float32, A holds it to ε max κ Σ 2/dx², beside which it must not be small:
+            a warning says so. Take float64 for large jumps of κ on fine grids.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes) or "periodic":
             one for all sides, one for each axis, or a pair (low, high) for each axis.
         length: the side of the box, one number or one for each axis in the order of `shape`.

@@ -1,6 +1,8 @@
 """operators.Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -238,3 +240,20 @@ def test_the_benchmarks_hand_the_same_matrix_to_their_rivals(shape):
     found = np.zeros((cells.size, cells.size))
     np.add.at(found, places, shape[0] ** 2 * values)
     np.testing.assert_allclose(found, Diffusion(kappa).dense(), rtol=1e-13, atol=1e-12)
+
+
+LOSES_ITS_SHIFT = """
+import torch, prdp_torch as prdp
+kappa = torch.ones(1, 64, 64, dtype=torch.{dtype})
+kappa[:, 20:40, 20:40] = {jump}
+for _ in range(2):
+    a = prdp.operators.Diffusion(kappa, shift=1.0, boundary="flux")
+    prdp.linear_solve(a, torch.ones(1, 1, 64, 64, dtype=torch.{dtype}), prdp.CG(2, rtol=0.0), on_failure="return")
+"""
+
+
+@pytest.mark.parametrize("dtype, jump, warnings", [("float32", 1e3, 1), ("float32", 1.0, 0), ("float64", 1e3, 0)])
+def test_a_shift_that_float32_cannot_hold_beside_the_jumps_is_warned_of_once(dtype, jump, warnings):
+    program = LOSES_ITS_SHIFT.format(dtype=dtype, jump=jump)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr.count("a shift of 1 is lost in the rounding") == warnings

@@ -340,3 +340,23 @@ def test_a_preconditioner_without_values_is_refused(solver):
         ValueError, match="Function: a tensor of it is on meta but the vector is on cpu; it has no values"
     ):
         prdp.linear_solve(operators.Heat((8,), 1e-3, 0.1), torch.ones(2, 1, 8), solver(5, preconditioner=inverse))
+
+
+def test_failures_of_an_own_preconditioner_are_not_blamed_on_a():
+    a, b = operators.Heat((8, 8), 1e-2, 1.0), torch.ones(1, 1, 8, 8).cumsum(-1)
+
+    def solve(apply):
+        m = operators.Function(apply, symmetric=True)
+        return prdp.linear_solve(a, b, prdp.CG(50, preconditioner=m))
+
+    with pytest.raises(torch.linalg.LinAlgError, match="its preconditioner hands out NaN or Inf for a vector of ones"):
+        solve(lambda v: v * torch.nan)
+    with pytest.raises(torch.linalg.LinAlgError, match="its preconditioner is not definite, or A is not"):
+        solve(lambda v: 0 * v)
+    with pytest.raises(ValueError, match=r"preconditioner: Heat: expected \(batch, 1, 4, 4\), got \(1, 1, 8, 8\)"):
+        prdp.linear_solve(a, b, prdp.CG(50, preconditioner=operators.Heat((4, 4), 1e-2, 1.0)))
+
+
+def test_what_is_singular_to_float32_is_sent_to_float64():
+    with pytest.raises(torch.linalg.LinAlgError, match="singular to float32; take float64, or GMRES"):
+        prdp.linear_solve(torch.diag(torch.tensor([1.0, 0.0, 2.0])), torch.ones(3), prdp.Direct())

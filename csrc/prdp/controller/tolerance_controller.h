@@ -40,7 +40,8 @@ class ToleranceController final : public Controller {
  private:
   const char* name() const override { return "ToleranceController"; }
   const char* remedy() const override {
-    return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\"";
+    return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\", or "
+           "float64 if it stalls";
   }
   bool stalled() const override { return true; }  // not used: its metric is the error
   double asked_for() const override;

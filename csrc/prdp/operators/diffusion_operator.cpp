@@ -102,13 +102,28 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 void DiffusionOperator::check_parameters() const {
-  if (kappa_.is_meta()) return;  // no numbers
+  if (kappa_.is_meta() || kappa_.numel() == 0) return;  // no numbers
+  const auto [low, high] = at::aminmax(kappa_);
+  const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
+  const auto* least_and_most = ends.const_data_ptr<double>();
+  if (least_and_most[0] > 0.0) return warn_if_shift_is_rounding(least_and_most[1]);
   const auto wrong = kappa_.le(0);
   if (!wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
   TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
                     kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
                     " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(2));
+}
+
+void DiffusionOperator::warn_if_shift_is_rounding(double largest_kappa) const {
+  if (kappa_.scalar_type() != at::kFloat || !shift_.is_cpu()) return;
+  double diagonal = 0.0;
+  for (int64_t axis = 0; axis < dim(); ++axis) diagonal += 2.0 * largest_kappa * per_cell2(axis);
+  const double shift = shift_.min().item<double>(), rounding = epsilon_of(kappa_) * diagonal;
+  if (shift > 0.0 && std::isfinite(diagonal) && rounding > 0.1 * shift) {
+    TORCH_WARN_ONCE("Diffusion: in float32, a shift of ", shift, " is lost in the rounding of a diagonal of up to ",
+                    diagonal, ", so that u may be off by per cents and its mean is not conserved; take float64");
+  }
 }
 
 double DiffusionOperator::per_cell2(int64_t axis) const {

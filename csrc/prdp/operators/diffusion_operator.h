@@ -49,6 +49,7 @@ class DiffusionOperator final : public Operator {
  private:
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   bool is_periodic(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic; }
+  void warn_if_shift_is_rounding(double largest_kappa) const;
   double per_cell2(int64_t axis) const;  // 1/h²
   /// Coefficients of the faces below and above each cell along an axis, times factor/h²; of a side with u = 0 twice
   /// that of its cell, as it is half as far away.

@@ -70,11 +70,22 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
 }
 
-std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
+/// The preconditioner that somebody wrote, as an operator.
+std::unique_ptr<Operator> own_preconditioner(const Solver& solver) {
+  return solver.preconditioner.is_operator() ? make_operator(solver.preconditioner.spec()) : nullptr;
+}
+
+std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto is_finite = [&](const Operator& m) {
+    return m.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>();
+  };
+  const auto preconditioner = own_preconditioner(solver);
+  if (preconditioner && !is_finite(*preconditioner))
+    return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
   const bool single = b.scalar_type() == at::kFloat;
   const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
   const bool known = norm > 0.0;  // not of a function
-  if (!known && !a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>())
+  if (!known && !is_finite(a))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
   return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
          (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " +
@@ -83,7 +94,13 @@ std::string overflow(const Operator& a, const at::Tensor& b, int64_t sample) {
 }
 
 std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (traits(solver.method).is_direct) return "A is singular; GMRES solves it for any b in the range of A";
+  if (traits(solver.method).is_direct)
+    return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
+           " GMRES solves it for any b in the range of A";
+  if (traits(solver.method).made_for == MadeFor::kDefinite && own_preconditioner(solver))
+    return "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, or A "
+           "is "
+           "not; prdp.check_operator(A, b, solver) looks at both";
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
   if (traits(solver.method).counts == Counts::kIterations)
@@ -128,7 +145,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       return "A maps the constant to zero, so it is singular; give nullspace=\"constant\"";
     switch (status) {
       case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
-      case SolveStatus::kOverflow: return overflow(a, b, sample);
+      case SolveStatus::kOverflow: return overflow(role.solver, a, b, sample);
       case SolveStatus::kBreakdown: return breakdown(role.solver, a, b, sample);
       case SolveStatus::kZeroDiagonal: return zero_diagonal(role);
       case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);

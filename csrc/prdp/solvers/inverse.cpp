@@ -95,7 +95,11 @@ c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, int64_t smoothing, con
 Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
   if (preconditioner.is_operator()) {
     const std::shared_ptr<Operator> inverse = make_operator(preconditioner.spec());
-    inverse->check_vector(b);
+    try {
+      inverse->check_vector(b);
+    } catch (const c10::ValueError& error) {
+      TORCH_CHECK_VALUE(false, "preconditioner: ", error.what_without_backtrace());
+    }
     return [inverse](const at::Tensor& v) { return inverse->apply(v); };
   }
   if (!preconditioner.is_multigrid()) return {};
