@@ -1,5 +1,7 @@
 """`Stepper`: what all steppers have in common, and the base of those that solve A(u) u_next = b(u)."""
 
+import inspect
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -73,9 +75,12 @@ class Stepper(torch.nn.Module):
         on_failure: OnFailure = "raise",
         checkpoint_every: CheckpointEvery = None,
         start: Start = "zero",
+        **unknown: object,
     ) -> None:
         super().__init__()
         who = type(self).__name__
+        if unknown:
+            raise TypeError(_unknown_argument(type(self), unknown))
         if type(self).operator is Stepper.operator and type(self).forward is Stepper.forward:
             raise TypeError(
                 f"{who}: a subclass of Stepper must define operator(u), and rhs(u) where b is not the state; "
@@ -255,3 +260,9 @@ class Stepper(torch.nn.Module):
             else f", preconditioner={self.preconditioner!r}"
         )
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
+
+
+def _unknown_argument(kind: type[Stepper], unknown: Mapping[str, object]) -> str:
+    parameters = (p for init in (kind.__init__, Stepper.__init__) for p in inspect.signature(init).parameters.values())
+    allowed = dict.fromkeys(p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name != "self")
+    return f"{kind.__name__}: unknown argument '{next(iter(unknown))}'; allowed: {', '.join(allowed)}"

@@ -268,3 +268,15 @@ def test_vectors_without_unknowns_are_refused():
     for solver in (prdp.CG(3), prdp.Direct(), prdp.Jacobi(3), prdp.GMRES(3)):
         with pytest.raises(ValueError, match=r"Stencil: a vector must have at least one channel, got \[2, 0, 4\]"):
             prdp.linear_solve(stencil, torch.zeros(2, 0, 4), solver)
+
+
+@pytest.mark.parametrize("make, expected", [
+    (lambda: prdp.Heat((8,), 1e-2, 1.0, prdp.CG(5), onfailure="warn"),
+     "Heat: unknown argument 'onfailure'; allowed: shape, nu, dt, solver, backward, length, .*, on_failure"),
+    (lambda: prdp.Flow((8, 8), 1e-2, 1e-3, bounday="wall"), "Flow: unknown argument 'bounday'; allowed: .*boundary"),
+    (lambda: prdp.ImplicitStep(lambda u: None, solver=prdp.CG(5), strat="state"),
+     "ImplicitStep: unknown argument 'strat'; allowed: operator, rhs, .*, start"),
+])  # fmt: skip
+def test_an_argument_that_no_stepper_has_is_named_with_those_it_has(make, expected):
+    with pytest.raises(TypeError, match=expected):
+        make()
