@@ -163,7 +163,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
     std::vector<int64_t> applications(batch, 0);
     if (caps.any().item<bool>()) {
       auto found = of_iterations(
-          of_none ? at::zeros_like(bar) : bar, solved.b,
+          only(bar, rows), solved.b,
           {spec, solved.x0, options.solver, caps.to(solved.iterations.device()), options.checkpoint_every}, needed);
       sum = std::move(found.gradients);
       applications = to_host<int64_t>(found.operator_applications, batch);

@@ -70,17 +70,11 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
   return "the residual grew beyond 1e13 ‖b‖; take GMRES with a larger restart, a preconditioner, or Direct";
 }
 
-/// The preconditioner that somebody wrote, as an operator.
-std::unique_ptr<Operator> own_preconditioner(const Solver& solver) {
-  return solver.preconditioner.is_operator() ? make_operator(solver.preconditioner.spec()) : nullptr;
-}
-
 std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto is_finite = [&](const Operator& m) {
     return m.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>();
   };
-  const auto preconditioner = own_preconditioner(solver);
-  if (preconditioner && !is_finite(*preconditioner))
+  if (solver.preconditioner.is_operator() && !is_finite(*make_operator(solver.preconditioner.spec())))
     return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
   const bool single = b.scalar_type() == at::kFloat;
   const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
@@ -97,10 +91,9 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
   if (traits(solver.method).is_direct)
     return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
            " GMRES solves it for any b in the range of A";
-  if (traits(solver.method).made_for == MadeFor::kDefinite && own_preconditioner(solver))
-    return "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, or A "
-           "is "
-           "not; prdp.check_operator(A, b, solver) looks at both";
+  if (traits(solver.method).made_for == MadeFor::kDefinite && solver.preconditioner.is_operator())
+    return "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, "
+           "or A is not; prdp.check_operator(A, b, solver) looks at both";
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
   if (traits(solver.method).counts == Counts::kIterations)

@@ -17,7 +17,7 @@ namespace prdp {
 namespace {
 
 at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
-  return samples.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
+  return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
 }
 
 /// The change of the velocity by explicit Euler.
@@ -128,10 +128,8 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
   const auto& box = *e.box;
   CombinedInfo adjoint;
-  const auto& of_potential = cotangent.potential;
   const auto velocity_bar =
-      project_vjp(box, cleared(cotangent.u, refused),
-                  of_potential.defined() ? cleared(of_potential, refused) : of_potential, options, adjoint);
+      project_vjp(box, cleared(cotangent.u, refused), cleared(cotangent.potential, refused), options, adjoint);
   const auto& free = box.fields(u.options()).free;
   DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
   if (is_implicit(e)) {
