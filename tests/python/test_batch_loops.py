@@ -44,7 +44,7 @@ def noise(shape, batch=3, dtype=F64):
     return torch.randn(batch, 1, *shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("shape", [(8, 16), (7, 9)], ids=str)  # the second one has odd vectors
+@pytest.mark.parametrize("shape", [(8, 16), (7, 9), (96, 96)], ids=str)  # odd vectors; sums over blocks
 @pytest.mark.parametrize("dtype", [F32, F64])
 @pytest.mark.parametrize("method", METHODS)
 def test_iterates_and_gradients_are_those_of_the_kernels(method, dtype, shape):

@@ -19,6 +19,7 @@ constexpr Loops<T> table(const char* level) {
           copy_rows<T>,
           dot<T>,
           scale<T>,
+          scale_with_dots<T>,
           axpy<T>,
           xpby<T>,
           xpby_with_square<T>,

@@ -112,6 +112,8 @@ struct Loops {
   T (*dot)(const T* a, const T* b, int64_t n);
   /// out = factor·x; out may be x. From here on n is that of padded vectors where not said otherwise.
   void (*scale)(T factor, const T* x, T* out, int64_t n);
+  /// The same in one pass with dots = {w·out, ‖out‖²}.
+  void (*scale_with_dots)(T factor, const T* x, const T* w, T* out, T* dots, int64_t n);
   /// y += alpha x; any n.
   void (*axpy)(T alpha, const T* x, T* y, int64_t n);
   /// y = x + beta y; and the same, returning ‖y‖².

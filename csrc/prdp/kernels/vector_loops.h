@@ -108,6 +108,19 @@ void scale(T factor, const T* x, T* out, int64_t n) {
 }
 
 template <class T>
+void scale_with_dots(T factor, const T* x, const T* w, T* out, T* dots, int64_t n) {
+  Register<T> along[2] = {}, squares[2] = {};
+  for_each_in_turn<T>(n, [&](int64_t i, int k) {
+    const Register<T> scaled = factor * load(x + i);
+    store(out + i, scaled);
+    along[k] += scaled * load(w + i);
+    squares[k] += scaled * scaled;
+  });
+  dots[0] = sum_lanes<T>(along[0] + along[1]);
+  dots[1] = sum_lanes<T>(squares[0] + squares[1]);
+}
+
+template <class T>
 T xpby_with_square(const T* x, T beta, T* y, int64_t n) {
   Register<T> squares[2] = {};
   for_each_in_turn<T>(n, [&](int64_t i, int k) {

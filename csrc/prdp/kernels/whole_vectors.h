@@ -88,6 +88,13 @@ class WholeVectors {
   void scale(T factor, const T* x, T* out, int64_t n) const {
     for_each_block_of(n, [&](int64_t i, int64_t end) { loops_.scale(factor, x + i, out + i, end - i); });
   }
+  /// The same in one pass; returns w·out and ‖out‖².
+  std::array<T, 2> scale_with_dots(T factor, const T* x, const T* w, T* out, int64_t n) const {
+    return sums_over<T, 2>((n + kBlock - 1) / kBlock, [&](int64_t p, T* dots) {
+      const int64_t i = p * kBlock;
+      loops_.scale_with_dots(factor, x + i, w + i, out + i, dots, std::min(n - i, kBlock));
+    });
+  }
   void axpy(T alpha, const T* x, T* y, int64_t n) const {
     for_each_block_of(n, [&](int64_t i, int64_t end) { loops_.axpy(alpha, x + i, y + i, end - i); });
   }

@@ -71,6 +71,17 @@ at::Tensor dot(const Vector& a, const Vector& b) {
   return found;
 }
 
+at::Tensor largest_magnitude(const Vector& v) {
+  auto found = at::empty({v.size(0)}, v.options());
+  with_type(v, [&]<class T>(T) {
+    const T* from = data<T>(v);
+    T* to = found.mutable_data_ptr<T>();
+    const kernels::WholeVectors<T> loops;
+    for_each_sample(v, [&](int64_t s, int64_t at) { to[s] = loops.largest_magnitude(from + at, unknowns(v)); });
+  });
+  return found;
+}
+
 void scale(const Scalar& factor, const Vector& v, Vector& out) {
   with_type(v, [&]<class T>(T) {
     T* to = own<T>(out);
@@ -78,6 +89,21 @@ void scale(const Scalar& factor, const Vector& v, Vector& out) {
     const kernels::WholeVectors<T> loops;
     for_each_sample(v, [&](int64_t s, int64_t at) { loops.scale(times[s], from + at, to + at, unknowns(v)); });
   });
+}
+
+std::array<Scalar, 2> scale_with_dots(const Scalar& factor, const Vector& v, const Vector& w, Vector& out) {
+  std::array<Scalar, 2> found{numbers_like(v), numbers_like(v)};
+  with_type(v, [&]<class T>(T) {
+    T *to = own<T>(out), *along = found[0].mutable_data_ptr<T>(), *square = found[1].mutable_data_ptr<T>();
+    const T *from = data<T>(v), *with = data<T>(w), *times = numbers<T>(factor, v);
+    const kernels::WholeVectors<T> loops;
+    for_each_sample(v, [&](int64_t s, int64_t at) {
+      const auto dots = loops.scale_with_dots(times[s], from + at, with + at, to + at, unknowns(v));
+      along[s] = dots[0];
+      square[s] = dots[1];
+    });
+  });
+  return found;
 }
 
 void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active) {
@@ -145,6 +171,16 @@ bool any(const Scalar& where) {
   });
 }
 
+at::Tensor sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c) {
+  auto sum = at::empty_like(a);
+  with_type(a, [&]<class T>(T) {
+    const T *first = data<T>(a), *factor = data<T>(b), *second = data<T>(c);
+    T* to = sum.mutable_data_ptr<T>();
+    for (int64_t s = 0; s < a.numel(); ++s) to[s] = first[s] + factor[s] * factor[s] * second[s];
+  });
+  return sum;
+}
+
 at::Tensor ratio(const Scalar& num, const Scalar& den, double negligible) {
   auto quotient = at::empty_like(den);
   with_type(den, [&]<class T>(T) {
@@ -159,8 +195,10 @@ at::Tensor ratio(const Scalar& num, const Scalar& den, double negligible) {
 Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
                  double negligible) {
   Step step{at::empty_like(num), {}};
-  auto vanishes = at::zeros_like(num, num.options().dtype(at::kBool));
-  bool any = false;
+  const auto note = [&](int64_t sample) {
+    if (!step.vanishes.defined()) step.vanishes = at::zeros_like(num, num.options().dtype(at::kBool));
+    step.vanishes.mutable_data_ptr<bool>()[sample] = true;
+  };
   with_type(num, [&]<class T>(T) {
     const T *above = data<T>(num), *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2);
     T* to = step.length.mutable_data_ptr<T>();
@@ -169,10 +207,9 @@ Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const S
       const T bound = static_cast<T>(epsilon) * std::sqrt(left2[s]) * std::sqrt(right2[s]);
       const bool breaks = std::abs(below[s]) <= bound && std::isfinite(bound) && !nothing_left;
       to[s] = nothing_left || breaks ? T(0) : above[s] / below[s];
-      if (breaks) any = vanishes.mutable_data_ptr<bool>()[s] = true;
+      if (breaks) note(s);
     }
   });
-  if (any) step.vanishes = vanishes;
   return step;
 }
 

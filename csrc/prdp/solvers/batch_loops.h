@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <array>
 #include <vector>
 
 /// The operations of TensorSpace that an iteration spends its time on, by the loops of this processor: for a batch in
@@ -19,8 +20,11 @@ using Active = std::vector<bool>;
 bool take(const at::Tensor& b);
 
 Scalar dot(const Vector& a, const Vector& b);
-/// out = factor v, of all samples.
+/// max |v| of each sample, (batch,); NaN or Inf if any entry is.
+at::Tensor largest_magnitude(const Vector& v);
+/// out = factor v, of all samples; and the same in one pass with w·out and ‖out‖².
 void scale(const Scalar& factor, const Vector& v, Vector& out);
+std::array<Scalar, 2> scale_with_dots(const Scalar& factor, const Vector& v, const Vector& w, Vector& out);
 /// y = x + beta y
 void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active);
 /// x += alpha p and r -= alpha q; returns ‖r‖².
@@ -33,6 +37,8 @@ Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64
 
 /// Whether a number is not zero.
 bool any(const Scalar& where);
+/// a + b² c
+Scalar sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c);
 /// As TensorSpace's: num / den, or 0; the latter says of which samples it breaks down.
 Scalar ratio(const Scalar& num, const Scalar& den, double negligible);
 struct Step {

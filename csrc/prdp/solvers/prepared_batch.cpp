@@ -1,6 +1,9 @@
 #include "prdp/solvers/prepared_batch.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
+
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/stopping.h"
 
@@ -56,7 +59,12 @@ OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, dou
 
 }  // namespace
 
-at::Tensor largest_magnitude(const at::Tensor& b) { return b.detach().abs().flatten(1).amax(1); }
+at::Tensor largest_magnitude(const at::Tensor& b) {
+  const auto plain = b.detach();
+  const bool has_memory = !at::isTensorSubclassLike(plain);
+  return has_memory && batch_loops::take(plain) ? batch_loops::largest_magnitude(plain)
+                                                : plain.abs().flatten(1).amax(1);
+}
 
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
@@ -86,10 +94,14 @@ PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveR
   auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, others);
   const auto rhs = a.project(whole);
-  const auto outside = outside_range(whole, rhs, solver.rtol);
-  const auto inconsistent = outside.some.logical_and(takes_part), hopeless = outside.all.logical_and(takes_part);
-  status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
-  takes_part = takes_part.logical_and(hopeless.logical_not());
+  auto inconsistent = at::zeros_like(takes_part);
+  if (a.leaks()) {
+    const auto outside = outside_range(whole, rhs, solver.rtol);
+    const auto hopeless = outside.all.logical_and(takes_part);
+    inconsistent = outside.some.logical_and(takes_part);
+    status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
+    takes_part = takes_part.logical_and(hopeless.logical_not());
+  }
   TensorStart start;
   if (starts) start = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
   return {status, takes_part, inconsistent, rhs, scale, start};

@@ -1,5 +1,7 @@
 #include <ATen/core/grad_mode.h>
 
+#include <cstdlib>
+
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
@@ -96,11 +98,23 @@ void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& stat
   if constexpr (detail::kLeastResidual<M>) method.residual2();
 }
 
+/// glibc returns the top of the heap to the system once it exceeds twice the largest block ever freed. Vectors of some
+/// 100 KB are then faulted in again for every product, which can double the time of a solve. A large block that is
+/// freed untouched raises the bound, as the first large tensor of a training would.
+void keep_top_of_heap() {
+  [[maybe_unused]] static const bool done = [] {
+    void* volatile block = std::malloc((size_t{32} << 20) - 8192);  // volatile: or the pair is optimised away
+    std::free(block);
+    return true;
+  }();
+}
+
 }  // namespace
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
   if (auto unseen = solve_unseen(a, b, request)) return *std::move(unseen);
+  if (b.is_cpu()) keep_top_of_heap();
   const auto& solver = request.solver;
   const auto batch = prepare_batch(a, b, request, at::zeros_like(b));
   std::vector<SampleState> states(b.size(0));
@@ -133,14 +147,16 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
     else note_underflow<double>(s, rows[2][i]);
   }
   if (!request.guarded) return {u.contiguous(), info_of(states, b.options())};
-  u = at::where(per_sample(largest.isfinite(), b), u, at::zeros_like(u));
+  bool overflows = false;
   for (size_t i = 0; i < states.size(); ++i) {
     if (std::isfinite(rows[2][i])) continue;
+    overflows = true;
     states[i].status = SolveStatus::kOverflow;
     states[i].iterations = 0;
     states[i].residual2 = states[i].b2;
     states[i].floor2 = 0.0;
   }
+  if (overflows) u = at::where(per_sample(largest.isfinite(), b), u, at::zeros_like(u));
   return {u.contiguous(), info_of(states, b.options())};
 }
 

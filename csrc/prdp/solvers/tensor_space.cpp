@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/prepared_batch.h"
 
 namespace prdp {
 
@@ -54,7 +55,7 @@ const at::Tensor& TensorSpace::diagonal() {
 
 void TensorSpace::define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const {
   if (scale.defined()) return;
-  const auto magnitude = [&](const Vector& t) { return t.detach().abs().amax(all_but_batch_, /*keepdim=*/true); };
+  const auto magnitude = [](const Vector& t) { return per_sample(largest_magnitude(t), t); };
   const auto of_product = magnitude(product), of_v = magnitude(v);
   const auto usable = of_product.gt(0).logical_and(of_product.isfinite()).logical_and(of_v.gt(0));
   const auto one = at::ones_like(of_v);

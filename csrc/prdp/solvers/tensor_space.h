@@ -82,20 +82,22 @@ class TensorSpace {
   }
 
   void apply(const Vector& v, Vector& out) {
-    last_product_ = product(v);
-    define_scale(last_product_, v, system_.scale_of_a);
-    if (in_loops_) return batch_loops::scale(system_.scale_of_a, last_product_, out);
-    out = std::exchange(last_product_, {}) * system_.scale_of_a;
+    const auto made = unscaled_product(v);
+    if (in_loops_) return batch_loops::scale(system_.scale_of_a, made, out);
+    out = made * system_.scale_of_a;
   }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
+    if (in_loops_) return apply_along(v, v, out);
     apply(v, out);
     return {dot(v, out), dot(out, out)};
   }
   std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
+    if (in_loops_) return batch_loops::scale_with_dots(system_.scale_of_a, unscaled_product(v), w, out);
     apply(v, out);
     return {dot(w, out), unseen_ ? Scalar() : dot(out, out)};
   }
   Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) {
+    if (in_loops_) return batch_loops::sum_of_squares(rr, beta, pp);
     return unseen_ ? unseen_->sum_of_squares(rr, beta) : rr + beta * beta * pp;
   }
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
@@ -233,6 +235,12 @@ class TensorSpace {
     count();
     return laid_out(system_.a.apply(in_loops_ ? v.detach() : v));  // a handle of its own, which a product may keep
   }
+  /// The same; from then on, the scale of A is known.
+  Vector unscaled_product(const Vector& v) {
+    auto made = product(v);
+    define_scale(made, v, system_.scale_of_a);
+    return made;
+  }
   /// Sets the scale that brings the product to the order of v, if it is not known yet.
   void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
   void check_scale(const at::Tensor& scale) const;
@@ -248,8 +256,6 @@ class TensorSpace {
   System& system_;
   at::Tensor b_, b2_, diagonal_;
   at::Tensor start_, whole_b_;  // undefined: from zero
-  /// Kept until the next one: where it ends the heap, its pages would go back to the system, to be faulted in again.
-  at::Tensor last_product_;
   States& states_;
   std::vector<int64_t> all_but_batch_;
   std::vector<bool> active_;

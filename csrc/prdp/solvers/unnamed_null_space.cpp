@@ -82,18 +82,22 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   if (suspects.empty()) return;
 
   const at::NoGradGuard no_grad;
-  const auto shares = at::stack({constant_shares(b.detach()), constant_shares(result.u)}).to(at::kCPU);
-  const auto *of_b = shares.const_data_ptr<double>(), *of_u = of_b + b.size(0);
   const auto residuals = info.residual.to(at::kCPU, at::kDouble);
-  const auto is_clear = [&](int64_t i) {
-    const double residual = residuals.const_data_ptr<double>()[i];
-    // No u takes the constant part of b off the residual. A half leaves room for rounding.
-    if (!(of_b[i] > 64.0 * epsilon_of(b) && residual >= 0.5 * of_b[i])) return true;
+  const auto* residual = residuals.const_data_ptr<double>();
+  const auto of_b = constant_shares(b.detach()).to(at::kCPU);
+  // No u takes the constant part of b off the residual. A half leaves room for rounding.
+  std::erase_if(suspects, [&](int64_t i) {
+    const double share = of_b.const_data_ptr<double>()[i];
+    return !(share > 64.0 * epsilon_of(b) && residual[i] >= 0.5 * share);
+  });
+  if (suspects.empty()) return;
+  const auto of_u = constant_shares(result.u).to(at::kCPU);
+  std::erase_if(suspects, [&](int64_t i) {
     if (products[i] >= kManyProducts || traits(solver.method).is_direct) return false;
     // The products that tell it are dear here, so u has to look like no truncated solution.
-    return status_of(i) != SolveStatus::kStagnated && residual <= 1.0 && of_u[i] <= 0.9;
-  };
-  std::erase_if(suspects, is_clear);
+    const double share = of_u.const_data_ptr<double>()[i];
+    return status_of(i) != SolveStatus::kStagnated && residual[i] <= 1.0 && share <= 0.9;
+  });
   if (suspects.empty()) return;
   const auto found = maps_constant_to_zero(a, b, /*transposed=*/true).to(at::kCPU);
   for (const int64_t i : suspects)
