@@ -65,6 +65,13 @@ LIST = [
     refinement("diffusion_inverse", 10, 5),
     refinement("benchmarks/scenes/diffusion_inverse_256.toml", 3, 90, name="diffusion_inverse_256"),
     refinement("kolmogorov", 3, 20),
+    Made(
+        "heat_3d",
+        "-m benchmarks.refinement heat_3d --rows converged prdp auto multigrid auto_multigrid --resume",
+        150,
+        "summary.json",
+        "results/heat_3d.json",
+    ),
     refinement("navier_stokes", 3, 300, "--rows converged prdp auto none"),
     study("data", "--seeds 5", 60),
     study("inference", "", 60),
