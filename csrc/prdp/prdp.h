@@ -6,6 +6,7 @@
 #include "prdp/controller/linear_schedule.h"
 #include "prdp/controller/prdp_controller.h"
 #include "prdp/controller/tolerance_controller.h"
+#include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/flow/flow.h"
