@@ -110,6 +110,8 @@ def main():
         parser.error("there are changes that are not committed: commit them, or pass --dirty")
     for entry in chosen:
         make(entry, commit)
+    for entry in chosen:  # only now: a changed file in docs would mark the records after it as made on a dirty tree
+        keep(entry, commit)
     for script in ("benchmarks.pictures", "docs.result_tables", "docs.performance_tables", "docs.flow_tables"):
         subprocess.run([sys.executable, "-m", script], cwd=ROOT, check=True)
 
@@ -123,9 +125,12 @@ def make(entry, commit):
             [sys.executable, *entry.command.split(), "--out", folder.relative_to(ROOT)], cwd=ROOT, check=True
         )
         done.touch()
+
+
+def keep(entry, commit):
     target = ROOT / "docs" / entry.kept
-    for path in folder.glob(entry.made):
-        if path != done:
+    for path in (RUNS / commit / entry.name).glob(entry.made):
+        if path.name != ".done":
             shutil.copy(path, target / path.name if target.is_dir() else target)
 
 
