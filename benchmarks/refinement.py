@@ -26,6 +26,7 @@ MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most 
     "poisson_3p_sd": 'method = "cg"\nmax_iter = 100',
     "heat_3d": 'method = "cg"\nmax_iter = 100',
     "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
+    "burgers_2d_192": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
     "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
     "diffusion_inverse_256": 'method = "cg"\nmax_iter = 100',
 }
