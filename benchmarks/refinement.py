@@ -21,14 +21,14 @@ from prdp_torch.experiments.refinement import Refinement
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
 MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update; and for Poisson
-    "poisson_1p": 'method = "cg"\nmax_iter = 100',
-    "poisson_3p": 'method = "cg"\nmax_iter = 100',
-    "poisson_3p_sd": 'method = "cg"\nmax_iter = 100',
-    "heat_3d": 'method = "cg"\nmax_iter = 100',
-    "burgers_2d": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
-    "burgers_2d_192": 'method = "gmres"\nrestart = 8\nmax_iter = 20',
-    "diffusion_inverse": 'method = "cg"\nmax_iter = 100',
-    "diffusion_inverse_256": 'method = "cg"\nmax_iter = 100',
+    "poisson_1p": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
+    "poisson_3p": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
+    "poisson_3p_sd": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
+    "heat_3d": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
+    "burgers_2d": 'method = "multigrid"\nmax_iter = 50',
+    "burgers_2d_192": 'method = "multigrid"\nmax_iter = 50',
+    "diffusion_inverse": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
+    "diffusion_inverse_256": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
 }
 
 
@@ -78,9 +78,7 @@ def scene_of(name, row):
     if row.label == "none":
         scene.backward = "none"
     if row.label in ("multigrid", "auto_multigrid"):
-        solver = (
-            f'[solver]\n{MULTIGRID[scene.name]}\npreconditioner = "multigrid"\nrtol = 1e-5\nbackward = "implicit"\n\n'
-        )
+        solver = f'[solver]\n{MULTIGRID[scene.name]}\nrtol = 1e-5\nbackward = "implicit"\n\n'
         text = re.sub(r"\[solver\]\n.*?\n\n", lambda _: solver, scene.text, flags=re.DOTALL)
         scene = _C.parse_scene(text, scene.path)
     return scene

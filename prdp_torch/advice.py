@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
-from prdp_torch.solver_trials import TOLERANCES, Row, candidates, measure, measure_one_iteration, measure_with_start
+from prdp_torch.solver_trials import (
+    TOLERANCES,
+    Row,
+    candidates,
+    measure,
+    measure_one_iteration,
+    measure_with_start,
+    preconditioner_of,
+)
 from prdp_torch.solvers import GMRES, Direct, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
@@ -89,7 +97,7 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
             `step.to(dtype)` does not reach. Its batch is never changed.
 
     Returns:
-        An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-3 and 1e-5,
+        An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-2 and 1e-5,
         forward and adjoint. Its `notes` name the solvers that the operator does not allow. Its
         `recommendation` is one choice with the reason for it.
 
@@ -174,41 +182,57 @@ def _start_gain(zero: Row, state: Row) -> str:
 def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, update: Update) -> str:
     """The recommendation where `best` is the fastest solver to the finest tolerance."""
     physics = update.physics(best)
-    most = max(solve.iterations for solve in best.solves)
-    if isinstance(best.solver, Direct):
-        rough = update.fastest(rows, TOLERANCES[0]) or best
-        if isinstance(rough.solver, Direct):
-            rough = best
-        least, cheapest = update.physics(rough), f"{rough.name} to {_power(rough.rtol)}"
-    elif most == 1:
-        least, cheapest = physics, ""
-    else:
-        least = update.physics(measure_one_iteration(step, sample, best.solver))
-        cheapest = "a single iteration"
+    refined, least, cheapest = _cheapest(step, sample, rows, best, update)
     saving = max(0.0, 1 - least / physics) * physics / (physics + update.network)
     if isinstance(best.solver, Direct):
-        choice = "Use the direct solver, Direct()"
+        chosen, choice = best, "Use the direct solver, Direct()"
     elif saving < WORTH_REFINING:
-        choice = f"Use converged solves with {_call(best.solver, 2 * most, best.rtol)}"
+        chosen, choice = best, f"Use converged solves with {_call(best.solver, 2 * _most(best), best.rtol)}"
     else:
-        choice = f"Refine {best.name} with a controller, up to K = {most}"
-    whole = "an update" if update.network else "a step"
-    reason = (
+        chosen, choice = refined, f"Refine {refined.name} with a controller, up to K = {_most(refined)}"
+    loosest, finest = (_power(rtol) for rtol in TOLERANCES)
+    cost = (
         f"physics is {update.share(physics)}"
         if update.network
-        else f"{whole} takes {milliseconds(physics)} with its adjoint"
+        else f"a step takes {milliseconds(physics)} with its adjoint"
     )
-    limit = f"at most {_percent(saving)} of {whole}, as {cheapest} takes {milliseconds(least)}"
-    if saving >= WORTH_REFINING:
-        limit = f"Refinement can save {limit}."
-    elif saving > 0.0:
-        limit = f"Refinement has nothing to save: {limit}."
-    elif most == 1 and not isinstance(best.solver, Direct):
-        limit = "Refinement has nothing to save: one iteration is enough."
+    if chosen.name == best.name:
+        fastest = "the fastest" if best is update.fastest(rows, best.rtol) else "as fast as any"
+        why = f"it is {fastest} to {finest}, and {cost}"
     else:
-        limit = f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."
-    fastest = "the fastest" if best is update.fastest(rows, best.rtol) else "as fast as any"
-    return f"{choice}: it is {fastest} to {_power(best.rtol)}, and {reason}. {limit}"
+        why = f"it is the fastest to {loosest}. With {best.name}, the fastest to {finest}, {cost}"
+    most = f"{_percent(saving)} of {'an update' if update.network else 'a step'}, as {cheapest} takes"
+    return f"{choice}: {why}. {_limit(saving, f'{most} {milliseconds(least)}', best)}"
+
+
+def _limit(saving: float, most: str, best: Row) -> str:
+    if saving >= WORTH_REFINING:
+        return f"Refinement can save at most {most}."
+    if saving > 0.0:
+        return f"Refinement has nothing to save: at most {most}."
+    if _most(best) == 1 and not isinstance(best.solver, Direct):
+        return "Refinement has nothing to save: one iteration is enough."
+    return f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."
+
+
+def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, update: Update) -> tuple[Row, float, str]:
+    """What to refine, the least seconds that its solves can take, and these in words. It is another solver than the
+    best if that is faster to the loosest tolerance by more than the noise."""
+    loosest, finest = TOLERANCES
+    solved = {(row.name, row.rtol): row for row in rows if row.solved}
+    rough = update.fastest([row for row in rows if not isinstance(row.solver, Direct)], loosest)
+    if rough is not None and rough.name != best.name:
+        own = best if isinstance(best.solver, Direct) else solved.get((best.name, loosest), best)
+        if update.physics(rough) < (1 - NOISE) * update.physics(own):
+            refined = solved.get((rough.name, finest), rough)
+            return refined, update.physics(rough), f"{rough.name} to {_power(loosest)}"
+    if isinstance(best.solver, Direct) or _most(best) == 1:
+        return best, update.physics(best), ""
+    return best, update.physics(measure_one_iteration(step, sample, best.solver)), "a single iteration"
+
+
+def _most(row: Row) -> int:
+    return max(solve.iterations for solve in row.solves)
 
 
 def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:
@@ -227,7 +251,7 @@ def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: flo
 
 def _call(solver: Solver, max_iter: int, rtol: float) -> str:
     extra = f", restart={solver.restart}" if isinstance(solver, GMRES) else ""
-    if getattr(solver, "preconditioner", None):
+    if preconditioner_of(solver) is not None:
         extra += f", preconditioner={solver.preconditioner!r}"
     return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
 

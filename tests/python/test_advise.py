@@ -47,7 +47,7 @@ def test_the_counts_are_those_of_the_solves(heat):
                 assert solve.iterations == int(truth.iterations.max())
                 assert solve.products == int(truth.operator_applications.max())
                 assert solve.status == "CONVERGED" and solve.seconds > 0
-    assert {row.rtol for row in advice.rows} == {1e-3, 1e-5}
+    assert {row.rtol for row in advice.rows} == {1e-2, 1e-5}
 
 
 def test_the_recommendation_names_the_fastest_solver_and_its_reason(heat):
@@ -81,7 +81,7 @@ def test_a_function_without_diagonal_leaves_out_jacobi():
     advice = advise(own_step(function), field((16,), batch=2))
     names = {row.name for row in advice.rows}
     assert {"GMRES(8)", "Direct"} <= names and "Jacobi" not in names
-    assert any("Jacobi was not tried" in note and "diagonal" in note for note in advice.notes)
+    assert any(re.match("Jacobi and .* were not tried: .*diagonal", note) for note in advice.notes)
 
 
 def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype():
@@ -138,7 +138,7 @@ def test_a_solver_that_diverges_is_named():
     step = own_step(0.1 * torch.eye(3, dtype=torch.float64) + 0.9)
     advice = advise(step, torch.randn(2, 3, dtype=torch.float64))
     jacobi = rows(advice, "Jacobi", torch.float64)
-    assert jacobi.keys() == {1e-3} and jacobi[1e-3].status == "DIVERGED"
+    assert jacobi.keys() == {1e-2} and jacobi[1e-2].status == "DIVERGED"
     assert re.search(r"Jacobi .* DIVERGED", str(advice)) and "Jacobi" not in advice.recommendation
 
 
@@ -146,7 +146,7 @@ def test_a_solver_that_takes_too_long_is_marked_and_bounded():
     """On 3000 points Jacobi needs tens of millions of iterations."""
     advice = advise(prdp.Poisson((3000,), prdp.CG(1)), field((3000,), batch=1), seconds=0.2)
     (jacobi,) = rows(advice, "Jacobi", torch.float64).values()
-    assert jacobi.rtol == 1e-3 and jacobi.status == "MAX_ITER" and "MAX_ITER" in str(advice)
+    assert jacobi.rtol == 1e-2 and jacobi.status == "MAX_ITER" and "MAX_ITER" in str(advice)
     assert jacobi.forward.seconds + jacobi.adjoint.seconds < 2.0
     assert rows(advice, "Direct", torch.float64)[1e-5].solved and "Direct" in advice.recommendation
 
@@ -157,7 +157,7 @@ def test_no_solver_is_recommended_where_none_gets_there():
     advice = advise(own_step(function), field((5000,), batch=1), seconds=0.1)
     assert advice.rows and not any(row.solved for row in advice.rows)
     assert any(note.startswith("Direct was not tried: 5000 unknowns are too many") for note in advice.notes)
-    assert advice.recommendation.startswith("No solver reaches 1e-3 within 0.1 s")
+    assert advice.recommendation.startswith("No solver reaches 1e-2 within 0.1 s")
 
 
 def test_a_solve_that_ends_at_its_rounding_counts_as_solved():
@@ -189,7 +189,7 @@ def test_gradients_of_parameters_count_though_the_state_has_none():
 
 def made_up(name, rtol, seconds, iterations=10):
     solve = Solve(iterations, iterations + 1, seconds / 2, "CONVERGED", True)
-    solver = {"CG": prdp.CG(1), "Direct": prdp.Direct(1)}[name]
+    solver = {"CG": prdp.CG(1), "Direct": prdp.Direct(1), "Jacobi": prdp.Jacobi(1)}[name]
     return Row(solver, torch.float64, rtol, solve, solve)
 
 
@@ -210,15 +210,30 @@ def test_refinement_is_recommended_where_physics_is_a_large_part(seconds, networ
 
 
 def test_the_direct_solver_says_whether_a_rough_solve_is_faster():
-    best, equal, rough = (made_up(*row) for row in (("Direct", 1e-5, 1.0), ("Direct", 1e-3, 1.0), ("CG", 1e-3, 0.4)))
+    best, equal, rough = (made_up(*row) for row in (("Direct", 1e-5, 1.0), ("Direct", 1e-2, 1.0), ("CG", 1e-2, 0.4)))
     update = module.Update(network=1.0)
     assert module._recommend(None, None, [best, equal], best, update) == (
         "Use the direct solver, Direct(): it is the fastest to 1e-5, and physics is 50% of an update: 1000 ms of "
-        "2000 ms. Refinement has nothing to save: no solver is faster to 1e-3."
+        "2000 ms. Refinement has nothing to save: no solver is faster to 1e-2."
     )
     assert module._recommend(None, None, [best, equal, rough], best, update).endswith(
-        "Refinement can save at most 30% of an update, as CG to 1e-3 takes 400 ms."
+        "Refinement can save at most 30% of an update, as CG to 1e-2 takes 400 ms."
     )
+
+
+def test_another_solver_is_refined_where_it_is_faster_to_a_loose_tolerance():
+    """By more than the noise. Its K is what it takes to the finest one, where it reaches that."""
+    best, rough = made_up("CG", 1e-5, 1.0, iterations=1), made_up("Jacobi", 1e-2, 0.4, iterations=3)
+    update, finer = module.Update(), made_up("Jacobi", 1e-5, 1.5, iterations=20)
+    words = (
+        "Refine Jacobi with a controller, up to K = {}: it is the fastest to 1e-2. With CG, the fastest to 1e-5, "
+        "a step takes 1000 ms with its adjoint. Refinement can save at most 60% of a step, "
+        "as Jacobi to 1e-2 takes 400 ms."
+    )
+    assert module._recommend(None, None, [best, rough], best, update) == words.format(3)
+    assert module._recommend(None, None, [best, rough, finer], best, update) == words.format(20)
+    near = made_up("CG", 1e-2, 0.43)
+    assert module._recommend(None, None, [best, near, rough], best, update).startswith("Use converged solves with CG")
 
 
 def test_one_iteration_is_not_to_be_refined():
@@ -271,7 +286,7 @@ def test_the_command_ends_with_a_recommendation(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "Chebyshev" in done.stdout and "of an update" in done.stdout and not list(tmp_path.iterdir())
-    assert re.match("(Use|Refine) .*it is (the fastest|as fast as any) to 1e-5", done.stdout.splitlines()[-1])
+    assert re.match("(Use|Refine) .*it is (the fastest|as fast as any) to 1e-[25]", done.stdout.splitlines()[-1])
     assert max(map(len, done.stdout.split("Batch of")[0].splitlines())) <= 80 and "…" not in done.stdout
     wrong = subprocess.run([*command[:-1], "0"], cwd=tmp_path, capture_output=True, text=True)
     assert wrong.returncode == 2 and wrong.stderr == "prdp: advise: seconds must be a number > 0, got 0.0\n"

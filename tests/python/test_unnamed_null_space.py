@@ -92,6 +92,20 @@ def test_a_few_iterations_are_left_alone():
     assert statuses(info) == ["MAX_ITER"]
 
 
+@pytest.mark.parametrize("k", [1, 5, 20, 40, 200])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_worse_than_zero_raises_after_any_number_of_iterations(k, dtype):
+    """CG on a periodic Laplacian grows the constant part of b, and hands out nothing of it where it says so."""
+    a = torch.tensor([4.0, -1, -1, -1, -1], dtype=dtype).view(1, 5, 1, 1).expand(1, 5, 16, 16) * 256
+    stencil = operators.Stencil(a, [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], boundary="periodic")
+    b = 1 + torch.randn(4, 1, 16, 16, generator=torch.Generator().manual_seed(3), dtype=dtype)
+    u, info = prdp.linear_solve(stencil, b, prdp.CG(k), on_failure="return")
+    left = (b - stencil.apply(u)).flatten(1).norm(dim=1) / b.flatten(1).norm(dim=1)
+    assert info.failed.all() or bool((left <= 1 + 1e-4).all())
+    diverged = info.status == int(prdp.SolveStatus.DIVERGED)
+    assert bool((left[diverged] <= 1 + 1e-4).all())
+
+
 @pytest.mark.parametrize("leak", [1e-4, 1e-2])
 def test_regular_operators_may_end_at_max_iter(leak):
     n = 64

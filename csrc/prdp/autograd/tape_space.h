@@ -174,6 +174,9 @@ class TapeSpace {
     const T length = values_.step_length(num.value, den.value, a2.value, b2.value);
     return length == T(0) ? Scalar(length) : num / den;
   }
+  Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const {
+    return values_.breaks_down(den.value, a2.value, b2.value, going.value);
+  }
   Scalar ratio(const Scalar& num, const Scalar& den) const {
     const T value = values_.ratio(num.value, den.value);
     return value == T(0) ? Scalar(value) : num / den;

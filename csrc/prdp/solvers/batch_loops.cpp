@@ -192,6 +192,27 @@ at::Tensor ratio(const Scalar& num, const Scalar& den, double negligible) {
   return quotient;
 }
 
+namespace {
+
+template <class T>
+bool is_zero_beside(T den, T a2, T b2, double epsilon) {
+  const T bound = static_cast<T>(epsilon) * std::sqrt(a2) * std::sqrt(b2);
+  return std::abs(den) <= bound && std::isfinite(bound);
+}
+
+}  // namespace
+
+Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going, double epsilon) {
+  auto where = at::empty_like(den);
+  with_type(den, [&]<class T>(T) {
+    const T *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2), *goes = data<T>(going);
+    T* to = where.mutable_data_ptr<T>();
+    for (int64_t s = 0; s < den.numel(); ++s)
+      to[s] = goes[s] != T(0) && is_zero_beside(below[s], left2[s], right2[s], epsilon) ? T(1) : T(0);
+  });
+  return where;
+}
+
 Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
                  double negligible) {
   Step step{at::empty_like(num), {}};
@@ -204,8 +225,7 @@ Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const S
     T* to = step.length.mutable_data_ptr<T>();
     for (int64_t s = 0; s < num.numel(); ++s) {
       const bool nothing_left = above[s] < static_cast<T>(negligible);
-      const T bound = static_cast<T>(epsilon) * std::sqrt(left2[s]) * std::sqrt(right2[s]);
-      const bool breaks = std::abs(below[s]) <= bound && std::isfinite(bound) && !nothing_left;
+      const bool breaks = !nothing_left && is_zero_beside(below[s], left2[s], right2[s], epsilon);
       to[s] = nothing_left || breaks ? T(0) : above[s] / below[s];
       if (breaks) note(s);
     }

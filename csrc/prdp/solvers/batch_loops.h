@@ -47,5 +47,6 @@ struct Step {
 };
 Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
                  double negligible);
+Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going, double epsilon);
 
 }  // namespace prdp::batch_loops

@@ -14,7 +14,8 @@ namespace prdp {
 /// along M⁻¹ p and M⁻¹ s.
 ///
 /// Where r has become all but orthogonal to r̂, so that two digits of ρ are left at most, it starts anew from
-/// r̂ = p = r. It breaks down where r̂·v is rounding, or s·t of the iteration before was.
+/// r̂ = p = r. Where r̂·v is rounding, it leaves out the half of the iteration with α, and starts anew after the other.
+/// It breaks down where r·A r is rounding: as r̂·v of a start, or as s·t of the iteration before.
 template <VectorSpace Space>
 class BiCGStabMethod {
  public:
@@ -49,7 +50,11 @@ class BiCGStabMethod {
     const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
     space_.xmby(v_, over_omega, p_);
     space_.xmby(r_, rho * inverse_, p_);
-    const auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
+    auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
+    const Scalar starts_anew = space_.breaks_down(hv, hh_, vv, inverse_);
+    space_.restore(starts_anew, zero_, rho);
+    space_.restore(starts_anew, zero_, hh_);
+    space_.restore(starts_anew, vv, hv);  // a number to divide by, which ρ = 0 takes out again
     inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
     const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_); };
     ss_ = space_.descend(moves(rho * inverse_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
@@ -57,6 +62,9 @@ class BiCGStabMethod {
     st_ = st;
     tt_ = tt;
     rr_ = space_.descend(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x, r_);
+    space_.restore(starts_anew, r_, hat_);
+    space_.restore(starts_anew, rr_, hh_);
+    space_.restore(starts_anew, zero_, inverse_);
   }
   auto residual2() const { return rr_; }
   /// From the true residual it starts anew.

@@ -86,12 +86,16 @@ void conclude(Space& space, Method& method, typename Space::States& states, doub
   }
 }
 
-/// Which samples end with a residual above ‖b‖, though nothing failed: zero would be a better answer.
+/// Whether the residual is above ‖b‖: zero would be a better answer.
+template <class Space>
+bool is_above_b(const Space& space, const SampleState& s) {
+  return s.residual2 > (1.0 + 256.0 * space.epsilon()) * s.b2;
+}
+
+/// Which samples end so, though nothing failed.
 template <class Space>
 auto worse_than_zero(Space& space, const typename Space::States& states) {
-  return space.map(states, [&](const SampleState& s) {
-    return is_unsolved(s.status) && s.residual2 > (1.0 + 256.0 * space.epsilon()) * s.b2;
-  });
+  return space.map(states, [&](const SampleState& s) { return is_unsolved(s.status) && is_above_b(space, s); });
 }
 
 /// What energy_falls() is told by: products of two of u, x; b; r, its residual; and A r. One per sample, or all.
@@ -219,8 +223,8 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
     if (useless[i]) return int64_t{0};
     return lost(first[i]) || worse[i] ? watched[i].best : watched[i].iterations;
   });
-  const auto still_worse = worse_than_zero(space, states);
-  for (size_t i = 0; i < states.size(); ++i) worse[i] = worse[i] && still_worse[i];
+  for (size_t i = 0; i < states.size(); ++i)
+    worse[i] = (worse[i] || (again[i] && lost(first[i]))) && is_above_b(space, states[i]);
   if (any(worse)) {  // a recursive residual had said otherwise
     const auto remade = states;
     remake([&](size_t i) { return worse[i] ? 0 : remade[i].iterations; });

@@ -186,11 +186,14 @@ class SampleSpace {
     if (num < kNegligible) return 0;
     if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
     if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
-    if (std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2)) {
+    if (is_zero_beside(den, a2, b2)) {
       broken_ = true;
       return 0;
     }
     return num / den;
+  }
+  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar going) {
+    return going != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
   }
   Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
   void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
@@ -258,6 +261,9 @@ class SampleSpace {
   }
 
  private:
+  static bool is_zero_beside(Scalar den, Scalar a2, Scalar b2) {
+    return std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2);
+  }
   /// Squared norms below this are zero to the dtype, b and A being scaled to the order of one.
   static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
 

@@ -61,6 +61,8 @@ concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, 
   /// a/b for a step, where the third and fourth are the squares of the norms whose product bounds b: 0 where a is
   /// negligible, and 0 with a breakdown where b is rounding beside that bound.
   { s.step_length(a, b, a, b) } -> std::same_as<typename S::Scalar>;
+  /// 1 where step_length() would break down dividing by a, and the last is not zero, else 0; for restore() alone.
+  { s.breaks_down(a, a, b, b) } -> std::same_as<typename S::Scalar>;
   /// a/b for b >= 0; 0 where b is negligible.
   { s.ratio(a, b) } -> std::same_as<typename S::Scalar>;
   /// A breakdown of the samples where a is not positive, and b not negligible.

@@ -111,6 +111,15 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
   return at::where(none, at::zeros_like(num), num / safe);
 }
 
+TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2,
+                                             const Scalar& going) const {
+  if (unseen_) return {};  // step_length() tells
+  if (in_loops_) return batch_loops::breaks_down(den, a2, b2, going, limits_of(b_).epsilon);
+  const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
+  const auto vanishes = den.detach().abs().le(bound).logical_and(bound.isfinite());
+  return vanishes.logical_and(going.detach().ne(0)).to(b_.scalar_type());
+}
+
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {
   if (in_loops_) return batch_loops::ratio(num, den, negligible_);
   if (unseen_) return unseen_->ratio(num, den);

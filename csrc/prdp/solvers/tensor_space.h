@@ -139,6 +139,7 @@ class TensorSpace {
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
+  Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const;
   Scalar ratio(const Scalar& num, const Scalar& den);
   void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
     if (unseen_) return unseen_->expect_positive(a, r2);

@@ -28,6 +28,11 @@ at::Tensor constant_shares(const at::Tensor& v) {
   return sums / (whole * std::sqrt(static_cast<double>(channels.size(-1))));
 }
 
+double residual_of_sample(const at::Tensor& residuals, int64_t sample) {
+  return residuals.scalar_type() == at::kFloat ? residuals.const_data_ptr<float>()[sample]
+                                               : residuals.const_data_ptr<double>()[sample];
+}
+
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
 /// Whether rounding may have grown, after so many products.
@@ -77,8 +82,10 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   const auto* products = info.operator_applications.const_data_ptr<int64_t>();
   const auto status_of = [&](int64_t i) { return static_cast<SolveStatus>(status[i]); };
   std::vector<int64_t> suspects;
+  const auto is_worse_than_zero = [&](int64_t i) { return residual_of_sample(info.residual, i) > 1.0; };
   for (int64_t i = 0; i < b.size(0); ++i)
-    if (is_unsolved(status_of(i)) && worked_for_long(solver, products[i])) suspects.push_back(i);
+    if (is_unsolved(status_of(i)) && (worked_for_long(solver, products[i]) || is_worse_than_zero(i)))
+      suspects.push_back(i);
   if (suspects.empty()) return;
 
   const at::NoGradGuard no_grad;

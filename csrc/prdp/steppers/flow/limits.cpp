@@ -21,6 +21,15 @@ double largest_courant_number(const FlowEquation& e) {
       1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
 }
 
+/// What is not finite in sample i: the inflow that makes the boundary values of u, or u.
+std::string nonfinite_part(const at::Tensor& inflow, const at::Tensor& u, int64_t i) {
+  if (inflow.defined()) {
+    const auto bad = nonfinite(inflow.select(0, inflow.size(0) == 1 ? 0 : i));
+    if (bad.any().item<bool>()) return "inflow is not finite at index " + c10::str(at::IntArrayRef(first_true(bad)));
+  }
+  return "the velocity is not finite at index " + c10::str(at::IntArrayRef(first_true(nonfinite(u[i]))));
+}
+
 }  // namespace
 
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
@@ -45,7 +54,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
     const auto status = static_cast<SolveStatus>(refused.status[i].item<int64_t>());
     text << (k ? "; " : ": ") << "sample " << i << " " << name(status);
     if (status == SolveStatus::kNonfiniteInput)
-      text << ": the velocity is not finite at index " << at::IntArrayRef(first_true(nonfinite(u[i])));
+      text << ": " << nonfinite_part(equation.inflow, u, i);
     else
       text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
            << largest_courant_number(equation) << "; take a smaller dt";
