@@ -135,6 +135,15 @@ def test_an_instability_ends_in_an_error():
         flow.rollout(u, 2000)
 
 
+def test_an_inflow_that_is_not_finite_is_named():
+    inflow = torch.ones(2, 2, 8, 1)
+    inflow[1, 0, 3, 0] = torch.nan
+    flow = prdp.Flow((8, 6), 0.1, 0.01, boundary=("wall", "open"), inflow=inflow)
+    words = r"1 of 2 samples failed: sample 1 NONFINITE_INPUT: inflow is not finite at index \[0, 3, 0\]"
+    with pytest.raises(torch.linalg.LinAlgError, match=words):
+        flow(torch.zeros(2, 2, 8, 6))
+
+
 def test_copies_pickles_and_parameters():
     nu, force = torch.nn.Parameter(torch.tensor(0.1)), torch.zeros(1, 2, 8, 6)
     flow = prdp.Flow((8, 6), nu, 0.01, force=force, obstacle=solid((8, 6), (3, 3)), inflow=None)
