@@ -256,7 +256,12 @@ def _spreads(entry: Entry, cost: str) -> tuple[float | None, float | None]:
     if entry["seeds"] < 2:
         return None, None
     each = entry.get("each")
-    return float(np.std(each[cost], ddof=1)) if each else None, entry["metric_std"]
+    if not each:
+        return None, entry["metric_std"]
+    if cost == "seconds":  # one of them may have waited
+        low, high = np.quantile(each[cost], [0.25, 0.75])
+        return float(high - low) / 2, entry["metric_std"]
+    return float(np.std(each[cost], ddof=1)), entry["metric_std"]
 
 
 def error_against_cost(scene: _C.Scene, rows: list[Row]) -> Figure:

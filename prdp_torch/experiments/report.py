@@ -55,7 +55,7 @@ def columns(scene: _C.Scene) -> list[Column]:
             "saved: share of the converged run's products, given only if the error is at most one standard deviation, "
             "or a tenth, above that of the converged run and the controller does not warn.",
         ),
-        Column("s", "seconds of training"),
+        Column("s", "seconds of training (median)"),
     ]
 
 
