@@ -96,8 +96,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
            "or A is not; prdp.check_operator(A, b, solver) looks at both";
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
-  if (traits(solver.method).counts == Counts::kIterations)
-    return "r·A r is zero for a residual r; take GMRES";
+  if (traits(solver.method).counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
   return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
          "take a b without that part, or add a multiple of the identity to A";
 }

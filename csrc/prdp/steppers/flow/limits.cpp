@@ -53,8 +53,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
     const auto i = failed[k].item<int64_t>();
     const auto status = static_cast<SolveStatus>(refused.status[i].item<int64_t>());
     text << (k ? "; " : ": ") << "sample " << i << " " << name(status);
-    if (status == SolveStatus::kNonfiniteInput)
-      text << ": " << nonfinite_part(equation.inflow, u, i);
+    if (status == SolveStatus::kNonfiniteInput) text << ": " << nonfinite_part(equation.inflow, u, i);
     else
       text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
            << largest_courant_number(equation) << "; take a smaller dt";
