@@ -26,7 +26,6 @@ MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most 
     "poisson_3p_sd": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "heat_3d": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "burgers_2d": 'method = "multigrid"\nmax_iter = 50',
-    "burgers_2d_192": 'method = "multigrid"\nmax_iter = 50',
     "diffusion_inverse": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "diffusion_inverse_256": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
 }

@@ -154,8 +154,9 @@ def the_best_constant():
         of_best = ["none", "–"] if best is None else [_power_of(best), _beside(best, found["auto"])]
         loosest, tightest = tolerances[0], tolerances[-1]
         wrong = f"{loosest['metric'] / found['converged']['metric']:.2g}", _beside(tightest, found["auto"])
-        body.append([name, *of_best, wrong[0], f"{wrong[1]} with {_power_of(tightest)}"])
-    head = ["scene", "loosest that ends as converged", "products / auto's", "error with 1e-1 / converged"]
+        wrong = (f"{what} with {_power_of(row)}" for what, row in zip(wrong, (loosest, tightest), strict=True))
+        body.append([name, *of_best, *wrong])
+    head = ["scene", "loosest that ends as converged", "products / auto's", "error of the loosest / converged"]
     return page_tables.markdown([*head, "products of the tightest / auto's"], body)
 
 
