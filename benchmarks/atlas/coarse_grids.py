@@ -36,12 +36,23 @@ def stretched(ratio, n=63):
     )
 
 
-def windy(peclet, n=64):
-    """u/dt + w·∇u - Δu, first-order upwind and periodic, in vortices w with max|w| dx = peclet; dt is a hundredth."""
+def in_vortices(peclet, n=64):
+    """`windy` in vortices, with max|w| dx = peclet."""
     y, x = np.meshgrid(*[np.arange(n) / n] * 2, indexing="ij")
+    return windy(peclet * torch.tensor(np.stack([np.cos(2 * np.pi * x), np.sin(2 * np.pi * y)])))
+
+
+def in_noise(peclet, n=64):
+    """`windy` where winds turn from cell to cell: white noise with max|w| dx = peclet."""
+    wind = problems.noise(1, 2, n, n)[0]
+    return windy(peclet * wind / wind.abs().max())
+
+
+def windy(winds):
+    """u/dt + w·∇u - Δu, first-order upwind and periodic; dt is a hundredth. `winds` is w dx, (2, n, n)."""
+    n = winds.shape[-1]
     sides, offsets = [], []
-    for axis, wave in ((0, np.cos(2 * np.pi * x)), (1, np.sin(2 * np.pi * y))):
-        wind = torch.tensor(peclet * wave)  # times 1/dx², as diffusion is
+    for axis, wind in enumerate(winds):  # times 1/dx², as diffusion is
         for step, inflow in ((-1, wind.clamp(min=0)), (1, (-wind).clamp(min=0))):
             sides.append(-1 - inflow)
             offsets.append(tuple(step * (d == axis) for d in range(2)))
@@ -63,8 +74,16 @@ def sizes(quick):
     return _answered(lines(x, lambda n: smooth_diffusion(100.0, n), OF_SYMMETRIC), "N =")
 
 
-def peclet(quick):
-    data = lines(spaced(0.01, 100, 3 if quick else 9), windy, OF_WINDS)
+def vortices(quick):
+    return _of_peclet(in_vortices, quick)
+
+
+def rough_winds(quick):
+    return _of_peclet(in_noise, quick)
+
+
+def _of_peclet(problem, quick):
+    data = lines(spaced(0.01, 100, 3 if quick else 9), problem, OF_WINDS)
     plain, cycles = (data["lines"][name][-1] for name in ("BiCGStab", 'BiCGStab, preconditioner="multigrid"'))
     return {**data, "answer": f"at a cell Péclet number of {data['x'][-1]:g}: {_pair('BiCGStab', plain, cycles)}"}
 

@@ -57,9 +57,15 @@ MAPS = {
     "multigrid_sizes": Map("Does multigrid mind the size of the grid?", coarse_grids.sizes, "grid_size"),
     "multigrid_winds": Map(
         "Does multigrid mind winds?",
-        coarse_grids.peclet,
+        coarse_grids.vortices,
         "cost",
         ("cell Péclet number, max|w| dx/nu, of vortices (64²)",),
+    ),
+    "multigrid_rough_winds": Map(
+        "Does multigrid mind winds that turn from cell to cell?",
+        coarse_grids.rough_winds,
+        "cost",
+        ("cell Péclet number, max|w| dx/nu, of white noise (64²)",),
     ),
     "burgers_solvers": Map(
         "Which solver takes a Burgers step?",

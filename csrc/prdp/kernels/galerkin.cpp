@@ -72,9 +72,12 @@ Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
   return sums;
 }
 
-/// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros.
+/// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros. Where
+/// the neighbours outweigh the point, as in the columns of A where winds meet, they are made to add up to one.
 template <class T>
-Weights<T> weights_of(const StencilGrid& grid, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
+Weights<T> weights_of(const RawStencil<T>& a, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
+  const StencilGrid& grid = a.grid;
+  const T* diagonal = a.coefficients[RawStencil<T>::kCentre];
   const Ringed ringed(grid);
   Weights<T> w{zeros<T>(Ringed::size(grid)), zeros<T>(Ringed::size(grid))};
   const auto& [nz, ny, nx] = grid.shape;
@@ -84,9 +87,11 @@ Weights<T> weights_of(const StencilGrid& grid, const Sums<T>& sums, const Sums<T
       T s[3] = {sums[0][at + i], sums[1][at + i], sums[2][at + i]};
       if (averaged_with)
         for (int d = 0; d < 3; ++d) s[d] += (*averaged_with)[d][at + i];
-      const T centre = s[1] == T(0) ? T(1) : s[1];
-      left[i] = std::clamp(-s[0] / centre, T(0), T(1));
-      right[i] = std::clamp(-s[2] / centre, T(0), T(1));
+      const T sign = diagonal[at + i] < T(0) ? T(-1) : T(1);
+      const T before = std::max(-sign * s[0], T(0)), after = std::max(-sign * s[2], T(0));
+      const T whole = std::max(sign * s[1], before + after);
+      left[i] = whole > T(0) ? before / whole : before;
+      right[i] = whole > T(0) ? after / whole : after;
     }
   });
   for (auto* field : {&w.left, &w.right}) {
@@ -193,11 +198,11 @@ template <class T>
 AxisTransfer<T> make_transfer(const RawStencil<T>& a, int axis, bool symmetric) {
   const auto own = sums_along(a, axis, false);
   if (symmetric) {
-    auto w = weights_of(a.grid, own);
+    auto w = weights_of(a, own);
     return {w, w};
   }
   const auto of_transpose = sums_along(a, axis, true);
-  return {weights_of(a.grid, own, &of_transpose), weights_of(a.grid, of_transpose)};
+  return {weights_of(a, own, &of_transpose), weights_of(a, of_transpose)};
 }
 
 template <class T>

@@ -48,13 +48,16 @@ TensorTransfer::TensorTransfer(const TensorStencil& a, const TensorStencil& tran
   const auto is_coarse = places.remainder(2).eq(periodic_ ? 0 : 1), pairs = places.div(2, "floor");
   order_ = at::where(is_coarse, pairs, coarse_ + pairs);
   const auto own = sums_along(a, axis), other = sums_along(transpose, axis);
-  const auto weight = [&](const at::Tensor& side, const at::Tensor& centre) {
-    const auto w = -side / at::where(centre.eq(0), at::ones_like(centre), centre);
-    return at_between(w.clamp(0.0, 1.0)).contiguous();
+  // As weights_of() in kernels/galerkin.cpp.
+  const auto against = at::where(at_between(a.diagonal()).lt(0), 1.0, -1.0).to(a.diagonal().scalar_type());
+  const auto weights = [&](const at::Tensor& before, const at::Tensor& centre, const at::Tensor& after) {
+    const auto b = (at_between(before) * against).clamp_min(0.0), c = (at_between(after) * against).clamp_min(0.0);
+    const auto whole = at::maximum(-against * at_between(centre), b + c);
+    const auto share = at::where(whole.gt(0), whole, 1.0).reciprocal();
+    return Weights{b * share, c * share};
   };
-  const auto centre = own.own + other.own;
-  interpolation_ = {weight(own.before + other.before, centre), weight(own.after + other.after, centre)};
-  restriction_ = {weight(other.before, other.own), weight(other.after, other.own)};
+  interpolation_ = weights(own.before + other.before, own.own + other.own, own.after + other.after);
+  restriction_ = weights(other.before, other.own, other.after);
 }
 
 at::Tensor TensorTransfer::after_coarse(const at::Tensor& between, double without) const {
