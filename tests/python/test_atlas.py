@@ -142,6 +142,6 @@ def test_multigrid_takes_as_many_products_at_every_distance_from_trouble(measure
 
 
 def test_winds_slow_cycles_down_but_less_than_methods_without_them():
-    found = coarse_grids.peclet(quick=True)["lines"]
+    found = coarse_grids.vortices(quick=True)["lines"]
     assert found['BiCGStab, preconditioner="multigrid"'][0] <= 8
     assert found['BiCGStab, preconditioner="multigrid"'][-1] < found["BiCGStab"][-1] / 10
