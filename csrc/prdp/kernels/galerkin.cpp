@@ -90,8 +90,8 @@ Weights<T> weights_of(const RawStencil<T>& a, const Sums<T>& sums, const Sums<T>
       const T sign = diagonal[at + i] < T(0) ? T(-1) : T(1);
       const T before = std::max(-sign * s[0], T(0)), after = std::max(-sign * s[2], T(0));
       const T whole = std::max(sign * s[1], before + after);
-      left[i] = whole > T(0) ? before / whole : before;
-      right[i] = whole > T(0) ? after / whole : after;
+      left[i] = whole > T(0) ? before / whole : T(0);
+      right[i] = whole > T(0) ? after / whole : T(0);
     }
   });
   for (auto* field : {&w.left, &w.right}) {

@@ -49,15 +49,16 @@ TensorTransfer::TensorTransfer(const TensorStencil& a, const TensorStencil& tran
   order_ = at::where(is_coarse, pairs, coarse_ + pairs);
   const auto own = sums_along(a, axis), other = sums_along(transpose, axis);
   // As weights_of() in kernels/galerkin.cpp.
-  const auto against = at::where(at_between(a.diagonal()).lt(0), 1.0, -1.0).to(a.diagonal().scalar_type());
-  const auto weights = [&](const at::Tensor& before, const at::Tensor& centre, const at::Tensor& after) {
-    const auto b = (at_between(before) * against).clamp_min(0.0), c = (at_between(after) * against).clamp_min(0.0);
-    const auto whole = at::maximum(-against * at_between(centre), b + c);
+  const auto sign = at::where(at_between(a.diagonal()).lt(0), -1.0, 1.0).to(a.diagonal().scalar_type());
+  const auto weights = [&](const Row& sums) {
+    const auto before = (-sign * at_between(sums.before)).clamp_min(0.0);
+    const auto after = (-sign * at_between(sums.after)).clamp_min(0.0);
+    const auto whole = at::maximum(sign * at_between(sums.own), before + after);
     const auto share = at::where(whole.gt(0), whole, 1.0).reciprocal();
-    return Weights{b * share, c * share};
+    return Weights{before * share, after * share};
   };
-  interpolation_ = weights(own.before + other.before, own.own + other.own, own.after + other.after);
-  restriction_ = weights(other.before, other.own, other.after);
+  interpolation_ = weights({own.before + other.before, own.own + other.own, own.after + other.after});
+  restriction_ = weights(other);
 }
 
 at::Tensor TensorTransfer::after_coarse(const at::Tensor& between, double without) const {
