@@ -72,7 +72,7 @@ LIST = [
         "summary.json",
         "results/heat_3d.json",
     ),
-    refinement("navier_stokes", 3, 300, "--rows converged prdp auto none"),
+    refinement("navier_stokes", 3, 600, "--rows converged prdp auto none rtol_0.1 rtol_0.01 rtol_0.001 rtol_0.0001"),
     study("data", "--seeds 5", 60),
     study("inference", "", 60),
     study("loss", "--seeds 10", 10),
