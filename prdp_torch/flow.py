@@ -8,7 +8,7 @@ from torch import Tensor
 
 from prdp_torch import _C, _check
 from prdp_torch.operators.base import real_tensor
-from prdp_torch.solvers import CG, Solver
+from prdp_torch.solvers import CG, Kept, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
 
@@ -96,7 +96,7 @@ class Flow(Stepper):
         self._keep_tensor("force", force)
         self._keep_tensor("inflow", inflow)
         self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
-        self._box: _C.FlowBox | None = None
+        self._kept_box = Kept(_make_box)
         self._equation().check()
 
     def _keep_tensor(self, name: str, value: Tensor | Sequence[float] | float | None) -> None:
@@ -152,26 +152,38 @@ class Flow(Stepper):
         return self._equation().divergence(_check.dense("Flow", "u", u))
 
     def _equation(self) -> _C.FlowEquation:
-        if self._box is None:
-            self._box = self._make_box()
         nu = real_tensor("Flow", "nu", self.nu)
-        return _C.FlowEquation(self._box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
-
-    def _make_box(self) -> _C.FlowBox:
-        names = [self.boundary] if isinstance(self.boundary, str) else self.boundary
-        if not isinstance(names, (tuple, list)):
-            raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
-        checked_names = [_check.string("Flow", "boundary", name) for name in names]
-        lengths = self.length if isinstance(self.length, (tuple, list)) else [self.length]
-        checked_lengths = [_check.real("Flow", "length", side) for side in lengths]
-        return _C.FlowBox(list(self.shape), checked_names, checked_lengths, self.obstacle)
-
-    def __getstate__(self) -> dict[str, Any]:
-        state: dict[str, Any] = super().__getstate__()  # type: ignore[no-untyped-call]
-        return {**state, "_box": None}  # of the compiled library; made again where it is needed
+        box = self._kept_box.of(tuple(self.shape), _of_axes(self.boundary), _of_axes(self.length), _Mask(self.obstacle))
+        return _C.FlowEquation(box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
 
     def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
+
+
+class _Mask:
+    """An obstacle, which equals another one only if it is the same tensor and nobody wrote to it since."""
+
+    def __init__(self, obstacle: Tensor | None) -> None:
+        self.obstacle = obstacle
+        self.version = 0 if obstacle is None or obstacle.is_inference() else obstacle._version
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Mask) and self.obstacle is other.obstacle and self.version == other.version
+
+
+def _of_axes(values: Any) -> tuple[Any, ...]:
+    """What is given for all axes at once, or for each."""
+    return tuple(values) if isinstance(values, (tuple, list)) else (values,)
+
+
+def _make_box(
+    shape: tuple[int, ...], boundary: tuple[object, ...], length: tuple[object, ...], mask: _Mask
+) -> _C.FlowBox:
+    names = [name for name in boundary if isinstance(name, str)]
+    if len(names) < len(boundary):
+        raise TypeError(f"Flow: boundary must be a name or one per axis, got {boundary!r}")
+    lengths = [_check.real("Flow", "length", side) for side in length]
+    return _C.FlowBox(list(shape), names, lengths, mask.obstacle)
 
 
 def _of_numbers(name: str, value: object) -> Tensor:

@@ -1,5 +1,6 @@
 """`Stepper`: what all steppers have in common, and the base of those that solve A(u) u_next = b(u)."""
 
+import difflib
 import inspect
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
@@ -23,6 +24,12 @@ from prdp_torch.solvers import (
     tensors_of,
 )
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
+
+# What may be set on a stepper at any time.
+SETTINGS = (
+    "max_iter", "rtol", "restart", "preconditioner", "backward", "adjoint_max_iter", "adjoint_rtol", "on_failure",
+    "checkpoint_every", "start",
+)  # fmt: skip
 
 
 class Stepper(torch.nn.Module):
@@ -102,6 +109,13 @@ class Stepper(torch.nn.Module):
         self._last_log: AdjointLog | AdjointLogs = self._adjoint_log
         self._kept_options = Kept(solve_options)
         self.info = None
+
+    if not TYPE_CHECKING:
+
+        def __setattr__(self, name: str, value: object) -> None:
+            if not torch.compiler.is_compiling() and not hasattr(type(self), name) and name not in self.__dict__:
+                _refuse_misspelt(type(self), name)
+            super().__setattr__(name, value)
 
     def operator(self, u: Tensor) -> operators.Operator | Tensor:
         """A(u), an operator of `prdp_torch.operators`."""
@@ -260,6 +274,17 @@ class Stepper(torch.nn.Module):
             else f", preconditioner={self.preconditioner!r}"
         )
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
+
+
+def _refuse_misspelt(kind: type[Stepper], name: str) -> None:
+    """Raise AttributeError for a new attribute that must be meant for a setting, which would stay as it is. Subclasses
+    outside this library may have attributes of any name."""
+    if name.startswith("_") or name in SETTINGS or not kind.__module__.startswith("prdp_torch."):
+        return
+    if name == "solver":
+        raise AttributeError(f"{kind.__name__}: the solver cannot be set later; set {', '.join(SETTINGS[:4])}")
+    if meant := difflib.get_close_matches(name, SETTINGS, n=1, cutoff=0.8):
+        raise AttributeError(f"{kind.__name__}: no setting '{name}'; did you mean '{meant[0]}'?")
 
 
 def _unknown_argument(kind: type[Stepper], unknown: Mapping[str, object]) -> str:

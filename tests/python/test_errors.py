@@ -1,6 +1,7 @@
 """Bad input: clear errors before any work, tested by their words."""
 
 import math
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -280,3 +281,32 @@ def test_vectors_without_unknowns_are_refused():
 def test_an_argument_that_no_stepper_has_is_named_with_those_it_has(make, expected):
     with pytest.raises(TypeError, match=expected):
         make()
+
+
+@pytest.mark.parametrize("name, expected", [
+    ("max_iters", "Heat: no setting 'max_iters'; did you mean 'max_iter'?"),
+    ("adjoint_tol", "Heat: no setting 'adjoint_tol'; did you mean 'adjoint_rtol'?"),
+    ("onfailure", "Heat: no setting 'onfailure'; did you mean 'on_failure'?"),
+    ("solver", "Heat: the solver cannot be set later; set max_iter, rtol, restart, preconditioner"),
+])  # fmt: skip
+def test_a_misspelt_setting_is_refused(name, expected):
+    step = heat()
+    with pytest.raises(AttributeError, match=re.escape(expected)):
+        setattr(step, name, 50)
+    assert not hasattr(step, name) and step.max_iter == 3
+
+
+def test_other_attributes_are_free():
+    """Those of another name, and all of a user's own stepper."""
+
+    class Own(prdp.Stepper):
+        def __init__(self):
+            super().__init__(prdp.CG(5))
+            self.solver, self.max_iters = "mine", 3
+
+        def operator(self, u):
+            return operators.Heat((8,), 1e-2, 1.0)
+
+    step = heat()
+    step.label, step.name = "fine", "heat"
+    assert Own().max_iters == 3 and step.label == "fine"

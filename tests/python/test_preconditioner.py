@@ -355,6 +355,8 @@ def test_failures_of_an_own_preconditioner_are_not_blamed_on_a():
         solve(lambda v: 0 * v)
     with pytest.raises(ValueError, match=r"preconditioner: Heat: expected \(batch, 1, 4, 4\), got \(1, 1, 8, 8\)"):
         prdp.linear_solve(a, b, prdp.CG(50, preconditioner=operators.Heat((4, 4), 1e-2, 1.0)))
+    with pytest.raises(ValueError, match="preconditioner: Function: matvec must return what it was given"):
+        solve(lambda v: v[..., :4])
 
 
 def test_what_is_singular_to_float32_is_sent_to_float64():

@@ -144,6 +144,68 @@ def test_an_inflow_that_is_not_finite_is_named():
         flow(torch.zeros(2, 2, 8, 6))
 
 
+@pytest.mark.parametrize("uniform", [True, False])
+@pytest.mark.parametrize("on_failure", ["raise", "warn", "return", "zero_grad"])
+def test_a_force_that_is_not_finite_is_named_and_leaves_other_samples_alone(uniform, on_failure):
+    force = torch.ones(2) if uniform else torch.ones(2, 2, 8, 6)
+    force[(1,) if uniform else (1, 0, 3, 2)] = torch.inf
+    flow = prdp.Flow((8, 6), 0.1, 0.01, force=force, on_failure=on_failure)
+    u = (0.1 * random_velocity((8, 6), dtype=torch.float32)[:1]).repeat(2, 1, 1, 1).requires_grad_()
+    which = r"2 of 2 samples failed: sample 0" if uniform else "1 of 2 samples failed: sample 1"
+    words = rf"Flow: {which} NONFINITE_INPUT: force is not finite at index \[{'1' if uniform else '0, 3, 2'}"
+    if on_failure == "raise":
+        with pytest.raises(torch.linalg.LinAlgError, match=words):
+            flow(u)
+        return
+    if on_failure == "warn":
+        with pytest.warns(UserWarning, match=words) as caught:
+            states = flow(u)
+        assert len(caught) == 1
+    else:
+        states = flow(u)
+    failed = ["NONFINITE_INPUT"] * 2 if uniform else [statuses(flow.info)[0], "NONFINITE_INPUT"]
+    assert statuses(flow.info) == failed and (states[1] == 0).all()
+    if uniform:
+        return
+    alone = prdp.Flow((8, 6), 0.1, 0.01, force=force[:1])
+    v = u.detach()[:1].requires_grad_()
+    assert torch.equal(states[:1], alone(v))
+    states.square().sum().backward()
+    alone(v).square().sum().backward()
+    assert torch.equal(u.grad[:1], v.grad) and (u.grad[1] == 0).all()
+
+
+@pytest.mark.parametrize("change", ["set", "write", "load", "remove"])
+def test_an_obstacle_may_move(change):
+    """The box that the library keeps is that of the obstacle as it is now."""
+    before, after = solid((8, 6), (3, 3)), solid((8, 6), (2, 1), (5, 4))
+    flow = prdp.Flow((8, 6), 0.1, 0.01, obstacle=before.clone())
+    u = 0.1 * random_velocity((8, 6))
+    flow(u)
+    if change == "set":
+        flow.obstacle = after
+    elif change == "write":
+        flow.obstacle.copy_(after)
+    elif change == "load":
+        flow.load_state_dict({"obstacle": after})
+    else:
+        flow.obstacle = None
+    other = prdp.Flow((8, 6), 0.1, 0.01, obstacle=None if change == "remove" else after)
+    assert torch.equal(flow(u), other(u)) and torch.equal(flow.divergence(u), other.divergence(u))
+
+
+def test_boundary_and_length_may_be_set():
+    flow = prdp.Flow((8, 6), 0.1, 0.01)
+    u = 0.1 * random_velocity((8, 6))
+    periodic = flow(u)
+    flow.boundary, flow.length = ["wall", "periodic"], 2.0
+    other = prdp.Flow((8, 6), 0.1, 0.01, boundary=("wall", "periodic"), length=2.0)
+    assert torch.equal(flow(u), other(u)) and not torch.equal(flow(u), periodic)
+    flow.boundary[0] = "walls"
+    with pytest.raises(ValueError, match="'periodic', 'wall' or 'open', got 'walls'"):
+        flow(u)
+
+
 def test_copies_pickles_and_parameters():
     nu, force = torch.nn.Parameter(torch.tensor(0.1)), torch.zeros(1, 2, 8, 6)
     flow = prdp.Flow((8, 6), nu, 0.01, force=force, obstacle=solid((8, 6), (3, 3)), inflow=None)

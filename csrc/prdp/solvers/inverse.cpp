@@ -90,17 +90,25 @@ c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, int64_t smoothing, con
   return c10::make_intrusive<CyclesOf<double>>(std::move(kernels), std::move(transpose), smoothing, b.size(0));
 }
 
+/// What an operator refuses, said of the preconditioner.
+template <typename Call>
+auto in_its_name(const Call& call) {
+  try {
+    return call();
+  } catch (const c10::TypeError& error) {
+    TORCH_CHECK_TYPE(false, "preconditioner: ", error.what_without_backtrace());
+  } catch (const c10::ValueError& error) {
+    TORCH_CHECK_VALUE(false, "preconditioner: ", error.what_without_backtrace());
+  }
+}
+
 }  // namespace
 
 Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
   if (preconditioner.is_operator()) {
     const std::shared_ptr<Operator> inverse = make_operator(preconditioner.spec());
-    try {
-      inverse->check_vector(b);
-    } catch (const c10::ValueError& error) {
-      TORCH_CHECK_VALUE(false, "preconditioner: ", error.what_without_backtrace());
-    }
-    return [inverse](const at::Tensor& v) { return inverse->apply(v); };
+    in_its_name([&] { inverse->check_vector(b); });
+    return [inverse](const at::Tensor& v) { return in_its_name([&] { return inverse->apply(v); }); };
   }
   if (!preconditioner.is_multigrid()) return {};
   const auto like = b.detach();

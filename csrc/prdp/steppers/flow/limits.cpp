@@ -21,13 +21,17 @@ double largest_courant_number(const FlowEquation& e) {
       1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
 }
 
-/// What is not finite in sample i: the inflow that makes the boundary values of u, or u.
-std::string nonfinite_part(const at::Tensor& inflow, const at::Tensor& u, int64_t i) {
-  if (inflow.defined()) {
-    const auto bad = nonfinite(inflow.select(0, inflow.size(0) == 1 ? 0 : i));
-    if (bad.any().item<bool>()) return "inflow is not finite at index " + c10::str(at::IntArrayRef(first_true(bad)));
+/// What is not finite in sample i: the inflow that makes the boundary values of u, the force, or u.
+std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
+  const auto said = [](const char* name, const at::Tensor& bad) {
+    return c10::str(name, " is not finite at index ", at::IntArrayRef(first_true(bad)));
+  };
+  for (const auto& [name, t] : {std::pair("inflow", e.inflow), std::pair("force", e.force)}) {
+    if (!t.defined()) continue;
+    const auto bad = nonfinite(t.select(0, t.size(0) == 1 ? 0 : i));
+    if (bad.any().item<bool>()) return said(name, bad);
   }
-  return "the velocity is not finite at index " + c10::str(at::IntArrayRef(first_true(nonfinite(u[i]))));
+  return said("the velocity", nonfinite(u[i]));
 }
 
 }  // namespace
@@ -35,11 +39,13 @@ std::string nonfinite_part(const at::Tensor& inflow, const at::Tensor& u, int64_
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;
   const auto courant = courant_numbers(equation, u);
-  const auto fine = courant.le(largest_courant_number(equation));
+  auto finite = courant.isfinite();
+  if (equation.force.defined()) finite = finite.logical_and(equation.force.isfinite().flatten(1).all(1));
+  const auto fine = courant.le(largest_courant_number(equation)).logical_and_(finite);
   if (fine.all().item<bool>()) return {};
   const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);
   return {fine.logical_not(),
-          diverged.masked_fill(courant.isfinite().logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
+          diverged.masked_fill(finite.logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
 }
 
 void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,
@@ -53,7 +59,7 @@ void report_refused(const FlowEquation& equation, const at::Tensor& u, const Ref
     const auto i = failed[k].item<int64_t>();
     const auto status = static_cast<SolveStatus>(refused.status[i].item<int64_t>());
     text << (k ? "; " : ": ") << "sample " << i << " " << name(status);
-    if (status == SolveStatus::kNonfiniteInput) text << ": " << nonfinite_part(equation.inflow, u, i);
+    if (status == SolveStatus::kNonfiniteInput) text << ": " << nonfinite_part(equation, u, i);
     else
       text << ": dt Σ |u|/dx is " << courant[i].item<double>() << ", and the explicit advection needs at most "
            << largest_courant_number(equation) << "; take a smaller dt";

@@ -4,7 +4,7 @@
 
 namespace prdp {
 
-/// The samples that cannot be advected: their step is too long, or they are not finite.
+/// The samples that cannot be advected: their step is too long, or they or their force are not finite.
 struct RefusedSamples {
   at::Tensor mask;    // bool (batch,)
   at::Tensor status;  // int64 (batch,): DIVERGED or NONFINITE_INPUT

@@ -26,7 +26,7 @@ struct ExplicitPart {
 };
 ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& u, const at::Tensor& refused) {
   const auto velocity = cleared(with_boundary_values(e, u), refused);
-  const auto change = tendency(e, velocity);
+  const auto change = cleared(tendency(e, velocity), refused);
   return {velocity, flow_has_loops(u) ? change.mul_(e.dt) : change * e.dt};
 }
 
