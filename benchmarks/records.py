@@ -61,6 +61,13 @@ LIST = [
     refinement("heat_1d", 10, 3),
     refinement("burgers_1d", 10, 90),
     refinement("burgers_2d", 3, 55),
+    refinement(
+        "benchmarks/scenes/burgers_2d_192.toml",
+        1,
+        70,
+        "--rows converged auto rtol_0.1 rtol_0.01 multigrid auto_multigrid",
+        name="burgers_2d_192",
+    ),
     refinement("heat_2d", 3, 60),
     refinement("diffusion_inverse", 10, 5),
     refinement("benchmarks/scenes/diffusion_inverse_256.toml", 3, 90, name="diffusion_inverse_256"),

@@ -9,6 +9,7 @@ trainings are kept. With --rows, only these are trained: the summary takes the o
 import argparse
 import json
 import re
+import time
 from pathlib import Path
 
 import torch
@@ -26,6 +27,7 @@ MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most 
     "poisson_3p_sd": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "heat_3d": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "burgers_2d": 'method = "multigrid"\nmax_iter = 50',
+    "burgers_2d_192": 'method = "multigrid"\nmax_iter = 50',
     "diffusion_inverse": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
     "diffusion_inverse_256": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
 }
@@ -100,9 +102,9 @@ def main():
     asked = [row for row in rows_of(scene) if not options.rows or row.label in options.rows]
     summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, **kept}
     for row in asked:
-        train(row, options, folder, environment)
+        shares = train(row, options, folder, environment)
         (entry,) = compare.summarise(scene, [row], _row(summary, "converged"))
-        entry |= {key: environment[key] for key in ("commit", "machine")}
+        entry |= {key: environment[key] for key in ("commit", "machine")} | {"share_of_a_core": shares}
         print(f"{row.title}: {entry['metric']:.2e}, {entry['operator_applications']:,.0f} products", flush=True)
         order = [other.label for other in rows_of(scene)]
         others = [other for other in summary["rows"] if other["label"] != row.label]
@@ -116,11 +118,17 @@ def _row(summary, label):
 
 
 def train(row, options, folder, environment):
-    """Fill in the curves of a row, one for each seed."""
+    """Fill in the curves of a row, one for each seed. Returns the CPU seconds per second of each training, None where it
+    was not made now: what is below 1 waited for other programs."""
+    shares = []
     for seed in range(options.seeds):
         scene = scene_of(options.scene, row)
+        began, cpu = time.perf_counter(), time.process_time()
         run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume)
+        passed, cpu = time.perf_counter() - began, time.process_time() - cpu
         row.curves.append(run)
+        shares.append(round(cpu / passed, 3) if passed > sum(run["seconds"]) else None)
+    return shares
 
 
 def _curves(row):
