@@ -118,8 +118,8 @@ def _row(summary, label):
 
 
 def train(row, options, folder, environment):
-    """Fill in the curves of a row, one for each seed. Returns the CPU seconds per second of each training, None where it
-    was not made now: what is below 1 waited for other programs."""
+    """Fill in the curves of a row, one for each seed. Returns the CPU seconds per second of each training: less than
+    1 where other programs had the core, None where the training was there before."""
     shares = []
     for seed in range(options.seeds):
         scene = scene_of(options.scene, row)
