@@ -96,6 +96,14 @@ class _Attached(_Compiled):
                     raise TypeError(f"{who}: a stepper must have {name}, got {stepper!r}")
         self._push()
 
+    if not TYPE_CHECKING:
+
+        def __setattr__(self, name: str, value: object) -> None:
+            if name in self.settings:
+                who = type(self).__name__
+                raise AttributeError(f"{who}: {name} cannot be set later; make a new controller")
+            super().__setattr__(name, value)
+
     def _push(self) -> None:
         budget = {name: value for name, value in self._budget.items() if value is not None}
         for stepper in self.steppers:
@@ -133,15 +141,18 @@ class _Attached(_Compiled):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
-        return {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
+        state = {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
+        return {"controller": _kind(type(self)), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict()` exactly. ValueError for anything else."""
         wanted = self.state_dict().keys()
         if not isinstance(state, dict) or state.keys() != wanted:
             raise ValueError(f"{type(self).__name__}: expected a state of {', '.join(wanted)}, got {state!r:.80}")
+        if state["controller"] != _kind(type(self)):
+            raise ValueError(f"{type(self).__name__}: expected its own state, got one of a {state['controller']}")
         try:
-            self._load(**state)
+            self._load(**{name: value for name, value in state.items() if name != "controller"})
         except TypeError:
             raise ValueError(
                 f"{type(self).__name__}: expected a state as state_dict() returns it, got {state!r:.80}"
@@ -154,9 +165,14 @@ class _Attached(_Compiled):
         return _remade, (type(self), self.steppers, self.settings, self.state_dict())
 
 
+def _kind(controller: type) -> str:
+    """Which of the controllers of this module it is, or is derived from."""
+    return next(base.__name__ for base in controller.__mro__ if base.__module__ == __name__)
+
+
 def _beyond_rounding(info: SolveInfo) -> Tensor:
     """The residuals of a report, with 0 where it is rounding alone."""
-    return info.residual.double().masked_fill(info.floor > 0, 0.0)
+    return info.residual.double().masked_fill((info.floor > 0) & ~info.failed, 0.0)
 
 
 def _remade(

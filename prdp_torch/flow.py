@@ -111,6 +111,7 @@ class Flow(Stepper):
 
     def forward(self, u: Tensor) -> Tensor:
         _check.dense("Flow", "u", u)
+        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
@@ -119,6 +120,7 @@ class Flow(Stepper):
     def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
         _check.dense("Flow", "u", u)
+        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
@@ -132,6 +134,7 @@ class Flow(Stepper):
         tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1."""
         _check.dense("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
+        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
@@ -152,9 +155,13 @@ class Flow(Stepper):
         return self._equation().divergence(_check.dense("Flow", "u", u))
 
     def _equation(self) -> _C.FlowEquation:
-        nu = real_tensor("Flow", "nu", self.nu)
-        box = self._kept_box.of(tuple(self.shape), _of_axes(self.boundary), _of_axes(self.length), _Mask(self.obstacle))
-        return _C.FlowEquation(box, self.dt, nu, self.force, self.inflow, self.advection, self.diffusion)
+        nu, dt = real_tensor("Flow", "nu", self.nu), _check.real("Flow", "dt", self.dt)
+        force = _check.optional(_check.dense, "Flow", "force", self.force)
+        inflow = _check.optional(_check.dense, "Flow", "inflow", self.inflow)
+        d = len(self.shape)
+        boundary, length = _of_axes("boundary", self.boundary, d), _of_axes("length", self.length, d)
+        box = self._kept_box.of(tuple(self.shape), boundary, length, _Mask(self.obstacle))
+        return _C.FlowEquation(box, dt, nu, force, inflow, self.advection, self.diffusion)
 
     def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
@@ -171,9 +178,13 @@ class _Mask:
         return isinstance(other, _Mask) and self.obstacle is other.obstacle and self.version == other.version
 
 
-def _of_axes(values: Any) -> tuple[Any, ...]:
-    """What is given for all axes at once, or for each."""
-    return tuple(values) if isinstance(values, (tuple, list)) else (values,)
+def _of_axes(name: str, values: Any, dim: int) -> tuple[Any, ...]:
+    """One for each axis."""
+    if not isinstance(values, (tuple, list)):
+        return (values,) * dim
+    if len(values) != dim:
+        raise ValueError(f"Flow: {name} must be one for all axes or one per axis, {dim} here, got {values!r}")
+    return tuple(values)
 
 
 def _make_box(

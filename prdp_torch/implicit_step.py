@@ -46,8 +46,10 @@ class ImplicitStep(Stepper):
         backward: Backward = "implicit",
         **options: Unpack[StepOptions],
     ) -> None:
-        super().__init__(solver, backward, **options)
         who = type(self).__name__
+        if isinstance(rhs, Solver) and solver is None:
+            raise TypeError(f"{who}: rhs must be a function of u or None, got {rhs!r}; write solver={rhs!r}")
+        super().__init__(solver, backward, **options)
         if isinstance(operator, (operators.Operator, Tensor)):
             operator = ConstantOperator(as_operator(who, "operator", operator))
         if not callable(operator):

@@ -108,7 +108,7 @@ class SolveInfo(NamedTuple):
     @property
     def solved(self) -> Tensor:
         """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows."""
-        return (self.status > 0) | (self.floor > 0)
+        return (self.status > 0) | ((self.floor > 0) & ~self.failed)
 
     @property
     def adjoint(self) -> "SolveInfo | None":
@@ -160,7 +160,7 @@ def linear_solve(
         A: an operator of `prdp_torch.operators`, or a tensor (n, n) or (batch, n, n), dense or sparse CSR.
         b: (batch, channel, *shape) for stencil operators, (n,) or (batch, n) for matrices; float32 or
             float64, any strides.
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `Multigrid` or `Direct`.
         backward: how the gradient is computed.
             "implicit" solves one adjoint system, Aᵀλ = ū, with the same method. Then b̄ = λ, and a tensor g
             in A gets ḡ = -λᵀ ∂(A u)/∂g. "unrolled" differentiates the iterations that ran. "none" gives no

@@ -249,15 +249,49 @@ def check_options(
     """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
         raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
+    check_settings(
+        who,
+        solver.method,
+        solver.max_iter,
+        solver.rtol,
+        solver.restart,
+        solver.preconditioner,
+        backward,
+        adjoint_max_iter,
+        adjoint_rtol,
+        on_failure,
+        checkpoint_every,
+        start,
+    )
+
+
+def check_settings(
+    who: str,
+    method: str,
+    max_iter: object,
+    rtol: object,
+    restart: object,
+    preconditioner: Preconditioner,
+    backward: object,
+    adjoint_max_iter: object,
+    adjoint_rtol: object,
+    on_failure: object,
+    checkpoint_every: Any,
+    start: object,
+) -> None:
+    """The same for the parts of a solver: they and the options fit together."""
+    check_preconditioner(who, preconditioner)
+    if isinstance(checkpoint_every, str) and checkpoint_every != "sqrt":
+        raise TypeError(f"{who}: checkpoint_every must be a whole number, 'sqrt' or None, got {checkpoint_every!r}")
     if checkpoint_every not in (None, "sqrt") and _check.whole(who, "checkpoint_every", checkpoint_every) < 1:
         raise ValueError(f"{who}: checkpoint_every must be >= 1, 'sqrt' or None, got {checkpoint_every}")
     _C.check_options(
         who,
-        solver.method,
-        _check.whole(who, "max_iter", solver.max_iter),
-        _check.real(who, "rtol", solver.rtol),
-        _check.whole(who, "restart", solver.restart),
-        flat_preconditioner(solver.preconditioner)[0],
+        method,
+        _check.whole(who, "max_iter", max_iter),
+        _check.real(who, "rtol", rtol),
+        _check.whole(who, "restart", restart),
+        flat_preconditioner(preconditioner)[0],
         _check.string(who, "backward", backward),
         _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),

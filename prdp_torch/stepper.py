@@ -18,6 +18,7 @@ from prdp_torch.solvers import (
     Preconditioner,
     Solver,
     check_options,
+    check_settings,
     checkpoint_number,
     flat_preconditioner,
     solve_options,
@@ -25,11 +26,10 @@ from prdp_torch.solvers import (
 )
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
 
-# What may be set on a stepper at any time.
-SETTINGS = (
-    "max_iter", "rtol", "restart", "preconditioner", "backward", "adjoint_max_iter", "adjoint_rtol", "on_failure",
-    "checkpoint_every", "start",
-)  # fmt: skip
+# What may be set on a stepper at any time: as properties, and as plain attributes.
+PROPERTIES = ("max_iter", "rtol", "adjoint_rtol", "start")
+PLAIN = ("restart", "preconditioner", "backward", "adjoint_max_iter", "on_failure", "checkpoint_every")
+SETTINGS = (*PROPERTIES, *PLAIN)
 
 
 class Stepper(torch.nn.Module):
@@ -42,7 +42,8 @@ class Stepper(torch.nn.Module):
     `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two as functions instead.
 
     Args:
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `Multigrid` or `Direct`. Its settings are
+            copied: set those of the stepper later, not those of the solver.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
         start: where the solves start: at "zero", or at "state", the state before the step, which then is the x0 of
             `linear_solve`. This saves iterations if a step changes the state little.
@@ -53,7 +54,8 @@ class Stepper(torch.nn.Module):
         rtol, adjoint_rtol: the tolerances. They may be set at any time as well, but under `torch.compile`
             each new value compiles again, up to `torch._dynamo.config.recompile_limit` times.
         start: as above. It may be set at any time.
-        info: the `SolveInfo` of the last forward pass or rollout; None before the first.
+        restart, preconditioner and the options above: they may be set at any time, and are checked then.
+        info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised.
         adjoint_info: the `SolveInfo` of the last backward pass; None before the first.
 
     Raises:
@@ -113,9 +115,17 @@ class Stepper(torch.nn.Module):
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if not torch.compiler.is_compiling() and not hasattr(type(self), name) and name not in self.__dict__:
-                _refuse_misspelt(type(self), name)
+            if not torch.compiler.is_compiling():
+                if name in PLAIN and "info" in self.__dict__:
+                    self._check_settings(**{name: value})
+                elif not hasattr(type(self), name) and name not in self.__dict__:
+                    _refuse_misspelt(type(self), name)
             super().__setattr__(name, value)
+
+    def _check_settings(self, **changed: object) -> None:
+        """Raise ValueError or TypeError unless the solver and the options fit together with what is changed."""
+        settings = {name: getattr(self, name) for name in SETTINGS} | changed
+        check_settings(type(self).__name__, self.method, **settings)
 
     def operator(self, u: Tensor) -> operators.Operator | Tensor:
         """A(u), an operator of `prdp_torch.operators`."""
@@ -125,7 +135,13 @@ class Stepper(torch.nn.Module):
         """b(u), the right-hand side of the step from u."""
         return u
 
+    def _forget(self) -> None:
+        """A step that raises has no report."""
+        self.__dict__["info"] = None
+
     def forward(self, u: Tensor) -> Tensor:
+        if not torch.compiler.is_compiling():
+            self._forget()
         found = self._solve(u, self._adjoint_log)
         self._keep(found[1:], self._adjoint_log)
         if found[0].requires_grad:
@@ -142,6 +158,7 @@ class Stepper(torch.nn.Module):
             _check.dense(type(self).__name__, "u", u)
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
+            self._forget()
         logs = AdjointLogs(0 if compiling else steps)
         states, reports = [u], []
         for step in range(steps):
@@ -282,7 +299,8 @@ def _refuse_misspelt(kind: type[Stepper], name: str) -> None:
     if name.startswith("_") or name in SETTINGS or not kind.__module__.startswith("prdp_torch."):
         return
     if name == "solver":
-        raise AttributeError(f"{kind.__name__}: the solver cannot be set later; set {', '.join(SETTINGS[:4])}")
+        may = "max_iter, rtol, restart and preconditioner"
+        raise AttributeError(f"{kind.__name__}: the solver cannot be set later; {may} can")
     if meant := difflib.get_close_matches(name, SETTINGS, n=1, cutoff=0.8):
         raise AttributeError(f"{kind.__name__}: no setting '{name}'; did you mean '{meant[0]}'?")
 

@@ -27,12 +27,11 @@ class EquationStepper(Stepper):
     """A stepper of a built-in equation, whose rollout is a single operation.
 
     If nu is given as a Parameter, it becomes a Parameter of the module. A tensor becomes a buffer, and a number
-    stays a number.
+    stays a number. nu, dt and length may be set at any time.
     """
 
     kind: ClassVar[str]
     nu: Number
-    length: Length
     equation: Equation
 
     def __init__(
@@ -49,7 +48,7 @@ class EquationStepper(Stepper):
         who = type(self).__name__
         self._refuse_own_system()
         extents = _check.shape(who, shape)
-        self.length = length
+        self._length = length
         parameters = _check.lengths(who, length, len(extents))
         if nu_and_dt is not None:
             nu, dt = nu_and_dt
@@ -57,7 +56,31 @@ class EquationStepper(Stepper):
             parameters.insert(0, _check.real(who, "dt", dt))
         self.equation = Equation(self.kind, extents, parameters, _check.whole(who, "picard_steps", picard_steps))
         self._kept_equation = Kept(_C.Equation)
-        torch.ops.prdp.check_equation(*self._equation())
+        self._take_parameters(parameters)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.equation.shape)
+
+    @property
+    def length(self) -> Length:
+        return self._length
+
+    @length.setter
+    def length(self, length: Length) -> None:
+        dt = self.equation.parameters[: self._others]
+        self._take_parameters(dt + _check.lengths(type(self).__name__, length, len(self.equation.shape)))
+        self._length = length
+
+    _others: ClassVar[int] = 0  # parameters of the equation before its lengths
+
+    def _take_parameters(self, parameters: list[float]) -> None:
+        before, self.equation.parameters = self.equation.parameters, parameters
+        try:
+            torch.ops.prdp.check_equation(*self._equation())
+        except BaseException:
+            self.equation.parameters = before
+            raise
 
     def _keep_nu(self, nu: Number) -> None:
         if isinstance(nu, torch.nn.Parameter):
@@ -82,6 +105,7 @@ class EquationStepper(Stepper):
         found: Solution | None = None
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
+            self._forget()
             log = self._adjoint_log.number
             found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
         if found is None:
@@ -100,6 +124,7 @@ class EquationStepper(Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
+            self._forget()
         found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
         self._keep(found[1:], self._adjoint_log)
         return found[0]
@@ -134,6 +159,20 @@ class EquationStepper(Stepper):
     def extra_repr(self) -> str:
         length = "" if self.length == 1.0 else f"length={self.length}, "
         return f"shape={tuple(self.equation.shape)}, {length}{super().extra_repr()}"
+
+
+class TimeStepper(EquationStepper):
+    """The base of those that make a step of dt."""
+
+    _others = 1
+
+    @property
+    def dt(self) -> float:
+        return self.equation.parameters[0]
+
+    @dt.setter
+    def dt(self, dt: float) -> None:
+        self._take_parameters([_check.real(type(self).__name__, "dt", dt), *self.equation.parameters[1:]])
 
 
 class Poisson(EquationStepper):
@@ -171,7 +210,7 @@ class Poisson(EquationStepper):
         return operators.Poisson(self.equation.shape, self.length)
 
 
-class Heat(EquationStepper):
+class Heat(TimeStepper):
     """Make one implicit Euler step of the heat equation u_t = nu Δu with u = 0 on the boundary.
 
     It solves (I - nu dt L) u_next = u, where L is the discrete Laplacian.
@@ -211,7 +250,7 @@ class Heat(EquationStepper):
         return operators.Heat(e.shape, self.nu, e.parameters[0], self.length)
 
 
-class Burgers(EquationStepper):
+class Burgers(TimeStepper):
     """Make one implicit Euler step of Burgers' equation u_t + (u·∇)u = nu Δu on a periodic grid.
 
     It solves (I + dt Γ(u) - nu dt L) u_next = u, where Γ is first-order upwind advection, linearised about the
@@ -253,7 +292,7 @@ class Burgers(EquationStepper):
         return operators.Burgers(u, self.nu, self.equation.parameters[0], self.length)
 
 
-class NavierStokes(EquationStepper):
+class NavierStokes(TimeStepper):
     """Make one implicit Euler step of the Navier-Stokes equations u_t + (u·∇)u + ∇p = nu Δu, ∇·u = 0.
 
     The grid is periodic and staggered. The step is linearised about the state, which is (batch, 3, Ny, Nx): u₁

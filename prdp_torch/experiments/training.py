@@ -228,7 +228,9 @@ class _Run:
 
     def _keep(self, task: Task, checkpoint: Checkpoint) -> None:
         tensors = {**task.state(), "random": torch.get_rng_state()}
-        checkpoint.save(tensors, self.curves, self.controller.state_dict())
+        state = self.controller.state_dict()
+        del state["controller"]  # the refinement names it
+        checkpoint.save(tensors, self.curves, state)
 
     def _restores(self, task: Task, found: Found) -> bool:
         """Whether there is a checkpoint to continue from."""
@@ -241,7 +243,7 @@ class _Run:
         """Take the state of this training. ValueError where it is another's; some of it may have been taken."""
         curves, controller = saved.progress(task.updates_per_interval)
         task.load(saved, len(curves["update_loss"]))
-        self.controller.load_state_dict(controller)
+        self.controller.load_state_dict({**self.controller.state_dict(), **controller})
         saved.restore("random", torch.default_generator)
         self.curves = curves
 

@@ -1,13 +1,18 @@
 """The base of all operators, and what several of them need."""
 
+import inspect
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
 from prdp_torch.types import NullSpace, Number
+
+# What the compiled library reads.
+DESCRIPTION = ("kind", "shape", "parameters", "tensors")
 
 
 class Operator:
@@ -32,6 +37,13 @@ class Operator:
             self.kind = "singular_" + self.kind
         if not torch.compiler.is_compiling():
             _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
+
+    if not TYPE_CHECKING:
+
+        def __setattr__(self, name: str, value: object) -> None:
+            if not torch.compiler.is_compiling() and "tensors" in self.__dict__ and name not in DESCRIPTION:
+                _refuse_argument(type(self), name)
+            super().__setattr__(name, value)
 
     def __repr__(self) -> str:
         tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
@@ -83,6 +95,12 @@ def real_tensor(who: str, name: str, value: Number) -> Tensor:
     if isinstance(value, Tensor):
         return value
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+
+
+def _refuse_argument(kind: type, name: str) -> None:
+    """Raise AttributeError for an argument of an operator that is made: the library would not see the change."""
+    if name in inspect.signature(kind).parameters:
+        raise AttributeError(f"{kind.__name__}: {name} cannot be set later; make a new operator")
 
 
 def full_precision(t: Tensor) -> Tensor:

@@ -105,6 +105,7 @@ class Diffusion(Operator):
                     continue
                 at_side = self.kappa.select(axis + 1, -end)
                 given = (values if side == "zero" else fluxes)[axis][end]
+                _check_of_side("values" if side == "zero" else "fluxes", given, at_side)
                 added = 2 * at_side * given / h**2 if side == "zero" else torch.ones_like(at_side) * given / h
                 if added.shape[0] != b.shape[0]:
                     b = b.expand(added.shape[0], *b.shape[1:])
@@ -121,9 +122,11 @@ class Diffusion(Operator):
             stray = _is_given(given) and not any(kind in sides for sides in self.boundary)
         else:
             pairs = given
-            if len(given) != dim or any(len(pair) != 2 for pair in given):
+            of_axes = isinstance(given, (tuple, list)) and len(given) == dim
+            if not of_axes or any(not isinstance(pair, (tuple, list)) or len(pair) != 2 for pair in given):
                 raise ValueError(
-                    f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes"
+                    f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes, got "
+                    f"{given!r:.80}"
                 )
             stray = any(
                 _is_given(value) and side != kind
@@ -153,6 +156,17 @@ def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
     if any(pair.count("periodic") == 1 for pair in pairs):
         raise ValueError(f"Diffusion: boundary: both sides of an axis are periodic or none is, got {boundary!r}")
     return pairs
+
+
+def _check_of_side(name: str, value: Number, side: Tensor) -> None:
+    if not isinstance(value, Tensor) or value.dim() == 0:
+        return
+    extents = zip(reversed(value.shape[1:]), reversed(side.shape[1:]), strict=False)
+    if value.dim() > side.dim() or any(n not in (1, of_side) for n, of_side in extents):
+        raise ValueError(
+            f"Diffusion: {name} must broadcast to (batch or 1, *side), here {('batch', *side.shape[1:])}, got "
+            f"{tuple(value.shape)}"
+        )
 
 
 def _is_given(value: Number) -> bool:

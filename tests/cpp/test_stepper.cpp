@@ -1,6 +1,8 @@
 #include <gtest/gtest.h>
 #include <torch/csrc/autograd/autograd.h>
 
+#include <limits>
+
 #include "helpers.h"
 #include "prdp/prdp.h"
 
@@ -47,6 +49,17 @@ TEST(Heat, BudgetMayChangeAtAnyTime) {
     EXPECT_TRUE(heat.info()->iterations.eq(k).all().item<bool>());
   }
   EXPECT_THROW(heat.set_max_iter(-1), c10::ValueError);
+}
+
+TEST(Heat, AStepThatThrowsLeavesNoReportOfAnEarlierOne) {
+  auto heat = prdp::Heat({30}, 1e-3, 1.0, prdp::CG{.max_iter = 100});
+  auto u = prdp_test::random_field({30}, 2);
+  heat(u);
+  ASSERT_TRUE(heat.info());
+  u[1][0][3] = std::numeric_limits<double>::quiet_NaN();
+  EXPECT_THROW(heat(u), c10::LinAlgError);
+  EXPECT_FALSE(heat.info());
+  EXPECT_FALSE(heat.converged());
 }
 
 TEST(Start, FromTheStateIsALinearSolveThatIsGivenTheState) {

@@ -1,4 +1,4 @@
-"""operators.Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
+"""Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
 
 import itertools
 import subprocess
@@ -257,3 +257,43 @@ def test_a_shift_that_float32_cannot_hold_beside_the_jumps_is_warned_of_once(dty
     program = LOSES_ITS_SHIFT.format(dtype=dtype, jump=jump)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.count("a shift of 1 is lost in the rounding") == warnings
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")  # by torch's own forward mode
+@pytest.mark.parametrize("of", ["kappa", "shift"])
+def test_transforms_of_torch_func(of):
+    """Against autograd, and vmap against a loop."""
+    generator = torch.Generator().manual_seed(2)
+    kappa = torch.rand(2, 6, 5, dtype=torch.float64, generator=generator) + 0.5
+    shift = torch.rand(2, 6, 5, dtype=torch.float64, generator=generator)
+    b = torch.randn(2, 1, 6, 5, dtype=torch.float64, generator=generator)
+    x, given = (kappa, {"shift": shift}) if of == "kappa" else (shift, {"kappa": kappa})
+
+    def loss(x):
+        return prdp.linear_solve(Diffusion(**{of: x}, **given), b, prdp.CG(100, rtol=1e-13))[0].square().sum()
+
+    leaf = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(loss(leaf), leaf)
+    direction = torch.ones_like(x)
+    close = {"rtol": 1e-9, "atol": 1e-11}
+    torch.testing.assert_close(torch.func.grad(loss)(x), expected, **close)
+    torch.testing.assert_close(torch.func.jvp(loss, (x,), (direction,))[1], expected.sum(), **close)
+    many = torch.stack([x, 2 * x])
+    torch.testing.assert_close(torch.func.vmap(loss)(many), torch.stack([loss(x), loss(2 * x)]), **close)
+    gradients = torch.func.vmap(torch.func.grad(loss))(many)
+    torch.testing.assert_close(gradients[0], expected, **close)
+
+
+def test_a_kappa_that_is_not_positive_is_refused_within_a_transform_as_well():
+    b, kappa = torch.ones(2, 1, 4), torch.tensor([[1.0, 1, 1, 1], [1, -1, 1, 1]])
+    with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1 in sample 1 at index \[1\]"):
+        torch.func.grad(lambda k: prdp.linear_solve(Diffusion(k), b, prdp.CG(20))[0].sum())(kappa)
+
+
+@pytest.mark.parametrize("values, words", [
+    ((1.0, 2.0), r"values must be one for all sides or a pair \(low, high\) for each of 2 axes, got \(1.0, 2.0\)"),
+    (torch.ones(1, 7), r"values must broadcast to \(batch or 1, \*side\), here \('batch', 5\), got \(1, 7\)"),
+])  # fmt: skip
+def test_values_that_do_not_fit_the_sides_are_named(values, words):
+    with pytest.raises(ValueError, match=words):
+        Diffusion(torch.ones(1, 4, 5)).boundary_rhs(values=values)

@@ -137,8 +137,8 @@ def test_tolerances_are_checked_when_they_are_set():
         for name in ("rtol", "adjoint_rtol"):
             with pytest.raises(error, match=f"Heat: {name} {message}"):
                 setattr(step, name, wrong)
-    step.rtol, step.adjoint_rtol = 1, None
-    assert step.rtol == 1.0 and step.adjoint_rtol is None
+    step.rtol, step.adjoint_rtol = 0, None
+    assert step.rtol == 0.0 and step.adjoint_rtol is None
 
 
 def test_wrong_kinds_of_arguments():
@@ -287,7 +287,7 @@ def test_an_argument_that_no_stepper_has_is_named_with_those_it_has(make, expect
     ("max_iters", "Heat: no setting 'max_iters'; did you mean 'max_iter'?"),
     ("adjoint_tol", "Heat: no setting 'adjoint_tol'; did you mean 'adjoint_rtol'?"),
     ("onfailure", "Heat: no setting 'onfailure'; did you mean 'on_failure'?"),
-    ("solver", "Heat: the solver cannot be set later; set max_iter, rtol, restart, preconditioner"),
+    ("solver", "Heat: the solver cannot be set later; max_iter, rtol, restart and preconditioner can"),
 ])  # fmt: skip
 def test_a_misspelt_setting_is_refused(name, expected):
     step = heat()

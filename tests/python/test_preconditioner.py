@@ -342,6 +342,36 @@ def test_a_preconditioner_without_values_is_refused(solver):
         prdp.linear_solve(operators.Heat((8,), 1e-3, 0.1), torch.ones(2, 1, 8), solver(5, preconditioner=inverse))
 
 
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("way", ["step", "rollout", "implicit_step", "solve", "replaced"])
+def test_a_backward_pass_holds_the_preconditioner_that_it_needs(way, backward):
+    """When nobody else does any more."""
+
+    def run(x, kept=None):
+        m = operators.Function(lambda r: r / 1.5, lambda r: r / 1.5)
+        solver = prdp.GMRES(50, preconditioner=m)
+        if kept is not None:
+            kept.append(m)
+        a = operators.Heat((30,), 1e-3, 1.0)
+        if way == "solve":
+            return prdp.linear_solve(a, x, solver, backward=backward)[0].sum()
+        if way == "implicit_step":
+            step = prdp.ImplicitStep(a, None, solver, backward)
+        else:
+            step = prdp.Heat((30,), 1e-3, 1.0, solver, backward)
+        u = step.rollout(x, 2)[:, -1] if way == "rollout" else step(x)
+        if way == "replaced" and kept is None:
+            step.preconditioner = None
+            step(x)
+        return u.sum()
+
+    x = torch.randn(2, 1, 30, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    (found,) = torch.autograd.grad(run(x), x)
+    alive = []
+    (expected,) = torch.autograd.grad(run(x, alive), x)
+    assert torch.equal(found, expected)
+
+
 def test_failures_of_an_own_preconditioner_are_not_blamed_on_a():
     a, b = operators.Heat((8, 8), 1e-2, 1.0), torch.ones(1, 1, 8, 8).cumsum(-1)
 

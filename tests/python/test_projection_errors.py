@@ -206,6 +206,48 @@ def test_boundary_and_length_may_be_set():
         flow(u)
 
 
+def test_one_of_several_axes_is_no_value_for_all():
+    for wrong in ({"length": (2.0,)}, {"boundary": ("wall",)}, {"boundary": ["wall"] * 3}):
+        name = next(iter(wrong))
+        with pytest.raises(ValueError, match=f"Flow: {name} must be one for all axes or one per axis, 2 here, got"):
+            prdp.Flow((8, 6), 0.1, 0.01, **wrong)
+
+
+@pytest.mark.parametrize("name, value, words", [
+    ("dt", "a", "Flow: dt must be a real number, got 'a'"),
+    ("force", 3.0, "Flow: force must be a torch tensor, got float"),
+])  # fmt: skip
+def test_what_is_set_wrongly_is_named_in_the_next_step(name, value, words):
+    flow = prdp.Flow((8, 6), 0.1, 0.01)
+    setattr(flow, name, value)
+    with pytest.raises(TypeError, match=words):
+        flow(torch.zeros(1, 2, 8, 6))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")  # by torch's own forward mode
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_transforms_and_forward_mode_are_refused(backward):
+    """They would compute something else."""
+    u = 0.1 * random_velocity((8, 6))
+    flow = prdp.Flow((8, 6), 0.1, 0.01, backward=backward)
+    for transform in (torch.func.grad, torch.func.jacfwd, torch.func.jacrev):
+        with pytest.raises(NotImplementedError, match=r"Flow: takes no transform of torch.func"):
+            transform(lambda v: flow(v).square().sum())(u)
+    with pytest.raises(NotImplementedError, match=r"Flow: takes no transform of torch.func"):
+        torch.func.jvp(lambda v: flow.rollout(v, 2), (u,), (u,))
+    with pytest.raises(NotImplementedError, match=r"Flow: takes no transform of torch.func"):
+        torch.func.vmap(flow)(u[None])
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual
+        with pytest.raises(NotImplementedError, match="Flow: takes no dual tensors of forward mode"):
+            flow(dual(u, u))
+        of_nu = prdp.Flow((8, 6), torch.tensor(0.1, dtype=u.dtype), 0.01, backward=backward)
+        of_nu.nu = dual(of_nu.nu, torch.ones_like(of_nu.nu))
+        for call in (of_nu, of_nu.pressure, of_nu.step_and_pressure):
+            with pytest.raises(NotImplementedError, match="Flow: takes no dual tensors of forward mode"):
+                call(u)
+
+
 def test_copies_pickles_and_parameters():
     nu, force = torch.nn.Parameter(torch.tensor(0.1)), torch.zeros(1, 2, 8, 6)
     flow = prdp.Flow((8, 6), nu, 0.01, force=force, obstacle=solid((8, 6), (3, 3)), inflow=None)

@@ -106,6 +106,19 @@ def test_what_is_worse_than_zero_raises_after_any_number_of_iterations(k, dtype)
     assert bool((left[diverged] <= 1 + 1e-4).all())
 
 
+@pytest.mark.parametrize("method", ["bicgstab", "cg multigrid", "gmres"])
+def test_no_sample_is_both_solved_and_failed(method):
+    """As large as u becomes, what its rounding leaves is no excuse."""
+    n, dtype = 16, torch.float64
+    kappa = torch.full((n, n), float(n * n), dtype=dtype)
+    sides = [kappa.clone() for _ in OFFSETS[1:]]
+    sides[0][0], sides[1][-1], sides[2][:, 0], sides[3][:, -1] = 0, 0, 0, 0
+    a = operators.Stencil(torch.stack([sum(sides), *(-side for side in sides)])[None], OFFSETS, "zero")
+    b = torch.randn(60, 1, n, n, dtype=dtype, generator=torch.Generator().manual_seed(1))
+    _, info = prdp.linear_solve(a, b, METHODS[method](300, 1e-5), on_failure="return")
+    assert info.failed.any() and not (info.solved & info.failed).any()
+
+
 @pytest.mark.parametrize("leak", [1e-4, 1e-2])
 def test_regular_operators_may_end_at_max_iter(leak):
     n = 64

@@ -259,7 +259,8 @@ def test_the_op_behind_it_passes_opcheck():
     "options, error, message",
     [
         ({"checkpoint_every": 0}, ValueError, "Heat: checkpoint_every must be >= 1, 'sqrt' or None, got 0"),
-        ({"checkpoint_every": "all"}, TypeError, "Heat: checkpoint_every must be a whole number, got 'all'"),
+        ({"checkpoint_every": "all"}, TypeError,
+         "Heat: checkpoint_every must be a whole number, 'sqrt' or None, got 'all'"),
         ({"checkpoint_every": 2, "backward": "implicit"}, ValueError,
          "Heat: checkpoint_every is for backward = unrolled alone, got implicit"),
     ],

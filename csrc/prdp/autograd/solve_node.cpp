@@ -12,9 +12,9 @@ using torch::autograd::variable_list;
 SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
     : Node(torch::autograd::collect_next_edges(b, at::TensorList(a.tensors))),
       a_(std::move(a)),
-      options_(std::move(options)) {
-  if (is_function(a_)) products_ = RegisteredProducts::find(a_.shape[0]);
-}
+      options_(std::move(options)),
+      products_(products_of(a_)),
+      products_of_inverse_(products_of(options_.solver.preconditioner.spec())) {}
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve

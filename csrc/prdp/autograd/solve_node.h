@@ -26,7 +26,7 @@ class SolveNode final : public torch::autograd::Node {
 
   OperatorSpec a_;  // its tensors are among the saved ones
   SolveOptions options_;
-  std::shared_ptr<const RegisteredProducts> products_;  // of a Function, kept alive
+  std::shared_ptr<const RegisteredProducts> products_, products_of_inverse_;  // of A and of its preconditioner
   std::pair<int64_t, int64_t> step_ = FailuresOfStep::now();  // of a rollout, for what the backward pass reports
   std::vector<torch::autograd::SavedVariable> tensors_;
   torch::autograd::SavedVariable b_, x0_, u_, iterations_, status_, residual_;

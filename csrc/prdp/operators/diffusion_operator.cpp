@@ -1,5 +1,6 @@
 #include "prdp/operators/diffusion_operator.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
 #include <cmath>
@@ -102,7 +103,8 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 void DiffusionOperator::check_parameters() const {
-  if (kappa_.is_meta() || kappa_.numel() == 0) return;  // no numbers
+  const bool wrapped = at::isTensorSubclassLike(kappa_) || at::isTensorSubclassLike(shift_);
+  if (wrapped || kappa_.is_meta() || kappa_.numel() == 0) return;  // no numbers, or none yet
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
   const auto* least_and_most = ends.const_data_ptr<double>();

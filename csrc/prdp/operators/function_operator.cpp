@@ -91,6 +91,10 @@ RegisteredProducts::~RegisteredProducts() {
   registry().entries.erase(number_);
 }
 
+std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a) {
+  return is_function(a) ? RegisteredProducts::find(a.shape.at(0)) : nullptr;
+}
+
 void refuse_captured_gradients(const OperatorSpec& a) {
   auto unknown = RegisteredProducts::Captures::kUnknown;
   RegisteredProducts::find(a.shape.at(0))

@@ -50,6 +50,9 @@ class RegisteredProducts {
 
 /// Whether the operator is made of RegisteredProducts, whose number is the first entry of its shape.
 inline bool is_function(const OperatorSpec& a) { return a.kind == "function" || a.kind == "singular_function"; }
+/// What keeps the products of a Function alive; null for other operators. Nodes of autograd hold it, as their backward
+/// pass may come when nobody else does.
+std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a);
 
 /// A product that captures a tensor which requires grad, instead of getting it as an argument, would silently lose its
 /// gradient. After this call, the operator's next product below autograd raises ValueError in that case. This

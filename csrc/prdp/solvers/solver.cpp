@@ -61,6 +61,7 @@ void check_budget(const char* who, const char* prefix, const c10::SymInt& max_it
   TORCH_CHECK_VALUE(max_iter.is_symbolic() || max_iter.expect_int() >= 0, who, ": ", prefix,
                     "max_iter must be >= 0, got ", max_iter);
   TORCH_CHECK_VALUE(rtol >= 0.0, who, ": ", prefix, "rtol must be >= 0, got ", rtol);
+  TORCH_CHECK_VALUE(rtol < 1.0, who, ": ", prefix, "rtol must be < 1, got ", rtol, "; u = 0 would meet it");
 }
 
 }  // namespace

@@ -7,6 +7,7 @@
 #include <string_view>
 
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/status.h"
 
 namespace prdp {
 
@@ -61,8 +62,8 @@ struct Solver {
   int64_t restart = kDefaultRestart;  // m of GMRES(m)
   Preconditioner preconditioner{};
 
-  /// Raises ValueError unless max_iter >= 0, rtol >= 0 and restart >= 1, and for a preconditioner that the method does
-  /// not take.
+  /// Raises ValueError unless max_iter >= 0, 0 <= rtol < 1 and restart >= 1, and for a preconditioner that the method
+  /// does not take.
   void check(const char* who) const;
 };
 
@@ -159,7 +160,9 @@ struct SolveInfo {
   /// All of them, in this order.
   std::array<at::Tensor*, 5> parts() { return {&iterations, &residual, &status, &operator_applications, &floor}; }
   /// Which samples are solved, as far as their dtype goes (bool).
-  at::Tensor solved() const { return status.gt(0).logical_or(floor.gt(0)); }
+  at::Tensor solved() const {
+    return status.gt(0).logical_or(floor.gt(0).logical_and(status.ge(static_cast<int64_t>(SolveStatus::kStagnated))));
+  }
 };
 
 /// A value of checkpoint_every that stands for ⌈√K⌉, where K is the number of iterations that ran.

@@ -31,6 +31,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
+  info_.reset();  // a step that raises has none
   auto [next, info] = solve(u, *log_);
   if (next.requires_grad()) logs_of_steps_.clear();
   info_ = std::move(info);
@@ -38,6 +39,7 @@ at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
 }
 
 at::Tensor ImplicitStep::rollout(const at::Tensor& u, int64_t steps) {
+  info_.reset();  // a step that raises has none
   TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
   std::vector<at::Tensor> states{u};
   std::vector<AdjointLog> logs;

@@ -9,6 +9,7 @@
 
 #include "prdp/autograd/flat_options.h"
 #include "prdp/operators/autocast.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
@@ -151,6 +152,7 @@ struct Call : torch::CustomClassHolder {
   Equation equation;
   c10::SymInt solves;
   SolveOptions options;
+  std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
 };
 
 class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
@@ -224,6 +226,7 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
   call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call->solves = std::move(solves);
   call->options = unflatten(std::move(flat)...);
+  call->products = products_of(call->options.solver.preconditioner.spec());
   const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
                               (u.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) {

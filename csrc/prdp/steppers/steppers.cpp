@@ -24,12 +24,14 @@ Stepper::Stepper(Equation equation, SolveOptions options)
 }
 
 at::Tensor Stepper::operator()(const at::Tensor& u) {
+  info_.reset();  // a step that raises has none
   auto [next, info] = step(equation_, u, options_);
   info_ = std::move(info);
   return next;
 }
 
 at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
+  info_.reset();  // a step that raises has none
   auto [states, info] = prdp::rollout(equation_, u, steps, options_);
   info_ = std::move(info);
   return states;

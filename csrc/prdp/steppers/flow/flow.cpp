@@ -46,12 +46,14 @@ Flow::Flow(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings set
     : Flow(make_equation(std::move(shape), std::move(nu), dt, std::move(settings)), {std::move(solver), backward}) {}
 
 at::Tensor Flow::operator()(const at::Tensor& u) {
+  info_.reset();  // a step that raises has none
   auto [next, info] = flow_next(equation_, u, options_);
   info_ = std::move(info);
   return next;
 }
 
 std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
+  info_.reset();  // a step that raises has none
   auto [both, info] = flow_next_and_pressure(equation_, u, options_);
   info_ = std::move(info);
   const int64_t d = equation_.box->dim();
@@ -59,6 +61,7 @@ std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
 }
 
 at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
+  info_.reset();  // a step that raises has none
   auto [states, info] = flow_rollout(equation_, u, steps, options_);
   info_ = std::move(info);
   return states;

@@ -7,6 +7,7 @@
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/detach_failed.h"
 #include "prdp/operators/autocast.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/rollout_vjp.h"
@@ -27,6 +28,7 @@ struct Call : torch::CustomClassHolder {
   int64_t steps;
   Returned returned;
   SolveOptions options;
+  std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
 };
 
 /// Functions of autograd take no undefined tensors: an empty one stands for none.
@@ -158,6 +160,7 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
   call->steps = steps;
   call->returned = returned;
   call->options = options;
+  call->products = products_of(options.solver.preconditioner.spec());
   const auto out = FlowSteps::apply(u, equation.nu, or_empty(equation.force, u), or_empty(equation.inflow, u), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
 }
