@@ -250,9 +250,9 @@ def _copy(step: Stepper) -> Stepper:
 
 
 def set_solver(step: Stepper, solver: Solver, max_iter: int, rtol: float) -> None:
-    step.method, step.restart, step.rtol = solver.method, solver.restart, rtol
-    step.preconditioner = solver.preconditioner
-    step.max_iter = max_iter
+    # All at once: one by one, they would be checked together with those of the solver before.
+    step.__dict__.update(method=solver.method, restart=solver.restart, preconditioner=solver.preconditioner)
+    step.max_iter, step.rtol = max_iter, rtol
 
 
 def _check_direct(trial: Trial, seconds: float) -> None:

@@ -38,7 +38,8 @@ class Checkpoint(_C.Checkpoint):
         """Save named tensors, the curves of `training.train` and the `state_dict` of a controller. ValueError if the
         file cannot be written."""
         if data_parallel.is_first():
-            self.write(_C.pack_state(tensors, curves, **controller))  # type: ignore[arg-type]  # it takes bytes
+            state = {name: value for name, value in controller.items() if name != "controller"}  # the row tells which
+            self.write(_C.pack_state(tensors, curves, **state))  # type: ignore[arg-type]  # it takes bytes
 
     def found(self) -> Found:
         """Return what `restore` takes, the same in all processes: the files that are there, the last one first.

@@ -228,9 +228,7 @@ class _Run:
 
     def _keep(self, task: Task, checkpoint: Checkpoint) -> None:
         tensors = {**task.state(), "random": torch.get_rng_state()}
-        state = self.controller.state_dict()
-        del state["controller"]  # the refinement names it
-        checkpoint.save(tensors, self.curves, state)
+        checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
     def _restores(self, task: Task, found: Found) -> bool:
         """Whether there is a checkpoint to continue from."""
