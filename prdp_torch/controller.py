@@ -99,9 +99,8 @@ class _Attached(_Compiled):
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if name in self.settings:
-                who = type(self).__name__
-                raise AttributeError(f"{who}: {name} cannot be set later; make a new controller")
+            if type(self).__module__ == __name__ and name in self.settings:
+                raise AttributeError(f"{type(self).__name__}: {name} cannot be set later; make a new controller")
             super().__setattr__(name, value)
 
     def _push(self) -> None:

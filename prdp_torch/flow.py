@@ -10,7 +10,7 @@ from prdp_torch import _C, _check
 from prdp_torch.operators.base import real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
 from prdp_torch.stepper import Stepper
-from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
+from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
 Boundary: TypeAlias = Literal["periodic", "wall", "open"]
 
@@ -85,8 +85,6 @@ class Flow(Stepper):
     ) -> None:
         solver = CG(max_iter=100, preconditioner="multigrid") if solver is None else solver
         super().__init__(solver, backward, **options)
-        if self.start != "zero":
-            raise ValueError(f"Flow: start must be 'zero': its solves are for changes, got {self.start!r}")
         self.shape = tuple(_check.shape("Flow", shape))
         self.dt = _check.real("Flow", "dt", dt)
         self.boundary, self.length = boundary, length
@@ -108,6 +106,15 @@ class Flow(Stepper):
             setattr(self, name, value)
         else:
             self.register_buffer(name, _of_numbers(name, value))
+
+    @property
+    def start(self) -> Start:
+        return "zero"
+
+    @start.setter
+    def start(self, start: Start) -> None:
+        if start != "zero":
+            raise ValueError(f"Flow: start must be 'zero': its solves are for changes, got {start!r}")
 
     def forward(self, u: Tensor) -> Tensor:
         _check.dense("Flow", "u", u)
@@ -160,7 +167,10 @@ class Flow(Stepper):
         inflow = _check.optional(_check.dense, "Flow", "inflow", self.inflow)
         d = len(self.shape)
         boundary, length = _of_axes("boundary", self.boundary, d), _of_axes("length", self.length, d)
-        box = self._kept_box.of(tuple(self.shape), boundary, length, _Mask(self.obstacle))
+        if not all(isinstance(name, str) for name in boundary):
+            raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
+        sides = tuple(_check.real("Flow", "length", side) for side in length)
+        box = self._kept_box.of(tuple(self.shape), boundary, sides, _Mask(self.obstacle))
         return _C.FlowEquation(box, dt, nu, force, inflow, self.advection, self.diffusion)
 
     def extra_repr(self) -> str:
@@ -172,10 +182,12 @@ class _Mask:
 
     def __init__(self, obstacle: Tensor | None) -> None:
         self.obstacle = obstacle
-        self.version = 0 if obstacle is None or obstacle.is_inference() else obstacle._version
+        counts = obstacle is not None and not obstacle.is_inference()  # nobody counts what is written to others
+        self.version = obstacle._version if obstacle is not None and counts else None
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Mask) and self.obstacle is other.obstacle and self.version == other.version
+        same = isinstance(other, _Mask) and self.obstacle is other.obstacle and self.version == other.version
+        return same and (self.obstacle is None or self.version is not None)
 
 
 def _of_axes(name: str, values: Any, dim: int) -> tuple[Any, ...]:
@@ -187,14 +199,8 @@ def _of_axes(name: str, values: Any, dim: int) -> tuple[Any, ...]:
     return tuple(values)
 
 
-def _make_box(
-    shape: tuple[int, ...], boundary: tuple[object, ...], length: tuple[object, ...], mask: _Mask
-) -> _C.FlowBox:
-    names = [name for name in boundary if isinstance(name, str)]
-    if len(names) < len(boundary):
-        raise TypeError(f"Flow: boundary must be a name or one per axis, got {boundary!r}")
-    lengths = [_check.real("Flow", "length", side) for side in length]
-    return _C.FlowBox(list(shape), names, lengths, mask.obstacle)
+def _make_box(shape: tuple[int, ...], boundary: tuple[str, ...], length: tuple[float, ...], mask: _Mask) -> _C.FlowBox:
+    return _C.FlowBox(list(shape), list(boundary), list(length), mask.obstacle)
 
 
 def _of_numbers(name: str, value: object) -> Tensor:

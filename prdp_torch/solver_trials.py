@@ -244,8 +244,8 @@ def _copy(step: Stepper) -> Stepper:
     except RuntimeError:  # of an operator made of tensors that are not leaves of a graph
         trial = copy.copy(step)
         trial._adjoint_log = AdjointLog()
-    trial.backward, trial.on_failure = "implicit", "return"
     trial.adjoint_max_iter = trial.adjoint_rtol = trial.checkpoint_every = None
+    trial.backward, trial.on_failure = "implicit", "return"
     return trial
 
 

@@ -225,7 +225,9 @@ def solve_options(
 
 
 def tensors_of(preconditioner: Preconditioner) -> tuple[int, ...]:
-    """What tells whether the tensors of a preconditioner are others than before."""
+    """What tells whether a preconditioner that is the same object is made of others than before."""
+    if isinstance(preconditioner, Multigrid):
+        return (preconditioner.smoothing,)
     return tuple(map(id, preconditioner.tensors)) if isinstance(preconditioner, Operator) else ()
 
 

@@ -1,9 +1,10 @@
 """`Stepper`: what all steppers have in common, and the base of those that solve A(u) u_next = b(u)."""
 
 import difflib
+import functools
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -55,7 +56,8 @@ class Stepper(torch.nn.Module):
             each new value compiles again, up to `torch._dynamo.config.recompile_limit` times.
         start: as above. It may be set at any time.
         restart, preconditioner and the options above: they may be set at any time, and are checked then.
-        info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised.
+        info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised
+            (not under `torch.compile`).
         adjoint_info: the `SolveInfo` of the last backward pass; None before the first.
 
     Raises:
@@ -116,13 +118,16 @@ class Stepper(torch.nn.Module):
 
         def __setattr__(self, name: str, value: object) -> None:
             if not torch.compiler.is_compiling():
+                if isinstance(getattr(type(self), name, None), property):
+                    object.__setattr__(self, name, value)  # past Module, which would register a Parameter
+                    return
                 if name in PLAIN and "info" in self.__dict__:
                     self._check_settings(**{name: value})
-                elif not hasattr(type(self), name) and name not in self.__dict__:
-                    _refuse_misspelt(type(self), name)
+                elif name not in self.__dict__ and (meant := _meant_setting(type(self), name)):
+                    raise AttributeError(f"{type(self).__name__}: {meant}")
             super().__setattr__(name, value)
 
-    def _check_settings(self, **changed: object) -> None:
+    def _check_settings(self, **changed: Any) -> None:
         """Raise ValueError or TypeError unless the solver and the options fit together with what is changed."""
         settings = {name: getattr(self, name) for name in SETTINGS} | changed
         check_settings(type(self).__name__, self.method, **settings)
@@ -144,7 +149,7 @@ class Stepper(torch.nn.Module):
             self._forget()
         found = self._solve(u, self._adjoint_log)
         self._keep(found[1:], self._adjoint_log)
-        if found[0].requires_grad:
+        if found[0].requires_grad and self._last_log is not self._adjoint_log:
             self._last_log = self._adjoint_log
         return found[0]
 
@@ -155,10 +160,10 @@ class Stepper(torch.nn.Module):
         number, counted from 1. For the backward pass each step stores what a single step stores."""
         compiling = torch.compiler.is_compiling()
         if not compiling:
+            self._forget()
             _check.dense(type(self).__name__, "u", u)
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
-            self._forget()
         logs = AdjointLogs(0 if compiling else steps)
         states, reports = [u], []
         for step in range(steps):
@@ -293,16 +298,16 @@ class Stepper(torch.nn.Module):
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
 
 
-def _refuse_misspelt(kind: type[Stepper], name: str) -> None:
-    """Raise AttributeError for a new attribute that must be meant for a setting, which would stay as it is. Subclasses
-    outside this library may have attributes of any name."""
+@functools.cache
+def _meant_setting(kind: type[Stepper], name: str) -> str | None:
+    """What to say of a new attribute that must be meant for a setting, which would stay as it is. Classes outside this
+    library may have attributes of any name."""
     if name.startswith("_") or name in SETTINGS or not kind.__module__.startswith("prdp_torch."):
-        return
+        return None
     if name == "solver":
-        may = "max_iter, rtol, restart and preconditioner"
-        raise AttributeError(f"{kind.__name__}: the solver cannot be set later; {may} can")
-    if meant := difflib.get_close_matches(name, SETTINGS, n=1, cutoff=0.8):
-        raise AttributeError(f"{kind.__name__}: no setting '{name}'; did you mean '{meant[0]}'?")
+        return "the solver cannot be set later; max_iter, rtol, restart and preconditioner can"
+    meant = difflib.get_close_matches(name, SETTINGS, n=1, cutoff=0.85)
+    return f"no setting '{name}'; did you mean '{meant[0]}'?" if meant else None
 
 
 def _unknown_argument(kind: type[Stepper], unknown: Mapping[str, object]) -> str:

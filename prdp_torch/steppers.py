@@ -1,7 +1,7 @@
 """Steppers of built-in equations: one time step, or one elliptic solve, as an `nn.Module`."""
 
-from dataclasses import dataclass
-from typing import ClassVar, Unpack
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
@@ -21,6 +21,10 @@ class Equation:
     shape: list[int]
     parameters: list[float]
     picard_steps: int = 1
+
+
+def _kept_length(length: Length) -> Length:
+    return tuple(length) if isinstance(length, list) else length
 
 
 class EquationStepper(Stepper):
@@ -48,7 +52,7 @@ class EquationStepper(Stepper):
         who = type(self).__name__
         self._refuse_own_system()
         extents = _check.shape(who, shape)
-        self._length = length
+        self._length = _kept_length(length)
         parameters = _check.lengths(who, length, len(extents))
         if nu_and_dt is not None:
             nu, dt = nu_and_dt
@@ -56,11 +60,16 @@ class EquationStepper(Stepper):
             parameters.insert(0, _check.real(who, "dt", dt))
         self.equation = Equation(self.kind, extents, parameters, _check.whole(who, "picard_steps", picard_steps))
         self._kept_equation = Kept(_C.Equation)
-        self._take_parameters(parameters)
+        self._change()
 
     @property
     def shape(self) -> tuple[int, ...]:
         return tuple(self.equation.shape)
+
+    @shape.setter
+    def shape(self, shape: Shape) -> None:
+        if tuple(shape) != self.shape:
+            raise AttributeError(f"{type(self).__name__}: shape cannot be set later; make a new stepper")
 
     @property
     def length(self) -> Length:
@@ -69,18 +78,16 @@ class EquationStepper(Stepper):
     @length.setter
     def length(self, length: Length) -> None:
         dt = self.equation.parameters[: self._others]
-        self._take_parameters(dt + _check.lengths(type(self).__name__, length, len(self.equation.shape)))
-        self._length = length
+        self._change(parameters=dt + _check.lengths(type(self).__name__, length, len(self.equation.shape)))
+        self._length = _kept_length(length)
 
     _others: ClassVar[int] = 0  # parameters of the equation before its lengths
 
-    def _take_parameters(self, parameters: list[float]) -> None:
-        before, self.equation.parameters = self.equation.parameters, parameters
-        try:
-            torch.ops.prdp.check_equation(*self._equation())
-        except BaseException:
-            self.equation.parameters = before
-            raise
+    def _change(self, **changed: Any) -> None:
+        """Take another equation in one piece, once it is checked: other threads, and copies, have the one before."""
+        e = replace(self.equation, **changed)
+        torch.ops.prdp.check_equation(self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps)
+        self.equation = e
 
     def _keep_nu(self, nu: Number) -> None:
         if isinstance(nu, torch.nn.Parameter):
@@ -104,8 +111,8 @@ class EquationStepper(Stepper):
     def forward(self, u: Tensor) -> Tensor:
         found: Solution | None = None
         if not torch.compiler.is_compiling():
-            _check.dense(type(self).__name__, "u", u)
             self._forget()
+            _check.dense(type(self).__name__, "u", u)
             log = self._adjoint_log.number
             found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
         if found is None:
@@ -122,9 +129,9 @@ class EquationStepper(Stepper):
         a step fails, the error gives its number, counted from 1. The backward pass needs the states; in implicit
         mode `Poisson`, and `Heat` with a number as nu, need nothing."""
         if not torch.compiler.is_compiling():
+            self._forget()
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-            self._forget()
         found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
         self._keep(found[1:], self._adjoint_log)
         return found[0]
@@ -172,7 +179,19 @@ class TimeStepper(EquationStepper):
 
     @dt.setter
     def dt(self, dt: float) -> None:
-        self._take_parameters([_check.real(type(self).__name__, "dt", dt), *self.equation.parameters[1:]])
+        self._change(parameters=[_check.real(type(self).__name__, "dt", dt), *self.equation.parameters[1:]])
+
+
+class LinearisedStepper(TimeStepper):
+    """The base of those that are linearised about the state."""
+
+    @property
+    def picard_steps(self) -> int:
+        return self.equation.picard_steps
+
+    @picard_steps.setter
+    def picard_steps(self, steps: int) -> None:
+        self._change(picard_steps=_check.whole(type(self).__name__, "picard_steps", steps))
 
 
 class Poisson(EquationStepper):
@@ -250,7 +269,7 @@ class Heat(TimeStepper):
         return operators.Heat(e.shape, self.nu, e.parameters[0], self.length)
 
 
-class Burgers(TimeStepper):
+class Burgers(LinearisedStepper):
     """Make one implicit Euler step of Burgers' equation u_t + (u·∇)u = nu Δu on a periodic grid.
 
     It solves (I + dt Γ(u) - nu dt L) u_next = u, where Γ is first-order upwind advection, linearised about the
@@ -292,7 +311,7 @@ class Burgers(TimeStepper):
         return operators.Burgers(u, self.nu, self.equation.parameters[0], self.length)
 
 
-class NavierStokes(TimeStepper):
+class NavierStokes(LinearisedStepper):
     """Make one implicit Euler step of the Navier-Stokes equations u_t + (u·∇)u + ∇p = nu Δu, ∇·u = 0.
 
     The grid is periodic and staggered. The step is linearised about the state, which is (batch, 3, Ny, Nx): u₁

@@ -1,5 +1,6 @@
 """The base of all operators, and what several of them need."""
 
+import functools
 import inspect
 import math
 from collections.abc import Iterable
@@ -41,8 +42,9 @@ class Operator:
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if not torch.compiler.is_compiling() and "tensors" in self.__dict__ and name not in DESCRIPTION:
-                _refuse_argument(type(self), name)
+            made = "tensors" in self.__dict__ and not torch.compiler.is_compiling()
+            if made and name not in DESCRIPTION and name in _arguments(type(self)):
+                raise AttributeError(f"{type(self).__name__}: {name} cannot be set later; make a new operator")
             super().__setattr__(name, value)
 
     def __repr__(self) -> str:
@@ -97,10 +99,11 @@ def real_tensor(who: str, name: str, value: Number) -> Tensor:
     return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
 
 
-def _refuse_argument(kind: type, name: str) -> None:
-    """Raise AttributeError for an argument of an operator that is made: the library would not see the change."""
-    if name in inspect.signature(kind).parameters:
-        raise AttributeError(f"{kind.__name__}: {name} cannot be set later; make a new operator")
+@functools.cache
+def _arguments(kind: type) -> frozenset[str]:
+    """What an operator of the library is made of; it would not see a later change. Those of a user's own class are the
+    user's."""
+    return frozenset(inspect.signature(kind).parameters if kind.__module__.startswith("prdp_torch.") else ())
 
 
 def full_precision(t: Tensor) -> Tensor:

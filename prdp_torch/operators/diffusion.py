@@ -46,7 +46,7 @@ class Diffusion(Operator):
 
     kind = "diffusion"
     boundary: list[tuple[str, ...]]
-    length: list[float]
+    length: tuple[float, ...]
     kappa: Tensor
 
     def __init__(
@@ -66,7 +66,7 @@ class Diffusion(Operator):
         if faces not in ("harmonic", "arithmetic"):
             raise ValueError(f"Diffusion: faces must be 'harmonic' or 'arithmetic', got {faces!r}")
         self.boundary = _sides(boundary, dim)
-        self.length = _check.lengths("Diffusion", length, dim) or [1.0] * dim
+        self.length = tuple(_check.lengths("Diffusion", length, dim)) or (1.0,) * dim
         self.kappa = kappa
         if isinstance(shift, Tensor) and shift.dim() > 0:
             if shift.dim() != kappa.dim():
@@ -161,10 +161,13 @@ def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
 def _check_of_side(name: str, value: Number, side: Tensor) -> None:
     if not isinstance(value, Tensor) or value.dim() == 0:
         return
-    extents = zip(reversed(value.shape[1:]), reversed(side.shape[1:]), strict=False)
-    if value.dim() > side.dim() or any(n not in (1, of_side) for n, of_side in extents):
+    extents = zip(reversed(value.shape), reversed(side.shape), strict=False)
+    fits = [n == 1 or n == of_side for n, of_side in extents]
+    if value.dim() == side.dim() and side.shape[0] == 1:
+        fits[-1] = True  # the batch
+    if value.dim() > side.dim() or not all(fits):
         raise ValueError(
-            f"Diffusion: {name} must broadcast to (batch or 1, *side), here {('batch', *side.shape[1:])}, got "
+            f"Diffusion: {name} must broadcast to (batch or 1, *side), here {tuple(side.shape)}, got "
             f"{tuple(value.shape)}"
         )
 

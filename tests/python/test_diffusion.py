@@ -292,7 +292,8 @@ def test_a_kappa_that_is_not_positive_is_refused_within_a_transform_as_well():
 
 @pytest.mark.parametrize("values, words", [
     ((1.0, 2.0), r"values must be one for all sides or a pair \(low, high\) for each of 2 axes, got \(1.0, 2.0\)"),
-    (torch.ones(1, 7), r"values must broadcast to \(batch or 1, \*side\), here \('batch', 5\), got \(1, 7\)"),
+    (torch.ones(1, 7), r"values must broadcast to \(batch or 1, \*side\), here \(1, 5\), got \(1, 7\)"),
+    (torch.ones(7), r"values must broadcast to \(batch or 1, \*side\), here \(1, 5\), got \(7,\)"),
 ])  # fmt: skip
 def test_values_that_do_not_fit_the_sides_are_named(values, words):
     with pytest.raises(ValueError, match=words):

@@ -216,12 +216,27 @@ def test_one_of_several_axes_is_no_value_for_all():
 @pytest.mark.parametrize("name, value, words", [
     ("dt", "a", "Flow: dt must be a real number, got 'a'"),
     ("force", 3.0, "Flow: force must be a torch tensor, got float"),
+    ("length", torch.ones(2), "Flow: length must be a real number, got tensor"),
 ])  # fmt: skip
 def test_what_is_set_wrongly_is_named_in_the_next_step(name, value, words):
     flow = prdp.Flow((8, 6), 0.1, 0.01)
     setattr(flow, name, value)
     with pytest.raises(TypeError, match=words):
         flow(torch.zeros(1, 2, 8, 6))
+
+
+def test_an_obstacle_in_inference_mode_may_move():
+    with torch.inference_mode():
+        flow = prdp.Flow((8, 6), 0.1, 0.01, obstacle=solid((8, 6), (3, 3)))
+        u = 0.1 * random_velocity((8, 6))
+        flow(u)
+        flow.obstacle[2, 1] = True
+        assert torch.equal(flow(u), prdp.Flow((8, 6), 0.1, 0.01, obstacle=solid((8, 6), (3, 3), (2, 1)))(u))
+
+
+def test_a_start_is_refused():
+    with pytest.raises(ValueError, match="Flow: start must be 'zero': its solves are for changes, got 'state'"):
+        prdp.Flow((8, 6), 0.1, 0.01).start = "state"
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script")  # by torch's own forward mode

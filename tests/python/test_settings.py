@@ -39,6 +39,63 @@ def test_dt_and_length_count_when_they_are_set(name, changed):
     assert torch.equal(copy.deepcopy(step)(u), other(u))
 
 
+def test_picard_steps_count_when_they_are_set():
+    u = torch.randn(2, 1, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    step, other = (prdp.Burgers((12,), 1e-2, 0.5, prdp.Direct(), picard_steps=n) for n in (1, 3))
+    step.picard_steps = 3
+    assert torch.equal(step(u), other(u))
+
+
+def test_what_is_refused_or_changed_leaves_copies_alone():
+    step = heat()
+    twin = copy.copy(step)
+    twin.dt = 0.1
+    assert (step.dt, twin.dt) == (0.5, 0.1)
+    sides = [2.0]
+    stretched = heat(length=sides)
+    sides[0] = 3.0
+    assert stretched.length == (2.0,)
+
+
+def test_smoothing_counts_in_calls_as_in_rollouts():
+    solver = prdp.CG(50, rtol=1e-10, preconditioner=prdp.Multigrid(1, smoothing=1))
+    step, u = prdp.Poisson((31, 31), solver), torch.ones(1, 1, 31, 31, dtype=torch.float64)
+    step(u)
+    many = step.info.iterations.item()
+    step.preconditioner.smoothing = 6
+    step(u)
+    assert step.info.iterations.item() < many
+    step.rollout(u, 1)
+    few = step.info.iterations.item()
+    step(u)
+    assert step.info.iterations.item() == few
+
+
+def test_subclasses_of_a_user_keep_what_they_are_made_of():
+    class Own(prdp.Heat):
+        def __init__(self, shape, dt):
+            super().__init__(shape, 1e-2, dt, prdp.CG(5))
+            self.shape, self.dt, self.state, self.stats = shape, dt, None, {}
+
+    class OwnStencil(operators.Stencil):
+        def __init__(self, width):
+            super().__init__(torch.ones(1, 2, 4), [(0,), (1,)])
+            self.width = width
+
+    class OwnController(prdp.PRDPController):
+        def __init__(self, steppers, delta):
+            super().__init__(steppers, delta=delta)
+            self.delta = delta
+
+    assert Own((30,), 0.5).dt == 0.5 and OwnStencil(3).width == 3 and OwnController([], 3).delta == 3
+
+
+def test_advise_takes_steps_that_keep_checkpoints():
+    step = heat(backward="unrolled", checkpoint_every="sqrt")
+    assert prdp.advise(step, torch.randn(2, 1, 30), seconds=0.2).rows
+    assert (step.backward, step.checkpoint_every) == ("unrolled", "sqrt")
+
+
 def test_the_length_of_poisson_counts_when_it_is_set():
     step, b = prdp.Poisson((9,), prdp.Direct()), torch.ones(1, 1, 9)
     u = step(b)
@@ -52,7 +109,8 @@ def test_the_length_of_poisson_counts_when_it_is_set():
     ("dt", "a", TypeError, "Heat: dt must be a real number, got 'a'"),
     ("length", (1.0, 2.0), ValueError, "Heat: length must be one number or one per axis, 1 here"),
     ("length", 0.0, ValueError, "Heat: length must be finite and > 0, got [0]"),
-    ("shape", (5,), AttributeError, "shape"),
+    ("shape", (5,), AttributeError, "Heat: shape cannot be set later; make a new stepper"),
+    ("dt", torch.nn.Parameter(torch.tensor(0.1)), TypeError, "Heat: dt must be a real number, got Parameter"),
     ("restart", "x", TypeError, "Heat: restart must be a whole number, got 'x'"),
     ("restart", 0, ValueError, "Heat: restart must be >= 1, got 0"),
     ("preconditioner", "foo", ValueError,
