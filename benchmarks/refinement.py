@@ -17,7 +17,7 @@ import torch
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.experiments import _C, compare, records, scenes
 from prdp_torch.experiments.compare import Row
-from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.refinement import Refinement, start_from_states
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
@@ -65,8 +65,9 @@ def _constant(rtol):
     """One tolerance throughout. The start, the adjoint's share and the cap on K are those of auto."""
 
     def attach(steppers):
+        start_from_states(steppers)
         for stepper in steppers:
-            stepper.start, stepper.rtol, stepper.adjoint_rtol = "state", rtol, min(0.5, 10 * rtol)
+            stepper.rtol, stepper.adjoint_rtol = rtol, min(0.5, 10 * rtol)
         return LinearSchedule(steppers, initial=10_000, increment=0, maximum=10_000)
 
     label = f"rtol_{rtol:g}"

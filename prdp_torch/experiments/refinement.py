@@ -5,9 +5,17 @@ from typing import Self, TypeAlias
 
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController
 from prdp_torch.experiments import _C
+from prdp_torch.flow import Flow
 from prdp_torch.stepper import Stepper
 
 Controller: TypeAlias = LinearSchedule | PRDPController | ToleranceController
+
+
+def start_from_states(steppers: Sequence[Stepper]) -> None:
+    """Let the solves start from the state before the step. Those of a `Flow` are for changes, and start from zero."""
+    for stepper in steppers:
+        if not isinstance(stepper, Flow):
+            stepper.start = "state"
 
 
 class Refinement:
@@ -37,8 +45,7 @@ class Refinement:
         """A tolerance that follows the error (`ToleranceController`), and starts from the state: nothing to choose."""
 
         def attach(steppers: Sequence[Stepper]) -> ToleranceController:
-            for stepper in steppers:
-                stepper.start = "state"
+            start_from_states(steppers)
             return ToleranceController(steppers)
 
         return cls("auto", attach, watches_error=True)
