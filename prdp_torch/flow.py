@@ -9,7 +9,7 @@ from torch import Tensor
 from prdp_torch import _C, _check
 from prdp_torch.operators.base import real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
-from prdp_torch.stepper import Stepper
+from prdp_torch.stepper import Stepper, forgets_if_it_raises
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
 Boundary: TypeAlias = Literal["periodic", "wall", "open"]
@@ -116,24 +116,25 @@ class Flow(Stepper):
         if start != "zero":
             raise ValueError(f"Flow: start must be 'zero': its solves are for changes, got {start!r}")
 
+    @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
         _check.dense("Flow", "u", u)
-        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
         return found[0]
 
+    @forgets_if_it_raises
     def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
         _check.dense("Flow", "u", u)
-        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
         d = len(self.shape)
         return found[0][:, :d], found[0][:, d:]
 
+    @forgets_if_it_raises
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
 
@@ -141,7 +142,6 @@ class Flow(Stepper):
         tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1."""
         _check.dense("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
-        self._forget()
         log = self._adjoint_log.number
         found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)

@@ -3,8 +3,8 @@
 import difflib
 import functools
 import inspect
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -27,10 +27,29 @@ from prdp_torch.solvers import (
 )
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 # What may be set on a stepper at any time: as properties, and as plain attributes.
 PROPERTIES = ("max_iter", "rtol", "adjoint_rtol", "start")
 PLAIN = ("restart", "preconditioner", "backward", "adjoint_max_iter", "on_failure", "checkpoint_every")
 SETTINGS = (*PROPERTIES, *PLAIN)
+
+
+def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
+    """A step that raises has no report, and leaves none of an earlier one. Until then, other threads read theirs."""
+
+    @functools.wraps(step)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        if torch.compiler.is_compiling():
+            return step(*args, **kwargs)
+        try:
+            return step(*args, **kwargs)
+        except BaseException:
+            vars(args[0])["info"] = None
+            raise
+
+    return call
 
 
 class Stepper(torch.nn.Module):
@@ -140,19 +159,15 @@ class Stepper(torch.nn.Module):
         """b(u), the right-hand side of the step from u."""
         return u
 
-    def _forget(self) -> None:
-        """A step that raises has no report."""
-        self.__dict__["info"] = None
-
+    @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
-        if not torch.compiler.is_compiling():
-            self._forget()
         found = self._solve(u, self._adjoint_log)
         self._keep(found[1:], self._adjoint_log)
         if found[0].requires_grad and self._last_log is not self._adjoint_log:
             self._last_log = self._adjoint_log
         return found[0]
 
+    @forgets_if_it_raises
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
@@ -160,7 +175,6 @@ class Stepper(torch.nn.Module):
         number, counted from 1. For the backward pass each step stores what a single step stores."""
         compiling = torch.compiler.is_compiling()
         if not compiling:
-            self._forget()
             _check.dense(type(self).__name__, "u", u)
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")

@@ -9,7 +9,7 @@ from torch import Tensor
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.operators.base import real_tensor
 from prdp_torch.solvers import Kept, Solver
-from prdp_torch.stepper import Stepper
+from prdp_torch.stepper import Stepper, forgets_if_it_raises
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
 
 
@@ -108,10 +108,10 @@ class EquationStepper(Stepper):
                     f"build your own with ImplicitStep(operator, rhs, solver)"
                 )
 
+    @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
         found: Solution | None = None
         if not torch.compiler.is_compiling():
-            self._forget()
             _check.dense(type(self).__name__, "u", u)
             log = self._adjoint_log.number
             found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
@@ -121,6 +121,7 @@ class EquationStepper(Stepper):
         self._keep(found[1:], self._adjoint_log)
         return found[0]
 
+    @forgets_if_it_raises
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
@@ -129,7 +130,6 @@ class EquationStepper(Stepper):
         a step fails, the error gives its number, counted from 1. The backward pass needs the states; in implicit
         mode `Poisson`, and `Heat` with a number as nu, need nothing."""
         if not torch.compiler.is_compiling():
-            self._forget()
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
         found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
