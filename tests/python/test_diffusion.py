@@ -1,4 +1,4 @@
-"""Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
+"""operators.Diffusion: finite volumes in flux form, against an assembled matrix and closed forms."""
 
 import itertools
 import subprocess

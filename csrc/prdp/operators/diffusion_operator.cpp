@@ -103,7 +103,7 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 void DiffusionOperator::check_parameters() const {
-  const bool wrapped = at::isTensorSubclassLike(kappa_) || at::isTensorSubclassLike(shift_);
+  const bool wrapped = at::areAnyTensorSubclassLike({kappa_, shift_});
   if (wrapped || kappa_.is_meta() || kappa_.numel() == 0) return;  // no numbers, or none yet
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);

@@ -1,6 +1,5 @@
 #include "prdp/steppers/flow/equation.h"
 
-#include <algorithm>
 #include <cmath>
 
 #include "prdp/operators/plain_tensors.h"
@@ -78,8 +77,7 @@ void FlowEquation::check() const {
 
 void FlowEquation::check(const at::Tensor& u) const {
   const std::vector<at::Tensor> all{u, nu, force, inflow};
-  const auto is_wrapped = [](const at::Tensor& t) { return t.defined() && at::isTensorSubclassLike(t); };
-  TORCH_CHECK_NOT_IMPLEMENTED(!in_torch_func() || std::none_of(all.begin(), all.end(), is_wrapped),
+  TORCH_CHECK_NOT_IMPLEMENTED(!in_torch_func() || !at::areAnyTensorSubclassLike(all),
                               "Flow: takes no transform of torch.func; use autograd.grad and batches");
   TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(all), "Flow: takes no dual tensors of forward mode; use autograd.grad");
   box->check_velocity(u);
