@@ -171,7 +171,7 @@ def _kind(controller: type) -> str:
 
 def _beyond_rounding(info: SolveInfo) -> Tensor:
     """The residuals of a report, with 0 where it is rounding alone."""
-    return info.residual.double().masked_fill((info.floor > 0) & ~info.failed, 0.0)
+    return info.residual.double().masked_fill(info.floor > 0, 0.0)
 
 
 def _remade(

@@ -83,9 +83,9 @@ class SolveInfo(NamedTuple):
     operator_applications: Tensor
     """Number of products with A (int64)."""
     floor: Tensor
-    """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖; 0 elsewhere.
+    """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖.
     Such a sample is STAGNATED: its residual is as small as the dtype allows. u may be further off where A is badly
-    conditioned; float64 tells."""
+    conditioned; float64 tells. 0 for all other samples, those that failed among them."""
     log: AdjointLog | AdjointLogs | None = None
 
     def __repr__(self) -> str:
@@ -108,7 +108,7 @@ class SolveInfo(NamedTuple):
     @property
     def solved(self) -> Tensor:
         """Which samples are solved (bool): they met the tolerance, or came as near as their dtype allows."""
-        return (self.status > 0) | ((self.floor > 0) & ~self.failed)
+        return (self.status > 0) | (self.floor > 0)
 
     @property
     def adjoint(self) -> "SolveInfo | None":

@@ -117,6 +117,7 @@ def test_no_sample_is_both_solved_and_failed(method):
     b = torch.randn(60, 1, n, n, dtype=dtype, generator=torch.Generator().manual_seed(1))
     _, info = prdp.linear_solve(a, b, METHODS[method](300, 1e-5), on_failure="return")
     assert info.failed.any() and not (info.solved & info.failed).any()
+    assert info.floor[info.failed].eq(0).all()
 
 
 @pytest.mark.parametrize("leak", [1e-4, 1e-2])

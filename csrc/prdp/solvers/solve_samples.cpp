@@ -17,7 +17,7 @@ void report(const SampleBatch<T>& batch, int64_t s, SolveStatus status, int64_t 
   batch.iterations[s] = iterations;
   batch.residual[s] = static_cast<T>(residual);
   batch.applications[s] = applications;
-  batch.floor[s] = static_cast<T>(floor);
+  batch.floor[s] = is_failure(status) ? T(0) : static_cast<T>(floor);
 }
 
 template <class T>

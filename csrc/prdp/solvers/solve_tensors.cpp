@@ -28,7 +28,8 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
     info.residual.mutable_data_ptr<double>()[i] = residual;
     info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(s.status);
     info.operator_applications.mutable_data_ptr<int64_t>()[i] = s.applications;
-    info.floor.mutable_data_ptr<double>()[i] = s.floor2 > 0.0 ? std::sqrt(s.floor2 / s.b2) : 0.0;
+    info.floor.mutable_data_ptr<double>()[i] =
+        s.floor2 > 0.0 && !is_failure(s.status) ? std::sqrt(s.floor2 / s.b2) : 0.0;
   }
   for (auto* part : {&info.residual, &info.floor}) *part = part->to(real.device(at::kCPU));
   return info;

@@ -88,7 +88,7 @@ UnseenReport report_unseen(const PreparedBatch& batch, const UnseenEnd& end, con
       at::where(is(SolveStatus::kConverged), 0.0,
                 at::where(status <= code(SolveStatus::kNonfiniteInput), std::numeric_limits<double>::infinity(), 1.0));
   const auto residual = at::where(open, at::where(gone, 1.0, relative(residual2)), of_settled);
-  const auto floor = at::where(underflows.logical_and(open), relative(lost2), 0.0);
+  const auto floor = floor_of(at::where(underflows.logical_and(open), relative(lost2), 0.0), status);
   const auto counted = open.logical_and(gone.logical_not());
   return {{u.contiguous(), {counted * end.iterations, residual, status, (applications + for_energy) * open, floor}},
           gone};

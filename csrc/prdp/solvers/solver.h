@@ -154,16 +154,19 @@ struct SolveInfo {
   at::Tensor status;                 // SolveStatus
   at::Tensor operator_applications;  // number of products with A
   /// Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖: the sample is
-  /// STAGNATED, and u as accurate as the dtype allows. 0 elsewhere.
+  /// STAGNATED, and u as accurate as the dtype allows. 0 for all other samples, failed ones among them.
   at::Tensor floor;
 
   /// All of them, in this order.
   std::array<at::Tensor*, 5> parts() { return {&iterations, &residual, &status, &operator_applications, &floor}; }
   /// Which samples are solved, as far as their dtype goes (bool).
-  at::Tensor solved() const {
-    return status.gt(0).logical_or(floor.gt(0).logical_and(status.ge(static_cast<int64_t>(SolveStatus::kStagnated))));
-  }
+  at::Tensor solved() const { return status.gt(0).logical_or(floor.gt(0)); }
 };
+
+/// The floors of a report with this status: no rounding excuses a failure.
+inline at::Tensor floor_of(const at::Tensor& floor, const at::Tensor& status) {
+  return floor.masked_fill(status.lt(static_cast<int64_t>(SolveStatus::kStagnated)), 0.0);
+}
 
 /// A value of checkpoint_every that stands for ⌈√K⌉, where K is the number of iterations that ran.
 inline constexpr int64_t kCheckpointSqrt = -1;

@@ -68,6 +68,7 @@ void find_inconsistent_constants_there(const Operator& a, const at::Tensor& b, c
                            (constant_shares(result.u) > 0.9));
   const auto found = suspects & maps_constant_to_zero(a, b, /*transposed=*/true);
   info.status = info.status.masked_fill(found, static_cast<int64_t>(SolveStatus::kInconsistent));
+  info.floor = floor_of(info.floor, info.status);
 }
 
 }  // namespace
@@ -77,7 +78,7 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   if (!request.guarded || !a.may_be_singular()) return;
   const auto& solver = request.solver;
   if (!result.info.status.is_cpu()) return find_inconsistent_constants_there(a, b, solver, result);
-  const auto& info = result.info;
+  auto& info = result.info;
   auto* status = info.status.mutable_data_ptr<int64_t>();
   const auto* products = info.operator_applications.const_data_ptr<int64_t>();
   const auto status_of = [&](int64_t i) { return static_cast<SolveStatus>(status[i]); };
@@ -109,6 +110,7 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
   const auto found = maps_constant_to_zero(a, b, /*transposed=*/true).to(at::kCPU);
   for (const int64_t i : suspects)
     if (found.const_data_ptr<bool>()[i]) status[i] = static_cast<int64_t>(SolveStatus::kInconsistent);
+  info.floor = floor_of(info.floor, info.status);
 }
 
 }  // namespace prdp

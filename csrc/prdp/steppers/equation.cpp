@@ -62,6 +62,7 @@ SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptio
     info.iterations = info.iterations + last.iterations;
     info.operator_applications = info.operator_applications + last.operator_applications;
     info.status = at::minimum(info.status, last.status);  // the least is the worst
+    info.floor = floor_of(info.floor, info.status);
   }
   if (equation.picard_steps > 1 && options.on_failure == OnFailure::kZeroGrad)
     result.u = detach_failed(result.u, result.info.status);  // whichever of its solves failed

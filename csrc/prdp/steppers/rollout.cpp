@@ -267,9 +267,10 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
       call_solves(equation, u, steps * picard, options);
   if (picard == 1) return {solutions, {iterations, residual, status, applications, floor}};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
+  const auto worst = of_steps(status).amin(-1);
   return {solutions.slice_symint(1, 0, std::nullopt, picard),
-          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1), of_steps(status).amin(-1),
-           of_steps(applications).sum(-1), of_steps(floor).select(-1, picard - 1)}};
+          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1), worst,
+           of_steps(applications).sum(-1), floor_of(of_steps(floor).select(-1, picard - 1), worst)}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
