@@ -64,9 +64,15 @@ def _panel(axes, summary):
     constants = [row for row in shown if row["label"] not in ROWS]
     x, y = [_products(row, base) for row in constants], [_error(row, base) for row in constants]
     axes.plot(x, y, ".-", color=CONSTANT, lw=1, ms=6, zorder=2)
+    products = [_products(row, base) for row in shown]
+    crowded = (max(products) / min(products)) ** 0.15  # of a panel's width
+    left, below = 0.0, False
     for row, at, error in zip(constants, x, y, strict=True):
-        if error <= high:
-            axes.annotate(row["label"][5:], (at, error), xytext=(2, 3), textcoords="offset points", fontsize=6)
+        if error > high:
+            continue
+        left, below = at, at < crowded * left and not below  # neighbours take turns
+        offset = (2, -8 if below else 3)
+        axes.annotate(row["label"][5:], (at, error), xytext=offset, textcoords="offset points", fontsize=6, zorder=4)
     for label, (_, colour, marker) in ROWS.items():
         for row in shown:
             if row["label"] == label:
