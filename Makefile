@@ -4,7 +4,7 @@
 # make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
 # make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
-# make records  the records of the documentation again, with its pictures and tables: a day on one core, and it goes on where it stopped
+# make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
 # make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.

@@ -14,6 +14,7 @@ from prdp_torch.experiments import records
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs" / "records"
+TABLES = ("result", "performance", "flow", "record")
 
 
 class Made(NamedTuple):
@@ -119,7 +120,7 @@ def main():
         make(entry, commit)
     for entry in chosen:  # only now: a changed file in docs would mark the records after it as made on a dirty tree
         keep(entry, commit)
-    for script in ("benchmarks.pictures", "docs.result_tables", "docs.performance_tables", "docs.flow_tables"):
+    for script in ("benchmarks.pictures", *(f"docs.{kind}_tables" for kind in TABLES)):
         subprocess.run([sys.executable, "-m", script], cwd=ROOT, check=True)
 
 

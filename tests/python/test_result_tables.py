@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.studies.trainings import saved
-from docs import flow_tables, performance_tables, result_tables
+from docs import flow_tables, performance_tables, record_tables, result_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -36,6 +36,12 @@ def test_the_tables_of_flows_are_those_of_the_records():
     text = flow_tables.PAGE.read_text()
     assert flow_tables.TABLE.search(text)
     assert text == flow_tables.with_tables(text), "run: python -m docs.flow_tables"
+
+
+def test_the_table_of_records_is_that_of_the_records():
+    text = record_tables.PAGE.read_text()
+    assert len(record_tables.TABLE.findall(text)) == 1
+    assert text == record_tables.with_tables(text), "run: python -m docs.record_tables"
 
 
 def a_row(**changes):
