@@ -22,10 +22,13 @@ class Made(NamedTuple):
     of its files go where."""
 
     name: str
-    command: str
+    command: str  # {made} stands for the folder where the records of this commit are made
     minutes: int
     made: str  # in the folder of the command
     kept: str  # in docs
+
+    def shown(self):
+        return " ".join(f"python {self.command}".replace("{made}", "runs/records/COMMIT").split())
 
 
 def refinement(scene, seeds, minutes, rows="", name=None):
@@ -82,7 +85,7 @@ LIST = [
     ),
     refinement("navier_stokes", 3, 600, "--rows converged prdp auto none rtol_0.1 rtol_0.01 rtol_0.001 rtol_0.0001"),
     study("data", "--seeds 5", 60),
-    study("inference", "", 60),
+    study("inference", "--trainings {made}/refinement_navier_stokes", 60),
     study("loss", "--seeds 10", 10),
     study("precision", "--seeds 1", 60),
     study("residuals", "", 1),
@@ -111,7 +114,7 @@ def main():
             parser.error(f"unknown record '{name}'; allowed: {', '.join(known)}")
     chosen = [entry for entry in LIST if not options.names or entry.name in options.names]
     if options.list:
-        print("\n".join(f"{e.name:32} {e.minutes:4} min  python {e.command}" for e in chosen))
+        print("\n".join(f"{e.name:32} {e.minutes:4} min  {e.shown()}" for e in chosen))
         return
     commit = records.environment()["commit"]
     if commit is None or (commit.endswith("-dirty") and not options.dirty):
@@ -129,9 +132,8 @@ def make(entry, commit):
     done = folder / ".done"
     if not done.exists():
         print(f"{entry.name}: some {entry.minutes} minutes", flush=True)
-        subprocess.run(
-            [sys.executable, *entry.command.split(), "--out", folder.relative_to(ROOT)], cwd=ROOT, check=True
-        )
+        command = entry.command.replace("{made}", str(folder.parent.relative_to(ROOT))).split()
+        subprocess.run([sys.executable, *command, "--out", folder.relative_to(ROOT)], cwd=ROOT, check=True)
         done.touch()
 
 

@@ -15,10 +15,10 @@ SCRIPT = "record_tables.py"
 TABLE = page_tables.places(SCRIPT)
 ATLAS = "stability/*.json"
 OTHERS = {  # that are not in the list, as they need two free cores or are long tests; with their minutes
-    "performance/calls.json": ("-m benchmarks.calls", 1),
-    "performance/processes.json": ("-m benchmarks.processes", 10),
-    "stability/forgeries.json": ("tests/python/forgeries.py --count 10000", 10),
-    "stability/kills.json": ("tests/python/kills.py --kills 100", 60),
+    "performance/calls.json": ("python -m benchmarks.calls", 1),
+    "performance/processes.json": ("python -m benchmarks.processes", 10),
+    "stability/forgeries.json": ("python tests/python/forgeries.py --count 10000", 10),
+    "stability/kills.json": ("python tests/python/kills.py --kills 100", 60),
 }
 
 
@@ -33,7 +33,7 @@ def values(part, key):
 
 
 def table(_):
-    made = {entry.kept: (entry.command, entry.minutes) for entry in records.LIST} | OTHERS
+    made = {entry.kept: (entry.shown(), entry.minutes) for entry in records.LIST} | OTHERS
     made[ATLAS] = made.pop("stability")
     parts = {}
     for path in sorted(DOCS.rglob("*.json")):
@@ -47,10 +47,15 @@ def table(_):
 
 def _row(name, made, found):
     command, minutes = made[name]
-    command = " ".join(command.removesuffix(" --resume").split())
     commits = {commit[:7] for text in values(found, "commit") for commit in text.split(", ")}
     processors = sorted(values(found, "processor"))
-    return [f"`{name}`", f"`python {command}`", str(minutes), ", ".join(sorted(commits)), "; ".join(processors)]
+    return [
+        f"`{name}`",
+        f"`{command.removesuffix(' --resume')}`",
+        str(minutes),
+        ", ".join(sorted(commits)),
+        "; ".join(processors),
+    ]
 
 
 def with_tables(page):

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import importlib
 import sys
+from functools import partial
 from pathlib import Path
 
 STUDIES = ("data", "inference", "loss", "precision", "residuals", "unroll", "updates", "widths")
@@ -15,12 +16,17 @@ def main():
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("runs/studies"))
     parser.add_argument("--quick", action="store_true", help="the smallest part, to see that it runs")
+    parser.add_argument(
+        "--trainings", type=Path, default=Path("runs/navier_stokes-refinement"),
+        help="what 'benchmarks.refinement navier_stokes' has trained, for inference",
+    )  # fmt: skip
     options = parser.parse_args()
     from benchmarks.studies.trainings import Study
     from prdp_torch.experiments.charts import write_png
 
     module = importlib.import_module(f"benchmarks.studies.{options.study}")
-    study = Study(options.out / options.study, lambda text: print(text, file=sys.stderr, flush=True))
+    report = partial(print, file=sys.stderr, flush=True)
+    study = Study(options.out / options.study, report, options.trainings)
     with contextlib.suppress(KeyboardInterrupt):  # what is done is written
         module.run(study, options.seeds, options.quick)
     study.write(options.out / f"{options.study}.json")

@@ -2,7 +2,6 @@
 `python -m benchmarks.refinement navier_stokes`. Beside the record it draws what they predict."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ from prdp_torch.experiments.network_task import corrected, error
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.trajectories import Course, Trajectories
 
-FOLDER = Path("runs/navier_stokes-refinement")
 WAYS = {"converged": "#222222", "prdp": "#d62728", "auto": "#1f77b4"}
 COARSE = "coarse solver alone"
 KS = (1, 2, 4, 8, 12, 16, 24, 120)  # with 120 every solve meets the scene's rtol
@@ -27,10 +25,10 @@ VALID = 10
 
 
 def run(study, seeds, quick):
-    found = [path for how in WAYS for path in sorted((FOLDER / how).glob("seed_*.pt"))]
+    found = [path for how in WAYS for path in sorted((study.trainings / how).glob("seed_*.pt"))]
     if not found:
         raise SystemExit(
-            f"inference: no trained network in {FOLDER}; run 'python -m benchmarks.refinement navier_stokes'"
+            f"inference: no trained network in {study.trainings}; run 'python -m benchmarks.refinement navier_stokes'"
         )
     last = STEPS[0] if quick else STEPS[-1]
     networks = {(path.parent.name, _seed(path)): prdp.load_trained(path.parent, _seed(path)) for path in found}

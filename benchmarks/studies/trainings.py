@@ -70,9 +70,10 @@ REFINEMENTS = {
 class Study:
     """Trainings that are kept in a folder; one that is there already is not run again."""
 
-    def __init__(self, folder, report):
+    def __init__(self, folder, report, trainings=None):
         self.folder = records.prepare_folder(folder)
         self.report = report
+        self.trainings = trainings  # the folder of networks that `benchmarks.refinement` has trained
         self.rows = []
 
     def train(self, name, how, seed, changes, keep=()):

@@ -43,6 +43,23 @@ def test_what_is_done_on_this_commit_is_not_done_again(tmp_path, monkeypatch):
     assert (tmp_path / "docs" / "results" / "refinement_heat_1d.json").read_text() == "{}"
 
 
+def test_the_study_of_inference_takes_the_networks_of_the_same_commit(tmp_path, monkeypatch):
+    calls = {}
+
+    def run(command, **options):
+        (tmp_path / command[-1]).mkdir(parents=True)
+        calls[command[-1].name] = command
+
+    monkeypatch.setattr(records, "ROOT", tmp_path)
+    monkeypatch.setattr(records, "RUNS", tmp_path / "runs")
+    monkeypatch.setattr(records.subprocess, "run", run)
+    for entry in records.LIST:
+        if entry.name in ("refinement_navier_stokes", "inference"):
+            records.make(entry, "a")
+    trained, study = calls["refinement_navier_stokes"], calls["inference"]
+    assert study[study.index("--trainings") + 1] == str(trained[-1])
+
+
 @pytest.mark.parametrize("arguments, words", [(["moon"], "unknown record 'moon'"), (["heat_1d"], "not committed")])
 def test_it_refuses_what_it_does_not_know_and_changes_that_are_not_committed(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr(records.records, "environment", lambda: {"commit": "abc-dirty"})
