@@ -14,9 +14,11 @@ PAGE = DOCS / "records.md"
 SCRIPT = "record_tables.py"
 TABLE = page_tables.places(SCRIPT)
 ATLAS = "stability/*.json"
+CHECKS = DOCS / "results" / "checks.json"
 OTHERS = {  # that are not in the list, as they need two free cores or are long tests; with their minutes
     "performance/calls.json": ("python -m benchmarks.calls", 1),
     "performance/processes.json": ("python -m benchmarks.processes", 10),
+    "results/checks.json": ("python -m benchmarks.check_records", 30),
     "stability/forgeries.json": ("python tests/python/forgeries.py --count 10000", 10),
     "stability/kills.json": ("python tests/python/kills.py --kills 100", 60),
 }
@@ -36,12 +38,13 @@ def table(_):
     made = {entry.kept: (entry.shown(), entry.minutes) for entry in records.LIST} | OTHERS
     made[ATLAS] = made.pop("stability")
     parts = {}
+    checks = json.loads(CHECKS.read_text())
     for path in sorted(DOCS.rglob("*.json")):
         name = str(path.relative_to(DOCS))
         parts.setdefault(name if name in made else ATLAS, []).append(json.loads(path.read_text()))
     return page_tables.markdown(
-        ["record", "made by", "minutes", "commit", "processor"],
-        [_row(name, made, found) for name, found in parts.items()],
+        ["record", "made by", "minutes", "commit", "processor", "checked"],
+        [[*_row(name, made, found), _check(checks.get(name))] for name, found in parts.items()],
     )
 
 
@@ -56,6 +59,13 @@ def _row(name, made, found):
         ", ".join(sorted(commits)),
         "; ".join(processors),
     ]
+
+
+def _check(found):
+    if found is None:
+        return ""
+    same = found["same"].values()
+    return f"{sum(same)} of {len(same)} rows the same on {found['commit'][:7]}"
 
 
 def with_tables(page):
