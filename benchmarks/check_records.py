@@ -2,7 +2,7 @@
 
 On one processor a training is deterministic: it ends at the same error after the same products, to the last digit,
 until a change touches what is computed. So the first seed of a row tells, and rows that take long can be left out. What
-is found goes to docs/results/checks.json. Rows of another processor, or without the values of each seed, are passed
+is found goes to docs/checks.json. Rows of another processor, or without the values of each seed, are passed
 over."""
 
 import argparse
@@ -19,7 +19,7 @@ from benchmarks.records import LIST
 from prdp_torch.experiments import compare, records, scenes
 
 DOCS = Path(__file__).parents[1] / "docs"
-FOUND = DOCS / "results" / "checks.json"
+FOUND = DOCS / "checks.json"
 KNOWN = {entry.name: entry for entry in LIST if entry.command.startswith("-m benchmarks.refinement ")}
 
 

@@ -98,7 +98,7 @@ LIST = [
         Made(f"mosaic_{task}", f"-m benchmarks.mosaic {task} --limit 150", 60, f"{task}.json", f"flows/{task}.json")
         for task in ("forward", "cost", "gradient", "horizon", "design", "recovery", "conduction")
     ),
-    Made("atlas", "-m prdp_torch stability", 3, "*", "stability"),
+    Made("atlas", "-m prdp_torch stability", 1, "*", "stability"),
 ]
 
 

@@ -4,6 +4,7 @@ Run it after new records: python -m docs.record_tables
 """
 
 import json
+import re
 from pathlib import Path
 
 from benchmarks import records
@@ -14,11 +15,11 @@ PAGE = DOCS / "records.md"
 SCRIPT = "record_tables.py"
 TABLE = page_tables.places(SCRIPT)
 ATLAS = "stability/*.json"
-CHECKS = DOCS / "results" / "checks.json"
+CHECKS = DOCS / "checks.json"
 OTHERS = {  # that are not in the list, as they need two free cores or are long tests; with their minutes
     "performance/calls.json": ("python -m benchmarks.calls", 1),
     "performance/processes.json": ("python -m benchmarks.processes", 10),
-    "results/checks.json": ("python -m benchmarks.check_records", 30),
+    "checks.json": ("python -m benchmarks.check_records", 30),
     "stability/forgeries.json": ("python tests/python/forgeries.py --count 10000", 10),
     "stability/kills.json": ("python tests/python/kills.py --kills 100", 60),
 }
@@ -42,30 +43,25 @@ def table(_):
     for path in sorted(DOCS.rglob("*.json")):
         name = str(path.relative_to(DOCS))
         parts.setdefault(name if name in made else ATLAS, []).append(json.loads(path.read_text()))
-    return page_tables.markdown(
-        ["record", "made by", "minutes", "commit", "processor", "checked"],
-        [[*_row(name, made, found), _check(checks.get(name))] for name, found in parts.items()],
-    )
+    head = ["record", "commit", "processor", "checked", "minutes", "made by"]
+    return page_tables.markdown(head, [_row(name, made, found, checks.get(name)) for name, found in parts.items()])
 
 
-def _row(name, made, found):
+def _row(name, made, found, check):
     command, minutes = made[name]
+    command = command.removesuffix(" --resume").replace("python -m prdp_torch", "prdp")
     commits = {commit[:7] for text in values(found, "commit") for commit in text.split(", ")}
-    processors = sorted(values(found, "processor"))
-    return [
-        f"`{name}`",
-        f"`{command.removesuffix(' --resume')}`",
-        str(minutes),
-        ", ".join(sorted(commits)),
-        "; ".join(processors),
-    ]
+    processors = {_short(name) for text in values(found, "processor") for name in text.split("; ")}
+    checked = ""
+    if check:
+        same = check["same"].values()
+        checked = f"{sum(same)} of {len(same)} the same on {check['commit'][:7]}"
+    return [name, ", ".join(sorted(commits)), ", ".join(sorted(processors)), checked, str(minutes), f"`{command}`"]
 
 
-def _check(found):
-    if found is None:
-        return ""
-    same = found["same"].values()
-    return f"{sum(same)} of {len(same)} rows the same on {found['commit'][:7]}"
+def _short(processor):
+    """AMD EPYC 25/17, with family and model."""
+    return re.sub(r", family (\d+), model (\d+)", r" \1/\2", processor.replace("(R)", "").replace(" Processor", ""))
 
 
 def with_tables(page):

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
-from benchmarks import records
+from benchmarks import check_records, records
 from docs import record_tables
+from prdp_torch.experiments import compare
 from prdp_torch.experiments import records as of_trainings
 
 DOCS = Path(records.__file__).parents[1] / "docs"
@@ -67,6 +69,26 @@ def test_it_refuses_what_it_does_not_know_and_changes_that_are_not_committed(arg
     with pytest.raises(SystemExit):
         records.main()
     assert words in capsys.readouterr().err
+
+
+def test_a_check_trains_the_first_seed_and_sees_any_other_number():
+    scene = check_records.scenes.load("heat_1d")
+    row = next(row for row in check_records.refinement.rows_of(scene) if row.label == "auto")
+    environment = of_trainings.environment()
+    with tempfile.TemporaryDirectory() as folder:
+        row.curves.append(compare.run_one(scene, row.label, row.refinement, 0, Path(folder), environment))
+    (kept,) = compare.summarise(scene, [row])
+    assert check_records.is_same("heat_1d", kept, environment)
+    kept["each"]["metric"][0] *= 1 + 1e-15
+    assert not check_records.is_same("heat_1d", kept, environment)
+
+
+def test_a_check_passes_over_other_processors_long_rows_and_means():
+    here, there = {"processor": "here"}, {"processor": "there"}
+    rows = [{"each": {}, "seconds": 1.0, "label": "a"}, {"each": {}, "seconds": 200.0}, {"seconds": 1.0},
+            {"each": {}, "seconds": 1.0, "machine": there}]  # fmt: skip
+    found = check_records.checkable({"machine": here, "rows": rows}, here, limit=100.0)
+    assert [row["label"] for row in found] == ["a"]
 
 
 def test_the_list_can_be_printed():
