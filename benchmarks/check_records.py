@@ -33,6 +33,7 @@ def main():
     torch.set_num_threads(1)
     environment = records.environment()
     found = json.loads(FOUND.read_text()) if FOUND.exists() else {}
+    all_same = True
     for name in options.names or KNOWN:
         entry = KNOWN[name]
         rows = list(checkable(json.loads((DOCS / entry.kept).read_text()), environment["machine"], options.limit))
@@ -41,7 +42,8 @@ def main():
         same = {row["label"]: is_same(entry.command.split()[2], row, environment) for row in rows}
         found[entry.kept] = {**environment, "same": same}
         records.write(FOUND, found)
-    sys.exit(not all(all(record["same"].values()) for record in found.values()))
+        all_same = all_same and all(same.values())
+    sys.exit(not all_same)
 
 
 def checkable(record, machine, limit):

@@ -50,13 +50,19 @@ def table(_):
 def _row(name, made, found, check):
     command, minutes = made[name]
     command = command.removesuffix(" --resume").replace("python -m prdp_torch", "prdp")
-    commits = {commit[:7] for text in values(found, "commit") for commit in text.split(", ")}
+    commits = {_commit(commit) for text in values(found, "commit") for commit in text.split(", ")}
     processors = {_short(name) for text in values(found, "processor") for name in text.split("; ")}
     checked = ""
     if check:
         same = check["same"].values()
-        checked = f"{sum(same)} of {len(same)} the same on {check['commit'][:7]}"
+        checked = f"{sum(same)} of {len(same)} the same on {_commit(check['commit'])}"
     return [name, ", ".join(sorted(commits)), ", ".join(sorted(processors)), checked, str(minutes), f"`{command}`"]
+
+
+def _commit(name):
+    """Seven digits, and whether there were changes that were not committed."""
+    digits, *dirty = name.split("-")
+    return "-".join([digits[:7], *dirty])
 
 
 def _short(processor):
