@@ -50,7 +50,7 @@ def accuracy(title, points):
             axes.grid(alpha=0.3, lw=0.4)
         work = "solve" if cost == "forward" else "solve and gradient"
         panel_row[0].set(ylabel=f"{name}, worst of the batch", xlabel=f"{work}, ms for the batch")
-        panel_row[1].set(xlabel=f"{work}, products with A a sample")
+        panel_row[1].set(xlabel=f"{work}, products with A per sample")
     figure.suptitle(title)
     figure.legend(handles=_legend(points), loc="outside right upper", frameon=False)
     return figure

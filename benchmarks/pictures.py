@@ -1,13 +1,18 @@
 """`python -m benchmarks.pictures [NAME ...]`: draw the pictures of docs/ again, from the records that lie beside them.
+A picture that would look the same is left as it is.
 
 Not drawn again are the curves of `prdp compare` (docs/results/*_metric.png) and the snapshots of the inference study:
 their records would be too large for the repository."""
 
 import argparse
 import importlib
+import io
 import json
 from functools import partial
 from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 from benchmarks import page, refinement_charts
 from benchmarks.atlas import MAPS
@@ -37,6 +42,16 @@ def all_of_them():
     for task in ("cost", "design", "recovery", "conduction"):
         for name, figure in mosaic_charts.of(task, read(DOCS / "flows" / f"{task}.json")["rows"]).items():
             yield DOCS / "flows" / f"{name}.png", 110, partial(as_it_is, figure)
+
+
+def is_drawn(path, dpi, figure):
+    """Whether the file shows the figure, but for a thousandth of its pixels."""
+    if not path.exists():
+        return False
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=dpi)
+    new, old = (np.asarray(Image.open(image).convert("RGB"), dtype=int) for image in (drawn, path))
+    return new.shape == old.shape and (np.abs(new - old).max(-1) > 8).mean() < 1e-3
 
 
 def as_it_is(figure):
@@ -72,8 +87,10 @@ def main():
         parser.error(f"unknown: {', '.join(sorted(unknown))}; allowed: {', '.join(known)}")
     for name in options.names or known:
         path, dpi, draw = known[name]
-        charts.write_png(draw(), path, dpi=dpi)
-        print(path.relative_to(DOCS.parent))
+        figure = draw()
+        if not is_drawn(path, dpi, figure):
+            charts.write_png(figure, path, dpi=dpi)
+            print(path.relative_to(DOCS.parent))
 
 
 if __name__ == "__main__":

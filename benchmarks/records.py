@@ -69,7 +69,7 @@ LIST = [
         "benchmarks/scenes/burgers_2d_192.toml",
         1,
         70,
-        "--rows converged auto rtol_0.1 rtol_0.01 multigrid auto_multigrid",
+        "--rows converged auto rtol_0.1 rtol_0.01 multigrid auto_multigrid multigrid_rtol_0.01",
         name="burgers_2d_192",
     ),
     refinement("heat_2d", 3, 60),

@@ -20,6 +20,7 @@ from prdp_torch.experiments.compare import Row
 from prdp_torch.experiments.refinement import Refinement, start_from_states
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
+WITH_MULTIGRID = (1e-2, 1e-3)
 OF_PARAMETERS = (*TOLERANCES, 1e-5)  # without a network, their error falls as far as the solves allow
 MULTIGRID = {  # the solvers that `prdp advise` finds where the solves are most of an update; and for Poisson
     "poisson_1p": 'method = "cg"\npreconditioner = "multigrid"\nmax_iter = 100',
@@ -49,6 +50,7 @@ def rows_of(scene):
     if scene.name in MULTIGRID:
         rows.append(Row("multigrid", "converged, multigrid", "tolerance", Refinement.tolerance(1e-5, 100)))
         rows.append(Row("auto_multigrid", "auto, multigrid", "auto", Refinement.auto()))
+        rows.extend(_constant(rtol, "multigrid") for rtol in WITH_MULTIGRID)
     if scene.task == "corrector":
         rows.append(
             Row("none", f"K = {converged}, backward none", "constant", Refinement.constant(converged), converged)
@@ -61,7 +63,7 @@ def _tolerance(label, title, **settings):
     return Row(label, title, "auto", refinement)
 
 
-def _constant(rtol):
+def _constant(rtol, solver=None):
     """One tolerance throughout. The start, the adjoint's share and the cap on K are those of auto."""
 
     def attach(steppers):
@@ -70,8 +72,10 @@ def _constant(rtol):
             stepper.rtol, stepper.adjoint_rtol = rtol, min(0.5, 10 * rtol)
         return LinearSchedule(steppers, initial=10_000, increment=0, maximum=10_000)
 
-    label = f"rtol_{rtol:g}"
-    return Row(label, f"rtol = {rtol:g} throughout", "tolerance", Refinement(label, attach))
+    label, title = f"rtol_{rtol:g}", f"rtol = {rtol:g} throughout"
+    if solver:
+        label, title = f"{solver}_{label}", f"{title}, {solver}"
+    return Row(label, title, "tolerance", Refinement(label, attach))
 
 
 def scene_of(name, row):
@@ -79,7 +83,7 @@ def scene_of(name, row):
     scene = scenes.load(name)
     if row.label == "none":
         scene.backward = "none"
-    if row.label in ("multigrid", "auto_multigrid"):
+    if "multigrid" in row.label:
         solver = f'[solver]\n{MULTIGRID[scene.name]}\nrtol = 1e-5\nbackward = "implicit"\n\n'
         text = re.sub(r"\[solver\]\n.*?\n\n", lambda _: solver, scene.text, flags=re.DOTALL)
         scene = _C.parse_scene(text, scene.path)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from docs.record_rows import NOISE_OF_TIME, claims, median_seconds
 from prdp_torch.experiments.charts import write_png
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -24,6 +25,7 @@ ROWS = {  # label: title, colour, marker
 CONSTANT = "#9467bd"  # of the rows with one tolerance throughout
 GREEN = "#e8f4e8"
 HIGHEST = 3  # times the converged error; what is above has an arrow
+PANEL = (208, 150)  # points, of the panels side by side
 FOLLOWED = ("heat_1d", "burgers_2d", "diffusion_inverse")
 
 
@@ -40,7 +42,7 @@ def error_against_products(found):
     panels = figure.subplots(height, 3, squeeze=False).ravel()
     for axes, (name, summary) in zip(panels, found.items(), strict=False):
         _panel(axes, summary)
-        axes.set_title(f"{name} ({seeds_of(summary)})", fontsize=10)
+        axes.set_title(f"{name} ({seeds_of(summary['rows'])})", fontsize=10)
     for axes in panels[len(found) :]:
         axes.remove()
     figure.supxlabel("products with A, converged = 1", fontsize=10)
@@ -50,7 +52,7 @@ def error_against_products(found):
     handles.append(Line2D([], [], color=GREEN, lw=8, label="at most a tenth above converged"))
     handles.append(_legend_entry("#444444", 6, "above the panel, with its error"))
     if any(row["label"].startswith("rtol_") for summary in found.values() for row in summary["rows"]):
-        handles.append(Line2D([], [], color=CONSTANT, marker=".", label="one rtol throughout"))
+        handles.append(Line2D([], [], color=CONSTANT, marker="o", ms=4, label="one rtol throughout"))
     figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False, fontsize=8)
     return figure
 
@@ -59,29 +61,50 @@ def _panel(axes, summary):
     base = summary["rows"][0]
     shown = [row for row in summary["rows"] if row["label"] in ROWS or row["label"].startswith("rtol_")]
     errors = [_error(row, base) for row in shown]
-    low, high = min(0.8, *errors) / 1.15, 1.2 * max(1.3, *(error for error in errors if error <= HIGHEST))
+    low, high = min(0.8, *errors) / 1.3, 1.2 * max(1.3, *(error for error in errors if error <= HIGHEST))
     axes.axhspan(low, 1.1, color=GREEN, zorder=0, lw=0)
     constants = [row for row in shown if row["label"] not in ROWS]
     x, y = [_products(row, base) for row in constants], [_error(row, base) for row in constants]
-    axes.plot(x, y, ".-", color=CONSTANT, lw=1, ms=6, zorder=2)
-    products = [_products(row, base) for row in shown]
-    crowded = (max(products) / min(products)) ** 0.15  # of a panel's width
-    left, below = 0.0, False
+    axes.plot(x, y, color=CONSTANT, lw=1, zorder=2)
     for row, at, error in zip(constants, x, y, strict=True):
-        if error > high:
-            continue
-        left, below = at, at < crowded * left and not below  # neighbours take turns
-        offset = (2, -8 if below else 3)
-        axes.annotate(row["label"][5:], (at, error), xytext=offset, textcoords="offset points", fontsize=6, zorder=4)
+        fill = CONSTANT if claims(row) else "white"
+        axes.plot(at, error, "o", color=CONSTANT, mfc=fill, ms=4, zorder=2, clip_on=True)
     for label, (_, colour, marker) in ROWS.items():
         for row in shown:
             if row["label"] == label:
                 _point(axes, row, base, high, colour, marker)
     axes.set(xscale="log", yscale="log", ylim=(low, high))
+    markers = [(_products(row, base), _error(row, base)) for row in shown]
+    for row, at, error in zip(constants, x, y, strict=True):
+        if error <= high:
+            markers.append(_label(axes, row["label"][5:], (at, error), markers))
     axes.grid(alpha=0.3, lw=0.4)
     _plain(axes.xaxis, [0.05, 0.1, 0.2, 0.5, 1, 2, 4])
     _plain(axes.yaxis, [0.1, 0.2, 0.5, 0.7, 1, 1.5, 2, 3])
     axes.tick_params(labelsize=8)
+
+
+def _label(axes, text, point, taken):
+    """Write the text on that side of the point where the nearest marker or other text is the farthest. Returns its
+    middle."""
+    width, height = PANEL
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+
+    def place(at):
+        return np.array([width * math.log(at[0] / left, right / left), height * math.log(at[1] / low, high / low)])
+
+    others = [place(at) for at in taken if at != point and low <= at[1] <= high]
+
+    def room(side):
+        x, y = middle = place(point) + side
+        inside = 10 < x < width - 10 and 4 < y < height - 4
+        return min((float(np.hypot(*((middle - other) / (2, 0.6)))) for other in others), default=1e3) if inside else 0
+
+    side = max(((12, 7), (12, -7), (-12, 7), (-12, -7), (0, 9), (0, -9)), key=room)
+    style = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": 6, "zorder": 4}
+    axes.annotate(text, point, xytext=side, **style)
+    x, y = place(point) + side
+    return left * (right / left) ** (x / width), low * (high / low) ** (y / height)
 
 
 def _products(row, base):
@@ -96,10 +119,11 @@ def _point(axes, row, base, high, colour, marker):
     """A row, or an arrow with its error where that is above the panel."""
     at, error = _products(row, base), _error(row, base)
     if error <= high:
-        axes.scatter(at, error, **_marker(colour, marker, _claims(row)), zorder=3)
+        axes.scatter(at, error, **_marker(colour, marker, claims(row)), zorder=3)
         return
     axes.plot(at, 0.93, marker=6, ms=8, color=colour, transform=axes.get_xaxis_transform())
     beside = {"xytext": (7, 0), "textcoords": "offset points", "va": "center", "fontsize": 8, "color": colour}
+    beside["bbox"] = {"fc": "white", "ec": "none", "pad": 0.5, "alpha": 0.8}
     text = f"{error:.2g}" if math.isfinite(error) else f"{row['diverged']} of {row['seeds']} diverged"
     axes.annotate(text, (at, 0.93), xycoords=axes.get_xaxis_transform(), **beside)
 
@@ -111,9 +135,9 @@ def _plain(axis, ticks):
     axis.set_minor_locator(NullLocator())
 
 
-def seeds_of(summary):
-    """How many seeds the rows have, in words."""
-    counts = sorted({row["seeds"] for row in summary["rows"]})
+def seeds_of(rows):
+    """How many seeds they have, in words."""
+    counts = sorted({row["seeds"] for row in rows})
     several = " to ".join(map(str, counts[:: len(counts) - 1] if len(counts) > 1 else counts))
     return "one seed" if counts == [1] else f"{several} seeds"
 
@@ -121,10 +145,6 @@ def seeds_of(summary):
 def _legend_entry(colour, marker, title, hollow=False):
     face = "none" if hollow else colour
     return Line2D([], [], ls="", color=colour, marker=marker, mfc=face, ms=6, label=title)
-
-
-def _claims(row):
-    return row["as_good"] and not row["warnings"]
 
 
 def _marker(colour, marker, is_claimed):
@@ -137,26 +157,30 @@ def time_against_products(found):
     or warns."""
     figure = Figure(figsize=(8.0, 1.2 + 0.5 * len(found)), layout="constrained")
     axes = figure.subplots()
-    for at, summary in enumerate(found.values()):
+    titles = []
+    for at, (name, summary) in enumerate(found.items()):
+        shown = [row for row in summary["rows"] if row["label"] in ("converged", "prdp", "auto")]
+        titles.append(f"{name} ({seeds_of(shown)})")
         for label, shift in (("auto", -0.16), ("prdp", 0.16)):
             _, colour, _ = ROWS[label]
-            row, base = next((row for row in summary["rows"] if row["label"] == label), None), summary["rows"][0]
+            row, base = next((row for row in shown if row["label"] == label), None), shown[0]
             if row is None:
                 continue
-            products, seconds = (100 * (1 - row[cost] / base[cost]) for cost in ("operator_applications", "seconds"))
+            products = 100 * (1 - row["operator_applications"] / base["operator_applications"])
+            seconds = 100 * (1 - median_seconds(row) / median_seconds(base))
             marks = [(products, "o")]
             if row["seeds"] == base["seeds"]:  # rows of fewer seeds are older, and of another machine
                 marks.append((seconds, "D"))
                 axes.plot([seconds, products], [at + shift] * 2, color=colour, lw=1, alpha=0.6, zorder=1)
             for saved, marker in marks:
                 # White inside, so that the line does not run through a hollow one.
-                fill = colour if _claims(row) else "white"
+                fill = colour if claims(row) else "white"
                 axes.scatter(saved, at + shift, marker=marker, s=36, facecolors=fill, edgecolors=colour, zorder=2)
-    axes.set_yticks(range(len(found)), [f"{name} ({seeds_of(summary)})" for name, summary in found.items()])
+    axes.set_yticks(range(len(found)), titles)
     axes.invert_yaxis()
     axes.axvline(0, color="#888888", lw=1, zorder=0)
-    axes.axvspan(-15, 15, color="#eeeeee", lw=0, zorder=-1)
-    axes.set(xlabel="saved of the converged training, %. Grey: the noise of the seconds", xlim=(-20, 100))
+    axes.axvspan(-100 * NOISE_OF_TIME, 100 * NOISE_OF_TIME, color="#eeeeee", lw=0, zorder=-1)
+    axes.set(xlabel="saved of the converged training, %. Grey: the noise of the seconds", xlim=(-30, 100))
     axes.grid(alpha=0.3, lw=0.4, axis="x")
     axes.spines[["top", "right", "left"]].set_visible(False)
     handles = [Line2D([], [], color=ROWS[label][1], lw=3, label=ROWS[label][0]) for label in ("auto", "prdp")]

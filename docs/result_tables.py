@@ -5,83 +5,27 @@ Run it after new records: python -m docs.result_tables
 """
 
 import importlib
-import json
-from pathlib import Path
-from statistics import median
 
-from docs import page_tables
+from docs import baseline_tables, page_tables
+from docs.baseline_tables import SCENES
+from docs.record_rows import (
+    DOCS,
+    claim,
+    error,
+    fewer_seeds,
+    products,
+    products_saved,
+    record,
+    rows,
+    saved,
+    seconds,
+    time_saved,
+)
 
-DOCS = Path(__file__).parent
 TABLE = page_tables.places("result_tables.py")
 PAGES = [path for path in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))) if TABLE.search(path.read_text())]
 
-SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
-SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 BOLD = ("auto", "prdp")
-# Seconds are no more certain than this: on burgers_1d, 10 seeds, K = 4 takes 13 % longer than K = 16.
-NOISE_OF_TIME = 0.15
-
-
-def record(name):
-    return json.loads((DOCS / "results" / f"{name}.json").read_text())
-
-
-def rows(name):
-    return {row["label"]: row for row in record(name)["rows"]}
-
-
-def error(row):
-    """The error at the end, or after how many updates the target was reached; and how many of the seeds warn."""
-    warns = f", {_warns(row)}" if row["warnings"] else ""
-    if row["diverged"]:
-        return f"{row['diverged']} of {row['seeds']} diverged{warns}"
-    if row["reaches_target"]:
-        return f"after {row['intervals']:.0f} updates{warns}"
-    missed = ", not reached" if row["reaches_target"] is False else ""
-    return f"{_with_spread(row)}{missed}{warns}"
-
-
-def _fewer_seeds(row, seeds):
-    """How many seeds a row has, where others have more."""
-    return "" if row["seeds"] == seeds else ", one seed" if row["seeds"] == 1 else f", {row['seeds']} seeds"
-
-
-def _warns(row):
-    return "warns" if row["seeds"] == 1 else f"{row['warnings']} of {row['seeds']} warn"
-
-
-def claim(row, share, digits=0):
-    """A share that the row saves, unless it ends worse than the converged one or its controller warns."""
-    if not row["as_good"]:
-        return "fails"
-    return "warns" if row["warnings"] else _percent(share, digits)
-
-
-def _time_saved(row, base):
-    share = 1 - _median_seconds(row) / _median_seconds(base)
-    said = claim(row, share)
-    return "none" if said.endswith("%") and abs(share) < NOISE_OF_TIME else said
-
-
-def _with_spread(row):
-    spread = row["metric_std"]
-    return f"{row['metric']:.2e} ± {spread:.1e}" if spread else f"{row['metric']:.2e}"
-
-
-def _products(row):
-    adjoint = row["adjoint_applications"]
-    whole = row["operator_applications"]
-    return f"{whole - adjoint:,.0f}", f"{adjoint:,.0f}", f"{whole:,.0f}"
-
-
-def _median_seconds(row):
-    """Over the seeds; the mean where an older record holds no other."""
-    return median(row.get("each", {}).get("seconds") or [row["seconds"]])
-
-
-def _seconds(row):
-    seconds = _median_seconds(row)
-    return f"{seconds:.2g}" if seconds < 10 else f"{seconds:.0f}"
 
 
 def parts_of_auto():
@@ -94,8 +38,8 @@ def parts_of_auto():
         parts = [row for row in found["rows"] if not row["label"].startswith(elsewhere)]
         for i, row in enumerate(parts):
             title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += _fewer_seeds(row, found["seeds"])
-            costs = *_products(row), _saved(row), _seconds(row)
+            title += fewer_seeds(row, found["seeds"])
+            costs = *products(row), saved(row), seconds(row)
             body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *costs])
     return page_tables.markdown(["scene", "", "error", "forward", "adjoint", "in all", "saved", "s"], body)
 
@@ -121,109 +65,23 @@ def time_and_products():
         found = rows(f"refinement_{name}")
         base, cells = found["converged"], []
         for row in (found["prdp"], found["auto"]):
-            cells += [_products_saved(row, base), _time_saved(row, base), f"{row['metric'] / base['metric']:.2f}"]
-        body.append([name, _seconds(base), *cells])
+            cells += [products_saved(row, base), time_saved(row, base), f"{row['metric'] / base['metric']:.2f}"]
+        body.append([name, seconds(base), *cells])
     of_each = ("products saved", "time saved", "error / converged")
     head = ["scene", "converged, s", *(f"{who}: {what}" for who in ("PRDP", "auto") for what in of_each)]
     return page_tables.markdown(head, body)
 
 
-def constant_tolerances():
-    """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
-    body = []
-    for name in _with_constant():
-        found = rows(f"refinement_{name}")
-        seeds = record(f"refinement_{name}")["seeds"]
-        for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found)]):
-            title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += _fewer_seeds(row, seeds)
-            costs = _products(row)[2], _beside(row, found["auto"]), _saved(row)
-            body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
-            body[-1] += [error(row), *costs]
-    return page_tables.markdown(["scene", "", "error", "products", "products / auto's", "saved"], body)
-
-
-def the_best_constant():
-    """The loosest tolerance that ends as converged solves do, beside auto; and what a wrong one costs."""
-    body = []
-    for name in _with_constant():
-        found = rows(f"refinement_{name}")
-        tolerances = _constant(found)
-        good = [row for row in tolerances if row["as_good"]]
-        best = min(good, key=lambda row: row["operator_applications"], default=None)
-        of_best = ["none", "–"] if best is None else [_power_of(best), _beside(best, found["auto"])]
-        loosest, tightest = tolerances[0], tolerances[-1]
-        wrong = f"{loosest['metric'] / found['converged']['metric']:.2g}", _beside(tightest, found["auto"])
-        wrong = (f"{what} with {_power_of(row)}" for what, row in zip(wrong, (loosest, tightest), strict=True))
-        body.append([name, *of_best, *wrong])
-    head = ["scene", "loosest that ends as converged", "products / auto's", "error of the loosest / converged"]
-    return page_tables.markdown([*head, "products of the tightest / auto's"], body)
-
-
-def _with_constant():
-    """The scenes that were trained with constant tolerances."""
-    return [name for name in SCENES if _constant(rows(f"refinement_{name}"))]
-
-
-def _constant(found):
-    return [row for label, row in found.items() if label.startswith("rtol_")]
-
-
-def _beside(row, auto):
-    return f"{row['operator_applications'] / auto['operator_applications']:.2f}"
-
-
-def _power_of(row):
-    return f"{float(row['label'].removeprefix('rtol_')):.0e}".replace("e-0", "e-")
-
-
-# What takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has no network.
-TAKES_THE_TIME = {
-    "burgers_2d": "solves",
-    "diffusion_inverse": "solves",
-    "heat_1d": "network",
-    "heat_2d": "network",
-    "burgers_1d": "network",
-    "navier_stokes": "network",
-}
-
-
-def seconds():
-    """The seconds of a training with each way of solving; of a row that fails or warns, only that it does."""
-    body = []
-    for name, what in TAKES_THE_TIME.items():
-        found = rows(f"refinement_{name}")
-        base, auto, prdp = (found[label] for label in ("converged", "auto", "prdp"))
-        own = DOCS / "results" / f"{name}.json"
-        exact = found.get("direct") or (rows(name).get("direct") if own.exists() else None)
-        cells = [_seconds(base), _seconds(exact) if exact else "–", _seconds_claimed(auto), _seconds_claimed(prdp)]
-        body.append([name, what, *cells, _time_saved(auto, base)])
-    head = ["scene", "most of an update", "converged, s", "`Direct`, s", "auto, s", "PRDP, tuned, s", "auto saves"]
-    return page_tables.markdown(head, body)
-
-
-def _seconds_claimed(row):
-    return _seconds(row) if row["as_good"] and not row["warnings"] else claim(row, 0.0)
-
-
-def _products_saved(row, base):
-    return claim(row, 1 - row["operator_applications"] / base["operator_applications"])
-
-
-def comparison(name, seconds=True):
+def comparison(name, with_seconds=True):
     """The rows of `prdp compare`, or of a record of `python -m benchmarks.refinement`."""
     body = []
     for row in record(name)["rows"]:
         title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        title += _fewer_seeds(row, record(name)["seeds"])
+        title += fewer_seeds(row, record(name)["seeds"])
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
-        body.append([title, error(row), last, *_products(row), _saved(row), *([_seconds(row)] if seconds else [])])
-    head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if seconds else [])]
+        body.append([title, error(row), last, *products(row), saved(row), *([seconds(row)] if with_seconds else [])])
+    head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if with_seconds else [])]
     return page_tables.markdown(head, body)
-
-
-def _saved(row):
-    return "–" if row["kind"] in ("converged", "direct") else claim(row, row["products_saved"], 1)
 
 
 def readme():
@@ -235,12 +93,8 @@ def readme():
         body.append([f"{name}, {base['seeds']} seeds", "converged", error(base), "–", "–"])
         for label, title in (("auto", "**auto**"), ("prdp", "PRDP, tuned")):
             row = found[label]
-            body.append(["", title, error(row), _products_saved(row, base), _time_saved(row, base)])
+            body.append(["", title, error(row), products_saved(row, base), time_saved(row, base)])
     return page_tables.markdown(["scene", "", "error", "products saved", "time saved"], body)
-
-
-def _percent(share, digits=0):
-    return f"{100 * share:.{digits}f} %".replace("-", "−")
 
 
 # scene: its name and section in reproduction.md; the paper's share of iterations saved, and errors of the converged
@@ -261,17 +115,36 @@ PAPER = {
     "poisson_3p_sd_implicit": ("the same with steepest descent", "43 %", "", ""),
 }
 
+PARTS_OF_THE_PAPER = {
+    "heat_1d": "60 + 19 %",
+    "heat_2d": "72 + 14 %",
+    "burgers_1d": "30 + 29 %",
+    "refinement_navier_stokes": "65 + 16 %",
+}
+
 
 def beside_the_paper():
     """Of every scene that the paper has."""
     body = []
-    for name, (title, saved, converged, prdp) in PAPER.items():
+    for name, (title, theirs, converged, prdp) in PAPER.items():
         base, ours = record(name)["rows"][0], rows(name)["prdp"]
         spent = (f"{row['budget']:,.0f}" for row in (base, ours))
         errors = error(base), converged, error(ours), prdp
-        body.append([title, str(record(name)["seeds"]), *spent, claim(ours, ours["saved"], 1), saved, *errors])
+        body.append([title, str(record(name)["seeds"]), *spent, claim(ours, ours["saved"], 1), theirs, *errors])
     head = ["scene", "seeds", "iterations, converged", "PRDP", "saved", "paper"]
     return page_tables.markdown([*head, "error, converged", "paper", "error, PRDP", "paper"], body)
+
+
+def parts_of_the_saving():
+    """Iterations saved by stopping below full convergence, and by starting with few."""
+    body = []
+    for name, (title, *_) in PAPER.items():
+        row = rows(name)["prdp"]
+        incomplete, whole = row["saved_by_incomplete_convergence"], row["saved"]
+        ours = [claim(row, share, 1) for share in (incomplete, whole - incomplete)]
+        body.append([title, *ours, PARTS_OF_THE_PAPER.get(name, "")])
+    head = ["scene", "incomplete convergence", "progressive refinement", "paper"]
+    return page_tables.markdown(head, body)
 
 
 def three_parameters():
@@ -321,11 +194,13 @@ TABLES = {
     "the shares of auto": shares_of_auto,
     "the README's table": readme,
     "the scenes beside the paper": beside_the_paper,
+    "the parts of the saving": parts_of_the_saving,
     "three parameters": three_parameters,
     "time and products": time_and_products,
-    "seconds": seconds,
-    "constant tolerances": constant_tolerances,
-    "the best constant": the_best_constant,
+    "the seconds of Burgers 2D": baseline_tables.burgers_2d,
+    "seconds": baseline_tables.seconds,
+    "constant tolerances": baseline_tables.constant_tolerances,
+    "the best constant": baseline_tables.the_best_constant,
 }
 
 
@@ -340,7 +215,7 @@ def table(name):
     if kind == "the comparison":
         return comparison(what)
     if kind == "the comparison, without seconds,":
-        return comparison(what, seconds=False)
+        return comparison(what, with_seconds=False)
     if kind == "the study":
         return study(what)
     return TABLES[name]()

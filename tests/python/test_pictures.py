@@ -25,6 +25,19 @@ def test_every_picture_is_drawn_again_from_a_record():
     assert {path.stem for path in left} <= OF_TRAININGS | OF_EXAMPLES
 
 
+def test_every_picture_shows_its_record():
+    old = [path.name for path, dpi, draw in pictures.all_of_them() if not pictures.is_drawn(path, dpi, draw())]
+    assert not old, "run: python -m benchmarks.pictures"
+
+
+def test_a_picture_of_another_record_is_not_drawn(tmp_path):
+    path, dpi, draw = next(iter(pictures.all_of_them()))
+    figure = draw()
+    assert pictures.is_drawn(path, dpi, figure) and not pictures.is_drawn(tmp_path / "none.png", dpi, figure)
+    figure.axes[0].set_xlim(0, 2 * figure.axes[0].get_xlim()[1])
+    assert not pictures.is_drawn(path, dpi, figure)
+
+
 def test_scenes_of_one_seed_are_marked():
     found = refinement_charts.summaries()
     figure = refinement_charts.error_against_products(found)

@@ -1,0 +1,153 @@
+"""Auto beside what a user could take instead: the strongest converged solver, and one tolerance throughout."""
+
+from docs import page_tables
+from docs.record_rows import (
+    claim,
+    claims,
+    error,
+    fewer_seeds,
+    median_seconds,
+    products,
+    record,
+    rows,
+    saved,
+    time_saved,
+)
+from docs.record_rows import seconds as seconds_of
+
+SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
+SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
+TOO_SHORT = 0.5  # seconds of a training; what is shorter is all noise
+# What takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has no network.
+TAKES_THE_TIME = {
+    "burgers_2d": "solves",
+    "burgers_2d_192": "solves",
+    "diffusion_inverse": "solves",
+    "diffusion_inverse_256": "solves",
+    "kolmogorov": "both",
+    "heat_1d": "network",
+    "heat_2d": "network",
+    "burgers_1d": "network",
+    "navier_stokes": "network",
+}
+
+
+def seconds():
+    """The seconds of a training with each way of solving; of a row that fails or warns, only that it does."""
+    body = []
+    for name, what in TAKES_THE_TIME.items():
+        found = rows(f"refinement_{name}")
+        base, prdp = found["converged"], found.get("prdp")
+        others = _of_as_many_seeds(found.values(), base)
+        strongest = _fastest(row for row in others if row["label"] in ("converged", "direct", "multigrid"))
+        auto = _fastest(row for row in others if row["kind"] == "auto" and row["label"].startswith("auto"))
+        constant = _fastest(filter(None, (_loosest(others), _loosest(others, "multigrid_"))))
+        cells = [
+            seconds_of(base),
+            f"{seconds_of(strongest)}{_which(strongest)}",
+            f"{seconds_of(constant)} ({_power_of(constant)}{_with(constant)})",
+            _seconds_claimed(prdp if prdp in others else None),
+            f"{seconds_of(auto)}{_which(auto)}",
+        ]
+        title = name if base["seeds"] > 1 else f"{name}, one seed"
+        body.append([title, what, *cells, time_saved(auto, strongest)])
+    head = ["scene", "most of an update", "converged, s", "strongest converged, s", "one good rtol, s"]
+    return page_tables.markdown([*head, "PRDP, tuned, s", "auto, s", "auto saves of the strongest"], body)
+
+
+SOLVERS = {  # of Burgers 2D
+    "converged": "converged, GMRES(6)",
+    "multigrid": "converged, multigrid",
+    "rtol_0.01": "rtol = 1e-2 throughout, GMRES(6)",
+    "prdp": "PRDP, tuned, GMRES(6)",
+    "auto": "**auto**, GMRES(6)",
+    "multigrid_rtol_0.01": "rtol = 1e-2 throughout, multigrid",
+    "auto_multigrid": "**auto**, multigrid",
+}
+
+
+def burgers_2d():
+    """The seconds of Burgers 2D on two grids."""
+    grids = [rows(f"refinement_{name}") for name in ("burgers_2d", "burgers_2d_192")]
+    body = []
+    for label, title in SOLVERS.items():
+        if any(label in found for found in grids):
+            body.append([title, *(_seconds_claimed(found.get(label)) for found in grids)])
+    return page_tables.markdown(["seconds of a training", "96², 3 seeds", "192², one seed"], body)
+
+
+def _of_as_many_seeds(found, base):
+    """Rows of fewer seeds are older, and of another machine."""
+    return [row for row in found if row["seeds"] == base["seeds"]]
+
+
+def _fastest(found):
+    return min(filter(claims, found), key=median_seconds)
+
+
+def _which(row):
+    """The solver, where it is not that of the scene."""
+    return {"direct": " (`Direct`)", "multigrid": " (multigrid)", "auto_multigrid": " (multigrid)"}.get(
+        row["label"], ""
+    )
+
+
+def _with(row):
+    return ", multigrid" if row["label"].startswith("multigrid") else ""
+
+
+def _seconds_claimed(row):
+    if row is None:
+        return "–"
+    return seconds_of(row) if claims(row) else claim(row, 0.0)
+
+
+def constant_tolerances():
+    """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
+    body = []
+    for name in SCENES:
+        found = rows(f"refinement_{name}")
+        seeds = record(f"refinement_{name}")["seeds"]
+        for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found.values())]):
+            title = "**auto**" if row["label"] == "auto" else row["title"]
+            title += fewer_seeds(row, seeds)
+            costs = products(row)[2], _beside(row, found["auto"]), saved(row)
+            body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
+            body[-1] += [error(row), *costs]
+    return page_tables.markdown(["scene", "", "error", "products", "products / auto's", "saved"], body)
+
+
+def the_best_constant():
+    """The loosest tolerance that ends as converged solves do, without a warning, beside auto; and what a wrong one
+    costs."""
+    body = []
+    for name in (*SCENES, "kolmogorov"):
+        found, last = rows(f"refinement_{name}"), record(f"refinement_{name}")["curves"]["auto"]["rtol"][-1]
+        auto, tolerances = found["auto"], _constant(found.values())
+        best, loosest, tightest = _loosest(tolerances), tolerances[0], tolerances[-1]
+        wrong = f"{loosest['metric'] / found['converged']['metric']:.2g} with {_power_of(loosest)}"
+        time = f"{median_seconds(best) / median_seconds(auto):.2f}" if median_seconds(auto) > TOO_SHORT else "–"
+        spent = f"{_beside(tightest, auto)} with {_power_of(tightest)}"
+        body.append(
+            [name, _power_of(best), _beside(best, auto), time, f"{last:.0e}".replace("e-0", "e-"), wrong, spent]
+        )
+    head = ["scene", "best constant", "its products / auto's", "its seconds / auto's", "auto's last rtol"]
+    head += ["error of the loosest / converged", "products of the tightest / auto's"]
+    return page_tables.markdown(head, body)
+
+
+def _constant(found, solver=""):
+    return [row for row in found if row["label"].startswith(f"{solver}rtol_")]
+
+
+def _loosest(found, solver=""):
+    """Of the constant tolerances that end as converged solves do, without a warning."""
+    return min(filter(claims, _constant(found, solver)), key=lambda row: row["operator_applications"], default=None)
+
+
+def _beside(row, auto):
+    return f"{row['operator_applications'] / auto['operator_applications']:.2f}"
+
+
+def _power_of(row):
+    return f"{float(row['label'].rpartition('_')[2]):.0e}".replace("e-0", "e-")
