@@ -50,9 +50,10 @@ def seconds():
             f"{seconds_of(auto)}{_which(auto)}",
         ]
         title = name if base["seeds"] > 1 else f"{name}, one seed"
-        body.append([title, what, *cells, time_saved(auto, strongest)])
+        body.append([title, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"])
     head = ["scene", "most of an update", "converged, s", "strongest converged, s", "one good rtol, s"]
-    return page_tables.markdown([*head, "PRDP, tuned, s", "auto, s", "auto saves of the strongest"], body)
+    head += ["PRDP, tuned, s", "auto, s", "auto saves of the strongest", "auto's error / converged"]
+    return page_tables.markdown(head, body)
 
 
 SOLVERS = {  # of Burgers 2D
@@ -67,13 +68,17 @@ SOLVERS = {  # of Burgers 2D
 
 
 def burgers_2d():
-    """The seconds of Burgers 2D on two grids."""
+    """The seconds and the errors of Burgers 2D on two grids."""
     grids = [rows(f"refinement_{name}") for name in ("burgers_2d", "burgers_2d_192")]
     body = []
     for label, title in SOLVERS.items():
         if any(label in found for found in grids):
-            body.append([title, *(_seconds_claimed(found.get(label)) for found in grids)])
-    return page_tables.markdown(["seconds of a training", "96², 3 seeds", "192², one seed"], body)
+            body.append([title, *(cell for found in grids for cell in _seconds_and_error(found.get(label)))])
+    return page_tables.markdown(["", "96², 3 seeds: s", "error", "192², one seed: s", "error"], body)
+
+
+def _seconds_and_error(row):
+    return _seconds_claimed(row), "–" if row is None else f"{row['metric']:.3f}"
 
 
 def _of_as_many_seeds(found, base):
