@@ -18,24 +18,25 @@ from docs.record_rows import seconds as seconds_of
 SCENES = ("poisson_1p", "poisson_3p", "poisson_3p_sd", "heat_1d", "heat_2d", "burgers_1d", "burgers_2d")
 SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 TOO_SHORT = 0.5  # seconds of a training; what is shorter is all noise
-# What takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has no network.
-TAKES_THE_TIME = {
-    "burgers_2d": "solves",
-    "burgers_2d_192": "solves",
-    "diffusion_inverse": "solves",
-    "diffusion_inverse_256": "solves",
-    "kolmogorov": "both",
-    "heat_1d": "network",
-    "heat_2d": "network",
-    "burgers_1d": "network",
-    "navier_stokes": "network",
+# The scene's solver, and what takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has
+# no network.
+TRAININGS = {
+    "burgers_2d": ("GMRES(6)", "solves"),
+    "burgers_2d_192": ("GMRES(6)", "solves"),
+    "diffusion_inverse": ("CG", "solves"),
+    "diffusion_inverse_256": ("CG", "solves"),
+    "kolmogorov": ("CG with multigrid", "both"),
+    "heat_1d": ("Jacobi", "network"),
+    "heat_2d": ("Jacobi", "network"),
+    "burgers_1d": ("GMRES(2)", "network"),
+    "navier_stokes": ("GMRES(8)", "network"),
 }
 
 
 def seconds():
     """The seconds of a training with each way of solving; of a row that fails or warns, only that it does."""
     body = []
-    for name, what in TAKES_THE_TIME.items():
+    for name, (solver, what) in TRAININGS.items():
         found = rows(f"refinement_{name}")
         base, prdp = found["converged"], found.get("prdp")
         others = _of_as_many_seeds(found.values(), base)
@@ -50,8 +51,10 @@ def seconds():
             f"{seconds_of(auto)}{_which(auto)}",
         ]
         title = name if base["seeds"] > 1 else f"{name}, one seed"
-        body.append([title, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"])
-    head = ["scene", "most of an update", "converged, s", "strongest converged, s", "one good rtol, s"]
+        body.append(
+            [title, solver, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"]
+        )
+    head = ["scene", "solver", "most of an update", "converged, s", "strongest converged, s", "one good rtol, s"]
     head += ["PRDP, tuned, s", "auto, s", "auto saves of the strongest", "auto's error / converged"]
     return page_tables.markdown(head, body)
 

@@ -131,8 +131,9 @@ def beside_the_paper():
         spent = (f"{row['budget']:,.0f}" for row in (base, ours))
         errors = error(base), converged, error(ours), prdp
         body.append([title, str(record(name)["seeds"]), *spent, claim(ours, ours["saved"], 1), theirs, *errors])
-    head = ["scene", "seeds", "iterations, converged", "PRDP", "saved", "paper"]
-    return page_tables.markdown([*head, "error, converged", "paper", "error, PRDP", "paper"], body)
+    head = ["scene", "seeds", "iterations, converged", "iterations, PRDP", "iterations saved", "paper's saving"]
+    head += ["error, converged", "paper's error, converged", "error, PRDP", "paper's error, PRDP"]
+    return page_tables.markdown(head, body)
 
 
 def parts_of_the_saving():
