@@ -3,18 +3,21 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
 from prdp_torch.solver_trials import (
+    RUNS,
     TOLERANCES,
     Row,
     candidates,
     measure,
     measure_one_iteration,
     measure_with_start,
+    now,
     preconditioner_of,
 )
 from prdp_torch.solvers import GMRES, Direct, Solver
@@ -84,7 +87,13 @@ class Update:
         return direct
 
 
-def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence[torch.dtype] | None = None) -> Advice:
+def advise(
+    step: Stepper,
+    sample: Tensor,
+    seconds: float = 5.0,
+    dtypes: Sequence[torch.dtype] | None = None,
+    network: torch.nn.Module | None = None,
+) -> Advice:
     """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
 
     Args:
@@ -95,6 +104,8 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
         dtypes: those to try beside that of the sample, such as (torch.float64,). None tries the other one of float32
             and float64 for the built-in steps, and none for a step of your own: its functions may hold tensors that
             `step.to(dtype)` does not reach. Its batch is never changed.
+        network: what is trained, called once for each step, as network(sample). The advice then says how much of an
+            update the solves take, and how much of it refinement can save. It is not changed.
 
     Returns:
         An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-2 and 1e-5,
@@ -102,11 +113,12 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
         `recommendation` is one choice with the reason for it.
 
     Raises:
-        TypeError, ValueError: step and sample do not fit each other. This is checked before any measurement.
+        TypeError, ValueError: step and sample do not fit each other, or the network has nothing to train. This is
+            checked before any measurement.
 
     Examples:
         >>> heat = prdp.Heat((64, 64), nu=1e-3, dt=1.0, solver=prdp.CG(1))
-        >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64)))
+        >>> print(prdp.advise(heat, torch.randn(8, 1, 64, 64), network=torch.nn.Conv2d(1, 1, 3, padding=1)))
     """
     if not isinstance(step, Stepper):
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
@@ -123,8 +135,30 @@ def advise(step: Stepper, sample: Tensor, seconds: float = 5.0, dtypes: Sequence
         )
     if not sample.isfinite().all():
         raise ValueError("advise: sample holds NaN or Inf")
-    others = _other_dtypes(step, sample, dtypes)
-    return advise_on(step, sample.detach(), checked_limit(seconds), Update(), others)
+    others, seconds = _other_dtypes(step, sample, dtypes), checked_limit(seconds)
+    update = Update() if network is None else Update(network=network_seconds(network, sample.detach(), seconds))
+    return advise_on(step, sample.detach(), seconds, update, others)
+
+
+def network_seconds(network: torch.nn.Module, sample: Tensor, most: float) -> float:
+    """One forward and one backward pass; a first one that takes more than `most` is also the last."""
+    if not isinstance(network, torch.nn.Module):
+        raise TypeError(f"advise: network must be a torch.nn.Module, got {type(network).__name__}")
+    network = copy.deepcopy(network)  # a forward pass may change its buffers
+    trained = [p for p in network.parameters() if p.requires_grad]
+    if not trained:
+        raise ValueError("advise: network has no parameter that requires grad")
+    times: list[float] = []
+    deadline = now(sample) + most
+    with torch.enable_grad():
+        while len(times) <= RUNS and (not times or now(sample) < deadline):
+            started = now(sample)
+            out = network(sample)
+            if not isinstance(out, Tensor) or not out.requires_grad:
+                raise TypeError("advise: network(sample) must be a tensor that depends on the parameters")
+            torch.autograd.grad(out, trained, torch.ones_like(out), allow_unused=True)
+            times.append(now(sample) - started)
+    return median(times[1:] or times)
 
 
 def _other_dtypes(step: Stepper, sample: Tensor, dtypes: Sequence[torch.dtype] | None) -> list[torch.dtype]:

@@ -1,15 +1,12 @@
 """`prdp advise SCENE`: what `prdp_torch.advise` measures for a step, with the scene's network beside it."""
 
-from statistics import median
-
 import torch
-from torch import Tensor
 
-from prdp_torch.advice import Advice, Update, advise_on, checked_limit, milliseconds
+from prdp_torch.advice import Advice, Update, advise_on, checked_limit, milliseconds, network_seconds
 from prdp_torch.experiments import _C, datasets
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_solver, make_stepper
-from prdp_torch.solver_trials import RUNS, now, run, trial_of
+from prdp_torch.solver_trials import RUNS, run, trial_of
 
 
 def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
@@ -31,7 +28,7 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
         network = make_network(scene, 0)
         # A corrector's first solve starts from data, which need no gradient.
         adjoints = 0 if scene.backward == "none" else 1
-        update = Update(scene.executions * _network_seconds(network, sample, seconds), scene.executions, adjoints)
+        update = Update(scene.executions * network_seconds(network, sample, seconds), scene.executions, adjoints)
     other = torch.float64 if sample.dtype == torch.float32 else torch.float32
     trial, solver = trial_of(step, sample), make_solver(scene, scene.max_iter)
     run(trial, solver)  # to warm up
@@ -42,21 +39,9 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
     )
     if update.network > physics and scene.dtype == torch.float32:
         with torch.autocast(sample.device.type, torch.bfloat16):
-            low = scene.executions * _network_seconds(network, sample, seconds)
+            low = scene.executions * network_seconds(network, sample, seconds)
         update.notes.append(
             f"The network is the larger part, {milliseconds(update.network)}; in bfloat16 autocast it takes "
             f"{milliseconds(low)}, {low / update.network:.2g} times that."
         )
     return advise_on(step, sample, seconds, update, [other])
-
-
-def _network_seconds(network: torch.nn.Module, u: Tensor, most: float) -> float:
-    """One forward and one backward pass; a first one that takes more than `most` is also the last."""
-    times: list[float] = []
-    deadline = now(u) + most
-    while len(times) <= RUNS and (not times or now(u) < deadline):
-        started = now(u)
-        out = network(u)
-        torch.autograd.grad(out, list(network.parameters()), torch.ones_like(out))
-        times.append(now(u) - started)
-    return median(times[1:] or times)
