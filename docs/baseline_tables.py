@@ -50,12 +50,9 @@ def seconds():
             _seconds_claimed(prdp if prdp in others else None),
             f"{seconds_of(auto)}{_which(auto)}",
         ]
-        title = name if base["seeds"] > 1 else f"{name}, one seed"
-        body.append(
-            [title, solver, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"]
-        )
-    head = ["scene", "solver", "most of an update", "converged, s", "strongest converged, s", "one good rtol, s"]
-    head += ["PRDP, tuned, s", "auto, s", "auto saves of the strongest", "auto's error / converged"]
+        title = f"{name}, {solver}" if base["seeds"] > 1 else f"{name}, {solver}, one seed"
+        body.append([title, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"])
+    head = ["scene", "its time is in the", "converged", "strongest", "one rtol", "PRDP", "auto", "auto saves", "error"]
     return page_tables.markdown(head, body)
 
 
