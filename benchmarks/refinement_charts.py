@@ -68,7 +68,7 @@ def _panel(axes, summary):
     axes.plot(x, y, color=CONSTANT, lw=1, zorder=2)
     for row, at, error in zip(constants, x, y, strict=True):
         fill = CONSTANT if claims(row) else "white"
-        axes.plot(at, error, "o", color=CONSTANT, mfc=fill, ms=4, zorder=2, clip_on=True)
+        axes.plot(at, error, "o", color=CONSTANT, mfc=fill, ms=4, zorder=2)
     for label, (_, colour, marker) in ROWS.items():
         for row in shown:
             if row["label"] == label:

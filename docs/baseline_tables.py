@@ -45,10 +45,10 @@ def seconds():
         constant = _fastest(filter(None, (_loosest(others), _loosest(others, "multigrid_"))))
         cells = [
             seconds_of(base),
-            f"{seconds_of(strongest)}{_which(strongest)}",
-            f"{seconds_of(constant)} ({_power_of(constant)}{_with(constant)})",
+            _with_notes(strongest, _other_solver(strongest)),
+            _with_notes(constant, _power_of(constant), _other_solver(constant)),
             _seconds_claimed(prdp if prdp in others else None),
-            f"{seconds_of(auto)}{_which(auto)}",
+            _with_notes(auto, _other_solver(auto)),
         ]
         title = f"{name}, {solver}" if base["seeds"] > 1 else f"{name}, {solver}, one seed"
         body.append([title, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"])
@@ -90,15 +90,14 @@ def _fastest(found):
     return min(filter(claims, found), key=median_seconds)
 
 
-def _which(row):
+def _other_solver(row):
     """The solver, where it is not that of the scene."""
-    return {"direct": " (`Direct`)", "multigrid": " (multigrid)", "auto_multigrid": " (multigrid)"}.get(
-        row["label"], ""
-    )
+    return "`Direct`" if row["label"] == "direct" else "multigrid" if "multigrid" in row["label"] else None
 
 
-def _with(row):
-    return ", multigrid" if row["label"].startswith("multigrid") else ""
+def _with_notes(row, *notes):
+    said = ", ".join(filter(None, notes))
+    return f"{seconds_of(row)} ({said})" if said else seconds_of(row)
 
 
 def _seconds_claimed(row):
