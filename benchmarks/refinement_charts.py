@@ -228,17 +228,18 @@ def error_over_cost(summary):
     """The validation error of one scene against the seconds and the products spent so far."""
     figure = Figure(figsize=(9.2, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    for axes, cost, title in zip(
-        panels, ("seconds", "operator_applications"), ("seconds of training", "products with A"), strict=True
-    ):
+    costs = (
+        ("seconds", 1, "seconds of training"),
+        ("operator_applications", 1000, "thousands of products with A (without multigrid's own)"),
+    )
+    for axes, (cost, unit, title) in zip(panels, costs, strict=True):
         for label, (name, colour) in FIVE.items():
             curves = summary["curves"][label]
-            spent = np.cumsum(curves[cost])
+            spent = np.cumsum(curves[cost]) / unit
             axes.plot(spent, curves["metric"][1:], color=colour, lw=1.6, label=name)
             axes.plot(spent[-1], curves["metric"][-1], "o", color=colour, ms=5)
         axes.set(yscale="log", xlabel=title)
         axes.grid(alpha=0.3, lw=0.4)
-        axes.ticklabel_format(axis="x", scilimits=(-3, 5))
     panels[0].set_ylabel("validation error")
     panels[1].legend(frameon=False, fontsize=9)
     figure.suptitle(f"{summary['settings']['scene']}: what an error costs (one seed; the dots are the ends)")
