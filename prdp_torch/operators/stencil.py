@@ -57,7 +57,7 @@ class Stencil(Operator):
                 "Stencil: coefficients must have shape (batch or 1, k, *shape) with 1 to 3 axes in shape, got "
                 f"{tuple(coefficients.shape)}"
             )
-        self.offsets = _offsets(offsets, dim)
+        self.offsets = _offsets(offsets, tuple(coefficients.shape))
         self.boundary = (boundary,) * dim if isinstance(boundary, str) else tuple(boundary)
         if len(self.boundary) != dim or not set(self.boundary) <= {"zero", "periodic"}:
             raise ValueError(
@@ -74,14 +74,16 @@ class Stencil(Operator):
         return f"Stencil(shape={shape}, offsets={self.offsets}, boundary={self.boundary}, tensors=[{tensors}])"
 
 
-def _offsets(offsets: Sequence[Sequence[int]], dim: int) -> list[tuple[int, ...]]:
-    """As a list of tuples of `dim` whole numbers."""
+def _offsets(offsets: Sequence[Sequence[int]], coefficients: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """As a list of tuples of whole numbers, one for each axis of the grid."""
+    dim = len(coefficients) - 2
     if not isinstance(offsets, (tuple, list)) or not all(isinstance(o, (tuple, list)) for o in offsets):
         raise TypeError(f"Stencil: offsets must be a list of tuples such as [(0, 0), (0, -1)], got {offsets!r}")
     for offset in offsets:
         if len(offset) != dim:
             entries = "1 entry" if dim == 1 else f"{dim} entries"
             raise ValueError(
-                f"Stencil: every offset must have {entries}, one for each axis of shape, got {tuple(offset)}"
+                f"Stencil: every offset must have {entries}, one for each axis of shape, got {tuple(offset)}; "
+                f"coefficients {coefficients} are (batch or 1, k, *shape), so shape is {coefficients[2:]}"
             )
     return [tuple(_check.whole("Stencil", "every entry of an offset", n) for n in offset) for offset in offsets]

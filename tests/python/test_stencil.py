@@ -227,6 +227,7 @@ C = torch.ones(2, 5, 4, 6)
     (lambda: operators.Stencil(C.int(), NEAREST[2]), TypeError, "coefficients must be float32 or float64, got Int"),
     (lambda: operators.Stencil(C, NEAREST[2][:4]), ValueError, "4 offsets need coefficients of shape .batch or 1, 4"),
     (lambda: operators.Stencil(C, NEAREST[1]), ValueError, r"every offset must have 2 entries.*got \(0,\)"),
+    (lambda: operators.Stencil(C[0], NEAREST[2]), ValueError, r"1 entry.* \(0, 0\); .*so shape is \(\d+,\)"),
     (lambda: operators.Stencil(C, NEAREST[3]), ValueError, r"every offset must have 2 entries.*got \(0, 0, 0\)"),
     (lambda: operators.Stencil(C[:, :1], [(0, 3)]), ValueError, r"reach at most 2 cells along each axis, got \(0, 3\)"),
     (lambda: operators.Stencil(C[:, :2], [(0, 1)] * 2), ValueError, r"the offset \(0, 1\) is there twice"),
