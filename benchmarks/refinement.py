@@ -115,6 +115,8 @@ def main():
         others = [other for other in summary["rows"] if other["label"] != row.label]
         summary["rows"] = sorted([*others, entry], key=lambda entry: order.index(entry["label"]))
         summary["curves"][row.label] = _curves(row)
+        if row.label == "converged":  # the kept rows were judged by an earlier one
+            compare.judge(summary["rows"], entry)
         records.write(folder / "summary.json", summary)
 
 

@@ -208,13 +208,17 @@ def summarise(scene: _C.Scene, rows: list[Row], base: Entry | None = None) -> li
     the first row."""
     target = scene.compare.target
     table = [_entry(scene, row, target) for row in rows]
-    base = base or table[0]
+    judge(table, base or table[0])
+    return table
+
+
+def judge(table: list[Entry], base: Entry) -> None:
+    """Write into each entry whether it ends as well as `base`, and what it saves of it."""
     for entry in table:
         entry["as_good"] = _as_good(entry, base)
         # A cap on K is no allowance; the products are everybody's.
         entry["saved"] = None if entry["capped"] else 1 - entry["budget"] / max(1.0, base["budget"])
         entry["products_saved"] = 1 - entry["operator_applications"] / max(1.0, base["operator_applications"])
-    return table
 
 
 def _entry(scene: _C.Scene, row: Row, target: float | None) -> Entry:

@@ -34,6 +34,28 @@ def test_rows_that_are_not_trained_are_kept(tmp_path, monkeypatch):
     assert looser["metric"] > tighter["metric"]
 
 
+def test_a_new_converged_row_judges_the_kept_ones(tmp_path, monkeypatch):
+    first = run(monkeypatch, tmp_path / "first", "--rows", "converged", "rtol_0.01")
+    for row in first["rows"]:  # as if an earlier commit had needed twice the products, and ended far better
+        if row["label"] == "converged":
+            row["operator_applications"] *= 2
+    first["rows"][1] |= {"products_saved": 0.99, "as_good": False}
+    kept = tmp_path / "kept.json"
+    kept.write_text(json.dumps(first))
+    again = run(monkeypatch, tmp_path / "again", "--rows", "converged", "--keep", str(kept))
+    base, row = again["rows"]
+    share = 1 - row["operator_applications"] / base["operator_applications"]
+    assert row["as_good"] and row["products_saved"] == pytest.approx(share)
+
+
+def test_the_rows_with_multigrid_have_a_solver_of_their_own():
+    rows = {row.label: row for row in refinement.rows_of(scenes.load("burgers_2d"))}
+    row = rows["multigrid_rtol_0.01"]
+    assert row.title == "rtol = 0.01 throughout, multigrid" and rows["rtol_0.01"].title == "rtol = 0.01 throughout"
+    assert refinement.scene_of("burgers_2d", row).method == "multigrid"
+    assert refinement.scene_of("burgers_2d", rows["rtol_0.01"]).method == "gmres"
+
+
 def test_a_row_keeps_the_value_of_each_seed():
     scene = scenes.load("poisson_1p")
     (row,) = (row for row in refinement.rows_of(scene) if row.label == "rtol_0.1")
