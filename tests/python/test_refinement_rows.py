@@ -36,7 +36,7 @@ def test_rows_that_are_not_trained_are_kept(tmp_path, monkeypatch):
 
 def test_a_new_converged_row_judges_the_kept_ones(tmp_path, monkeypatch):
     first = run(monkeypatch, tmp_path / "first", "--rows", "converged", "rtol_0.01")
-    for row in first["rows"]:  # as if an earlier commit had needed twice the products, and ended far better
+    for row in first["rows"]:  # as if an earlier commit had needed twice the products
         if row["label"] == "converged":
             row["operator_applications"] *= 2
     first["rows"][1] |= {"products_saved": 0.99, "as_good": False}
