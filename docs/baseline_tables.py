@@ -62,7 +62,6 @@ SOLVERS = {  # of Burgers 2D
     "rtol_0.01": "rtol = 1e-2 throughout, GMRES(6)",
     "prdp": "PRDP, tuned, GMRES(6)",
     "auto": "**auto**, GMRES(6)",
-    "multigrid_rtol_0.01": "rtol = 1e-2 throughout, multigrid",
     "auto_multigrid": "**auto**, multigrid",
 }
 
