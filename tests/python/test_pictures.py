@@ -8,7 +8,7 @@ import pytest
 from benchmarks import charts, pictures, refinement_charts
 
 OF_TRAININGS = {  # their records are not in the repository
-    "burgers_1d_metric", "heat_1d_metric", "kolmogorov_error", "kolmogorov_vorticity", "snapshots",
+    "burgers_1d_metric", "kolmogorov_error", "kolmogorov_vorticity", "snapshots",
 }  # fmt: skip
 OF_EXAMPLES = {"first_emulator", "coarse_corrector", "inverse_permeability", "pdebench_data",
                "flow_around_cylinder", "passive_scalar", "force_network"}  # fmt: skip
@@ -23,6 +23,11 @@ def test_every_picture_is_drawn_again_from_a_record():
     drawn = {path for path, _, _ in pictures.all_of_them()}
     left = tracked("docs/*.png") - drawn
     assert {path.stem for path in left} <= OF_TRAININGS | OF_EXAMPLES
+
+
+def test_every_picture_is_on_a_page():
+    pages = "".join(path.read_text() for path in tracked("*.md"))
+    assert not [path.name for path in tracked("docs/*.png") if path.exists() and f"/{path.name})" not in pages]
 
 
 def test_every_picture_shows_its_record():
