@@ -108,20 +108,17 @@ def main():
     summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, **kept}
     for row in asked:
         shares = train(row, options, folder, environment)
-        (entry,) = compare.summarise(scene, [row], _row(summary, "converged"))
+        (entry,) = compare.summarise(scene, [row])
         entry |= {key: environment[key] for key in ("commit", "machine")} | {"share_of_a_core": shares}
         print(f"{row.title}: {entry['metric']:.2e}, {entry['operator_applications']:,.0f} products", flush=True)
         order = [other.label for other in rows_of(scene)]
         others = [other for other in summary["rows"] if other["label"] != row.label]
         summary["rows"] = sorted([*others, entry], key=lambda entry: order.index(entry["label"]))
         summary["curves"][row.label] = _curves(row)
-        if row.label == "converged":  # the kept rows were judged by an earlier one
-            compare.judge(summary["rows"], entry)
+        base = next((entry for entry in summary["rows"] if entry["label"] == "converged"), None)
+        if base:
+            compare.judge(summary["rows"], base)
         records.write(folder / "summary.json", summary)
-
-
-def _row(summary, label):
-    return next((row for row in summary["rows"] if row["label"] == label), None)
 
 
 def train(row, options, folder, environment):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from docs.record_rows import NOISE_OF_TIME, claims, median_seconds
+from docs.record_rows import NOISE_OF_TIME, by_label, claims, share_of_products, share_of_seconds
 from prdp_torch.experiments.charts import write_png
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -74,37 +74,37 @@ def _panel(axes, summary):
             if row["label"] == label:
                 _point(axes, row, base, high, colour, marker)
     axes.set(xscale="log", yscale="log", ylim=(low, high))
-    markers = [(_products(row, base), _error(row, base)) for row in shown]
+    place = _points_of(axes)
+    taken = [place(_products(row, base), error) for row, error in zip(shown, errors, strict=True) if error <= high]
     for row, at, error in zip(constants, x, y, strict=True):
         if error <= high:
-            markers.append(_label(axes, row["label"][5:], (at, error), markers))
+            taken.append(_label(axes, row["label"][5:], (at, error), place(at, error), taken))
     axes.grid(alpha=0.3, lw=0.4)
     _plain(axes.xaxis, [0.05, 0.1, 0.2, 0.5, 1, 2, 4])
     _plain(axes.yaxis, [0.1, 0.2, 0.5, 0.7, 1, 1.5, 2, 3])
     axes.tick_params(labelsize=8)
 
 
-def _label(axes, text, point, taken):
-    """Write the text on that side of the point where the nearest marker or other text is the farthest. Returns its
-    middle."""
-    width, height = PANEL
+def _points_of(axes):
+    """The function that says how many points a value is from the lower left corner of a logarithmic panel."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    return lambda x, y: np.array(PANEL) * (math.log(x / left, right / left), math.log(y / low, high / low))
 
-    def place(at):
-        return np.array([width * math.log(at[0] / left, right / left), height * math.log(at[1] / low, high / low)])
 
-    others = [place(at) for at in taken if at != point and low <= at[1] <= high]
+def _label(axes, text, point, place, taken):
+    """Write the text on that side of the point where the nearest of the taken places, beside its own, is the farthest.
+    Returns the place of its middle."""
+    others = [other for other in taken if (other != place).any()]
 
     def room(side):
-        x, y = middle = place(point) + side
-        inside = 10 < x < width - 10 and 4 < y < height - 4
+        middle = place + side
+        inside = (middle > (10, 4)).all() and (middle < np.array(PANEL) - (10, 4)).all()
         return min((float(np.hypot(*((middle - other) / (2, 0.6)))) for other in others), default=1e3) if inside else 0
 
     side = max(((12, 7), (12, -7), (-12, 7), (-12, -7), (0, 9), (0, -9)), key=room)
     style = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": 6, "zorder": 4}
     axes.annotate(text, point, xytext=side, **style)
-    x, y = place(point) + side
-    return left * (right / left) ** (x / width), low * (high / low) ** (y / height)
+    return place + side
 
 
 def _products(row, base):
@@ -159,15 +159,15 @@ def time_against_products(found):
     axes = figure.subplots()
     titles = []
     for at, (name, summary) in enumerate(found.items()):
-        shown = [row for row in summary["rows"] if row["label"] in ("converged", "prdp", "auto")]
-        titles.append(f"{name} ({seeds_of(shown)})")
+        rows = {label: row for label, row in by_label(summary).items() if label in ("converged", "prdp", "auto")}
+        base = rows["converged"]
+        titles.append(f"{name} ({seeds_of(rows.values())})")
         for label, shift in (("auto", -0.16), ("prdp", 0.16)):
             _, colour, _ = ROWS[label]
-            row, base = next((row for row in shown if row["label"] == label), None), shown[0]
+            row = rows.get(label)
             if row is None:
                 continue
-            products = 100 * (1 - row["operator_applications"] / base["operator_applications"])
-            seconds = 100 * (1 - median_seconds(row) / median_seconds(base))
+            products, seconds = (100 * share(row, base) for share in (share_of_products, share_of_seconds))
             marks = [(products, "o")]
             if row["seeds"] == base["seeds"]:  # rows of fewer seeds are older, and of another machine
                 marks.append((seconds, "D"))

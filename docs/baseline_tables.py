@@ -2,16 +2,19 @@
 
 from docs import page_tables
 from docs.record_rows import (
+    by_label,
     claim,
     claims,
     error,
-    fewer_seeds,
     median_seconds,
+    of_scene,
+    power,
     products,
     record,
     rows,
     saved,
     time_saved,
+    title,
 )
 from docs.record_rows import seconds as seconds_of
 
@@ -41,7 +44,7 @@ def seconds():
         base, prdp = found["converged"], found.get("prdp")
         others = _of_as_many_seeds(found.values(), base)
         strongest = _fastest(row for row in others if row["label"] in ("converged", "direct", "multigrid"))
-        auto = _fastest(row for row in others if row["kind"] == "auto" and row["label"].startswith("auto"))
+        auto = _fastest(row for row in others if row["label"] in ("auto", "auto_multigrid"))
         constant = _fastest(filter(None, (_loosest(others), _loosest(others, "multigrid_"))))
         cells = [
             seconds_of(base),
@@ -50,8 +53,16 @@ def seconds():
             _seconds_claimed(prdp if prdp in others else None),
             _with_notes(auto, _other_solver(auto)),
         ]
-        title = f"{name}, {solver}" if base["seeds"] > 1 else f"{name}, {solver}, one seed"
-        body.append([title, what, *cells, time_saved(auto, strongest), f"{auto['metric'] / base['metric']:.2f}"])
+        seeds = "" if base["seeds"] > 1 else ", one seed"
+        body.append(
+            [
+                f"{name}, {solver}{seeds}",
+                what,
+                *cells,
+                time_saved(auto, strongest),
+                f"{auto['metric'] / base['metric']:.2f}",
+            ]
+        )
     head = ["scene", "its time is in the", "converged", "strongest", "one rtol", "PRDP", "auto", "auto saves", "error"]
     return page_tables.markdown(head, body)
 
@@ -70,9 +81,9 @@ def burgers_2d():
     """The seconds and the errors of Burgers 2D on two grids."""
     grids = [rows(f"refinement_{name}") for name in ("burgers_2d", "burgers_2d_192")]
     body = []
-    for label, title in SOLVERS.items():
+    for label, how in SOLVERS.items():
         if any(label in found for found in grids):
-            body.append([title, *(cell for found in grids for cell in _seconds_and_error(found.get(label)))])
+            body.append([how, *(cell for found in grids for cell in _seconds_and_error(found.get(label)))])
     return page_tables.markdown(["", "96², 3 seeds: s", "error", "192², one seed: s", "error"], body)
 
 
@@ -109,14 +120,11 @@ def constant_tolerances():
     """Errors and products of auto, of tuned PRDP and of one tolerance throughout."""
     body = []
     for name in SCENES:
-        found = rows(f"refinement_{name}")
-        seeds = record(f"refinement_{name}")["seeds"]
+        whole = record(f"refinement_{name}")
+        found, seeds = by_label(whole), whole["seeds"]
         for i, row in enumerate([found["converged"], found["auto"], found["prdp"], *_constant(found.values())]):
-            title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += fewer_seeds(row, seeds)
             costs = products(row)[2], _beside(row, found["auto"]), saved(row)
-            body.append([f"{name}, {seeds} seeds" if i == 0 < seeds - 1 else name if i == 0 else "", title])
-            body[-1] += [error(row), *costs]
+            body.append(["" if i else of_scene(name, seeds), title(row, seeds), error(row), *costs])
     return page_tables.markdown(["scene", "", "error", "products", "products / auto's", "saved"], body)
 
 
@@ -125,15 +133,14 @@ def the_best_constant():
     costs."""
     body = []
     for name in (*SCENES, "kolmogorov"):
-        found, last = rows(f"refinement_{name}"), record(f"refinement_{name}")["curves"]["auto"]["rtol"][-1]
+        whole = record(f"refinement_{name}")
+        found, last = by_label(whole), power(whole["curves"]["auto"]["rtol"][-1])
         auto, tolerances = found["auto"], _constant(found.values())
         best, loosest, tightest = _loosest(tolerances), tolerances[0], tolerances[-1]
         wrong = f"{loosest['metric'] / found['converged']['metric']:.2g} with {_power_of(loosest)}"
         time = f"{median_seconds(best) / median_seconds(auto):.2f}" if median_seconds(auto) > TOO_SHORT else "–"
         spent = f"{_beside(tightest, auto)} with {_power_of(tightest)}"
-        body.append(
-            [name, _power_of(best), _beside(best, auto), time, f"{last:.0e}".replace("e-0", "e-"), wrong, spent]
-        )
+        body.append([name, _power_of(best), _beside(best, auto), time, last, wrong, spent])
     head = ["scene", "best constant", "its products / auto's", "its seconds / auto's", "auto's last rtol"]
     head += ["error of the loosest / converged", "products of the tightest / auto's"]
     return page_tables.markdown(head, body)
@@ -153,4 +160,4 @@ def _beside(row, auto):
 
 
 def _power_of(row):
-    return f"{float(row['label'].rpartition('_')[2]):.0e}".replace("e-0", "e-")
+    return power(float(row["label"].rpartition("_")[2]))

@@ -15,7 +15,20 @@ def record(name):
 
 
 def rows(name):
-    return {row["label"]: row for row in record(name)["rows"]}
+    return by_label(record(name))
+
+
+def by_label(found):
+    return {row["label"]: row for row in found["rows"]}
+
+
+def of_scene(name, seeds):
+    return f"{name}, {seeds} seeds" if seeds > 1 else name
+
+
+def title(row, seeds):
+    """With how many seeds the row has, where the record has more."""
+    return ("**auto**" if row["label"] == "auto" else row["title"]) + fewer_seeds(row, seeds)
 
 
 def error(row):
@@ -60,12 +73,21 @@ def saved(row):
     return "–" if row["kind"] in ("converged", "direct") else claim(row, row["products_saved"], 1)
 
 
+def share_of_products(row, base):
+    """What the row saves of those of another."""
+    return 1 - row["operator_applications"] / base["operator_applications"]
+
+
+def share_of_seconds(row, base):
+    return 1 - median_seconds(row) / median_seconds(base)
+
+
 def products_saved(row, base):
-    return claim(row, 1 - row["operator_applications"] / base["operator_applications"])
+    return claim(row, share_of_products(row, base))
 
 
 def time_saved(row, base):
-    share = 1 - median_seconds(row) / median_seconds(base)
+    share = share_of_seconds(row, base)
     said = claim(row, share)
     return "none" if said.endswith("%") and abs(share) < NOISE_OF_TIME else said
 
@@ -85,6 +107,10 @@ def median_seconds(row):
 def seconds(row):
     value = median_seconds(row)
     return f"{value:.2g}" if value < 10 else f"{value:,.0f}"
+
+
+def power(rtol):
+    return f"{rtol:.0e}".replace("e-0", "e-")
 
 
 def percent(share, digits=0):

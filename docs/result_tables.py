@@ -13,6 +13,7 @@ from docs.record_rows import (
     claim,
     error,
     fewer_seeds,
+    of_scene,
     products,
     products_saved,
     record,
@@ -20,6 +21,7 @@ from docs.record_rows import (
     saved,
     seconds,
     time_saved,
+    title,
 )
 
 TABLE = page_tables.places("result_tables.py")
@@ -33,14 +35,12 @@ def parts_of_auto():
     body = []
     for name in SCENES:
         found = record(f"refinement_{name}")
-        seeds = f", {found['seeds']} seeds" if found["seeds"] > 1 else ""
+        seeds = found["seeds"]
         elsewhere = ("rtol_", "direct", "multigrid", "auto_multigrid")  # in "constant tolerances" and other tables
         parts = [row for row in found["rows"] if not row["label"].startswith(elsewhere)]
         for i, row in enumerate(parts):
-            title = "**auto**" if row["label"] == "auto" else row["title"]
-            title += fewer_seeds(row, found["seeds"])
             costs = *products(row), saved(row), seconds(row)
-            body.append([f"{name}{seeds}" if i == 0 else "", title, error(row), *costs])
+            body.append(["" if i else of_scene(name, seeds), title(row, seeds), error(row), *costs])
     return page_tables.markdown(["scene", "", "error", "forward", "adjoint", "in all", "saved", "s"], body)
 
 
@@ -74,12 +74,12 @@ def time_and_products():
 
 def comparison(name, with_seconds=True):
     """The rows of `prdp compare`, or of a record of `python -m benchmarks.refinement`."""
-    body = []
-    for row in record(name)["rows"]:
-        title = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        title += fewer_seeds(row, record(name)["seeds"])
+    body, found = [], record(name)
+    for row in found["rows"]:
+        shown = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
+        shown += fewer_seeds(row, found["seeds"])
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
-        body.append([title, error(row), last, *products(row), saved(row), *([seconds(row)] if with_seconds else [])])
+        body.append([shown, error(row), last, *products(row), saved(row), *([seconds(row)] if with_seconds else [])])
     head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if with_seconds else [])]
     return page_tables.markdown(head, body)
 
@@ -91,9 +91,9 @@ def readme():
         found = rows(f"refinement_{name}")
         base = found["converged"]
         body.append([f"{name}, {base['seeds']} seeds", "converged", error(base), "–", "–"])
-        for label, title in (("auto", "**auto**"), ("prdp", "PRDP, tuned")):
+        for label, shown in (("auto", "**auto**"), ("prdp", "PRDP, tuned")):
             row = found[label]
-            body.append(["", title, error(row), products_saved(row, base), time_saved(row, base)])
+            body.append(["", shown, error(row), products_saved(row, base), time_saved(row, base)])
     return page_tables.markdown(["scene", "", "error", "products saved", "time saved"], body)
 
 
@@ -126,11 +126,11 @@ PARTS_OF_THE_PAPER = {
 def beside_the_paper():
     """Of every scene that the paper has."""
     body = []
-    for name, (title, theirs, converged, prdp) in PAPER.items():
+    for name, (scene, theirs, converged, prdp) in PAPER.items():
         base, ours = record(name)["rows"][0], rows(name)["prdp"]
         spent = (f"{row['budget']:,.0f}" for row in (base, ours))
         errors = error(base), converged, error(ours), prdp
-        body.append([title, str(record(name)["seeds"]), *spent, claim(ours, ours["saved"], 1), theirs, *errors])
+        body.append([scene, str(record(name)["seeds"]), *spent, claim(ours, ours["saved"], 1), theirs, *errors])
     head = ["scene", "seeds", "iterations, converged", "iterations, PRDP", "iterations saved", "paper's saving"]
     head += ["error, converged", "paper's error, converged", "error, PRDP", "paper's error, PRDP"]
     return page_tables.markdown(head, body)
@@ -139,11 +139,11 @@ def beside_the_paper():
 def parts_of_the_saving():
     """Iterations saved by stopping below full convergence, and by starting with few."""
     body = []
-    for name, (title, *_) in PAPER.items():
+    for name, (scene, *_) in PAPER.items():
         row = rows(name)["prdp"]
         incomplete, whole = row["saved_by_incomplete_convergence"], row["saved"]
         ours = [claim(row, share, 1) for share in (incomplete, whole - incomplete)]
-        body.append([title, *ours, PARTS_OF_THE_PAPER.get(name, "")])
+        body.append([scene, *ours, PARTS_OF_THE_PAPER.get(name, "")])
     head = ["scene", "incomplete convergence", "progressive refinement", "paper"]
     return page_tables.markdown(head, body)
 
@@ -151,13 +151,13 @@ def parts_of_the_saving():
 def three_parameters():
     """Poisson with three parameters: two solvers, two kinds of gradient."""
     body = []
-    for name, title in (("poisson_3p", "Jacobi"), ("poisson_3p_sd", "steepest descent")):
+    for name, solver in (("poisson_3p", "Jacobi"), ("poisson_3p_sd", "steepest descent")):
         for backward in ("implicit", "unrolled"):
             found = rows(f"{name}_{backward}")
             base, prdp, auto, direct = (found[label] for label in ("converged", "prdp", "auto", "direct"))
             ours = error(prdp), f"{prdp['budget']:,.0f}", claim(prdp, prdp["saved"], 1)
             body.append(
-                [f"{title}, {backward}", error(base), f"{base['budget']:,.0f}", *ours, error(auto), error(direct)]
+                [f"{solver}, {backward}", error(base), f"{base['budget']:,.0f}", *ours, error(auto), error(direct)]
             )
     head = ["", "converged: error", "iterations", "PRDP: error", "iterations", "saved", "auto: error", "direct: error"]
     return page_tables.markdown(head, body)

@@ -203,12 +203,12 @@ def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | N
     return curves
 
 
-def summarise(scene: _C.Scene, rows: list[Row], base: Entry | None = None) -> list[Entry]:
-    """The table of a comparison: one dict a row, means over seeds and the values of each; savings against `base`, or
-    the first row."""
+def summarise(scene: _C.Scene, rows: list[Row]) -> list[Entry]:
+    """The table of a comparison: one dict a row, means over seeds and the values of each; savings against the first
+    row."""
     target = scene.compare.target
     table = [_entry(scene, row, target) for row in rows]
-    judge(table, base or table[0])
+    judge(table, table[0])
     return table
 
 
