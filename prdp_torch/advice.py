@@ -25,6 +25,7 @@ from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 
 WORTH_REFINING = 0.1  # of an update
+WORTH_A_START = 0.1  # of the products of a solve
 NOISE = 0.1  # of the seconds of a solve
 
 
@@ -208,7 +209,8 @@ def advise_on(
 
 def _start_gain(zero: Row, state: Row) -> str:
     products = f"{state.forward.products} products to {_power(zero.rtol)} in place of {zero.forward.products}"
-    worth = state.forward.status != "MAX_ITER" and state.forward.products < zero.forward.products
+    fewer = state.forward.products < (1 - WORTH_A_START) * zero.forward.products
+    worth = fewer and state.forward.status != "MAX_ITER"
     advice = 'pass start="state"' if worth else "keep the start from zero"
     return f"From the state, the forward solve of {zero.name} takes {products}: {advice}."
 
