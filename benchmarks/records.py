@@ -67,9 +67,9 @@ LIST = [
     refinement("burgers_2d", 3, 55),
     refinement(
         "benchmarks/scenes/burgers_2d_192.toml",
-        1,
-        70,
-        "--rows converged auto rtol_0.1 rtol_0.01 multigrid auto_multigrid multigrid_rtol_0.01",
+        3,
+        150,
+        "--rows converged prdp auto rtol_0.1 rtol_0.01 multigrid auto_multigrid multigrid_rtol_0.01",
         name="burgers_2d_192",
     ),
     refinement("heat_2d", 3, 60),
