@@ -245,7 +245,7 @@ def _limit(saving: float, most: str, best: Row) -> str:
     if saving >= WORTH_REFINING:
         return f"Refinement can save at most {most}."
     if saving > 0.0:
-        return f"Refinement has nothing to save: at most {most}."
+        return f"Refinement has little to save: at most {most}."
     if _most(best) == 1 and not isinstance(best.solver, Direct):
         return "Refinement has nothing to save: one iteration is enough."
     return f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."

@@ -47,6 +47,8 @@ class Solve:
     """The worst of the samples, a name of `SolveStatus`."""
     solved: bool
     """Whether all samples met the tolerance."""
+    cut_off: bool = False
+    """Whether a sample ran out of iterations."""
 
 
 @dataclass
@@ -76,6 +78,12 @@ class Row:
     def status(self) -> str:
         """The word solved, or the worse of the two statuses."""
         return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
+
+    @property
+    def may_go_on(self) -> bool:
+        """Whether more iterations may solve it: a sample ran out of them, and none failed. The status does not say so,
+        as STAGNATED, at the rounding of another sample or of the adjoint solve, is worse than MAX_ITER."""
+        return self.status in ("MAX_ITER", "STAGNATED") and any(solve.cut_off for solve in self.solves)
 
 
 @dataclass
@@ -198,7 +206,7 @@ def _measure_one(trial: Trial, solver: Solver, seconds: float) -> list[Row]:
             set_solver(trial.step, solver, k, rtol)
             row = run(trial, solver)
             # The next run takes about as long as all that were before it.
-            if row.status != "MAX_ITER" or time.perf_counter() > deadline - seconds / 2:
+            if not row.may_go_on or time.perf_counter() > deadline - seconds / 2:
                 break
             k *= 2
         if not row.solved:
@@ -235,6 +243,7 @@ def _solve(info: SolveInfo, seconds: list[float]) -> Solve:
         median(seconds),
         worst,
         bool(info.solved.all()),
+        bool((info.status == SolveStatus.MAX_ITER).any()),
     )
 
 

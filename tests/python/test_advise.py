@@ -199,7 +199,7 @@ def made_up(name, rtol, seconds, iterations=10):
     [
         (1.0, 0.0, "Refine CG with a controller, up to K = 10: it is the fastest to 1e-5, and a step takes 1000 ms"),
         (1.0, 24.0, "Use converged solves with CG(max_iter=20, rtol=1e-5): it is the fastest to 1e-5, and physics is 4%"
-         " of an update: 1000 ms of 25000 ms. Refinement has nothing to save: at most 4% of an update"),
+         " of an update: 1000 ms of 25000 ms. Refinement has little to save: at most 4% of an update"),
         (1.0, 3.0, "Refine CG with a controller, up to K = 10: it is the fastest to 1e-5, and physics is 25% of an"),
     ],
 )  # fmt: skip
@@ -325,6 +325,29 @@ def test_what_cannot_be_advised_on_is_refused_in_words(step, sample, error, mess
 def test_the_limit_is_a_positive_number(seconds):
     with pytest.raises(ValueError, match="advise: seconds must be a number > 0"):
         prdp.advise(prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 8), seconds)
+
+
+def test_an_adjoint_at_its_rounding_does_not_end_the_trials_of_the_forward_solve():
+    """Here the adjoint solve is STAGNATED after four cycles, while a forward solve is MAX_ITER and needs more."""
+    generator = torch.Generator().manual_seed(0)
+    kappa = (0.5 * torch.randn(1, 32, 32, generator=generator) - 3).exp()
+    u = torch.randn(2, 1, 32, 32, generator=generator)
+    diffusion = operators.Diffusion(kappa, shift=0.1, boundary=["flux", "periodic"])
+    step, solver = prdp.ImplicitStep(diffusion, lambda u: u, prdp.Multigrid(1)), prdp.Multigrid(1)
+    trial = solver_trials.Trial(step, u, torch.ones_like(u), False)
+    solver_trials.set_solver(step, solver, 4, 1e-5)
+    cut = solver_trials.run(trial, solver)
+    assert (cut.forward.cut_off, cut.adjoint.cut_off, cut.status) == (True, False, "STAGNATED") and cut.may_go_on
+    assert [row.solved for row in solver_trials._measure_one(trial, solver, 5.0)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("status", "cut_off", "goes_on"),
+    [("MAX_ITER", True, True), ("STAGNATED", True, True), ("STAGNATED", False, False), ("DIVERGED", True, False)],
+)
+def test_more_iterations_are_tried_where_samples_ran_out_of_them_and_none_failed(status, cut_off, goes_on):
+    solve = Solve(1, 1, 1.0, status, False, cut_off)
+    assert Row(prdp.CG(1), torch.float64, 1e-5, solve, None).may_go_on == goes_on
 
 
 def test_the_gain_of_a_start_is_counted():
