@@ -97,8 +97,8 @@ def test_a_part_that_was_asked_for_is_not_left_out(tmp_path):
 
 
 def test_a_torch_that_is_too_old_is_refused_in_one_sentence(tmp_path):
-    status, said = configure(tmp_path / "build", f"-DTorch_DIR={fake_torch(tmp_path, '2.12.1+cu130')}")
-    assert status != 0 and "prdp: needs PyTorch 2.13 or newer, found 2.12.1 in " in said
+    status, said = configure(tmp_path / "build", f"-DTorch_DIR={fake_torch(tmp_path, '2.10.1+cu130')}")
+    assert status != 0 and "prdp: needs PyTorch 2.11 or newer, found 2.10.1 in " in said
 
 
 def test_warnings_stop_no_user():

@@ -129,7 +129,7 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
   const bool reverse =
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
-  const auto node = reverse ? c10::make_intrusive<SolveNode>(b, a, options) : nullptr;
+  const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
   const auto out = call_below(b, a, options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};

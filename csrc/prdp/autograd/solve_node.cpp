@@ -47,7 +47,7 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
   {
     const std::lock_guard lock(mutex_);
     // The function that torch.func.vjp returns runs after its transform: the wrappers are dead by then.
-    const auto unpack = [](const SavedVariable& saved, c10::intrusive_ptr<Node> of = nullptr) {
+    const auto unpack = [](const SavedVariable& saved, NodePointer<Node> of = nullptr) {
       return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
     };
     solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_), unpack(residual_), unpack(x0_)};

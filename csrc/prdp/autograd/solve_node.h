@@ -1,7 +1,7 @@
 #pragma once
-#include <torch/csrc/autograd/function.h>
 #include <torch/csrc/autograd/saved_variable.h>
 
+#include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/solvers/solve.h"

@@ -5,6 +5,7 @@
 #include <torch/library.h>
 
 #include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/plain_tensors.h"
 
@@ -77,8 +78,8 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
     op.callBoxed(stack);
   }
   if (!record) return;
-  const auto refusal = c10::make_intrusive<torch::autograd::Error>(
-      kRefusal, torch::autograd::collect_next_edges(at::TensorList(inputs)));
+  const auto refusal =
+      make_node<torch::autograd::Error>(kRefusal, torch::autograd::collect_next_edges(at::TensorList(inputs)));
   const auto& derivatives = torch::jit::peek(*stack, 0, op.schema().returns().size());  // the first result
   if (derivatives.isTensor()) torch::autograd::set_history(derivatives.toTensor(), refusal);
   else torch::autograd::set_history(derivatives.toTensorVector(), refusal);
