@@ -65,6 +65,27 @@ def test_the_examples_build_with_the_installed_package_and_run(installed, tmp_pa
     assert epochs[-1][0] < 0.3 * epochs[0][0] and [k for _, k in epochs] == sorted(k for _, k in epochs)
 
 
+def shown_symbols(library):
+    """The names, with their namespaces alone, that other libraries can find in this one."""
+    listed = run("nm", "--dynamic", "--defined-only", "--demangle", library).stdout
+    for line in listed.splitlines():
+        name = line.split(maxsplit=2)[2]
+        while name != (name := re.sub(r"\([^()]*\)|<[^<>]*>", "", name)):  # arguments, of templates and of functions
+            pass
+        yield re.sub(r" const\b|\[.*", "", name).split()[-1]
+
+
+def test_libraries_show_no_symbols_but_their_own():
+    """What they hold of torch, Eigen and libstdc++ must not take the place of what other libraries hold of them: where
+    the compiler links libstdc++ statically, streams of two copies crashed."""
+    own = set(shown_symbols(BUILD / "libprdp.so"))
+    assert "prdp::linear_solve" in own and "prdp::Heat::Heat" in own
+    assert {name for name in own if not name.startswith("prdp::")} == set()
+    for folder in (BUILD, BUILD / "experiments"):
+        (module,) = folder.glob("_C.*.so")
+        assert set(shown_symbols(module)) == {"PyInit__C"}
+
+
 def setup(tmp_path, *commands):
     run(
         sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path, *commands, PRDP_BUILD_DIR=str(BUILD)
