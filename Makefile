@@ -5,7 +5,7 @@
 # make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
-# make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU)
+# make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU; HEADERS=folder where the system has no headers)
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -45,22 +45,26 @@ records: $(STAMPS)/configure
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/python -m benchmarks.records
 
-# An environment of its own, which sees the torch of PYTHON, whatever its version. The modules take the place of those of
-# `make test` in prdp_torch, until that is called again.
+# An environment of its own, which sees the packages of PYTHON, whatever its version of torch. What is there is used, so it
+# takes no network where nothing is missing: HEADERS names a folder with the headers of Eigen, toml++ and nlohmann-json.
+# The modules take the place of those of `make test` in prdp_torch, until that is called again.
 DEVICE ?= cuda
-CUDA_NEEDS := cmake|cmeel-eigen|ninja|numpy|pytest|hypothesis|matplotlib|jinja2|rich|typer|h5py
-cuda: $(STAMPS)/system
+HEADERS ?=
+CUDA := .venv-cuda/bin
+CUDA_CMAKE = PATH=$(CURDIR)/$(CUDA):$$(dirname $$(command -v $(PYTHON))):$$PATH cmake
+cuda: export HEADERS := $(HEADERS)
+cuda:
 	@$(PYTHON) -c 'import torch' || { echo "prdp: $(PYTHON) has no torch; make cuda PYTHON=/path/to/python"; exit 1; }
 	@$(PYTHON) -c 'import torch; torch.ones(1, device="$(DEVICE)")' || { echo "prdp: the torch of $(PYTHON) has no device $(DEVICE)"; exit 1; }
-	[ -x .venv-cuda/bin/python ] || $(PYTHON) -m venv .venv-cuda
-	$(PYTHON) -c 'import sysconfig; print(sysconfig.get_path("purelib"))' > "$$(ls -d .venv-cuda/lib/python*/site-packages)/prdp.pth"
-	grep -E '^($(CUDA_NEEDS))==' requirements.txt | .venv-cuda/bin/python -m pip install --quiet --disable-pip-version-check -r /dev/stdin
+	cmake/system-packages.sh toml++/toml.h nlohmann/json.hpp
+	cmake/cuda-packages.sh $(PYTHON) .venv-cuda
 	mkdir -p build-cuda
-	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/.venv-cuda/bin/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF > build-cuda/configure.log
-	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake --build build-cuda --parallel $$(nproc) --target python
-	PATH=$(CURDIR)/.venv-cuda/bin:$$PATH cmake --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
-	.venv-cuda/bin/python -m pytest -m cuda tests/python/test_cuda.py
-	.venv-cuda/bin/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
+	$(CUDA_CMAKE) -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(CUDA)/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF \
+	  $(if $(HEADERS),-DCMAKE_INCLUDE_PATH=$(abspath $(HEADERS)) -DCMAKE_PREFIX_PATH=$(abspath $(HEADERS))) > build-cuda/configure.log
+	$(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target python
+	$(CUDA_CMAKE) --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
+	$(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py
+	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
 
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)

@@ -23,8 +23,13 @@ if(cmeel_prefix)
 endif()
 
 find_package(Eigen3 3.4 QUIET NO_MODULE)
-if(NOT Eigen3_FOUND)
-  message(FATAL_ERROR "prdp: Eigen was not found; apt-get install libeigen3-dev or pip install cmeel-eigen")
+if(NOT Eigen3_FOUND)  # without its files for CMake, as in a folder of headers; this header came with Eigen 3.4
+  find_path(eigen_INCLUDE_DIR Eigen/src/Core/StlIterators.h PATH_SUFFIXES eigen3)
+  if(NOT eigen_INCLUDE_DIR)
+    message(FATAL_ERROR "prdp: Eigen was not found; apt-get install libeigen3-dev or pip install cmeel-eigen")
+  endif()
+  add_library(Eigen3::Eigen INTERFACE IMPORTED)
+  target_include_directories(Eigen3::Eigen INTERFACE ${eigen_INCLUDE_DIR})
 endif()
 
 # A header-only library as an imported target. The part of the project that needs it is left out where it is AUTO and

@@ -96,6 +96,40 @@ def test_a_part_that_was_asked_for_is_not_left_out(tmp_path):
     assert "<toml++/toml.h> was not found; apt-get install libtomlplusplus-dev, or configure with -DPRDP_EXP" in said
 
 
+def test_headers_may_lie_in_a_folder_that_is_named(tmp_path):
+    """As in `make cuda HEADERS=`: headers alone, without files for CMake."""
+    (eigen,) = Path(sys.prefix).glob("lib/python*/site-packages/cmeel.prefix/include/eigen3/Eigen")
+    folder = tmp_path / "headers"
+    folder.mkdir()
+    for header in (eigen, Path("/usr/include/toml++"), Path("/usr/include/nlohmann")):
+        (folder / header.name).symlink_to(header)
+    options = (NO_SYSTEM_HEADERS, "-DCMAKE_DISABLE_FIND_PACKAGE_Eigen3=ON", "-DPRDP_EXPERIMENTS=ON")
+    status, said = configure(tmp_path / "build", *options, f"-DCMAKE_INCLUDE_PATH={folder}")
+    assert status == 0, said
+    found = (tmp_path / "build" / "CMakeCache.txt").read_text()
+    for name in ("tomlplusplus", "json"):
+        assert f"{name}_INCLUDE_DIR:PATH={folder}\n" in found
+    assert re.search(r"^eigen_INCLUDE_DIR:PATH=/", found, re.MULTILINE)  # there, or beside torch
+
+
+def cuda_packages(folder, python):
+    """What `make cuda` installs into an environment beside this Python's packages, without a network."""
+    command = [ROOT / "cmake" / "cuda-packages.sh", python, folder]
+    alone = {"PATH": "/usr/bin:/bin", "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": "/dev/null"}
+    return subprocess.run(list(map(str, command)), cwd=ROOT, env=alone, capture_output=True, text=True)
+
+
+def test_make_cuda_takes_the_packages_that_are_there(tmp_path):
+    done = cuda_packages(tmp_path / "all", sys.executable)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    seen = "import torch, pytest; print(pytest.__file__)"
+    found = subprocess.run([tmp_path / "all" / "bin" / "python", "-c", seen], capture_output=True, text=True)
+    assert found.stdout.strip() == pytest.__file__
+    done = cuda_packages(tmp_path / "few", sys._base_executable)
+    assert done.returncode == 1 and "cmeel-eigen==" in done.stderr
+    assert "prdp: these packages are missing and cannot be installed from here: " in done.stderr
+
+
 def test_a_torch_that_is_too_old_is_refused_in_one_sentence(tmp_path):
     status, said = configure(tmp_path / "build", f"-DTorch_DIR={fake_torch(tmp_path, '2.10.1+cu130')}")
     assert status != 0 and "prdp: needs PyTorch 2.11 or newer, found 2.10.1 in " in said
