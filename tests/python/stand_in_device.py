@@ -11,6 +11,13 @@ DEVICE = torch.device("lazy", 0)  # of a kind that autograd takes without its dr
 KEY = torch._C.DispatchKeySet(torch._C.DispatchKey.Lazy)
 COPIES = {"_to_copy", "to", "copy_"}  # they may mix devices
 READS = {"_local_scalar_dense", "item", "equal", "nonzero", "is_nonzero", "masked_select", "_unique2"}
+# What takes a single number of the host beside tensors of CUDA: operations of two tensors, and those that read it here.
+PAIRS = {
+    "add", "sub", "rsub", "mul", "div", "pow", "remainder", "fmod", "atan2", "copysign", "nextafter", "maximum",
+    "minimum", "eq", "ne", "lt", "le", "gt", "ge", "logical_and", "logical_or", "logical_xor", "bitwise_and",
+    "bitwise_or", "bitwise_xor", "masked_fill", "fill",
+}  # fmt: skip
+SENDS = {"where"}  # it as well, by a copy
 VIEWS_AND_MEMORY = {
     "alias", "as_strided", "detach", "empty", "empty_like", "empty_strided", "expand", "narrow", "new_empty", "permute",
     "select", "slice", "squeeze", "t", "transpose", "unbind", "unsqueeze", "view", "zeros_like", "_reshape_alias",
@@ -88,8 +95,10 @@ class StandIn(TorchDispatchMode):
         if not given and not there:
             return function(*args, **kwargs)
         self.copies_from_host += name in COPIES and there and not all(isinstance(a, _There) for a in tensors_in(args))
-        strangers = [a for a in tensors_in(args) if not isinstance(a, _There) and a.dim() > 0]
-        assert not strangers or name in COPIES, f"{name}: a tensor on the CPU beside one on the device"
+        strangers = [a for a in tensors_in(args) if not isinstance(a, _There)]
+        takes_numbers = name.removesuffix("_") in PAIRS | SENDS and all(a.dim() == 0 for a in strangers)
+        assert not strangers or name in COPIES or takes_numbers, f"{name}: a tensor on the CPU beside one on the device"
+        self.copies_from_host += len(strangers) if name in SENDS else 0
         self.operations[name] += there
 
         def back(value):

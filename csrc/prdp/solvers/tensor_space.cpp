@@ -46,8 +46,7 @@ double TensorSpace::epsilon() const { return limits_of(b_).epsilon / 2; }
 const at::Tensor& TensorSpace::diagonal() {
   if (!diagonal_.defined()) {
     auto d = system_.a.diagonal();
-    const bool number_of_host = is_far() && d.is_cpu() && d.dim() == 0;  // as a plain nu leaves: to be filled, not sent
-    d = number_of_host ? at::full({}, d.item(), b_.options()) : d.to(b_.options());
+    d = is_number_of_host(d) ? at::full({}, d.item(), b_.options()) : d.to(b_.options());
     diagonal_ = at::where(d.eq(0), at::ones_like(d), d);
   }
   return diagonal_;

@@ -225,9 +225,14 @@ class TensorSpace {
   }
   /// As batch_loops take it.
   Vector laid_out(const Vector& v) const { return in_loops_ ? v.contiguous() : v; }
-  static Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) {
-    return omega ? at::addcmul(before, *omega, x + change - before) : x + change;
+  Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) const {
+    if (!omega) return x + change;
+    const auto step = x + change - before;
+    if (is_number_of_host(*omega)) return at::add(before, step, omega->item());
+    return at::addcmul(before, omega->to(b_.options()), step);
   }
+  /// As a plain nu leaves: an argument of operations on another device, not a tensor beside those there.
+  bool is_number_of_host(const at::Tensor& t) const { return is_far() && t.is_cpu() && t.dim() == 0; }
   Vector jacobi_change(const Vector& c, const Vector& x) { return at::addcdiv(c, product(x), diagonal(), -1); }
   /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
   const at::Tensor& diagonal();
