@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import dense_burgers, dense_heat, field, spd_matrices, statuses, written
+from test_other_devices import OFFSETS, SHAPE, five_points, noise
 from torch.autograd import gradcheck, gradgradcheck
 
 import prdp_torch as prdp
@@ -284,3 +285,22 @@ def test_both_trainers_take_it(tmp_path):
     python = train(scene, Refinement.constant(4))
     np.testing.assert_allclose(cpp["metric"], python["metric"], rtol=1e-4)
     assert cpp["budget"] == python["budget"] and python["metric"][-1] < python["metric"][0]
+
+
+@pytest.mark.parametrize("k", [12, 20])
+def test_unrolled_gradients_of_a_are_those_of_differences_but_near_rounding(k):
+    """Before residuals of 1e-6, and once the sample was solved to rounding; between, Ā is rounding, and b̄ is not."""
+    b, c = noise(3, 1, *SHAPE), five_points(4.3)
+    direction = noise(*c.shape, seed=5)
+
+    def loss(c, b, k=k):
+        a = operators.Stencil(c, OFFSETS, "periodic")
+        return prdp.linear_solve(a, b, prdp.BiCGStab(k, 0.0), backward="unrolled")[0].square().sum()
+
+    leaf, h = c.clone().requires_grad_(), 1e-7
+    (found,) = torch.autograd.grad(loss(leaf, b), leaf)
+    expected = (loss(c + h * direction, b) - loss(c - h * direction, b)) / (2 * h)
+    torch.testing.assert_close((found * direction).sum(), expected, rtol=1e-7, atol=0)
+    leaf = b.clone().requires_grad_()
+    between, end = (torch.autograd.grad(loss(c, leaf, k), leaf)[0] for k in (16, 40))
+    torch.testing.assert_close(between, end, rtol=1e-8, atol=1e-8)
