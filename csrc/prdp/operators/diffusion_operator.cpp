@@ -6,6 +6,7 @@
 #include <cmath>
 
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 
@@ -29,7 +30,7 @@ at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int64_t beh
 
 /// Summed over the samples where these share one.
 at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
-  if (tensor.dim() == 0) return sum.sum();
+  if (tensor.dim() == 0) return total(sum);
   return tensor.size(0) == 1 && sum.size(0) != 1 ? sum.sum(0, /*keepdim=*/true) : sum;
 }
 

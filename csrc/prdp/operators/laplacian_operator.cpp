@@ -7,6 +7,7 @@
 #include "prdp/kernels/laplacian.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/sums_in_order.h"
 
 namespace prdp {
 
@@ -63,7 +64,7 @@ std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, con
   // ∂⟨λ, u - ν Δt L u⟩/∂ν = -Δt ⟨λ, L u⟩
   const bool by_loops = !at::GradMode::is_enabled() && is_plain(u) && is_plain(lambda) && !has_tangent(u);
   const auto lu = by_loops ? apply_on_loops(PoissonOperator(grid_), u, /*transposed=*/false) : laplacian(u, grid_);
-  const auto derivative = (lambda * lu).sum() * -step_.dt;
+  const auto derivative = total(lambda * lu) * -step_.dt;
   return {derivative.to(step_.nu.options())};
 }
 

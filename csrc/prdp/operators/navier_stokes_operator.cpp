@@ -2,6 +2,7 @@
 
 #include "prdp/kernels/navier_stokes.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/upwind_kernels.h"
 
 namespace prdp {
@@ -27,7 +28,7 @@ at::Tensor at_u2_points(const at::Tensor& u1, const Grid& grid) {
 at::Tensor without_mean_pressure(const at::Tensor& u) {
   if (u.size(-3) == 2) return u;
   const auto p = part(u, 2);
-  return at::cat({u.narrow(-3, 0, 2), p - p.mean({-2, -1}, /*keepdim=*/true)}, -3);
+  return at::cat({u.narrow(-3, 0, 2), p - mean_in_order(p, {-2, -1})}, -3);
 }
 
 NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec) : FlowOperator("NavierStokes", spec, 3) {

@@ -5,6 +5,7 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 
@@ -67,9 +68,9 @@ at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v
 
 at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) const {
   const auto channels = by_channel(v);
-  if (basis.is_constant()) return (channels - channels.mean({-1}, /*keepdim=*/true)).reshape_as(v);
+  if (basis.is_constant()) return (channels - mean_in_order(channels, {-1})).reshape_as(v);
   const auto q = orthonormal(basis, v.detach());
-  return (channels - at::matmul(at::matmul(channels, q.mT()), q)).reshape_as(v);
+  return without_parts(channels, q, q).reshape_as(v);
 }
 
 namespace {

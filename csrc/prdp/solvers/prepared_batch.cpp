@@ -2,6 +2,7 @@
 
 #include <ATen/TensorSubclassLikeUtils.h>
 
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/methods.h"
@@ -74,13 +75,13 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
     const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
     return scale_rhs(v, magnitude, usable, at::zeros_like(v));
   };
-  const auto dot = [&](const at::Tensor& v, const at::Tensor& w) { return per_sample((v * w).flatten(1).sum(1), b); };
   const auto y = of_order_one(x0.detach()).b;
   const auto [product, scale] = of_order_one(a.project(a.apply(a.project_solution(y))));
-  const auto product2 = dot(product, product);
-  const auto alpha = dot(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
+  const auto product2 = dot_in_order(product, product);
+  const auto alpha = dot_in_order(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
   const auto x = a.project_solution(y) * scale * alpha, r = b - alpha * product;
-  const auto better = dot(r, r).lt(dot(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
+  const auto better =
+      dot_in_order(r, r).lt(dot_in_order(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
   return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
           per_sample(y.flatten(1).ne(0).any(1), b)};
 }

@@ -2,6 +2,7 @@
 
 #include <cstdlib>
 
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
@@ -208,7 +209,7 @@ StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::
   const auto [scaled, scale] = scale_whole(b);
   scale_ = scale;
   rhs_ = a.project(scaled);
-  const auto b2 = rhs_.square().flatten(1).sum(1).to(at::kCPU, at::kDouble);
+  const auto b2 = dot_in_order(rhs_, rhs_).reshape({-1}).to(at::kCPU, at::kDouble);
   b2_.assign(b2.const_data_ptr<double>(), b2.const_data_ptr<double>() + b2.numel());
   if (takes_start(solver.method, x0)) {
     const auto made = make_start(a, rhs_, x0);

@@ -29,7 +29,6 @@ std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
 
 TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
     : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
-  for (int64_t d = 1; d < b_.dim(); ++d) all_but_batch_.push_back(d);
   in_loops_ = !recording_ && batch_loops::take(b_);
   b2_ = dot(b_, b_);
   negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "prdp/operators/operator.h"
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
@@ -68,9 +69,7 @@ class TensorSpace {
     xpby(x, beta, y);
     return dot(y, y);
   }
-  Scalar dot(const Vector& a, const Vector& b) const {
-    return in_loops_ ? batch_loops::dot(a, b) : (a * b).sum(all_but_batch_, true);
-  }
+  Scalar dot(const Vector& a, const Vector& b) const { return in_loops_ ? batch_loops::dot(a, b) : dot_in_order(a, b); }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     if (in_loops_ && !system_.a.leaks()) return batch_loops::descend(alpha, p, q, x, r, active_);
     x = keep_frozen(at::addcmul(x, alpha, p), x);
@@ -263,7 +262,6 @@ class TensorSpace {
   at::Tensor b_, b2_, diagonal_;
   at::Tensor start_, whole_b_;  // undefined: from zero
   States& states_;
-  std::vector<int64_t> all_but_batch_;
   std::vector<bool> active_;
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/diffusion.h"
 
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/stencil_of.h"
 
 namespace prdp {
@@ -51,7 +52,7 @@ DiffuseVjp diffuse_vjp(const FlowEquation& equation, const at::Tensor& cotangent
     const auto found = solve_vjp(a, of_system(cotangent), of_system(result), options, info);
     parts.push_back(found.b);
     if (!found.coefficients.defined()) continue;
-    const auto share = (found.coefficients * patterns[k]).sum() * equation.dt;
+    const auto share = total(found.coefficients * patterns[k]) * equation.dt;
     nu = nu.defined() ? nu + share : share;
   }
   return {parts.size() == 1 ? parts[0] : at::cat(parts, 1), nu};

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/projection.h"
 
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 #include "prdp/steppers/flow/projection_loops.h"
 #include "prdp/steppers/flow/stencil_of.h"
@@ -27,10 +28,9 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
   const auto& parts = box.fields(t.options()).closed_parts;
   if (!parts.defined()) return t;
   const auto flat = t.flatten(2);
-  if (parts.numel() == 0) return (flat - flat.mean(2, /*keepdim=*/true)).view_as(t);
+  if (parts.numel() == 0) return (flat - mean_in_order(flat, {-1})).view_as(t);
   const auto of_parts = parts.flatten(1);
-  const auto means = at::matmul(flat, of_parts.mT()) / of_parts.sum(1);
-  return (flat - at::matmul(means, of_parts)).view_as(t);
+  return without_parts(flat, of_parts / of_parts.sum(1, /*keepdim=*/true), of_parts).view_as(t);
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }

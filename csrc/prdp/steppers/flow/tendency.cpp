@@ -4,6 +4,7 @@
 
 #include <algorithm>
 
+#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 
@@ -163,7 +164,7 @@ TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, cons
   if (fields.friction.defined()) {
     const auto held = fields.friction * g;
     found.u = found.u - equation.nu * held;
-    found.nu = found.nu - (held * u).sum();
+    found.nu = found.nu - total(held * u);
   }
   return found;
 }
