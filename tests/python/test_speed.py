@@ -10,10 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import prdp_torch as prdp
 from benchmarks import measure, problems
-from prdp_torch import _C
+from prdp_torch import _C, operators
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,16 +47,39 @@ def ratio(name, method):
     return seconds["tensors"]["min"] / seconds["loops"]["min"]
 
 
-@pytest.fixture(scope="module")
-def ratios():
-    """Of one thread each, in a process of its own."""
-    code = "import json, test_speed as t; print(json.dumps([t.ratio(*case) for case in t.BOUNDS]))"
+def product_over_iteration():
+    """The time of a product on its own over that of an iteration of CG, which holds one."""
+    c = -torch.ones(1, 5, 1023, 1023)
+    c[:, 0] = 4.3
+    a, v = operators.Stencil(c, [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], "zero"), torch.randn(1, 1, 1023, 1023)
+
+    def solve(k):
+        prdp.linear_solve(a, v, prdp.CG(k, 0.0), backward="none", on_failure="return")
+
+    calls = {"product": lambda: a.apply(v), "few": lambda: solve(2), "many": lambda: solve(10)}
+    seconds = {name: s["min"] for name, s in measure.interleaved(calls, rounds=5, sample_seconds=0.0).items()}
+    return 8 * seconds["product"] / (seconds["many"] - seconds["few"])
+
+
+def in_one_thread(expression):
+    """Of this file, in a process of its own."""
+    code = f"import json, test_speed as t; print(json.dumps({expression}))"
     paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
-    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    return dict(zip(BOUNDS, json.loads(done.stdout), strict=True))
+    return json.loads(
+        subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
+    )
+
+
+@pytest.fixture(scope="module")
+def ratios():
+    return dict(zip(BOUNDS, in_one_thread("[t.ratio(*case) for case in t.BOUNDS]"), strict=True))
 
 
 @pytest.mark.parametrize("case", BOUNDS, ids="-".join)
 def test_the_loops_are_faster_than_plain_tensors(case, ratios):
     assert ratios[case] > BOUNDS[case], f"only {ratios[case]:.1f} times as fast as plain tensors"
+
+
+def test_a_product_of_a_stencil_takes_no_longer_than_two_iterations():
+    assert in_one_thread("t.product_over_iteration()") < 2

@@ -256,3 +256,26 @@ def test_repr():
         "Stencil(shape=(4, 6), offsets=[(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], "
         "boundary=('periodic', 'periodic'), tensors=[tensor(2, 5, 4, 6)])"
     )
+
+
+THREE = torch.tensor([4.3, -1.0, -1.5]).view(1, 3, 1).repeat(2, 1, 16)
+
+
+@pytest.mark.parametrize(("scale", "of_v"), [(1e-44, 1.0), (1e-30, 1.0), (1e-30, 1e-12), (1e30, 1e7)])
+def test_products_at_the_ends_of_the_range(scale, of_v):
+    c, v = THREE.clone(), of_v * torch.rand(2, 1, 16, generator=torch.Generator().manual_seed(0))
+    c[0] *= scale
+    found, expected = (operators.Stencil(t, [(0,), (-1,), (1,)], "zero").apply(v.to(t)) for t in (c, c.double()))
+    torch.testing.assert_close(found[0].double(), expected[0], rtol=1e-5, atol=2e-45)
+    torch.testing.assert_close(found[1].double(), expected[1], rtol=1e-6, atol=1e-6 * of_v)
+
+
+@pytest.mark.parametrize("where", [(0, 1, 3), (0, 1, 0), (0, 2, 15), (0, 0, 0)])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_coefficient_that_is_not_finite_leaves_no_number_of_its_sample(where, value):
+    """Also where it belongs to a neighbour beyond the end."""
+    c, v = THREE.clone(), torch.ones(2, 1, 16)
+    expected = operators.Stencil(c, [(0,), (-1,), (1,)], "zero").apply(v)[1]
+    c[where] = value
+    found = operators.Stencil(c, [(0,), (-1,), (1,)], "zero").apply(v)
+    assert found[0].isnan().all() and torch.equal(found[1], expected)

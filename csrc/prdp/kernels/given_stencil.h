@@ -1,4 +1,6 @@
 #pragma once
+#include <numeric>
+
 #include "prdp/kernels/stencil.h"
 
 namespace prdp::kernels {
@@ -66,6 +68,37 @@ struct GivenStencil {
   std::shared_ptr<const StencilPattern> pattern;
   bool transposed;
 
+  /// Whether each given offset leads to a neighbour of its own.
+  bool is_one_to_one() const {
+    auto places = pattern->places;
+    std::sort(places.begin(), places.end());
+    return places.front() >= 0 && std::adjacent_find(places.begin(), places.end()) == places.end();
+  }
+  /// out = A v on each channel of a sample, from the coefficients where they lie, if they are one to one. Every point
+  /// adds up its products in the order of the kernel.
+  void apply(int64_t s, int64_t channels, const T* v, T* out) const {
+    const auto& [nz, ny, nx] = pattern->grid.shape;
+    const int64_t points = nz * ny * nx;
+    std::vector<const T*> fields(pattern->offsets.size());
+    for (size_t given = 0; given < pattern->places.size(); ++given)
+      fields[pattern->places[given]] = coefficients + s * sample_stride + static_cast<int64_t>(given) * points;
+    std::vector<size_t> order(fields.size());
+    std::iota(order.begin(), order.end(), 0);
+    if (pattern->nearest) std::swap(order[0], order[1]);  // where its loop fuses the first two products and their sum
+    const std::vector<T> zeros(nx);
+    for (int64_t c = 0; c < channels; ++c)
+      for_each_run_of_rows(nz * ny, nx, [&](int64_t begin, int64_t end) {
+        for (int64_t r = begin; r < end; ++r) {
+          T* const row = out + c * points + r * nx;
+          std::fill_n(row, nx, T(0));
+          for (const bool wraps : {false, true})  // what leaves a periodic row is added last
+            if (!wraps || pattern->grid.periodic[2])
+              for (const size_t k : order)
+                if (fields[k]) add_to_row(pattern->offsets[k], fields[k], v + c * points, r, wraps, zeros.data(), row);
+        }
+      });
+  }
+
   /// Null where a coefficient is not finite.
   std::unique_ptr<Kernel<T>> make(int64_t s, int64_t channels) const {
     const auto& [nz, ny, nx] = pattern->grid.shape;
@@ -88,6 +121,25 @@ struct GivenStencil {
   }
 
  private:
+  /// The products of one coefficient in row r: with neighbours in their row or with those that leave it. Beyond the
+  /// grid there are zeros.
+  void add_to_row(const Offset& offset, const T* field, const T* v, int64_t r, bool wraps, const T* zeros,
+                  T* row) const {
+    const auto& [nz, ny, nx] = pattern->grid.shape;
+    const auto& periodic = pattern->grid.periodic;
+    const auto& loops = kernels::loops<T>();
+    const int64_t z = neighbour(r / ny, offset.along[0], nz, periodic[0]);
+    const int64_t y = neighbour(r % ny, offset.along[1], ny, periodic[1]), there = (z * ny + y) * nx;
+    const bool outside = z < 0 || y < 0;
+    if (outside && (transposed || wraps)) return;
+    if (outside) return loops.add_product(field + r * nx, zeros, row, nx);
+    const Run x = runs(offset.along[2], nx, periodic[2], /*transposed=*/true)[wraps ? 1 : 0];
+    loops.add_product(transposed ? field + there + x.from : field + r * nx + x.to, v + there + x.from, row + x.to,
+                      x.count);
+    if (transposed || periodic[2]) return;
+    loops.add_product(field + r * nx, zeros, row, x.to);
+    loops.add_product(field + r * nx + x.to + x.count, zeros, row + x.to + x.count, nx - x.to - x.count);
+  }
   /// The part of the key that tells the grid and the offsets, as they are in the matrix that is not transposed.
   FactorKeyMaker of_matrix() const {
     FactorKeyMaker key;

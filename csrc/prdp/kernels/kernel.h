@@ -132,6 +132,9 @@ struct KernelBatch {
   bool is_shared;
   /// Null where A is not finite. The kernel may refer to the memory that the batch was made of.
   std::function<std::unique_ptr<Kernel<T>>(int64_t sample)> make;
+  /// out = A v of one sample, both contiguous, for whoever needs a single product: nothing is made first, so nothing is
+  /// scaled. Empty where that saves nothing.
+  std::function<void(int64_t sample, const T* v, T* out)> product = nullptr;
 };
 
 /// The same in the dtype of the vectors.

@@ -21,6 +21,7 @@ constexpr Loops<T> table(const char* level) {
           scale<T>,
           scale_with_dots<T>,
           axpy<T>,
+          add_product<T>,
           xpby<T>,
           xpby_with_square<T>,
           descend<T>,

@@ -116,6 +116,8 @@ struct Loops {
   void (*scale_with_dots)(T factor, const T* x, const T* w, T* out, T* dots, int64_t n);
   /// y += alpha x; any n.
   void (*axpy)(T alpha, const T* x, T* y, int64_t n);
+  /// out += c∘v, entry by entry; any n.
+  void (*add_product)(const T* c, const T* v, T* out, int64_t n);
   /// y = x + beta y; and the same, returning ‖y‖².
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
   T (*xpby_with_square)(const T* x, T beta, T* y, int64_t n);

@@ -98,6 +98,11 @@ void axpy(T alpha, const T* __restrict x, T* __restrict y, int64_t n) {
 }
 
 template <class T>
+void add_product(const T* __restrict c, const T* __restrict v, T* __restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) out[i] += c[i] * v[i];
+}
+
+template <class T>
 void xpby(const T* x, T beta, T* y, int64_t n) {
   for (int64_t i = 0; i < n; i += kWidth<T>) store<T>(y + i, load(x + i) + beta * load(y + i));
 }

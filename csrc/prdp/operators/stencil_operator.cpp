@@ -241,7 +241,10 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
        pattern = std::make_shared<kernels::StencilPattern>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                          transposed};
-    return {c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};
+    kernels::KernelBatch<T> batch{c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};
+    if (given.is_one_to_one())
+      batch.product = [c, given, channels](int64_t s, const T* v, T* out) { given.apply(s, channels, v, out); };
+    return batch;
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
 }
