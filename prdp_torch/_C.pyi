@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -109,6 +109,10 @@ class LinearSchedule(Controller):
 def batched_axes(kind: str) -> list[int] | None:
     """
     The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 if it is shaped like a state. None if that is not known.
+    """
+def bytes_of_factorisations() -> int:
+    """
+    The memory of those that are kept for later solves.
     """
 def check_operator(kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], tensors: collections.abc.Sequence[torch.Tensor]) -> None:
     ...

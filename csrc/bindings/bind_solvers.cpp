@@ -218,6 +218,7 @@ void bind_solvers(py::module_& m) {
       py::call_guard<py::gil_scoped_release>(), py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
       py::arg("parameters"));
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
+  m.def("bytes_of_factorisations", &factor_cache::bytes_kept, "The memory of those that are kept for later solves.");
   m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");
   m.def(
       "solve_with_tensors",

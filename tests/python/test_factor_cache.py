@@ -118,6 +118,41 @@ def test_those_of_a_batch_of_matrices_are_kept_for_its_adjoint_solves():
     assert factorisations(lambda: [update(), update()]) == 3
 
 
+def update_of(n, matrices):
+    """Updates of a training, each of which solves with these matrices of n² cells and goes back through them."""
+    b, multigrid = torch.randn(1, 1, n, n).requires_grad_(), prdp.CG(0, preconditioner="multigrid")
+    c = torch.tensor([4.3, -1, -1, -1, -1]).view(1, 5, 1, 1).expand(1, 5, n, n).contiguous()
+
+    def update(first):
+        made = _C.count_factorisations()
+        a = [operators.Stencil((1 + 1e-3 * (first + k)) * c, FIVE, "zero") for k in range(matrices)]
+        u = [prdp.linear_solve(one, b, multigrid, on_failure="return")[0] for one in a]
+        torch.autograd.grad(sum(u).sum(), b)
+        return _C.count_factorisations() - made
+
+    return update
+
+
+def test_matrices_that_are_never_used_again_take_little_memory():
+    """A new one in each update: it is there for the adjoint solve, and soon gone."""
+    update = update_of(512, 1)
+    _C.clear_factorisations()
+    kept = []
+    for first in range(28):
+        assert update(first) == 1
+        kept.append(_C.bytes_of_factorisations())
+    assert kept[3] == 4 * kept[0] and max(kept) <= (64 << 20) + kept[0] < 28 * kept[0] / 2
+
+
+def test_matrices_that_are_used_again_late_stay():
+    """More of them in an update than are kept at first: from the second on each is made once."""
+    update = update_of(512, 16)
+    _C.clear_factorisations()
+    assert update(0) > 16
+    assert [update(16), update(16)] == [16, 0]
+    assert _C.bytes_of_factorisations() <= 512 << 20
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_symmetric_matrices_of_either_sign_and_indefinite_ones(sign):
     """Cholesky's factors serve definite matrices; an indefinite one needs pivoting."""

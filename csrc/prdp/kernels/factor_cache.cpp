@@ -1,11 +1,13 @@
 #include "prdp/kernels/factor_cache.h"
 
+#include <algorithm>
 #include <atomic>
 #include <bit>
 #include <list>
 #include <mutex>
 #include <typeindex>
 #include <unordered_map>
+#include <vector>
 
 namespace prdp::kernels {
 
@@ -72,52 +74,83 @@ struct HashOfName {
 };
 struct Entry {
   Name name;
-  Kept kept;
+  Kept kept;  // null once it has gone; its name stays a while
   int64_t bytes;
+  int64_t used_at;  // bytes_made then
 };
+using Entries = std::list<Entry>;  // the last used first
 
 std::mutex mutex;
 // Never destroyed: at the end of a process, memory of a device can no longer be freed.
-auto& entries = *new std::list<Entry>;  // the last used first
-auto& places = *new std::unordered_map<Name, std::list<Entry>::iterator, HashOfName>;
-int64_t bytes_of_all = 0;
+auto& entries = *new Entries;
+auto& names_of_gone = *new Entries;
+auto& places = *new std::unordered_map<Name, Entries::iterator, HashOfName>;
+int64_t bytes_of_all = 0, bytes_made = 0;
+constexpr int64_t kLeastReach = int64_t{1} << 26;
+int64_t reach = kLeastReach;
 std::atomic<int64_t> made = 0;
+
+/// Moves an entry of `entries` to the names of what has gone; what it kept goes with `gone`.
+void let_go(Entries::iterator entry, std::vector<Kept>& gone) {
+  bytes_of_all -= entry->bytes;
+  gone.push_back(std::move(entry->kept));
+  names_of_gone.splice(names_of_gone.begin(), entries, entry);
+}
+
+/// Frees what has not been used while so much else was made, or takes too much memory, and forgets the oldest names.
+void make_room(std::vector<Kept>& gone) {
+  while (!entries.empty() && (bytes_of_all > limit() || bytes_made - entries.back().used_at > reach))
+    let_go(std::prev(entries.end()), gone);
+  while (!names_of_gone.empty() && bytes_made - names_of_gone.back().used_at > limit()) {
+    places.erase(names_of_gone.back().name);
+    names_of_gone.pop_back();
+  }
+}
 
 }  // namespace
 
 int64_t limit() { return int64_t{1} << 29; }
+int64_t bytes_kept() {
+  const std::lock_guard lock(mutex);
+  return bytes_of_all;
+}
 
 Kept find(const kernels::FactorKey& key, const std::type_info& type) {
   const std::lock_guard lock(mutex);
   const auto place = places.find({key, type});
   if (place == places.end()) return nullptr;
-  entries.splice(entries.begin(), entries, place->second);
-  return entries.front().kept;
+  const auto entry = place->second;
+  reach = std::max(reach, std::min(limit(), 2 * (bytes_made - entry->used_at)));
+  if (!entry->kept) return nullptr;
+  entry->used_at = bytes_made;
+  entries.splice(entries.begin(), entries, entry);
+  return entry->kept;
 }
 
 void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes) {
-  std::list<Entry> gone;  // destroyed without the lock
+  std::vector<Kept> gone;  // destroyed without the lock
   const std::lock_guard lock(mutex);
   if (bytes > limit()) return;
-  const auto free = [&gone](std::list<Entry>::iterator entry) {
-    bytes_of_all -= entry->bytes;
-    places.erase(entry->name);
-    gone.splice(gone.begin(), entries, entry);
-  };
   const Name name{key, type};
-  if (const auto place = places.find(name); place != places.end()) free(place->second);  // another thread made it too
-  entries.push_front({name, std::move(kept), bytes});
-  places[name] = entries.begin();
+  if (const auto place = places.find(name); place != places.end()) {
+    if (place->second->kept) let_go(place->second, gone);  // another thread made it too
+    names_of_gone.erase(place->second);
+  }
+  bytes_made += bytes;
   bytes_of_all += bytes;
-  while (bytes_of_all > limit()) free(std::prev(entries.end()));
+  entries.push_front({name, std::move(kept), bytes, bytes_made});
+  places[name] = entries.begin();
+  make_room(gone);
 }
 
 void clear() {
-  std::list<Entry> gone;
+  Entries gone;
   const std::lock_guard lock(mutex);
   gone.swap(entries);
+  names_of_gone.clear();
   places.clear();
   bytes_of_all = 0;
+  reach = kLeastReach;
 }
 
 void count_one() { ++made; }

@@ -56,8 +56,9 @@ using Kept = std::shared_ptr<const void>;
 
 /// What is kept under this key and type, or null.
 Kept find(const kernels::FactorKey& key, const std::type_info& type);
-/// Keeps it. What was used least recently goes once all take more than limit() bytes; what is larger than that is not
-/// kept.
+/// Keeps it, if it is not larger than limit() bytes. What was used least recently goes once all take more than that, or
+/// once so much else was made since that nothing is likely to ask for it: twice as much as between any two uses of one
+/// of them so far, and 64 MiB at least. So a training with a new matrix in each update does not fill the limit.
 void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, int64_t bytes);
 /// Frees all of it.
 void clear();
@@ -65,6 +66,7 @@ void clear();
 int64_t count_made();
 void count_one();
 int64_t limit();
+int64_t bytes_kept();
 
 /// The F of the matrix with this key, from the cache or from make(). Any thread may call this.
 template <class F, class Make>
