@@ -144,8 +144,9 @@ def _diagonal(A: Operator, v: Tensor) -> Iterator[str]:
 
 def _gradients(A: Operator, v: Tensor, w: Tensor, generator: Generator) -> Iterator[str]:
     found = _C.product_rule(w, v, A.tensors, A.kind, A.shape, A.parameters)
+    null_spaces = 2 if A.kind.startswith("singular_") else 0  # which have no gradient
     for i, (t, gradient) in enumerate(zip(A.tensors, found, strict=True)):
-        if not t.is_floating_point():
+        if not t.is_floating_point() or i >= len(A.tensors) - null_spaces:
             continue
         eps = max(torch.finfo(v.dtype).eps, torch.finfo(t.dtype).eps)
         largest = t.abs().max().item() if t.numel() else 0.0

@@ -27,7 +27,7 @@ Number: TypeAlias = float | Tensor
 """A number, or a tensor with a single element."""
 
 NullSpace: TypeAlias = Literal["constant"] | Tensor | None
-"""What an operator maps to zero: the constant, or vectors (k, *shape)."""
+"""What an operator maps to zero: the constant, or vectors (k, *shape) or (k, channels, *shape)."""
 
 Report: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """What the compiled library reports of a solve, in the order of `SolveInfo`."""

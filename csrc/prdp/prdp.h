@@ -8,6 +8,7 @@
 #include "prdp/controller/tolerance_controller.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/implicit_step.h"

@@ -26,8 +26,9 @@ class Function(Operator):
         diagonal: `diagonal(*tensors)` returns the diagonal of A in a shape that broadcasts against the vectors.
             `Jacobi` and `preconditioner="diagonal"` need it.
         symmetric: whether A = Aᵀ. Then matvec is used for both.
-        nullspace, left_nullspace: as for `Stencil`; a vector has the shape of a channel of b (batch, channel, *shape),
-            or of b without its batch axis if b has two axes.
+        nullspace, left_nullspace: as for `Stencil`: vectors have the shape of a channel of b (batch, channel, *shape),
+            for each channel, or that of all its channels, such as a pressure alone among other fields. If b has two
+            axes, they have that of b without its batch axis.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
     the functions with each other. A `Function` cannot be created inside `torch.compile`.

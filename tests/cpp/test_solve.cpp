@@ -4,6 +4,7 @@
 #include "prdp/autograd/linear_solve.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/operator.h"
+#include "prdp/operators/singular_operator.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/threads/interruption.h"
 
@@ -176,6 +177,27 @@ TEST(Solve, EmptyBatchIsNoTrouble) {
   const auto result = prdp::solve(*a, at::zeros({0, 1, 20}), {{Method::kJacobi, 3, 1e-5}});
   EXPECT_EQ(result.u.size(0), 0);
   EXPECT_EQ(result.info.status.numel(), 0);
+}
+
+TEST(Solve, NullVectorsOfAllChannelsAreThoseOfAPressureAlone) {
+  // (2 u + ∂ᵀp, ∂u) on a periodic line, which forgets the mean of p.
+  const int64_t n = 8;
+  const auto products =
+      prdp::RegisteredProducts::make({.apply = [](const at::Tensor& v, const std::vector<at::Tensor>&) {
+        const auto u = v.select(1, 0), p = v.select(1, 1);
+        return at::stack({2 * u + at::roll(p, 1, 1) - p, at::roll(u, -1, 1) - u}, 1);
+      }});
+  const auto of_pressure = at::stack({at::zeros({n}, at::kDouble), at::ones({n}, at::kDouble)}).unsqueeze(0);
+  const auto a = prdp::with_null_space(products->spec({}), of_pressure);
+  auto b = prdp_test::random_field({2, n}, 3).view({3, 2, n});
+  b.select(1, 1) -= b.select(1, 1).mean(-1, /*keepdim=*/true);
+  for (const Solver& solver :
+       {Solver(prdp::GMRES{.restart = 20, .max_iter = 5, .rtol = 1e-12}), Solver(prdp::Direct{})}) {
+    const auto u = prdp::linear_solve(a, b, {solver}).u;
+    EXPECT_TRUE(at::allclose(products->products().apply(u, {}), b, 1e-9, 1e-9));
+    EXPECT_LT(u.select(1, 1).mean(-1).abs().max().item<double>(), 1e-12);
+    EXPECT_GT(u.select(1, 0).mean(-1).abs().max().item<double>(), 1e-3);
+  }
 }
 
 }  // namespace

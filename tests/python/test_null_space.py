@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import field, statuses
+from helpers import field, random, statuses
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -70,8 +72,8 @@ def test_solution_and_gradient_are_those_of_the_pseudo_inverse(kind, solver):
     assert (info.status > 0).all()
     u.backward(cotangent)  # has a mean, which no u changes
     inverse = np.linalg.pinv(dense_of(a, shape), rcond=1e-10)
-    for found, given, m in ((u, b, inverse), (b.grad, cotangent, inverse.T)):
-        expected = given.detach().flatten(1).numpy() @ m.T
+    for found, of, m in ((u, b, inverse), (b.grad, cotangent, inverse.T)):
+        expected = of.detach().flatten(1).numpy() @ m.T
         np.testing.assert_allclose(found.detach().flatten(1), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
@@ -165,6 +167,59 @@ def test_a_vector_that_is_none_is_refused():
         prdp.linear_solve(regular, field((5, 6)), prdp.CG(3))
 
 
+def pinv_of(a, shape):
+    return torch.from_numpy(np.linalg.pinv(dense_of(a, shape), rcond=1e-12))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    stretch=st.floats(1, 1e3), turned=st.booleans(), seed=st.integers(0, 10**6),
+    boundary=st.sampled_from(["flux", "periodic", ("flux", "periodic")]),
+)  # fmt: skip
+def test_diffusion_takes_its_own_null_space_however_stretched_its_cells_are(stretch, turned, boundary, seed):
+    shape, length = (6, 7), (1.0, stretch * 7 / 6)
+    if turned:
+        length = length[::-1]
+    kappa = torch.exp(torch.randn(1, *shape, dtype=F64, generator=torch.Generator().manual_seed(seed)))
+    a = operators.Diffusion(kappa, boundary=boundary, length=length)
+    b = field(shape, channels=1, seed=seed)
+    b = b - b.mean((-1, -2), keepdim=True)
+    expected = (b.flatten(1) @ pinv_of(a, (1, 1, *shape)).T).view_as(b)
+    u, _ = prdp.linear_solve(a, b, prdp.Direct())
+    torch.testing.assert_close(u, expected, rtol=0, atol=1e-8 * expected.abs().max().item())
+    in_single = operators.Diffusion(kappa.float(), boundary=boundary, length=length)
+    prdp.linear_solve(in_single, b.float(), prdp.CG(3))  # is not refused
+
+
+def wide_laplacian(v):
+    return 2 * v - v.roll(2, -1) - v.roll(-2, -1)
+
+
+@pytest.mark.parametrize("kind", ["stencil", "function"])
+def test_a_checkerboard_is_a_null_vector_of_differences_over_two_cells(kind):
+    n = 12
+    basis = torch.stack([torch.ones(n, dtype=F64), 1.0 - 2.0 * (torch.arange(n) % 2).to(F64)])
+    if kind == "stencil":
+        coefficients = torch.tensor([2.0, -1.0, -1.0], dtype=F64).reshape(1, 3, 1).expand(1, 3, n).contiguous()
+        a = operators.Stencil(coefficients, [(0,), (-2,), (2,)], "periodic", nullspace=basis)
+    else:
+        a = operators.Function(wide_laplacian, symmetric=True, nullspace=basis)
+    b = wide_laplacian(field((n,), channels=1))
+    u, info = prdp.linear_solve(a, b, prdp.CG(60, rtol=1e-11))
+    assert (info.status > 0).all()
+    torch.testing.assert_close(u.flatten(1), b.flatten(1) @ pinv_of(a, (1, 1, n)).T, rtol=1e-8, atol=1e-8)
+
+
+def test_no_sample_is_judged_by_the_size_of_another():
+    """Of the first, the constant is no null vector; the second is 1e12 times as large."""
+    c = torch.tensor([2.0, -1.0, -1.0], dtype=F64).reshape(1, 3, 1).expand(2, 3, 8).clone()
+    c[1] *= 1e12
+    c[0, 0] += 1e-3
+    a = operators.Stencil(c, [(0,), (-1,), (1,)], "periodic", nullspace="constant")
+    with pytest.raises(ValueError, match=r"vector 0 of nullspace is not in the null space of A.*entries of 0\.001"):
+        prdp.linear_solve(a, field((8,)), prdp.CG(3))
+
+
 def test_arguments_are_checked():
     m = graph_laplacian()
     b = torch.ones(1, 7, dtype=F64)
@@ -225,3 +280,50 @@ def test_functions_stay_at_the_floor_as_stencils_do():
         left = (b - matvec(u)).double()
         assert statuses(info) == ["MAX_ITER"] * 2
         assert (left.flatten(1).norm(dim=1) < 5e-5 * b.double().flatten(1).norm(dim=1)).all()
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")
+@pytest.mark.parametrize("on_failure", ["raise", "zero_grad"])
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("kind", ["stencil", "matrix", "function", "diffusion", "left and right"])
+def test_forward_mode_takes_a_b_out_of_the_range_as_reverse_mode_does(kind, backward, on_failure):
+    """The entries of b are moved one by one, out of the range of A; what is outside does not reach u."""
+    if kind == "diffusion":
+        kappa = torch.exp(torch.randn(1, 4, 5, dtype=F64, generator=torch.Generator().manual_seed(1)))
+        a, shape = operators.Diffusion(kappa, boundary="flux"), (1, 1, 4, 5)
+    elif kind == "left and right":
+        q, p = (torch.linalg.qr(random(8, 8, seed=seed))[0] for seed in (1, 2))
+        m = q @ torch.diag(torch.tensor([3.0, 2.0, 1.5, 1.2, 1.0, 0.8, 0.0, 0.0], dtype=F64)) @ p.T
+        a, shape = operators.Matrix(m, nullspace=p[:, 6:].T, left_nullspace=q[:, 6:].T), (1, 8)
+    elif kind == "stencil":
+        a, shape = periodic_stencil((3, 4)), (1, 1, 3, 4)
+    else:
+        a, shape = SYMMETRIC[kind]()
+        shape = (1, *shape[1:])
+    solver = prdp.GMRES(4, rtol=1e-12, restart=30) if kind == "left and right" else prdp.CG(60, rtol=1e-12)
+    b = a_range(a, random(*shape), shape)
+
+    def solution(b):
+        return prdp.linear_solve(a, b, solver, backward=backward, on_failure=on_failure)[0]
+
+    n = b.numel()
+    forward = torch.func.jacfwd(solution)(b).reshape(n, n)
+    reverse = torch.func.jacrev(solution)(b).reshape(n, n)
+    rounding = 1e-8 * reverse.abs().max().item()
+    torch.testing.assert_close(forward, reverse, rtol=0, atol=rounding)
+    if backward == "implicit":
+        torch.testing.assert_close(forward, pinv_of(a, shape), rtol=0, atol=rounding)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")
+def test_forward_mode_takes_the_mean_off_a_pressure():
+    winds = 0.1 * field((4, 5), 1, 1, channels=3)
+    a, b = operators.NavierStokes(winds, 1e-2, 0.1), random(1, 3, 4, 5)
+    b[:, 2] -= b[:, 2].mean()
+
+    def solution(b):
+        return prdp.linear_solve(a, b, prdp.GMRES(3, rtol=1e-12, restart=60))[0]
+
+    tangent = torch.func.jvp(solution, (b,), (torch.ones_like(b),))[1]
+    expected = torch.ones(60, dtype=F64) @ pinv_of(a, (1, 3, 4, 5)).T
+    torch.testing.assert_close(tangent.flatten(), expected, rtol=1e-7, atol=1e-7)

@@ -26,10 +26,12 @@ at::Tensor tangent_rhs(const at::Tensor& b, const at::Tensor& u, const OperatorS
 }
 
 at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, SolveOptions options) {
+  const auto spec = primal(a);
   auto rhs = tangent_rhs(b, solved.u, a);
   rhs = without_lost(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
-  const auto tangent = linear_solve(primal(a), rhs, options);
+  // No u has a part in the null space, whatever b has.
+  const auto tangent = linear_solve(spec, make_operator(spec)->project(rhs), options);
   return options.on_failure == OnFailure::kZeroGrad ? without_lost(tangent.u, tangent.info.status, options.on_failure)
                                                     : tangent.u;
 }

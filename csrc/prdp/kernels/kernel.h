@@ -91,7 +91,8 @@ class Kernel {
   virtual void leave_source() {}
   /// Of memory, about.
   virtual int64_t bytes() const {
-    const int64_t vectors = 1 + (null_space_ ? null_space_->count() + left_null_space_->count() : 0);
+    const int64_t vectors =
+        1 + (null_space_ ? null_space_->count_in_one_field() + left_null_space_->count_in_one_field() : 0);
     return vectors * length() * static_cast<int64_t>(sizeof(T));
   }
 

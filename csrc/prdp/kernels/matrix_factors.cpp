@@ -33,7 +33,7 @@ class DenseFactors final : public Factors<T> {
       Eigen::MatrixXd m = Eigen::Map<const RowMajor>(a.values(), n_, n_).template cast<double>();
       if (!a.null_space()) return std::make_shared<DenseLU>(m);
       const double size = m.cwiseAbs().maxCoeff() * static_cast<double>(n_);
-      auto right = a.null_space()->contiguous(), left = a.left_null_space()->contiguous();
+      auto right = a.null_space()->in_one_field(), left = a.left_null_space()->in_one_field();
       if (transposed_) right.swap(left);
       for (size_t k = 0; k < right.size(); ++k) m += size * vector(left[k]) * vector(right[k]).transpose();
       return std::make_shared<DenseLU>(m);

@@ -1,5 +1,6 @@
 #pragma once
 #include <cmath>
+#include <numeric>
 #include <vector>
 
 #include "prdp/kernels/layout.h"
@@ -7,47 +8,73 @@
 
 namespace prdp::kernels {
 
-/// Vectors that A maps to zero, the same in each of some fields of a sample.
+/// Vectors that A maps to zero: the same in each of some fields of a sample, or vectors of several fields together.
 template <class T>
 class NullSpace {
  public:
-  /// `basis`: orthonormal vectors of one field, contiguous, one after the other. The fields are those from `first` on.
-  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<std::vector<double>>& basis)
-      : layout_(layout), first_(first), fields_(fields) {
+  /// `basis`: orthonormal vectors of `span` fields, contiguous, one after the other. The fields are those from `first`
+  /// on.
+  NullSpace(const Layout<T>& layout, int64_t first, int64_t fields, const std::vector<std::vector<double>>& basis,
+            int64_t span = 1)
+      : layout_(layout), first_(first), fields_(fields), span_(span) {
+    const int64_t points = layout.rows * layout.nx;
     for (const auto& q : basis) {
       const std::vector<T> v(q.begin(), q.end());
-      basis_.emplace_back(layout.plane, T(0));
-      loops<T>().copy_rows(T(1), v.data(), layout.nx, basis_.back().data(), layout.row, layout.rows, layout.nx);
+      basis_.emplace_back(span * layout.plane, T(0));
+      for (int64_t f = 0; f < span; ++f)
+        loops<T>().copy_rows(T(1), v.data() + f * points, layout.nx, basis_.back().data() + f * layout.plane,
+                             layout.row, layout.rows, layout.nx);
     }
   }
   /// Takes off the part of v in the null space; returns the norm of that part.
   T project(T* v) const {
     double part2 = 0;
-    for (int64_t f = first_; f < first_ + fields_; ++f)
+    const int64_t length = span_ * layout_.plane;
+    for (int64_t f = first_; f < first_ + fields_; f += span_)
       for (const auto& q : basis_) {
         T* field = v + f * layout_.plane;
-        const T along = vectors_.dot(q.data(), field, layout_.plane);
-        vectors_.axpy(-along, q.data(), field, layout_.plane);
+        const T along = vectors_.dot(q.data(), field, length);
+        vectors_.axpy(-along, q.data(), field, length);
         part2 += static_cast<double>(along) * static_cast<double>(along);
       }
     return static_cast<T>(std::sqrt(part2));
   }
 
-  int64_t count() const { return std::ssize(basis_); }
-  /// The basis as contiguous vectors of one field.
-  std::vector<std::vector<double>> contiguous() const {
+  /// Orthonormal vectors of one field, contiguous, that span what the basis has there: null vectors of an operator that
+  /// is the same for every field.
+  std::vector<std::vector<double>> in_one_field() const {
     std::vector<std::vector<double>> all;
-    for (const auto& q : basis_) {
-      std::vector<T> v(layout_.rows * layout_.nx);
-      loops<T>().copy_rows(T(1), q.data(), layout_.row, v.data(), layout_.nx, layout_.rows, layout_.nx);
-      all.emplace_back(v.begin(), v.end());
-    }
+    for (const auto& q : basis_)
+      for (int64_t f = 0; f < span_; ++f) {
+        std::vector<T> part(layout_.rows * layout_.nx);
+        loops<T>().copy_rows(T(1), q.data() + f * layout_.plane, layout_.row, part.data(), layout_.nx, layout_.rows,
+                             layout_.nx);
+        std::vector<double> v(part.begin(), part.end());
+        if (span_ == 1 || is_new(all, v)) all.push_back(std::move(v));
+      }
     return all;
   }
+  int64_t count_in_one_field() const { return span_ == 1 ? std::ssize(basis_) : std::ssize(in_one_field()); }
 
  private:
+  /// Makes v orthonormal to the others; false if it depends on them.
+  static bool is_new(const std::vector<std::vector<double>>& others, std::vector<double>& v) {
+    const auto dot = [](const auto& a, const auto& b) {
+      return std::inner_product(a.begin(), a.end(), b.begin(), 0.0);
+    };
+    for (int pass = 0; pass < 2; ++pass)
+      for (const auto& q : others) {
+        const double along = dot(q, v);
+        for (size_t i = 0; i < v.size(); ++i) v[i] -= along * q[i];
+      }
+    const double left = std::sqrt(dot(v, v));
+    for (auto& x : v) x /= left;
+    constexpr double independent = 1e-5;  // of vectors whose norm is one in all fields, in any dtype
+    return left > independent;
+  }
+
   Layout<T> layout_;
-  int64_t first_, fields_;
+  int64_t first_, fields_, span_;
   std::vector<std::vector<T>> basis_;
   WholeVectors<T> vectors_;
 };

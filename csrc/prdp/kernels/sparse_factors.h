@@ -1,5 +1,6 @@
 #pragma once
 #include <Eigen/Sparse>
+#include <algorithm>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -21,7 +22,10 @@ std::vector<int64_t> pivots(std::vector<std::vector<double>> vectors);
 template <class T>
 Pins pins_of(const std::optional<NullSpace<T>>& right, const std::optional<NullSpace<T>>& left, int64_t first_entry) {
   if (!right) return {};
-  Pins pins{pivots(right->contiguous()), pivots(left->contiguous())};
+  Pins pins{pivots(right->in_one_field()), pivots(left->in_one_field())};
+  const auto count = std::min(pins.unknowns.size(), pins.equations.size());
+  pins.unknowns.resize(count);
+  pins.equations.resize(count);
   for (auto& i : pins.unknowns) i += first_entry;
   for (auto& i : pins.equations) i += first_entry;
   return pins;

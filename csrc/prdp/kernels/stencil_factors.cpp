@@ -35,7 +35,8 @@ class StencilFactors final : public Factors<T> {
     if (a.pattern().nearest && a.rows() == 1 && !kernel.null_space()) thomas_.emplace(a);
     if (thomas_ && thomas_->is_dominant()) return;
     thomas_.reset();
-    if (a.rows() > 1) axes_ = fast_diagonalisation(a, key, kernel.null_space() ? kernel.null_space()->count() : 0);
+    if (a.rows() > 1)
+      axes_ = fast_diagonalisation(a, key, kernel.null_space() ? kernel.null_space()->count_in_one_field() : 0);
     if (axes_) return;
     sparse_ = sparse_factors(a, key, transposed, layout_.rows * layout_.nx,
                              pins_of(kernel.null_space(), kernel.left_null_space(), 0));

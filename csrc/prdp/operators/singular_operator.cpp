@@ -32,6 +32,16 @@ at::Tensor orthonormalised(const at::Tensor& rows, const char* title) {
 
 }  // namespace
 
+OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right, std::optional<at::Tensor> left) {
+  const auto basis = [&](const at::Tensor& t) {
+    return t.defined() ? t : at::empty({0}, a.tensors.empty() ? at::TensorOptions() : a.tensors.back().options());
+  };
+  const auto given = basis(right);
+  a.tensors.insert(a.tensors.end(), {given, left ? basis(*left) : given});
+  a.kind = "singular_" + a.kind;
+  return a;
+}
+
 SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title)
     : a_(std::move(a)),
       spec_(spec),
@@ -48,14 +58,26 @@ void SingularOperator::check_vector(const at::Tensor& b) const {
   for (const auto* side : {&right_, &left_}) {
     if (side->is_constant()) continue;
     const auto& basis = side->given;
-    const auto channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
-    TORCH_CHECK_VALUE(basis.dim() >= 2 && basis.sym_sizes().slice(1) == channel, title_,
-                      ": a null space must have shape (k, *shape) with the shape of a channel, ", channel, ", got ",
-                      basis.sym_sizes());
+    const auto vector = b.sym_sizes().slice(1), channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
+    const auto given = basis.sym_sizes().slice(basis.dim() > 0);
+    TORCH_CHECK_VALUE(basis.dim() >= 2 && (given == channel || given == vector), title_,
+                      ": a null space must have shape (k, *shape) with the shape of a channel, ", channel,
+                      b.dim() < 3 ? "" : ", or (k, channels, *shape)", ", got ", basis.sym_sizes());
     TORCH_CHECK_VALUE(basis.device() == b.device(), title_, ": its null space is on ", basis.device(),
                       " but the vector is on ", b.device());
   }
+  TORCH_CHECK_VALUE(right_.spans_channels(b) == left_.spans_channels(b), title_,
+                    ": nullspace and left_nullspace must both be of one channel, or both of all channels");
 }
+
+namespace {
+
+/// v with the unknowns that a vector of a basis has as its last axis: those of a channel, or of all.
+at::Tensor by_vector(const at::Tensor& v, bool spans_channels) {
+  return spans_channels ? v.flatten(1).unsqueeze(1) : by_channel(v);
+}
+
+}  // namespace
 
 at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v) const {
   if (basis.is_constant()) {
@@ -67,31 +89,58 @@ at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v
 }
 
 at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) const {
-  const auto channels = by_channel(v);
-  if (basis.is_constant()) return (channels - mean_in_order(channels, {-1})).reshape_as(v);
+  const auto parts = by_vector(v, basis.spans_channels(v));
+  if (basis.is_constant()) return (parts - mean_in_order(parts, {-1})).reshape_as(v);
   const auto q = orthonormal(basis, v.detach());
-  return without_parts(channels, q, q).reshape_as(v);
+  return without_parts(parts, q, q).reshape_as(v);
 }
 
 namespace {
 
-double largest(const at::Tensor& v) { return v.abs().amax().item<double>(); }
-/// A vector like b with q, (n,), in each channel.
-at::Tensor as_vector(const at::Tensor& q, const at::Tensor& b) { return q.expand_as(by_channel(b)).reshape_as(b); }
+/// max |v| of each sample.
+at::Tensor largest_of_samples(const at::Tensor& v) { return v.abs().flatten(1).amax(1).to(at::kDouble); }
+
+/// ‖A‖∞ of each sample or of all, by the CPU loops where there are some.
+at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
+  const auto kernels = b.is_cpu() ? a.kernels(b, /*transposed=*/false) : nullptr;
+  if (!kernels) return a.norm().to(b.device(), at::kDouble);
+  return std::visit(
+      [&](const auto& batch) {
+        std::vector<double> norms;
+        for (int64_t s = 0; s < (batch.is_shared ? 1 : b.size(0)); ++s) {
+          const auto kernel = batch.make(s);
+          norms.push_back(kernel ? kernel->norm() / static_cast<double>(kernel->factor())
+                                 : std::numeric_limits<double>::infinity());
+        }
+        return at::tensor(norms, at::kDouble);
+      },
+      kernels->of_dtype);
+}
+
+/// How large an entry of a product with numbers up to one can be, of each sample or of all: ‖A‖∞ or, of a Function,
+/// whose norm is not known, what the product with signs without a pattern has.
+at::Tensor size_of_products(const Operator& a, const at::Tensor& b) {
+  const auto norm = norm_of(a, b);
+  if (!norm.eq(0).all().item<bool>()) return norm;
+  const auto numbers = at::arange(1, b.numel() / b.size(0) + 1, b.options().dtype(at::kDouble));
+  const auto signs = numbers.square().sin().sign().to(b.scalar_type());
+  return largest_of_samples(apply_on_loops(a, signs.view_as(b[0]).expand_as(b).contiguous(), /*transposed=*/false));
+}
 
 }  // namespace
 
-void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude,
+void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, const at::Tensor& size,
                                                bool transposed) const {
   const auto q = orthonormal(basis, b);
   const double rounding = 200.0 * epsilon_of(b);
   for (int64_t k = 0; k < q.size(0); ++k) {
-    const auto v = q[k] / q[k].abs().amax();
-    const double left = largest(apply_on_loops(*a_, as_vector(v, b), transposed));
-    if (!std::isfinite(left) || !std::isfinite(magnitude)) return;  // said of each sample by its status
-    TORCH_CHECK_VALUE(left <= rounding * magnitude, title_, ": vector ", k, " of ",
+    const auto v = (q[k] / q[k].abs().amax()).expand_as(by_vector(b, basis.spans_channels(b))).reshape_as(b);
+    const auto left = largest_of_samples(apply_on_loops(*a_, v, transposed));
+    const auto wrong = (left > rounding * size).logical_and(left.isfinite());  // what is not finite, its status says
+    TORCH_CHECK_VALUE(!wrong.any().item<bool>(), title_, ": vector ", k, " of ",
                       transposed ? "left_nullspace" : "nullspace", " is not in the null space of ",
-                      transposed ? "Aᵀ" : "A", ": a product has entries of ", left, " where ‖v‖∞ is 1",
+                      transposed ? "Aᵀ" : "A", ": a product has entries of ",
+                      left.masked_fill(wrong.logical_not(), 0.0).amax().item<double>(), " where ‖v‖∞ is 1",
                       transposed ? "; give left_nullspace= if A is not symmetric" : "");
   }
 }
@@ -136,9 +185,9 @@ void SingularOperator::check_null_spaces(const at::Tensor& b) const {
   static thread_local Remembered checked;
   if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
   const at::NoGradGuard no_grad;
-  const double magnitude = largest(apply_on_loops(*a_, alternating(b), /*transposed=*/false));
-  check_is_mapped_to_zero(right_, b, magnitude, /*transposed=*/false);
-  check_is_mapped_to_zero(left_, b, magnitude, /*transposed=*/true);
+  const auto size = size_of_products(*a_, b);
+  check_is_mapped_to_zero(right_, b, size, /*transposed=*/false);
+  check_is_mapped_to_zero(left_, b, size, /*transposed=*/true);
   checked.take(spec_, b.scalar_type());
 }
 
@@ -190,7 +239,7 @@ std::optional<kernels::FactorKey> SingularOperator::key(bool transposed) const {
   if (!regular) return std::nullopt;
   kernels::FactorKeyMaker key;
   key.add(*regular).add(int64_t{transposed});
-  for (const auto* basis : {&right_, &left_}) add_numbers(key, basis->given);
+  for (const auto* basis : {&right_, &left_}) add_numbers(key.add(basis->given.dim()), basis->given);
   return key.key();
 }
 
@@ -206,13 +255,15 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
   };
   const auto right = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? left_ : right_));
   const auto left = std::make_shared<const std::vector<std::vector<double>>>(rows_of(transposed ? right_ : left_));
+  const bool spans_channels = right_.spans_channels(b);
   return std::visit(
       [&]<class T>(const kernels::KernelBatch<T>& batch) {
-        const auto make = [regular, &batch, right, left](int64_t s) {
+        const auto make = [regular, &batch, right, left, spans_channels](int64_t s) {
           auto a = batch.make(s);
           if (!a) return a;
           const auto& layout = a->layout();
-          a->set_null_spaces({layout, 0, layout.planes, *right}, {layout, 0, layout.planes, *left});
+          const int64_t fields = layout.planes, span = spans_channels ? fields : 1;
+          a->set_null_spaces({layout, 0, fields, *right, span}, {layout, 0, fields, *left, span});
           a->set_leaks();
           return a;
         };

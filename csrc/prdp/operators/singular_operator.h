@@ -5,15 +5,21 @@
 
 namespace prdp {
 
+/// `a`, a stencil, a matrix or a function, with its null spaces named: vectors that it maps to zero, (k, *shape) for
+/// each channel of a vector (batch, channel, *shape) or (k, channels, *shape) for all channels together, and as many
+/// that Aᵀ maps to zero. Undefined: the constant of each channel; `left` is `right` if it is left out, as of a
+/// symmetric A.
+OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right = {}, std::optional<at::Tensor> left = {});
+
 /// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
 /// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
 /// solutions onto those of least norm. Its kind is "singular_" and that of A; its tensors are those of A and the two
 /// bases.
 class SingularOperator final : public Operator {
  public:
-  /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are (k, *shape), the same for
-  /// every sample, and for every channel that a vector (batch, channel, *shape) has; empty for the constant vector.
-  /// Raises ValueError if they do not fit each other.
+  /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are the same for every sample:
+  /// (k, *shape) for each channel of a vector (batch, channel, *shape), (k, channels, *shape) for all channels
+  /// together, or empty for the constant of each channel. Raises ValueError if they do not fit each other.
   SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title);
 
   void check_vector(const at::Tensor& b) const override;
@@ -43,18 +49,20 @@ class SingularOperator final : public Operator {
 
  private:
   struct Basis {
-    at::Tensor given;  // (k, *shape), or empty for the constant vector
+    at::Tensor given;  // (k, *shape), (k, channels, *shape), or empty for the constant of each channel
     mutable at::Tensor orthonormal;  // (k, n) in double, once it has been asked for
 
     bool is_constant() const { return given.sym_numel() == 0; }
+    /// Whether its vectors are of all channels that v has.
+    bool spans_channels(const at::Tensor& v) const { return !is_constant() && v.dim() > 2 && given.dim() == v.dim(); }
     c10::SymInt count() const { return is_constant() ? c10::SymInt(1) : given.sym_size(0); }
   };
 
-  /// An orthonormal basis (k, n) in the dtype of v, with n the unknowns of a channel.
+  /// An orthonormal basis (k, n) in the dtype of v, with n the unknowns of a channel, or of all.
   at::Tensor orthonormal(const Basis& basis, const at::Tensor& v) const;
   at::Tensor without(const Basis& basis, const at::Tensor& v) const;
-  /// `magnitude`: how large an entry of a product can be.
-  void check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, double magnitude, bool transposed) const;
+  /// `size`: how large an entry of a product can be, of each sample or of all.
+  void check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, const at::Tensor& size, bool transposed) const;
 
   std::unique_ptr<Operator> a_;
   OperatorSpec spec_;
