@@ -197,8 +197,9 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
         if (worse[i]) states[i].status = SolveStatus::kBreakdown;
     }
   }
-  auto again = space.map(
-      states, [&](const SampleState& s) { return lost(s) || (!track && s.status == SolveStatus::kBreakdown); });
+  auto again = space.map(states, [&](const SampleState& s) {
+    return lost(s) || left_rounding_of_b(s) || (!track && s.status == SolveStatus::kBreakdown);
+  });
   for (size_t i = 0; i < states.size(); ++i) again[i] = again[i] || worse[i];
   if (!any(again)) return;
 
@@ -221,7 +222,7 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   };
   remake([&](size_t i) {
     if (useless[i]) return int64_t{0};
-    return lost(first[i]) || worse[i] ? watched[i].best : watched[i].iterations;
+    return lost(first[i]) || left_rounding_of_b(first[i]) || worse[i] ? watched[i].best : watched[i].iterations;
   });
   for (size_t i = 0; i < states.size(); ++i)
     worse[i] = (worse[i] || (again[i] && lost(first[i]))) && is_above_b(space, states[i]);

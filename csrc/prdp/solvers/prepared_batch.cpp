@@ -47,15 +47,16 @@ ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::
   return {at::where(rows, b, others) * scale, scale};
 }
 
-/// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol; all.
+/// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol and than
+/// their `rounding`; all.
 struct OutsideRange {
   at::Tensor some, all;
 };
-OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, double rtol) {
+OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, double rtol, const at::Tensor& rounding) {
   const double bound = b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
   const auto norm = [](const at::Tensor& t) { return t.flatten(1).norm(2, 1); };
   const auto whole = norm(b);
-  return {norm(b - projected) > bound * whole, norm(projected) <= epsilon_of(b) * whole};
+  return {norm(b - projected) > at::maximum(bound * whole, rounding), norm(projected) <= epsilon_of(b) * whole};
 }
 
 }  // namespace
@@ -65,6 +66,12 @@ at::Tensor largest_magnitude(const at::Tensor& b) {
   const bool has_memory = !at::isTensorSubclassLike(plain);
   return has_memory && batch_loops::take(plain) ? batch_loops::largest_magnitude(plain)
                                                 : plain.abs().flatten(1).amax(1);
+}
+
+at::Tensor rounding_of_least_numbers(const at::Tensor& scale, const at::Tensor& b) {
+  const double least = b.scalar_type() == at::kFloat ? std::numeric_limits<float>::denorm_min()
+                                                     : std::numeric_limits<double>::denorm_min();
+  return scale.flatten() * least * std::sqrt(static_cast<double>(b.numel() / std::max<int64_t>(b.size(0), 1)));
 }
 
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
@@ -95,17 +102,22 @@ PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveR
   auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, others);
   const auto rhs = a.project(whole);
+  const auto rounding = rounding_of_least_numbers(scale, b);
   auto inconsistent = at::zeros_like(takes_part);
   if (a.leaks()) {
-    const auto outside = outside_range(whole, rhs, solver.rtol);
+    const auto outside = outside_range(whole, rhs, solver.rtol, rounding);
     const auto hopeless = outside.all.logical_and(takes_part);
     inconsistent = outside.some.logical_and(takes_part);
-    status = status.masked_fill(hopeless, static_cast<int64_t>(SolveStatus::kInconsistent));
+    const auto mark = [&](const at::Tensor& rows, SolveStatus why) {
+      status = status.masked_fill(rows, static_cast<int64_t>(why));
+    };
+    mark(hopeless, SolveStatus::kStagnated);  // all of b is its rounding
+    mark(hopeless.logical_and(inconsistent), SolveStatus::kInconsistent);
     takes_part = takes_part.logical_and(hopeless.logical_not());
   }
   TensorStart start;
   if (starts) start = make_start(a, rhs, at::where(per_sample(takes_part, b), request.x0, at::zeros_like(rhs)));
-  return {status, takes_part, inconsistent, rhs, scale, start};
+  return {status, takes_part, inconsistent, rhs, scale, rounding, start};
 }
 
 }  // namespace prdp

@@ -15,6 +15,7 @@ struct PreparedBatch {
   at::Tensor takes_part;    // (batch,): those
   at::Tensor inconsistent;  // (batch,): those of them whose b lies outside the range of A, beyond rtol
   at::Tensor rhs, scale;    // b, scaled and within the range of A; its scale, (batch, 1, …)
+  at::Tensor rounding;      // (batch,): rounding_of_least_numbers() in the scaled b
   TensorStart start;
 };
 
@@ -28,5 +29,7 @@ bool takes_start(Method method, const at::Tensor& x0);
 TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0);
 /// max |b| of each sample, (batch,).
 at::Tensor largest_magnitude(const at::Tensor& b);
+/// rounding_of_least_numbers() of vectors like b that were multiplied by `scale`, (batch,).
+at::Tensor rounding_of_least_numbers(const at::Tensor& scale, const at::Tensor& b);
 
 }  // namespace prdp

@@ -24,7 +24,7 @@ template <class T>
 void hand_out_zeros(const SampleBatch<T>& batch, int64_t s, SolveStatus status, double residual,
                     int64_t applications = 0) {
   std::fill_n(batch.u + s * batch.unknowns, batch.unknowns, T(0));
-  report(batch, s, status, 0, residual, applications);
+  report(batch, s, status, 0, residual, applications, status == SolveStatus::kStagnated ? residual : 0.0);
 }
 
 template <class T>
@@ -74,19 +74,23 @@ void solve_sample(const kernels::Kernel<T>& a, SampleSpace<T>& space, Iteration&
   const T* b = batch.b + s * batch.unknowns;
   const T scale = kernels::power_of_two_scale(kernels::largest_magnitude(b, batch.unknowns));
   a.layout().load(b, scale, space.b());
+  const double rounding = rounding_of_least_numbers<T>(scale, batch.unknowns);
   bool consistent = true;
   if (const auto& null_space = a.left_null_space()) {
     const T whole = std::sqrt(space.dot(space.b(), space.b()));
-    consistent = null_space->project(space.b()) <= consistency_bound<T>(batch.solver.rtol) * whole;
+    const T outside = null_space->project(space.b());
+    consistent = outside <= std::max(consistency_bound<T>(batch.solver.rtol) * whole, static_cast<T>(rounding));
     if (std::sqrt(space.dot(space.b(), space.b())) <= std::numeric_limits<T>::epsilon() * whole)
-      return hand_out_zeros(batch, s, SolveStatus::kInconsistent, 1.0);
+      return hand_out_zeros(batch, s, consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent, 1.0);
   }
   space.begin(state);
   state.b2 = space.b2();
+  state.rounding2 = rounding * rounding;
   if (const T* x0 = start_of(batch, s)) space.start_from(x0);
   iterate(space, method, states, batch.solver.rtol, batch.guarded);
   space.add_start(method.x);
   space.project_solution(method.x);
+  if (batch.guarded) excuse_rounding_of_b(state);
   if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
   // With A' = factor A and b' = scale b, u = factor/scale u'.
   const T largest = store_scaled(a, std::ilogb(a.factor()) - std::ilogb(scale), method.x, batch.u + s * batch.unknowns);

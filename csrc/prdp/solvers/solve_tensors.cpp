@@ -40,14 +40,15 @@ SolveInfo info_of(const std::vector<SampleState>& states, const at::TensorOption
 void tell(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2) {
   const auto& applied = batch.start.applied;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b2.scalar_type()); };
-  const auto host =
-      at::stack({number(batch.status), number(b2), applied.defined() ? number(applied) : at::zeros_like(number(b2))})
-          .to(at::kCPU, at::kDouble);
+  const auto host = at::stack({number(batch.status), number(b2),
+                               applied.defined() ? number(applied) : at::zeros_like(number(b2)), batch.rounding})
+                        .to(at::kCPU, at::kDouble);
   const auto rows = host.accessor<double, 2>();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     s.status = static_cast<SolveStatus>(static_cast<int64_t>(rows[0][i]));
     s.b2 = rows[1][i];
+    s.rounding2 = rows[3][i] * rows[3][i];
     if (s.status == SolveStatus::kMaxIter) {
       s.applications += static_cast<int64_t>(rows[2][i]);
       continue;
@@ -55,7 +56,8 @@ void tell(std::vector<SampleState>& states, const PreparedBatch& batch, const at
     s.active = false;
     s.settled = true;
     s.iterations = s.applications = 0;
-    if (s.status == SolveStatus::kInconsistent) s.residual2 = s.b2 = 1.0;
+    if (s.status == SolveStatus::kInconsistent || s.status == SolveStatus::kStagnated) s.residual2 = s.b2 = 1.0;
+    if (s.status == SolveStatus::kStagnated) s.floor2 = 1.0;
   }
 }
 
@@ -143,6 +145,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto rows = host.accessor<double, 2>();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
+    if (request.guarded) excuse_rounding_of_b(s);
     if (rows[0][i] != 0.0 && !is_failure(s.status)) s.status = SolveStatus::kInconsistent;
     if (is_refused(s.status) || !(rows[1][i] > 0.0)) continue;
     if (u.scalar_type() == at::kFloat) note_underflow<float>(s, rows[2][i]);

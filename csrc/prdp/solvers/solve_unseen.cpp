@@ -63,6 +63,12 @@ UnseenReport report_unseen(const PreparedBatch& batch, const UnseenEnd& end, con
 
   auto gone = above.logical_or(residual2.isfinite().logical_not()).logical_and(open);
   if (end.falls.defined()) gone = gone.logical_and(is(SolveStatus::kMaxIter).logical_not());
+  // As excuse_rounding_of_b(), of the residual of what is handed out.
+  const auto left2 = at::where(gone, end.b2, residual2);
+  const auto excused = (is(SolveStatus::kDiverged) | is(SolveStatus::kBreakdown))
+                           .logical_and(open)
+                           .logical_and(left2 <= batch.rounding.to(at::kDouble).square());
+  set(excused, SolveStatus::kStagnated);
   const auto before = largest_magnitude(end.u) * open;
   auto u = at::where(per_sample(open.logical_and(gone.logical_not()), b), end.u / batch.scale, at::zeros_like(b));
   const auto largest = largest_magnitude(u);
@@ -88,7 +94,9 @@ UnseenReport report_unseen(const PreparedBatch& batch, const UnseenEnd& end, con
       at::where(is(SolveStatus::kConverged), 0.0,
                 at::where(status <= code(SolveStatus::kNonfiniteInput), std::numeric_limits<double>::infinity(), 1.0));
   const auto residual = at::where(open, at::where(gone, 1.0, relative(residual2)), of_settled);
-  const auto floor = floor_of(at::where(underflows.logical_and(open), relative(lost2), 0.0), status);
+  const auto all_is_rounding = batch.status.eq(code(SolveStatus::kStagnated)).logical_or(excused);
+  const auto floor = floor_of(
+      at::where(underflows.logical_and(open), relative(lost2), at::where(all_is_rounding, residual, 0.0)), status);
   const auto counted = open.logical_and(gone.logical_not());
   return {{u.contiguous(), {counted * end.iterations, residual, status, (applications + for_energy) * open, floor}},
           gone};

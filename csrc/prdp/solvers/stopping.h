@@ -29,6 +29,7 @@ struct SampleState {
   double fallen2 = std::numeric_limits<double>::infinity();  // the residual then
   double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
+  double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
 
   void note(double fresh2) {
     residual2 = fresh2;
@@ -59,6 +60,21 @@ inline constexpr double kDivergenceBound = 1e13;
 template <class T>
 T consistency_bound(double rtol) {
   return static_cast<T>(std::max(rtol, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon())));
+}
+
+/// The norm of what rounding to the least numbers of the dtype can leave in a vector of so many unknowns that was
+/// multiplied by `scale`: one of them in each, as twice a half.
+template <class T>
+double rounding_of_least_numbers(double scale, int64_t unknowns) {
+  return static_cast<double>(std::numeric_limits<T>::denorm_min()) * scale * std::sqrt(static_cast<double>(unknowns));
+}
+
+/// What A cannot reach of b, as nobody named its null space, is no failure where the rounding of b may be the cause.
+inline void excuse_rounding_of_b(SampleState& s) {
+  const bool failed = s.status == SolveStatus::kDiverged || s.status == SolveStatus::kBreakdown;
+  if (!failed || !(s.residual2 <= s.rounding2)) return;
+  s.status = SolveStatus::kStagnated;
+  s.floor2 = s.residual2;
 }
 
 /// Where u, of this largest entry, consists of the smallest numbers of its dtype, its residual is their rounding.
@@ -111,6 +127,11 @@ inline bool is_within(double residual2, double rtol, double b2) { return residua
 /// The iterates have run away: the last one is of no use.
 inline bool lost(const SampleState& s) {
   return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
+}
+
+/// It had come to the rounding of b and went on, and has lost that again.
+inline bool left_rounding_of_b(const SampleState& s) {
+  return s.best2 > 0.0 && s.best2 <= s.rounding2 && s.residual2 > 4.0 * s.rounding2;
 }
 
 /// The true residual no longer follows the method's own: a second false claim, after the method has

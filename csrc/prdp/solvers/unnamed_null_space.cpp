@@ -8,6 +8,7 @@
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/prepared_batch.h"
 
 namespace prdp {
 
@@ -20,12 +21,15 @@ at::Tensor norm_of_samples(const at::Tensor& v) {
   return unit.squeeze(1) * (rows / unit).norm(2, 1);
 }
 
-/// The share of each sample of v that is constant in a channel, (batch,) in double.
+/// The share of each sample of v that is constant in a channel, (batch,) in double; 0 where it may be the rounding of v
+/// to the least numbers of its dtype.
 at::Tensor constant_shares(const at::Tensor& v) {
-  const auto channels = by_channel(v);
+  const auto scale = power_of_two_scale(largest_magnitude(v));  // squares of small numbers are zero
+  const auto channels = by_channel(v * per_sample(scale, v));
   const auto sums = channels.sum(-1, /*keepdim=*/false, at::kDouble).view({v.size(0), -1}).norm(2, 1);
-  const auto whole = at::linalg_vector_norm(v.flatten(1), 2, 1, /*keepdim=*/false, at::kDouble);
-  return sums / (whole * std::sqrt(static_cast<double>(channels.size(-1))));
+  const auto whole = at::linalg_vector_norm(channels.flatten(1), 2, 1, /*keepdim=*/false, at::kDouble);
+  const auto part = sums / std::sqrt(static_cast<double>(channels.size(-1)));
+  return at::where(part <= rounding_of_least_numbers(scale, v), 0.0, part / whole);
 }
 
 double residual_of_sample(const at::Tensor& residuals, int64_t sample) {

@@ -1,6 +1,13 @@
 #include "prdp/steppers/flow/projection.h"
 
+#include <ATen/TensorSubclassLikeUtils.h>
+
+#include <limits>
+
+#include "prdp/operators/singular_operator.h"
 #include "prdp/operators/sums_in_order.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/prepared_batch.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 #include "prdp/steppers/flow/projection_loops.h"
 #include "prdp/steppers/flow/stencil_of.h"
@@ -18,9 +25,7 @@ OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const So
   const auto& fields = box.fields(u.options());
   auto a = stencil_of(box, fields.pressure);
   if (options.solver.method != Method::kDirect || !fields.closed_parts.defined()) return a;
-  a.kind = "singular_stencil";
-  a.tensors.insert(a.tensors.end(), 2, fields.closed_parts);
-  return a;
+  return with_null_space(std::move(a), fields.closed_parts);
 }
 
 /// Takes off the mean of each closed part of the fluid: differences of pressures have none, but for rounding.
@@ -31,6 +36,16 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
   if (parts.numel() == 0) return (flat - mean_in_order(flat, {-1})).view_as(t);
   const auto of_parts = parts.flatten(1);
   return without_parts(flat, of_parts / of_parts.sum(1, /*keepdim=*/true), of_parts).view_as(t);
+}
+
+/// Divergences that the dtype has no normal numbers for are rounding, and nothing to do: they are zero to the solve,
+/// which knows no null space and could not tell their mean from what rounding leaves of it.
+at::Tensor without_least_numbers(const at::Tensor& b) {
+  const double normal =
+      b.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
+  const auto rows = largest_magnitude(b) < normal;
+  if (b.is_cpu() && !at::isTensorSubclassLike(b) && !rows.any().item<bool>()) return b;
+  return b.masked_fill(per_sample(rows, b), 0.0);
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }
@@ -66,7 +81,7 @@ at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double facto
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
-  const auto b = without_means(box, flow_divergence(box, u, -scale_of(box)));
+  const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of(box))));
   const auto phi = without_means(box, solve(pressure_operator(box, u, options), b, options, info));
   return {add_gradient(box, u, phi, -1.0, box.fields(u.options()).free), phi};
 }
@@ -76,7 +91,7 @@ at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at
   const auto& fields = box.fields(cotangent.options());
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
   if (of_potential.defined()) phi_bar = phi_bar + masked(of_potential, fields.cells);
-  phi_bar = without_means(box, phi_bar);
+  phi_bar = without_least_numbers(without_means(box, phi_bar));
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
   return add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of(box), {});
