@@ -234,10 +234,12 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
 }
 
 at::Tensor FunctionOperator::norm() const {
+  auto norm = at::scalar_tensor(0.0, at::kDouble);
   for (const auto& t : tensors_)
-    if (at::isFloatingType(t.scalar_type()) && !t.detach().isfinite().all().item<bool>())
-      return at::scalar_tensor(std::numeric_limits<double>::quiet_NaN(), at::kDouble);
-  return at::scalar_tensor(0.0, at::kDouble);
+    if (at::isFloatingType(t.scalar_type()))
+      norm = norm.to(t.device())
+                 .masked_fill(t.detach().isfinite().all().logical_not(), std::numeric_limits<double>::quiet_NaN());
+  return norm;
 }
 
 at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {

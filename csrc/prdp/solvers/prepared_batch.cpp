@@ -83,14 +83,25 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
     return scale_rhs(v, magnitude, usable, at::zeros_like(v));
   };
   const auto y = of_order_one(x0.detach()).b;
-  const auto [product, scale] = of_order_one(a.project(a.apply(a.project_solution(y))));
+  auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
+  auto z = a.project_solution(y);
+  if (a.leaks()) {
+    takes_product =
+        takes_product.logical_and(leaves_rounding(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
+    z = at::where(takes_product, z, at::zeros_like(z));
+  }
+  const auto [product, scale] = of_order_one(a.project(a.apply(z)));
   const auto product2 = dot_in_order(product, product);
   const auto alpha = dot_in_order(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
-  const auto x = a.project_solution(y) * scale * alpha, r = b - alpha * product;
-  const auto better =
-      dot_in_order(r, r).lt(dot_in_order(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
-  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(),
-          per_sample(y.flatten(1).ne(0).any(1), b)};
+  const auto x = z * scale * alpha, r = b - alpha * product;
+  auto better = dot_in_order(r, r).lt(dot_in_order(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
+  if (a.may_be_singular()) {
+    const auto norm = per_sample(a.norm().detach().reshape({-1}).to(b.options()).nan_to_num(0.0), b);
+    const auto size = norm * (scale * alpha).abs() * dot_in_order(z, z).sqrt();
+    const auto b2 = dot_in_order(b, b), left2 = dot_in_order(r, r);
+    better = better & (left2.le(0.25 * b2) | outdoes_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
+  }
+  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(), takes_product};
 }
 
 PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request,

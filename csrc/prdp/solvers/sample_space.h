@@ -44,13 +44,18 @@ class SampleSpace {
     if (const auto& space = system_.a().null_space()) space->project(v);
   }
   /// Starts the sample from α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better
-  /// than zero. From here on b() is the residual of the start, and what the method looks for is added to it.
+  /// than zero, or A x0 is rounding. From here on b() is the residual of the start, and what the method looks for is
+  /// added to it.
   void start_from(const T* x0) {
     const T magnitude = kernels::largest_magnitude(x0, unknowns());
     if (magnitude == T(0)) return;
     Vector x = start(), product = scratch(), r = whole_b();
     layout().load(x0, kernels::power_of_two_scale(magnitude), x);
-    project_solution(x);
+    if (system_.a().null_space()) {
+      const T whole2 = dot(x, x);
+      project_solution(x);
+      if (leaves_rounding(dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
+    }
     apply(x, product);
     project(product);
     const T largest = vectors_.largest_magnitude(product, length());
@@ -64,6 +69,8 @@ class SampleSpace {
       vectors_.scale(alpha, x, x, length());
       const T left2 = dot(r, r);
       started_ = left2 < b2_ && std::isfinite(vectors_.largest_magnitude(x, length()));
+      if (started_ && left2 > b2_ / 4)  // less is no rounding's doing
+        started_ = outdoes_rounding<double>(b2_, left2, epsilon() * system_.a().norm() * std::sqrt(dot(x, x)));
       if (started_) {
         std::swap_ranges(b(), b() + length(), r);
         b2_ = left2;

@@ -77,6 +77,20 @@ inline void excuse_rounding_of_b(SampleState& s) {
   s.floor2 = s.residual2;
 }
 
+/// Whether of a start nothing but rounding is left once its part in the null space is taken off; by the squares of the
+/// norms then and before.
+template <class Number>
+auto leaves_rounding(const Number& left2, const Number& whole2, double epsilon) {
+  return left2 <= whole2 * (64.0 * epsilon * (64.0 * epsilon));
+}
+/// Whether what a start takes off b, by the squares of the norms before and then, is more than the rounding of its
+/// product, ε ‖A‖ ‖x‖: a start that A maps to zero, or nearly so, is large and worse than none.
+template <class Number>
+auto outdoes_rounding(const Number& b2, const Number& left2, const Number& rounding) {
+  using std::sqrt;
+  return sqrt(b2) - sqrt(left2) > 4.0 * rounding;
+}
+
 /// Where u, of this largest entry, consists of the smallest numbers of its dtype, its residual is their rounding.
 template <class T>
 void note_underflow(SampleState& s, double largest) {
