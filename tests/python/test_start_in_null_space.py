@@ -30,12 +30,20 @@ def laplacian(v):
     return 2 * v - v.roll(1, -1) - v.roll(-1, -1)
 
 
+def rough(dtype):
+    """-∂(κ ∂v) on a ring, by sums that leave rounding of a constant."""
+    face = (0.5 + torch.rand(40, dtype=F64, generator=torch.Generator().manual_seed(7))).to(dtype)
+    centre = face + face.roll(1, -1)
+    return lambda v: centre * v - face * v.roll(-1, -1) - face.roll(1, -1) * v.roll(1, -1)
+
+
 KINDS = {
     "diffusion": lambda dtype: (diffusion((12, 14), 1, dtype), (1, 12, 14)),
     "stencil": lambda dtype: (periodic_stencil((12, 14), dtype=dtype), (1, 12, 14)),
     "function": lambda dtype: (operators.Function(laplacian, symmetric=True, nullspace="constant"), (1, 40)),
     "matrix": lambda dtype: (operators.Matrix(graph_laplacian(dtype), nullspace="constant"), (7,)),
     "csr": lambda dtype: (operators.Matrix(graph_laplacian(dtype).to_sparse_csr(), nullspace="constant"), (7,)),
+    "function, not named": lambda dtype: (operators.Function(rough(dtype), symmetric=True), (1, 40)),
     "stencil, not named": lambda dtype: (insulated(16, dtype), (1, 16, 16)),
 }
 SOLVERS = {
@@ -57,7 +65,7 @@ def same(found, expected):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_constant_is_no_start(kind, name, dtype):
     a, shape = KINDS[kind](dtype)
-    if name == "cg, diagonal" and kind == "function":
+    if name == "cg, diagonal" and kind.startswith("function"):
         pytest.skip("its diagonal is not known")
     b = mean_free(3, *shape, dtype=dtype)
     expected = prdp.linear_solve(a, b, SOLVERS[name])

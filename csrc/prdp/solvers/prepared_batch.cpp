@@ -96,10 +96,16 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   const auto x = z * scale * alpha, r = b - alpha * product;
   auto better = dot_in_order(r, r).lt(dot_in_order(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
   if (a.may_be_singular()) {
-    const auto norm = per_sample(a.norm().detach().reshape({-1}).to(b.options()).nan_to_num(0.0), b);
-    const auto size = norm * (scale * alpha).abs() * dot_in_order(z, z).sqrt();
     const auto b2 = dot_in_order(b, b), left2 = dot_in_order(r, r);
-    better = better & (left2.le(0.25 * b2) | outdoes_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
+    const auto much = left2.le(0.25 * b2);
+    auto norm = per_sample(a.norm().detach().reshape({-1}).to(b.options()).nan_to_num(0.0), b);
+    const bool may_read = b.is_cpu() && !at::isTensorSubclassLike(b);
+    if (may_read && !norm.any().item<bool>() && !much.all().item<bool>()) {  // not known of a Function
+      const auto of_b = a.apply(b.detach());
+      norm = (dot_in_order(of_b, of_b) / b2).sqrt().nan_to_num(0.0);
+    }
+    const auto size = norm * (scale * alpha).abs() * dot_in_order(z, z).sqrt();
+    better = better & (much | outdoes_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
   }
   return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(), takes_product};
 }
