@@ -49,6 +49,13 @@ def test_a_constant_part_of_b_raises(method, n, dtype):
         prdp.linear_solve(insulated(n, dtype), point(n, dtype), solver)
 
 
+@pytest.mark.parametrize("dtype, scale", [(torch.float32, 1e-35), (torch.float64, 1e-200), (torch.float64, 1e-300)])
+def test_so_does_one_whose_squares_underflow(dtype, scale):
+    b = scale * point(16, dtype)
+    with pytest.raises(torch.linalg.LinAlgError, match='INCONSISTENT.*give nullspace="constant"'):
+        prdp.linear_solve(insulated(16, dtype), b, METHODS["gmres"](500, 1e-6))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_constant_part_of_a_cotangent_raises(method, dtype):
