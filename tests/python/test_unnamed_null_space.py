@@ -52,7 +52,7 @@ def test_a_constant_part_of_b_raises(method, n, dtype):
 @pytest.mark.parametrize("dtype, scale", [(torch.float32, 1e-35), (torch.float64, 1e-200), (torch.float64, 1e-300)])
 def test_so_does_one_whose_squares_underflow(dtype, scale):
     b = scale * point(16, dtype)
-    with pytest.raises(torch.linalg.LinAlgError, match='INCONSISTENT.*give nullspace="constant"'):
+    with pytest.raises(torch.linalg.LinAlgError, match=r'INCONSISTENT.*give nullspace="constant"'):
         prdp.linear_solve(insulated(16, dtype), b, METHODS["gmres"](500, 1e-6))
 
 
