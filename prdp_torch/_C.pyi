@@ -106,7 +106,7 @@ class LinearSchedule(Controller):
     @property
     def settings(self) -> dict:
         ...
-def batched_axes(kind: str) -> list[int] | None:
+def batched_axes(kind: str, axes: int, tensors: int) -> list[int] | None:
     """
     The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 if it is shaped like a state. None if that is not known.
     """

@@ -44,10 +44,9 @@ def _fold(
     tensors: list[Tensor], mapped: list[bool], kind: str, axes: int, size: int, batch: int
 ) -> list[Tensor] | None:
     """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
-    batched_axes = _C.batched_axes(kind)
-    if batched_axes is None:  # a Function: unknown which of its tensors have a batch axis
+    dims = _C.batched_axes(kind, axes, len(tensors))
+    if dims is None:  # a Function: unknown which of its tensors have a batch axis
         return None if tensors else []
-    dims = [axes + 2 if n < 0 else n for n in batched_axes]
     folded = []
     for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
         if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from operator import is_
 from typing import Unpack
 
 import torch
@@ -51,7 +52,13 @@ class ImplicitStep(Stepper):
             raise TypeError(f"{who}: rhs must be a function of u or None, got {rhs!r}; write solver={rhs!r}")
         super().__init__(solver, backward, **options)
         if isinstance(operator, (operators.Operator, Tensor)):
-            operator = ConstantOperator(as_operator(who, "operator", operator))
+            operator = as_operator(who, "operator", operator)
+            if isinstance(operator, operators.Matrix) and operator.is_sparse_parameter:
+                raise ValueError(
+                    f"{who}: torch cannot copy a sparse Parameter, nor train it by Adam; "
+                    "give operators.Matrix.csr(crow, col, values, size) with a Parameter as values"
+                )
+            operator = ConstantOperator(operator)
         if not callable(operator):
             raise TypeError(f"{who}: operator must be a function of u or an operator, got {operator!r}")
         if rhs is not None and not callable(rhs):
@@ -69,26 +76,30 @@ class ImplicitStep(Stepper):
 
 
 class ConstantOperator(torch_private.HearsOfMoves):
-    """One operator for all u. Its tensors move, save and train as those of a module do; a number given as
-    nu stays one."""
+    """One operator for all u. The tensors that it was made of are those of this module, under the names of its
+    arguments: they move, save and train with it. A number given as nu stays one."""
 
     def __init__(self, operator: operators.Operator) -> None:
         super().__init__()
         self._operator = copy.copy(operator)
-        for i, tensor in enumerate(operator.tensors):
+        for name, tensor in zip(operator.names, operator.tensors, strict=True):
+            if name is None or name in self._buffers:
+                continue
             if isinstance(tensor, torch.nn.Parameter):
-                self.register_parameter(f"tensor{i}", tensor)
-            elif tensor.dim() > 0 or tensor.requires_grad:
-                self.register_buffer(f"tensor{i}", tensor)
-        self.moved()
+                self.register_parameter(name, tensor)
+            else:
+                self.register_buffer(name, tensor)
 
     def forward(self, u: Tensor) -> operators.Operator:
-        return self._operator
+        tensors = self._tensors()
+        if all(map(is_, tensors, self._operator.tensors)):
+            return self._operator
+        return self._operator.of(tensors)  # others for this call, such as those of torch.func.functional_call
 
-    def moved(self) -> None:
-        """Take the tensors as the module has them now."""
-        held = {
-            **dict(self.named_parameters(recurse=False, remove_duplicate=False)),
-            **dict(self.named_buffers(recurse=False, remove_duplicate=False)),
-        }
-        self._operator.tensors = [held.get(f"tensor{i}", t) for i, t in enumerate(self._operator.tensors)]
+    def _moved(self, move: Callable[[Tensor], Tensor]) -> None:
+        """Keep the tensors that the module has now."""
+        self._operator.tensors = self._tensors()
+
+    def _tensors(self) -> list[Tensor]:
+        made_of = zip(self._operator.names, self._operator.tensors, strict=True)
+        return [tensor if name is None else getattr(self, name) for name, tensor in made_of]

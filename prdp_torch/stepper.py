@@ -4,6 +4,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Mapping
+from operator import is_
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
+from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
@@ -52,7 +54,7 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-class Stepper(torch.nn.Module):
+class Stepper(torch_private.HearsOfMoves):
     """The base of all steppers. A stepper maps a state u to the next one by solving A(u) u_next = b(u).
 
     States are (batch, channel, *shape) in float32 or float64, with any strides. Gradients are computed as
@@ -146,6 +148,15 @@ class Stepper(torch.nn.Module):
                     raise AttributeError(f"{type(self).__name__}: {meant}")
             super().__setattr__(name, value)
 
+    def _moved(self, move: Callable[[Tensor], Tensor]) -> None:
+        """A preconditioner goes with the step. It is no state: it changes how fast a solve is, not what it solves."""
+        inverse = self.preconditioner
+        if isinstance(inverse, operators.Operator):
+            with torch.no_grad():
+                tensors = [move(t) for t in inverse.tensors]
+            if not all(map(is_, tensors, inverse.tensors)):
+                self.preconditioner = inverse.of(tensors)
+
     def _check_settings(self, **changed: Any) -> None:
         """Raise ValueError or TypeError unless the solver and the options fit together with what is changed."""
         settings = {name: getattr(self, name) for name in SETTINGS} | changed
@@ -178,6 +189,7 @@ class Stepper(torch.nn.Module):
             _check.dense(type(self).__name__, "u", u)
             if _check.whole("rollout", "steps", steps) < 0:
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
+        u = full_precision(u)
         logs = AdjointLogs(0 if compiling else steps)
         states, reports = [u], []
         for step in range(steps):
@@ -216,15 +228,17 @@ class Stepper(torch.nn.Module):
         compiling = torch.compiler.is_compiling()
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
+        u = full_precision(u)
         a = as_operator(who, "operator(u)", self.operator(u))
         b = self.rhs(u)
         if not compiling:
             _check.dense(who, "rhs(u)", b)
-            if b.shape != u.shape or b.dtype != u.dtype:
-                raise ValueError(
-                    f"{who}: rhs must return the shape and dtype of the state, {tuple(u.shape)} in {u.dtype}, "
-                    f"got {tuple(b.shape)} in {b.dtype}"
-                )
+        b = full_precision(b)
+        if not compiling and (b.shape != u.shape or b.dtype != u.dtype):
+            raise ValueError(
+                f"{who}: rhs must return the shape and dtype of the state, {tuple(u.shape)} in {u.dtype}, "
+                f"got {tuple(b.shape)} in {b.dtype}"
+            )
         x0 = u if self.start == "state" else None
         if not compiling:
             found: Solution | None = _C.linear_solve(

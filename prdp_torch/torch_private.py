@@ -48,10 +48,10 @@ class HearsOfMoves(torch.nn.Module):
     """A module that is told when `to`, `half` and the like have given it new tensors: they all call `_apply`, and
     modules have no public hook for that."""
 
-    def moved(self) -> None:
-        """Called when this module has new tensors."""
+    def _moved(self, move: Callable[[Tensor], Tensor]) -> None:
+        """Called when this module has new tensors, with what made them of the old ones."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.moved()
+        self._moved(fn)
         return self

@@ -1,3 +1,5 @@
+#include <torch/csrc/Exceptions.h>
+
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/kernels/factor_cache.h"
@@ -133,15 +135,17 @@ void bind_solvers(py::module_& m) {
            py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
            py::arg("product_rule"))
       .def_property_readonly("number", &RegisteredProducts::number);
-  m.def(
-      "batched_axes", [](const std::string& kind) { return operator_kind(kind).batched_axes; }, py::arg("kind"),
-      "The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 "
-      "if it is shaped like a state. None if that is not known.");
+  m.def("batched_axes", &batched_axes, py::arg("kind"), py::arg("axes"), py::arg("tensors"),
+        "The number of axes of each of so many tensors of an operator where it has one for the batch, on a grid of so "
+        "many axes: 0 if all samples share it. None if that is not known.");
   m.def(
       "check_operator",
       [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
          std::vector<at::Tensor> tensors) {
-        make_operator(spec(kind, shape, parameters, tensors))->check_parameters();
+        HANDLE_TH_ERRORS  // hands warnings to Python's
+            make_operator(spec(kind, shape, parameters, tensors))
+                ->check_parameters();
+        END_HANDLE_TH_ERRORS_PYBIND
       },
       py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
   m.def(

@@ -3,8 +3,9 @@
 import functools
 import inspect
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
@@ -17,27 +18,36 @@ DESCRIPTION = ("kind", "shape", "parameters", "tensors")
 
 
 class Operator:
-    """The base of all operators. `kind`, `shape`, `parameters` and `tensors` describe it to the compiled library."""
+    """The base of all operators. `kind`, `shape`, `parameters` and `tensors` describe it to the compiled library.
+
+    The tensors are those that its user gave, and `names` their arguments; a number has no name."""
 
     kind: str
     shape: list[int]
     parameters: list[float]
     tensors: list[Tensor]
+    names: list[str | None]
 
     def __init__(
         self,
         shape: list[int],
         parameters: list[float],
-        tensors: Iterable[Tensor],
+        given: Mapping[str, Number],
         null_spaces: tuple[Tensor, ...] = (),
     ) -> None:
+        who = type(self).__name__
         self.shape = shape
         self.parameters = parameters
-        self.tensors = [full_precision(t) for t in (*tensors, *null_spaces)]
+        self.names = [name if isinstance(t, Tensor) else None for name, t in given.items()]
+        self.tensors = [real_tensor(who, name, t) for name, t in given.items()]
         if null_spaces:
             self.kind = "singular_" + self.kind
+            self.tensors += null_spaces
+            self.names += _names_of(*null_spaces)
+        # A Parameter is trained, so it stays what it is; the ops take it for float32 too.
+        self.tensors = [t if isinstance(t, torch.nn.Parameter) else full_precision(t) for t in self.tensors]
         if not torch.compiler.is_compiling():
-            _C.check_operator(self.kind, self.shape, self.parameters, self.tensors)
+            _C.check_operator(self.kind, self.shape, self.parameters, [full_precision(t) for t in self.tensors])
 
     if not TYPE_CHECKING:
 
@@ -50,6 +60,13 @@ class Operator:
     def __repr__(self) -> str:
         tensors = ", ".join(f"{t:.4g}" if t.dim() == 0 else f"tensor{tuple(t.shape)}" for t in self.tensors)
         return f"{type(self).__name__}(shape={tuple(self.shape)}, parameters={self.parameters}, tensors=[{tensors}])"
+
+    def of(self, tensors: Iterable[Tensor]) -> Self:
+        """The same operator, made of other tensors."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        other.tensors = list(tensors)
+        return other
 
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v has the shape of a right-hand side."""
@@ -78,10 +95,9 @@ class Operator:
         return math.prod(self.shape)
 
     def _check_dense_fits(self, dtype: torch.dtype) -> None:
-        axes = _C.batched_axes(self.kind)
+        axes = _C.batched_axes(self.kind, len(self.shape), len(self.tensors))
         if axes is None:  # a Function, whose vectors may be of any length
             return
-        axes = [len(self.shape) + 2 if n < 0 else n for n in axes]
         batch = max((t.shape[0] for t, n in zip(self.tensors, axes, strict=True) if t.dim() == n > 0), default=1)
         n, there = self._unknowns(), _C.physical_memory()
         needed = 2 * batch * n * n * dtype.itemsize  # the columns, and the matrix
@@ -112,14 +128,27 @@ def full_precision(t: Tensor) -> Tensor:
     return t.float() if low else t
 
 
+def without_autocast(t: Tensor) -> AbstractContextManager[object]:
+    """Within it, torch's operations on the device of t compute in the dtypes that they are given."""
+    device = t.device.type
+    on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
+    return torch.autocast(device, enabled=False) if on else nullcontext()
+
+
 def null_spaces_of(who: str, right: NullSpace, left: NullSpace, like: Tensor | None) -> tuple[Tensor, ...]:
     """The two bases for the compiled library, an empty one for "constant"; none without a null space."""
     if right is None and left is None:
         return ()
     if right is None:
         raise ValueError(f"{who}: left_nullspace= stands beside nullspace=, which is missing")
-    left = right if left is None else left
-    return _basis(who, "nullspace", right, like), _basis(who, "left_nullspace", left, like)
+    basis = _basis(who, "nullspace", right, like)
+    return basis, basis if left is None or left is right else _basis(who, "left_nullspace", left, like)
+
+
+def _names_of(right: Tensor, left: Tensor) -> list[str | None]:
+    """The names of two bases; "constant" has none."""
+    names = ["nullspace", "nullspace" if left is right else "left_nullspace"]
+    return [name if basis.numel() > 0 else None for name, basis in zip(names, (right, left), strict=True)]
 
 
 def _basis(who: str, name: str, value: NullSpace, like: Tensor | None) -> Tensor:

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from prdp_torch import _check
-from prdp_torch.operators.base import Operator, real_tensor
+from prdp_torch.operators.base import Operator
 from prdp_torch.types import Length, Number, Shape
 
 
@@ -19,7 +19,7 @@ class Poisson(Operator):
 
     def __init__(self, shape: Shape, length: Length = 1.0) -> None:
         shape = _check.shape("Poisson", shape)
-        super().__init__(shape, _check.lengths("Poisson", length, len(shape)), [])
+        super().__init__(shape, _check.lengths("Poisson", length, len(shape)), {})
 
 
 class Heat(Operator):
@@ -36,7 +36,7 @@ class Heat(Operator):
     def __init__(self, shape: Shape, nu: Number, dt: float, length: Length = 1.0) -> None:
         shape = _check.shape("Heat", shape)
         parameters = [_check.real("Heat", "dt", dt), *_check.lengths("Heat", length, len(shape))]
-        super().__init__(shape, parameters, [real_tensor("Heat", "nu", nu)])
+        super().__init__(shape, parameters, {"nu": nu})
 
 
 class Burgers(Operator):
@@ -96,9 +96,9 @@ class NavierStokes(Operator):
 
 def flow(
     who: str, name: str, winds: Tensor, nu: Number, dt: float, length: Length
-) -> tuple[list[int], list[float], list[Tensor]]:
+) -> tuple[list[int], list[float], dict[str, Number]]:
     """Shape, parameters and tensors of a flow linearised about winds (batch, channel, *shape)."""
     if _check.dense(who, name, winds).dim() < 3:
         raise ValueError(f"{who}: {name} must have shape (batch, channel, *shape), got {tuple(winds.shape)}")
     parameters = [_check.real(who, "dt", dt), *_check.lengths(who, length, winds.dim() - 2)]
-    return list(winds.shape[2:]), parameters, [winds, real_tensor(who, "nu", nu)]
+    return list(winds.shape[2:]), parameters, {name: winds, "nu": nu}

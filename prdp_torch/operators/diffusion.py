@@ -1,21 +1,26 @@
 """Diffusion by finite volumes."""
 
+import numbers
 from collections.abc import Sequence
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _check
-from prdp_torch.operators.base import Operator, real_tensor
+from prdp_torch.operators.base import Operator, full_precision
 from prdp_torch.types import Length, Number
 
-Side: TypeAlias = Literal["zero", "flux", "periodic"]
+Side: TypeAlias = Literal["zero", "flux", "periodic"] | tuple[Literal["robin"], Number]
 Sides: TypeAlias = Side | Sequence[Side | tuple[Side, Side] | list[Side]]
 """One for all sides, one for each axis, or a pair (low, high) for each axis."""
 
 OfSides: TypeAlias = Number | Sequence[Sequence[Number]]
 """One for all sides, or a pair (low, high) for each axis."""
+
+KINDS = ("zero", "flux", "periodic", "robin")  # by the numbers that the compiled library gives them
+TAKE_VALUES = ("zero", "robin")
+ENDS = ("low", "high")
 
 
 class Diffusion(Operator):
@@ -31,8 +36,10 @@ class Diffusion(Operator):
         shift: a number, or a tensor like kappa, which gets a gradient. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by
             implicit Euler, with b = u/dt. In float32, A holds it to ε max κ Σ 2/dx², beside which it must not be small:
             a warning says so. Take float64 for large jumps of κ on fine grids.
-        boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes) or "periodic":
-            one for all sides, one for each axis, or a pair (low, high) for each axis.
+        boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
+            ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
+            one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor
+            (batch or 1, *side) where side is shape without the axis, and gets a gradient.
         length: the side of the box, one number or one for each axis in the order of `shape`.
         faces: how κ on a face is made of its two cells: "harmonic", which is exact for layers, or "arithmetic".
 
@@ -47,7 +54,6 @@ class Diffusion(Operator):
     kind = "diffusion"
     boundary: list[tuple[str, ...]]
     length: tuple[float, ...]
-    kappa: Tensor
 
     def __init__(
         self,
@@ -65,24 +71,29 @@ class Diffusion(Operator):
             )
         if faces not in ("harmonic", "arithmetic"):
             raise ValueError(f"Diffusion: faces must be 'harmonic' or 'arithmetic', got {faces!r}")
-        self.boundary = _sides(boundary, dim)
+        sides = _sides(boundary, dim)
+        self.boundary = [tuple(_kind(side) for side in pair) for pair in sides]
         self.length = tuple(_check.lengths("Diffusion", length, dim)) or (1.0,) * dim
-        self.kappa = kappa
-        if isinstance(shift, Tensor) and shift.dim() > 0:
-            if shift.dim() != kappa.dim():
-                raise ValueError(
-                    f"Diffusion: shift must be a number or have the shape of kappa, {tuple(kappa.shape)}, got "
-                    f"{tuple(shift.shape)}"
-                )
-            shift, is_held = shift.unsqueeze(1), True
-        else:
-            is_held = isinstance(shift, Tensor) or shift != 0
-            shift = real_tensor("Diffusion", "shift", shift)
-        is_held = is_held or any("zero" in sides for sides in self.boundary)
-        codes = [float(("zero", "flux", "periodic").index(side)) for sides in self.boundary for side in sides]
+        if isinstance(shift, Tensor) and shift.dim() not in (0, kappa.dim()):
+            raise ValueError(
+                f"Diffusion: shift must be a number or have the shape of kappa, {tuple(kappa.shape)}, got "
+                f"{tuple(shift.shape)}"
+            )
+        given: dict[str, Number] = {"kappa": kappa, "shift": shift}
+        for axis, pair in enumerate(sides):
+            for end, side in zip(ENDS, pair, strict=True):
+                if _kind(side) == "robin":
+                    given[f"robin_{axis}_{end}"] = side[1]
+        holds = [value for name, value in given.items() if name != "kappa"]
+        is_held = any("zero" in pair for pair in self.boundary) or any(map(_is_given, holds))
+        codes = [float(KINDS.index(side)) for pair in self.boundary for side in pair]
         parameters = [*codes, *self.length, float(faces == "arithmetic")]
         null_spaces = () if is_held else (kappa.new_empty(0).detach(),) * 2
-        super().__init__(list(kappa.shape[1:]), parameters, [kappa.unsqueeze(1), shift], null_spaces)
+        super().__init__(list(kappa.shape[1:]), parameters, given, null_spaces)
+
+    @property
+    def kappa(self) -> Tensor:
+        return self.tensors[0]
 
     def boundary_rhs(self, values: OfSides = 0.0, fluxes: OfSides = 0.0) -> Tensor:
         """The part of b that given values and fluxes at the sides make, (batch or 1, 1, *shape), with gradients.
@@ -96,30 +107,37 @@ class Diffusion(Operator):
         Raises:
             ValueError: one of them stands where no side takes it.
         """
-        values, fluxes = self._of_sides("values", values, "zero"), self._of_sides("fluxes", fluxes, "flux")
-        b = torch.zeros_like(self.kappa)
+        values, fluxes = self._of_sides("values", values, TAKE_VALUES), self._of_sides("fluxes", fluxes, ("flux",))
+        kappa, robin = full_precision(self.kappa), iter(self.tensors[2:])
+        b = torch.zeros_like(kappa)
         for axis, sides in enumerate(self.boundary):
-            h = self.length[axis] / self.shape[axis]
+            per_cell = self.shape[axis] / self.length[axis]
             for end, side in enumerate(sides):
                 if side == "periodic":
                     continue
-                at_side = self.kappa.select(axis + 1, -end)
-                given = (values if side == "zero" else fluxes)[axis][end]
-                _check_of_side("values" if side == "zero" else "fluxes", given, at_side)
-                added = 2 * at_side * given / h**2 if side == "zero" else torch.ones_like(at_side) * given / h
-                if added.shape[0] != b.shape[0]:
-                    b = b.expand(added.shape[0], *b.shape[1:])
+                at_side = kappa.select(axis + 1, -end)
+                name, given = ("fluxes", fluxes) if side == "flux" else ("values", values)
+                value = given[axis][end]
+                _check_of_side(name, value, at_side)
+                if side == "flux":
+                    added = torch.ones_like(at_side) * value * per_cell
+                else:
+                    conductance = 2 * at_side * per_cell
+                    if side == "robin":  # in series with that of the side
+                        h = full_precision(next(robin))
+                        conductance = conductance * h / (conductance + h)
+                    added = conductance * value * per_cell
                 place = torch.zeros(self.shape[axis], dtype=b.dtype, device=b.device)
                 place[-end] = 1.0
                 b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (len(self.shape) - axis - 1))
         return b.unsqueeze(1)
 
-    def _of_sides(self, name: str, given: OfSides, kind: Side) -> Sequence[Sequence[Number]]:
-        """A value for each side, (low, high) for each axis; only sides of this kind take one that is not zero."""
+    def _of_sides(self, name: str, given: OfSides, kinds: tuple[str, ...]) -> Sequence[Sequence[Number]]:
+        """A value for each side, (low, high) for each axis; only sides of these kinds take one that is not zero."""
         dim = len(self.shape)
         if isinstance(given, (int, float, Tensor)):
             pairs: Sequence[Sequence[Number]] = [(given, given)] * dim
-            stray = _is_given(given) and not any(kind in sides for sides in self.boundary)
+            stray = _is_given(given) and not any(side in kinds for sides in self.boundary for side in sides)
         else:
             pairs = given
             of_axes = isinstance(given, (tuple, list)) and len(given) == dim
@@ -129,31 +147,49 @@ class Diffusion(Operator):
                     f"{given!r:.80}"
                 )
             stray = any(
-                _is_given(value) and side != kind
+                _is_given(value) and side not in kinds
                 for sides, pair in zip(self.boundary, pairs, strict=True)
                 for side, value in zip(sides, pair, strict=True)
             )
         if stray:
             raise ValueError(
-                f"Diffusion: {name} belong to sides that are {kind!r}; the boundary is {self.boundary}, in pairs "
-                f"(low, high), and {name} are {given!r:.80}"
+                f"Diffusion: {name} belong to sides that are {' or '.join(map(repr, kinds))}; the boundary is "
+                f"{self.boundary}, in pairs (low, high), and {name} are {given!r:.80}"
             )
         return pairs
 
 
-def _sides(boundary: Sides, dim: int) -> list[tuple[str, ...]]:
+def _kind(side: Any) -> Any:
+    """The name of a side; anything else as it is."""
+    return side[0] if _is_robin(side) else side
+
+
+def _is_robin(side: Any) -> bool:
+    """Whether this is ("robin", h), and not a pair of sides."""
+    return isinstance(side, (tuple, list)) and len(side) == 2 and side[0] == "robin" and _is_number(side[1])
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Tensor) or (isinstance(value, numbers.Real) and not isinstance(value, bool))
+
+
+def _sides(boundary: Any, dim: int) -> list[tuple[Any, Any]]:
     """The pair (low, high) of each axis."""
-    axes = [boundary] * dim if isinstance(boundary, str) else boundary
-    pairs: list[tuple[str, ...]] = [
-        (of_axis, of_axis) if isinstance(of_axis, str) else tuple(of_axis) for of_axis in axes
-    ]
-    known = {"zero", "flux", "periodic"}
-    if len(pairs) != dim or any(len(pair) != 2 or not set(pair) <= known for pair in pairs):
+
+    def is_side(side: Any) -> bool:
+        return isinstance(side, str) or _is_robin(side)
+
+    def is_known(side: Any) -> bool:
+        return _is_robin(side) or (side in KINDS and side != "robin")
+
+    axes = [boundary] * dim if is_side(boundary) else boundary
+    pairs = [(of_axis, of_axis) if is_side(of_axis) else tuple(of_axis) for of_axis in axes]
+    if len(pairs) != dim or any(len(pair) != 2 or not all(map(is_known, pair)) for pair in pairs):
         raise ValueError(
-            "Diffusion: boundary must be 'zero', 'flux' or 'periodic': one for all sides, or one, or a pair "
-            f"(low, high), for each of {dim} axes, got {boundary!r}"
+            "Diffusion: boundary must be 'zero', 'flux', 'periodic' or ('robin', h): one for all sides, or one, or a "
+            f"pair (low, high), for each of {dim} axes, got {boundary!r}"
         )
-    if any(pair.count("periodic") == 1 for pair in pairs):
+    if any([_kind(side) for side in pair].count("periodic") == 1 for pair in pairs):
         raise ValueError(f"Diffusion: boundary: both sides of an axis are periodic or none is, got {boundary!r}")
     return pairs
 

@@ -65,13 +65,16 @@ class Function(Operator):
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
         )
-        self._null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
-        super().__init__([self._products.number], [], tensors, self._null_spaces)
+        null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
+        given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
+        super().__init__([self._products.number], [], given, null_spaces)
 
     def __reduce__(self) -> tuple[Any, ...]:
         matvec, transpose, diagonal, symmetric = self._made_of
-        tensors = tuple(self.tensors[: len(self.tensors) - len(self._null_spaces)])
-        return Function, (matvec, transpose, tensors, diagonal, symmetric, *(self._null_spaces or (None, None)))
+        if self.kind == "function":
+            return Function, (matvec, transpose, tuple(self.tensors), diagonal, symmetric)
+        *tensors, right, left = self.tensors
+        return Function, (matvec, transpose, tuple(tensors), diagonal, symmetric, right, left)
 
 
 def _tensor(name: str, value: object) -> Tensor:

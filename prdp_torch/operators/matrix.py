@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _check, torch_private
-from prdp_torch.operators.base import Operator, null_spaces_of
+from prdp_torch.operators.base import Operator, full_precision, null_spaces_of
 from prdp_torch.types import NullSpace
 
 
@@ -18,6 +18,8 @@ class Matrix(Operator):
 
     `nullspace` and `left_nullspace` are those of `Stencil`: "constant" or vectors (k, n)."""
 
+    is_sparse_parameter = False
+
     def __init__(self, matrix: Tensor, nullspace: NullSpace = None, left_nullspace: NullSpace = None) -> None:
         if not isinstance(matrix, torch.Tensor):
             raise TypeError(f"Matrix: expected a torch tensor, got {type(matrix).__name__}")
@@ -25,23 +27,25 @@ class Matrix(Operator):
             _warn_of_csr_gradient(matrix)
             self.kind: str = "csr"
             with torch_private.without_transforms():
-                tensors = [matrix.crow_indices(), matrix.col_indices(), matrix.values()]
+                given = {"crow": matrix.crow_indices(), "col": matrix.col_indices(), "values": matrix.values()}
+            self.is_sparse_parameter = isinstance(matrix, torch.nn.Parameter)
         elif matrix.layout == torch.strided:
             self.kind = "dense"
-            tensors = [matrix]
+            given = {"matrix": matrix}
         else:
             raise ValueError(f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}")
         if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
             raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
-        if self.kind == "csr" and tensors[0].shape[-1] != matrix.shape[-1] + 1:
+        if self.kind == "csr" and given["crow"].shape[-1] != matrix.shape[-1] + 1:
             raise ValueError(
                 f"linear_solve: a CSR matrix of {matrix.shape[-1]} rows needs a crow of one more, got "
-                f"{tensors[0].shape[-1]}"
+                f"{given['crow'].shape[-1]}"
             )
-        super().__init__([], [], tensors, null_spaces_of("Matrix", nullspace, left_nullspace, tensors[-1]))
+        like = given["values" if self.kind == "csr" else "matrix"]
+        super().__init__([], [], given, null_spaces_of("Matrix", nullspace, left_nullspace, like))
 
     def _unknowns(self) -> int:
-        return self.tensors[0].shape[-1] - (self.kind == "csr")
+        return self.tensors[0].shape[-1] - self.kind.endswith("csr")
 
     @classmethod
     def csr(
@@ -68,7 +72,7 @@ class Matrix(Operator):
         for name, tensor in (("crow", crow), ("col", col)):
             if _check.dense("Matrix.csr", name, tensor).dtype not in (torch.int32, torch.int64):
                 raise TypeError(f"Matrix.csr: {name} must hold whole numbers (int32 or int64), got {tensor.dtype}")
-        if _check.dense("Matrix.csr", "values", values).dtype not in (torch.float32, torch.float64):
+        if full_precision(_check.dense("Matrix.csr", "values", values)).dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Matrix.csr: values must be float32 or float64, got {values.dtype}")
         if not isinstance(size, (tuple, list)):
             size = (_check.whole("Matrix.csr", "size", size),) * 2
@@ -84,9 +88,8 @@ class Matrix(Operator):
                 raise ValueError(f"Matrix.csr: {name} must have shape ({length},), got {tuple(tensor.shape)}")
         made = cls.__new__(cls)
         made.kind = "csr"
-        pattern = [index.expand(*batch, -1) for index in (crow, col)]
         null_spaces = null_spaces_of("Matrix.csr", nullspace, left_nullspace, values)
-        Operator.__init__(made, [], [], [*pattern, values], null_spaces)
+        Operator.__init__(made, [], [], {"crow": crow, "col": col, "values": values}, null_spaces)
         return made
 
 

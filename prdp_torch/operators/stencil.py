@@ -68,7 +68,7 @@ class Stencil(Operator):
         periodic = [float(b == "periodic") for b in self.boundary]
         cells = [float(n) for offset in self.offsets for n in offset]
         null_spaces = null_spaces_of("Stencil", nullspace, left_nullspace, coefficients)
-        super().__init__(list(coefficients.shape[2:]), periodic + cells, [coefficients], null_spaces)
+        super().__init__(list(coefficients.shape[2:]), periodic + cells, {"coefficients": coefficients}, null_spaces)
 
     def __repr__(self) -> str:
         shape, tensors = tuple(self.shape), ", ".join(f"tensor{tuple(t.shape)}" for t in self.tensors)

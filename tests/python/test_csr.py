@@ -121,7 +121,7 @@ def test_the_message_says_what_is_wrong(crow, col, values, message):
 def test_batch_axes_and_index_types_must_fit():
     crow, col, values = csr([0, 1, 2], [0, 1], [1.0, 1.0])
     with pytest.raises(ValueError, match="must have the same batch axis"):
-        solve([crow, col.expand(3, 2), values.expand(3, 2)])
+        solve([crow.expand(3, 3), col, values])
     with pytest.raises(ValueError, match="must have the same batch axis"):
         solve([crow.expand(2, 3), col.expand(3, 2), values.expand(3, 2)])
     with pytest.raises(TypeError, match="indices of a CSR matrix must be int32 or int64, got Double"):

@@ -122,8 +122,8 @@ def test_modules_hear_of_moves(move):
     class Listens(torch_private.HearsOfMoves):
         heard = 0
 
-        def moved(self):
-            self.heard += 1
+        def _moved(self, move):
+            self.heard += move(torch.ones(1)).shape == (1,)
 
     outer = torch.nn.Sequential(Listens())
     move(outer)

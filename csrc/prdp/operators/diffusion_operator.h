@@ -6,9 +6,9 @@
 
 namespace prdp {
 
-/// What holds at one side of the box: u = 0 on it, half a cell from the nearest centre; no flux through it; or the
-/// other side follows, for both sides of an axis.
-enum class Side { kZero, kFlux, kPeriodic };
+/// What holds at one side of the box: u = 0 on it, half a cell from the nearest centre; no flux through it; the other
+/// side follows, for both sides of an axis; or what flows out, -κ ∂u/∂n, is h u.
+enum class Side { kZero, kFlux, kPeriodic, kRobin };
 /// How the coefficient on a face is made of those of its two cells.
 enum class FaceMean { kHarmonic, kArithmetic };
 
@@ -18,19 +18,22 @@ enum class FaceMean { kHarmonic, kArithmetic };
 /// kappa: (batch or 1, *shape) with 1 to 3 axes in shape, the values in the centres of the cells, > 0. shift: a
 /// 0-dimensional tensor or one like kappa. Both get gradients, which for kappa are formed from differences of u and not
 /// from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each axis, or one
-/// pair for all. lengths: of the box, for each axis or one for all. Raises ValueError if these do not fit together.
+/// pair for all. lengths: of the box, for each axis or one for all. robin: h >= 0 of each such side in their order, 0-
+/// dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises ValueError if
+/// these do not fit together.
 OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
                        const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
-                       const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic);
+                       const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic,
+                       const std::vector<at::Tensor>& robin = {});
 
 /// The operator of kind "diffusion". Parameters: the two sides of each axis, the lengths, the mean on faces. Tensors:
-/// kappa and shift with an axis of one channel, or a 0-dimensional shift.
+/// kappa, shift, and h of each Robin side.
 class DiffusionOperator final : public Operator {
  public:
   explicit DiffusionOperator(const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
-  /// Raises ValueError unless kappa > 0.
+  /// Raises ValueError unless kappa > 0 and h >= 0.
   void check_parameters() const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
@@ -48,11 +51,20 @@ class DiffusionOperator final : public Operator {
 
  private:
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
-  bool is_periodic(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic; }
-  void warn_if_shift_is_rounding(double largest_kappa) const;
+  /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
+  bool is_closed(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
+  /// Warns where float32 rounds the diagonal by as much as what holds u.
+  void warn_if_rounding_holds(double least_kappa, double largest_kappa) const;
+  /// About the least eigenvalue of A where κ is the same everywhere: what holds u in the mean, in series with the way
+  /// there through the cells.
+  double held_by(double shift, double least_shift, double kappa) const;
+  double per_cell(int64_t axis) const;   // 1/h
   double per_cell2(int64_t axis) const;  // 1/h²
+  void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
+  const at::Tensor& robin(int64_t axis, size_t end) const;
+  std::vector<std::pair<const char*, at::Tensor>> tensors() const;
   /// Coefficients of the faces below and above each cell along an axis, times factor/h²; of a side with u = 0 twice
-  /// that of its cell, as it is half as far away.
+  /// that of its cell, as it is half as far away; of a Robin side that and its h in series.
   std::array<at::Tensor, 2> faces(int64_t axis, double factor = 1.0) const;
   /// The same operator as a stencil: the diagonal, and for each axis what couples a cell to those below and above.
   at::Tensor coefficients() const;
@@ -62,7 +74,9 @@ class DiffusionOperator final : public Operator {
   std::vector<std::array<Side, 2>> sides_;
   std::vector<double> lengths_;
   FaceMean mean_;
+  // With an axis of one channel, and one of extent 1 where a side has none; or 0-dimensional.
   at::Tensor kappa_, shift_;
+  std::vector<at::Tensor> robin_;  // h of each Robin side, in their order
 };
 
 }  // namespace prdp

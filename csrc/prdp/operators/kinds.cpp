@@ -36,12 +36,12 @@ const std::vector<OperatorKind> kKinds{
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
     {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
     {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, /*has_pressure=*/true},
-    {"diffusion", kDiffusion, make<DiffusionOperator>, Axes{kLikeState, kLikeState}},
+    {"diffusion", kDiffusion, make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide}},
     {"stencil", kStencil, make<StencilOperator>, Axes{kLikeState}},
     {"dense", kMatrix, make<DenseOperator>, Axes{3}},
     {"function", kFunction, make<FunctionOperator>, std::nullopt},
     {"csr", kMatrix, make<CsrOperator>, Axes{2, 2, 2}},
-    {"singular_diffusion", kDiffusion, singular<DiffusionOperator, kDiffusion>, Axes{kLikeState, kLikeState, 0, 0}},
+    {"singular_diffusion", kDiffusion, singular<DiffusionOperator, kDiffusion>, Axes{kLikeField, kLikeField, 0, 0}},
     {"singular_stencil", kStencil, singular<StencilOperator, kStencil>, Axes{kLikeState, 0, 0}},
     {"singular_dense", kMatrix, singular<DenseOperator, kMatrix>, Axes{3, 0, 0}},
     {"singular_csr", kMatrix, singular<CsrOperator, kMatrix>, Axes{2, 2, 2, 0, 0}},
@@ -51,6 +51,15 @@ const std::vector<OperatorKind> kKinds{
 }  // namespace
 
 const OperatorKind& operator_kind(const std::string& kind) { return row_of(kKinds, "operator", kind); }
+
+std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_t axes, size_t tensors) {
+  auto of_tensors = operator_kind(kind).batched_axes;
+  if (!of_tensors) return std::nullopt;
+  if (!of_tensors->empty()) of_tensors->resize(tensors, of_tensors->back());
+  for (auto& n : *of_tensors)
+    if (n < 0) n += axes - kLikeSide;
+  return of_tensors;
+}
 
 void check_devices(const OperatorSpec& a, const at::Tensor& b) {
   for (const auto& t : a.tensors) {

@@ -15,13 +15,17 @@ struct OperatorKind {
   const char* kind;   // as in OperatorSpec
   const char* title;  // as in messages
   std::unique_ptr<Operator> (*make)(const OperatorSpec& spec);
-  /// The number of axes of each tensor where it has one for the batch: 0 if all samples share it, kLikeState if it is
-  /// shaped like a state. nullopt if that is not known, as for the tensors of a function.
+  /// The number of axes of each tensor where it has one for the batch: 0 if all samples share it, or one of the below.
+  /// The last stands for all that follow. nullopt if that is not known, as for the tensors of a function.
   std::optional<std::vector<int64_t>> batched_axes;
   bool has_pressure = false;  // rows without a diagonal, and a mean that A maps to zero
 };
 
-inline constexpr int64_t kLikeState = -1;
+/// Of a tensor that is (batch, channel, *shape), (batch, *shape), or (batch, *side) with a side of that shape.
+inline constexpr int64_t kLikeState = -1, kLikeField = -2, kLikeSide = -3;
+
+/// The numbers of axes of an operator's `tensors` tensors where they have one for the batch, on a grid of `axes`.
+std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_t axes, size_t tensors);
 
 /// The row of a table. Raises ValueError for a kind that has none.
 template <class Row>

@@ -112,20 +112,26 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
   for (const auto* index : {&crow, &col})
     TORCH_CHECK_TYPE(index->scalar_type() == at::kInt || index->scalar_type() == at::kLong,
                      "linear_solve: indices of a CSR matrix must be int32 or int64, got ", index->scalar_type());
-  TORCH_CHECK_VALUE(col.sym_sizes() == values_.sym_sizes(),
-                    "linear_solve: a CSR matrix needs as many columns as "
-                    "values, got ",
-                    col.sym_sizes(), " and ", values_.sym_sizes());
+  TORCH_CHECK_VALUE(col.sym_size(-1) == values_.sym_size(-1),
+                    "linear_solve: a CSR matrix needs as many columns as values, got ", col.sym_sizes(), " and ",
+                    values_.sym_sizes());
   TORCH_CHECK_VALUE(crow.device() == values_.device() && col.device() == values_.device(),
                     "linear_solve: indices and values of a CSR matrix must be on one device, got ", crow.device(), ", ",
                     col.device(), " and ", values_.device());
   const bool batched = values_.dim() == 2;
-  TORCH_CHECK_VALUE(crow.dim() == values_.dim() && (!batched || crow.sym_size(0) == values_.sym_size(0)),
-                    "linear_solve: crow and values of a CSR matrix must have the same batch axis, got ",
-                    crow.sym_sizes(), " and ", values_.sym_sizes());
+  for (const auto* index : {&crow, &col})
+    TORCH_CHECK_VALUE(index->dim() == 1 || (batched && index->dim() == 2 && index->sym_size(0) == values_.sym_size(0)),
+                      "linear_solve: crow, col and values of a CSR matrix must have the same batch axis, but for "
+                      "indices without one, "
+                      "got ",
+                      index->sym_sizes(), " and ", values_.sym_sizes());
   check_has_rows(crow.sym_size(-1) - 1);
-  crow_ = crow.to(at::kLong);
-  col_ = col.to(at::kLong);
+  const auto for_values = [&](const at::Tensor& index) {
+    const auto whole = index.to(at::kLong);
+    return batched && whole.dim() == 1 ? whole.expand_symint({values_.sym_size(0), -1}) : whole;
+  };
+  crow_ = for_values(crow);
+  col_ = for_values(col);
 }
 
 void CsrOperator::check_parameters() const {

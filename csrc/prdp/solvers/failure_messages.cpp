@@ -49,9 +49,10 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
 /// Whether the null space of A is known: somebody named it, or it is that of a pressure.
 bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
 
-/// Whether A maps the constant to zero, though nobody named its null space.
+/// Whether A maps the constant to zero, though nobody named its null space. Operators of the library know their own.
 bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  return !knows_null_space(role) && maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
+  return a.may_be_singular() && !knows_null_space(role) &&
+         maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
 }
 
 /// Why a method for symmetric definite operators fails on this one.
