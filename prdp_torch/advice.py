@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
+from prdp_torch.operators.base import full_precision
 from prdp_torch.solver_trials import (
     RUNS,
     TOLERANCES,
@@ -128,7 +129,7 @@ def advise(
             f"advise: a step of {type(step).__name__} is not one equation A(u) u_next = b(u), as it has no "
             "operator(u); time its steps with each solver instead"
         )
-    _check.dense("advise", "sample", sample)
+    sample = full_precision(_check.dense("advise", "sample", sample))
     if sample.dim() < 2 or sample.numel() == 0 or sample.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             "advise: sample must be states (batch, channel, *shape) in float32 or float64, got "

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _check
+from prdp_torch.operators.base import full_precision
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 from prdp_torch.types import Length
@@ -21,7 +22,7 @@ _Y, _X = -2, -1
 
 def divergence(u: Tensor, length: Length = 1.0) -> Tensor:
     """∂u₁/∂x + ∂u₂/∂y in the cell centres by forward differences: (batch, 1, Ny, Nx)."""
-    u1, u2 = _velocity("divergence", u)
+    u1, u2, _ = _velocity("divergence", u)
     ly, lx = _sides("divergence", length)
     return _forward(u1, _X, lx) + _forward(u2, _Y, ly)
 
@@ -29,7 +30,7 @@ def divergence(u: Tensor, length: Length = 1.0) -> Tensor:
 def curl(u: Tensor, length: Length = 1.0) -> Tensor:
     """The vorticity ∂u₂/∂x - ∂u₁/∂y at the lower left corner of each cell by backward differences:
     (batch, 1, Ny, Nx)."""
-    u1, u2 = _velocity("curl", u)
+    u1, u2, _ = _velocity("curl", u)
     ly, lx = _sides("curl", length)
     return _backward(u2, _X, lx) - _backward(u1, _Y, ly)
 
@@ -37,7 +38,7 @@ def curl(u: Tensor, length: Length = 1.0) -> Tensor:
 def project(u: Tensor, length: Length = 1.0) -> Tensor:
     """Remove the divergence of a velocity: returns u - G φ, where D G φ = D u is solved by Fourier transform.
     This is the nearest field without discrete divergence. The mean velocity and the pressure do not change."""
-    u1, u2 = _velocity("project", u)
+    u1, u2, u = _velocity("project", u)
     ly, lx = _sides("project", length)
     ny, nx = u.shape[-2:]
     ky, kx = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (ny, nx // 2 + 1))
@@ -52,7 +53,7 @@ def project(u: Tensor, length: Length = 1.0) -> Tensor:
 def downsample(u: Tensor) -> Tensor:
     """Take every second point along both axes, at the indices 1, 3, …. Ny and Nx must be odd; (Ny, Nx) becomes
     ((Ny - 1)/2, (Nx - 1)/2), for example 97 becomes 48 (paper, appendix C.6)."""
-    _velocity("downsample", u)
+    u = _velocity("downsample", u)[2]
     if any(n % 2 == 0 for n in u.shape[-2:]):
         raise ValueError(f"downsample: Ny and Nx must be odd, got {tuple(u.shape[-2:])}")
     return u[..., 1::2, 1::2]
@@ -73,14 +74,14 @@ def rollout(stepper: Callable[[Tensor], Tensor], u: Tensor, steps: int) -> Tenso
     return torch.stack(states, dim=1)
 
 
-def _velocity(who: str, u: Tensor) -> tuple[Tensor, Tensor]:
-    """u₁ and u₂, each (batch, 1, Ny, Nx)."""
-    _check.dense(who, "u", u)
+def _velocity(who: str, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """u₁ and u₂, each (batch, 1, Ny, Nx), and u."""
+    u = full_precision(_check.dense(who, "u", u))
     if u.dim() != 4 or u.shape[1] not in (2, 3):
         raise ValueError(f"{who}: expected (batch, 2 or 3, Ny, Nx), got {tuple(u.shape)}")
     if u.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"{who}: expected float32 or float64, got {u.dtype}")
-    return u[:, 0:1], u[:, 1:2]
+    return u[:, 0:1], u[:, 1:2], u
 
 
 def _sides(who: str, length: Length) -> list[float]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
-from prdp_torch.operators.base import real_tensor
+from prdp_torch.operators.base import full_precision, real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
 from prdp_torch.stepper import Stepper, forgets_if_it_raises
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
@@ -118,7 +118,7 @@ class Flow(Stepper):
 
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
-        _check.dense("Flow", "u", u)
+        u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
@@ -127,7 +127,7 @@ class Flow(Stepper):
     @forgets_if_it_raises
     def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
-        _check.dense("Flow", "u", u)
+        u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
         self._keep(found[1:], self._adjoint_log)
@@ -140,7 +140,7 @@ class Flow(Stepper):
 
         It is a single node of autograd, whose backward pass needs the states alone. `info` and `adjoint_info` then hold
         tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1."""
-        _check.dense("Flow", "u", u)
+        u = _field("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
         log = self._adjoint_log.number
         found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
@@ -149,22 +149,22 @@ class Flow(Stepper):
 
     def project(self, u: Tensor) -> Tensor:
         """Return the velocity nearest to u that has the boundary values and no divergence."""
-        return self._equation().project(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
+        return self._equation().project(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     def pressure(self, u: Tensor) -> Tensor:
         """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
         unless an axis is open."""
-        return self._equation().pressure(_check.dense("Flow", "u", u), self._options_kept(), self._max_iter)
+        return self._equation().pressure(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     def divergence(self, u: Tensor) -> Tensor:
         """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
         cells before an open end, whose high faces take what mass conservation gives."""
-        return self._equation().divergence(_check.dense("Flow", "u", u))
+        return self._equation().divergence(_field("Flow", "u", u))
 
     def _equation(self) -> _C.FlowEquation:
-        nu, dt = real_tensor("Flow", "nu", self.nu), _check.real("Flow", "dt", self.dt)
-        force = _check.optional(_check.dense, "Flow", "force", self.force)
-        inflow = _check.optional(_check.dense, "Flow", "inflow", self.inflow)
+        nu, dt = full_precision(real_tensor("Flow", "nu", self.nu)), _check.real("Flow", "dt", self.dt)
+        force = _check.optional(_field, "Flow", "force", self.force)
+        inflow = _check.optional(_field, "Flow", "inflow", self.inflow)
         d = len(self.shape)
         boundary, length = _of_axes("boundary", self.boundary, d), _of_axes("length", self.length, d)
         if not all(isinstance(name, str) for name in boundary):
@@ -175,6 +175,10 @@ class Flow(Stepper):
 
     def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
+
+
+def _field(who: str, name: str, value: object) -> Tensor:
+    return full_precision(_check.dense(who, name, value))
 
 
 class _Mask:

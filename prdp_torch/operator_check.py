@@ -8,6 +8,7 @@ from torch import Generator, Tensor
 
 from prdp_torch import _C, _check
 from prdp_torch.operators import Operator
+from prdp_torch.operators.base import full_precision, without_autocast
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import linear_solve
 from prdp_torch.solvers import CG, GMRES, Solver
@@ -50,9 +51,10 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     A = as_operator(who, "A", A)
     if _check.dense(who, "example", example).dim() < 2:
         raise ValueError(f"{who}: example must have shape (batch, ...), got {tuple(example.shape)}")
+    A, example = A.of(map(full_precision, A.tensors)), full_precision(example)
     generator = Generator().manual_seed(0)
     v, w = (_noise(example, generator) for _ in range(2))
-    with torch.no_grad():
+    with torch.no_grad(), without_autocast(example):
         wrong = [
             *_products(A, v, w),
             *_null_space(A, v),

@@ -1,6 +1,7 @@
 #include <torch/csrc/Exceptions.h>
 
 #include "bindings.h"
+#include "prdp/operators/autocast.h"
 #include "prdp/steppers/flow/flow.h"
 #include "prdp/steppers/flow/steps.h"
 
@@ -39,6 +40,7 @@ template <class Call>
 auto without_lock(const Call& call) {
   HANDLE_TH_ERRORS
   const py::gil_scoped_release no_gil;
+  const WithoutAutocast full_precision;
   return call();
   END_HANDLE_TH_ERRORS_PYBIND
 }
