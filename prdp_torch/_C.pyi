@@ -106,9 +106,9 @@ class LinearSchedule(Controller):
     @property
     def settings(self) -> dict:
         ...
-def batched_axes(kind: str, axes: int, tensors: int) -> list[int] | None:
+def batched_axes(kind: str, axes: typing.SupportsInt | typing.SupportsIndex, tensors: typing.SupportsInt | typing.SupportsIndex) -> list[int] | None:
     """
-    The number of axes of each tensor of an operator where it has one for the batch: 0 if all samples share it, -1 if it is shaped like a state. None if that is not known.
+    The number of axes of each of so many tensors of an operator where it has one for the batch, on a grid of so many axes: 0 if all samples share it. None if that is not known.
     """
 def bytes_of_factorisations() -> int:
     """

@@ -26,7 +26,8 @@ class ImplicitStep(Stepper):
 
     Gradients reach u and every tensor that A(u) and b(u) are made of. If `operator` or `rhs` is an `nn.Module`, it
     becomes a submodule, so its Parameters are trained, moved and saved with the stepper. The same holds for the
-    tensors of a constant operator. It does not hold for variables that a plain function captures.
+    tensors of a constant operator, under the names of its arguments, such as `operator_at.kappa`; those of a
+    `Function` are tensors_0, tensors_1 and so on. It does not hold for variables that a plain function captures.
 
     Raises:
         TypeError, ValueError: A(u), b(u) and u do not fit each other. This is checked before any work.

@@ -2,6 +2,7 @@
 
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
+#include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/operator.h"
 #include "prdp/operators/singular_operator.h"
@@ -198,6 +199,22 @@ TEST(Solve, NullVectorsOfAllChannelsAreThoseOfAPressureAlone) {
     EXPECT_LT(u.select(1, 1).mean(-1).abs().max().item<double>(), 1e-12);
     EXPECT_GT(u.select(1, 0).mean(-1).abs().max().item<double>(), 1e-3);
   }
+}
+
+TEST(Diffusion, RobinSidesStandInSeriesWithHalfACell) {
+  using prdp::Side;
+  const auto options = at::TensorOptions(at::kDouble);
+  const auto kappa = at::full({1, 1}, 2.0, options), number = at::full({}, 4.0, options).requires_grad_();
+  const auto field = at::full({1}, 4.0, options).requires_grad_();
+  // The cell has width 1: half of it conducts by 4, and a side with h = 4 halves that. With shift 1, A is 1 + 2 · 2.
+  const auto a = prdp::diffusion(kappa, at::ones({}, options), {{Side::kRobin, Side::kRobin}}, {1.0},
+                                 prdp::FaceMean::kHarmonic, {number, field});
+  const auto u = prdp::linear_solve(a, at::ones({1, 1, 1}, options), {prdp::CG{.max_iter = 5}}).u;
+  EXPECT_NEAR(u.item<double>(), 1.0 / 5.0, 1e-12);
+  u.sum().backward();
+  EXPECT_NEAR(number.grad().item<double>(), -0.25 / 25.0, 1e-12);
+  EXPECT_NEAR(field.grad().item<double>(), -0.25 / 25.0, 1e-12);
+  EXPECT_THROW(prdp::diffusion(kappa, number, {{Side::kRobin, Side::kZero}}), c10::ValueError);
 }
 
 }  // namespace
