@@ -149,6 +149,9 @@ def test_vmap_over_h_is_a_loop():
     torch.testing.assert_close(torch.func.vmap(solve)(many), torch.stack([solve(h) for h in many]))
     of_samples = torch.cat([many, many]).unflatten(0, (5, 2)).squeeze(2)
     torch.testing.assert_close(torch.func.vmap(solve)(of_samples), torch.stack([solve(h) for h in of_samples]))
+    kappa, b, low = kappa.float(), b.float(), many.float()  # in float32 h is looked at, as it may be too small
+    torch.testing.assert_close(torch.func.vmap(solve)(low), torch.stack([solve(h) for h in low]))
+    kappa, b = kappa.double(), b.double()
     gradient = torch.func.grad(lambda h: solve(h).square().sum())(many[0])
     leaf = many[0].clone().requires_grad_()
     torch.testing.assert_close(gradient, torch.autograd.grad(solve(leaf).square().sum(), leaf)[0])
@@ -167,6 +170,14 @@ def test_vmap_over_h_is_a_loop():
 def test_mistakes_are_named(boundary, words):
     with pytest.raises(ValueError, match=words):
         Diffusion(torch.ones(1, 4, 5), boundary=boundary)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_an_empty_batch_is_no_trouble(dtype):
+    h, shift = torch.ones(0, 5, dtype=dtype), torch.ones(0, 4, 5, dtype=dtype)
+    a = Diffusion(torch.ones(1, 4, 5, dtype=dtype), shift, boundary=[("robin", h), "flux"])
+    u, _ = prdp.linear_solve(a, torch.ones(0, 1, 4, 5, dtype=dtype), prdp.CG(3))
+    assert u.shape == (0, 1, 4, 5)
 
 
 def test_h_of_another_batch_is_named():

@@ -32,7 +32,7 @@ at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int64_t beh
 /// a and b behind each other, where either may be the same for all samples.
 at::Tensor joined(const at::Tensor& a, const at::Tensor& b, int64_t axis) {
   if (a.sym_size(0) == b.sym_size(0)) return at::cat({a, b}, axis);
-  const auto grown = [batch = std::max(a.size(0), b.size(0))](const at::Tensor& t) {
+  const auto grown = [batch = a.size(0) == 1 ? b.size(0) : a.size(0)](const at::Tensor& t) {
     auto sizes = t.sizes().vec();
     sizes[0] = batch;
     return t.expand(sizes);
@@ -159,14 +159,13 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
 }
 
 void DiffusionOperator::check_parameters() const {
+  for (const auto& [name, t] : tensors())
+    if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
   for (const auto& h : robin_) {
-    if (at::isTensorSubclassLike(h) || h.is_meta() || h.numel() == 0) continue;
     const double least = h.min().item<double>();
     TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
-  const bool wrapped = at::areAnyTensorSubclassLike({kappa_, shift_});
-  if (wrapped || kappa_.is_meta() || kappa_.numel() == 0) return;  // no numbers, or none yet
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
   const auto* least_and_most = ends.const_data_ptr<double>();
