@@ -112,22 +112,24 @@ class Diffusion(Operator):
         kappa, robin = full_precision(self.kappa), iter(self.tensors[2:])
         b = torch.zeros_like(kappa)
         for axis, sides in enumerate(self.boundary):
-            per_cell = self.shape[axis] / self.length[axis]
+            width = self.length[axis] / self.shape[axis]
             for end, side in enumerate(sides):
                 if side == "periodic":
                     continue
                 at_side = kappa.select(axis + 1, -end)
+                conductance = torch.ones_like(at_side) if side == "flux" else 2 * at_side
+                if side == "robin":  # in series with that of the side
+                    h = width * full_precision(next(robin))
+                    _check_of_side("h", h, conductance)
+                    conductance = conductance * h / (conductance + h)
                 name, given = ("fluxes", fluxes) if side == "flux" else ("values", values)
-                value = given[axis][end]
-                _check_of_side(name, value, at_side)
-                if side == "flux":
-                    added = torch.ones_like(at_side) * value * per_cell
-                else:
-                    conductance = 2 * at_side * per_cell
-                    if side == "robin":  # in series with that of the side
-                        h = full_precision(next(robin))
-                        conductance = conductance * h / (conductance + h)
-                    added = conductance * value * per_cell
+                _check_of_side(name, given[axis][end], conductance)
+                added = conductance * given[axis][end] / (width if side == "flux" else width**2)
+                if len(added) != len(b) and 1 not in (len(added), len(b)):
+                    raise ValueError(
+                        f"Diffusion: the {ENDS[end]} side of axis {axis} holds {len(added)} samples, the sides before "
+                        f"it {len(b)}"
+                    )
                 place = torch.zeros(self.shape[axis], dtype=b.dtype, device=b.device)
                 place[-end] = 1.0
                 b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (len(self.shape) - axis - 1))

@@ -168,6 +168,8 @@ def test_values_of_sides_may_differ_in_their_batch():
     for i in range(5):
         one = a.boundary_rhs(values=[(left[i : i + 1], 2.0), (0.0, 0.0)], fluxes=[(0.0, 0.0), (flux[i : i + 1], 0.5)])
         torch.testing.assert_close(many[i : i + 1], one)
+    with pytest.raises(ValueError, match="Diffusion: the high side of axis 0 holds 2 samples, the sides before it 5"):
+        a.boundary_rhs(values=[(left, left[:2]), (0.0, 0.0)])
 
 
 def test_on_meta_it_has_shapes_alone():

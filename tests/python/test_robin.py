@@ -184,6 +184,8 @@ def test_h_of_another_batch_is_named():
     a = Diffusion(torch.ones(1, 4), boundary=[(("robin", torch.ones(3)), "zero")])
     with pytest.raises(ValueError, match="h of a Robin side holds 3 samples, the vector holds 2"):
         prdp.linear_solve(a, torch.ones(2, 1, 4), prdp.CG(3))
+    with pytest.raises(ValueError, match=r"values must broadcast to \(batch or 1, \*side\), here \(3,\), got \(2,\)"):
+        a.boundary_rhs(values=[(torch.ones(2), 0.0)])
     hole = torch.tensor([1.0, torch.nan, 1.0])
     a = Diffusion(torch.ones(1, 4), boundary=[(("robin", hole), "zero")])
     _, info = prdp.linear_solve(a, torch.ones(3, 1, 4), prdp.CG(9), on_failure="return")
