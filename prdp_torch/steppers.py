@@ -1,7 +1,7 @@
 """Steppers of built-in equations: one time step, or one elliptic solve, as an `nn.Module`."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
@@ -89,13 +89,26 @@ class EquationStepper(Stepper):
         torch.ops.prdp.check_equation(self._tensors(), e.kind, e.shape, e.parameters, e.picard_steps)
         self.equation = e
 
+    if not TYPE_CHECKING:
+
+        def __setattr__(self, name: str, value: object) -> None:
+            if name == "nu" and "equation" in vars(self) and not torch.compiler.is_compiling():
+                self._keep_nu(value)
+            else:
+                super().__setattr__(name, value)
+
     def _keep_nu(self, nu: Number) -> None:
+        """As what it is, whatever it was before; a Module lets no number take the place of a tensor."""
+        if not isinstance(nu, torch.Tensor):
+            nu = _check.real(type(self).__name__, "nu", nu)
+        for kept in (vars(self), self._parameters, self._buffers):
+            kept.pop("nu", None)
         if isinstance(nu, torch.nn.Parameter):
-            self.nu = nu
+            self.register_parameter("nu", nu)
         elif isinstance(nu, torch.Tensor):
             self.register_buffer("nu", nu)
         else:
-            self.nu = _check.real(type(self).__name__, "nu", nu)
+            vars(self)["nu"] = nu
         self._number: tuple[float, Tensor] | None = None  # nu as a number, and as the tensor that the library takes
 
     def _refuse_own_system(self) -> None:

@@ -254,3 +254,18 @@ def test_built_in_steppers_do_the_same(name):
     assert all((p != other.get_parameter(n)).any() for n, p in step.named_parameters())
     assert not torch.equal(step(u), before)
     assert step.float()(u.float()).dtype == torch.float32
+
+
+def test_nu_set_later_is_kept_as_what_it_is():
+    heat, u = prdp.Heat((6,), 1e-2, 0.1, prdp.CG(9)), torch.ones(2, 1, 6, dtype=F64)
+    number, buffer, parameter = 2e-2, rand(), torch.nn.Parameter(rand())
+    for before in (number, buffer, parameter):
+        for nu in (number, buffer, parameter):
+            heat.nu = before
+            heat.nu = nu
+            assert list(heat.parameters()) == ([nu] if nu is parameter else [])
+            assert list(heat.state_dict()) == ([] if nu is number else ["nu"])
+            assert heat.nu is nu and torch.equal(heat(u), prdp.Heat((6,), nu, 0.1, prdp.CG(9))(u))
+    with pytest.raises(TypeError, match="Heat: nu must be a real number, got 'large'"):
+        heat.nu = "large"
+    assert heat.nu is parameter
