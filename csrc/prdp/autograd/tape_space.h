@@ -46,6 +46,10 @@ class TapeSpace {
   Scalar b2() const { return b2_; }
   int64_t unknowns() const { return values_.unknowns(); }
   double epsilon() const { return values_.epsilon(); }
+  template <class X>
+  std::vector<X> array(int64_t n) const {
+    return std::vector<X>(n);
+  }
   bool started() const { return values_.started(); }
   int derivatives() const { return recording_ ? 1 : 0; }
 

@@ -150,13 +150,4 @@ std::shared_ptr<const Kernels> make_kernels(bool single, const Make& make) {
   return std::make_shared<Kernels>(Kernels{make(double())});
 }
 
-/// The power of two that brings an operator whose largest entry has this magnitude to the order of one; 1 if it is
-/// not far from there.
-template <class T>
-T scale_of_operator(T magnitude) {
-  constexpr int far = 8;
-  if (!std::isfinite(magnitude) || magnitude == T(0) || std::abs(std::ilogb(magnitude)) <= far) return 1;
-  return power_of_two_scale(magnitude);
-}
-
 }  // namespace prdp::kernels

@@ -5,6 +5,7 @@
 #include <limits>
 #include <vector>
 
+#include "prdp/kernels/scales.h"
 #include "prdp/kernels/whole_vectors.h"
 
 /// Scaling, finiteness and memory of the vectors of one sample.
@@ -13,15 +14,6 @@ namespace prdp::kernels {
 template <class T>
 int64_t round_up_to_lanes(int64_t n) {
   return (n + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
-}
-
-/// Power of two s with s·magnitude in [1, 2) (near the subnormals, as close as s and 1/s allow).
-template <class T>
-T power_of_two_scale(T magnitude) {
-  constexpr int limit = std::numeric_limits<T>::max_exponent - 2;
-  int exponent = std::ilogb(magnitude);
-  exponent = exponent > limit ? limit : exponent < -limit ? -limit : exponent;
-  return std::ldexp(T(1), -exponent);
 }
 
 /// Thread-local, grow-only memory that hands out zeroed vectors of one length with zeroed halos.

@@ -3,7 +3,6 @@
 #include <array>
 #include <cmath>
 #include <tuple>
-#include <vector>
 
 #include "prdp/solvers/hessenberg_problem.h"
 #include "prdp/solvers/space.h"
@@ -35,12 +34,12 @@ class GmresMethod {
         kept_r_(space.vector()),
         z_(space.is_preconditioned() ? space.vector() : r_),
         sum_(space.is_preconditioned() ? space.vector() : r_),
-        u_(m_ + 1),
+        u_(space.template array<Vector>(m_ + 1)),
+        products_(space.template array<Vector>(space.derivatives() > 0 ? m_ : 0)),
         problem_(space, m_),
-        again_(m_ + 1),
-        weights_(m_ + 1) {
+        again_(space.template array<Scalar>(m_ + 1)),
+        weights_(space.template array<Scalar>(m_ + 1)) {
     for (int64_t j = 1; j <= m_; ++j) u_[j] = space.vector();
-    if (space.derivatives() > 0) products_.resize(m_);
   }
 
   void start() {
@@ -155,9 +154,9 @@ class GmresMethod {
       Vector e = kept_r_;
       weigh(columns);
       space_.subtract_combination(weights_.data(), products_, columns, one_, e);
-      std::vector<Scalar> change(columns);
+      auto change = space_.template array<Scalar>(columns);
       for (int64_t j = 0; j < columns; ++j) change[j] = space_.dot(products_[j], e) * problem_.inverse_length(j);
-      problem_.solve_normal(change);
+      problem_.solve_normal(change.data(), columns);
       for (int64_t j = 0; j < columns; ++j) problem_.y(j) = problem_.y(j) + change[j];
     }
     weigh(columns);
@@ -166,9 +165,9 @@ class GmresMethod {
   Space& space_;
   int64_t m_;
   Vector r_, kept_x_, kept_r_, z_, sum_;
-  std::vector<Vector> u_, products_;  // orthogonal basis; A u_j, kept while recording
+  ArrayOf<Space, Vector> u_, products_;  // orthogonal basis; A u_j, kept while recording
   HessenbergProblem<Space> problem_;
-  std::vector<Scalar> again_, weights_;  // of a second pass; of the u_j
+  ArrayOf<Space, Scalar> again_, weights_;  // of a second pass; of the u_j
   Scalar residual2_{}, grew_{};
   Scalar loss_{};  // of orthogonality, in units of rounding
   Scalar one_{};

@@ -1,6 +1,7 @@
 #pragma once
 #include <cstdint>
-#include <vector>
+
+#include "prdp/solvers/space.h"
 
 namespace prdp {
 
@@ -13,7 +14,13 @@ class HessenbergProblem {
   using Scalar = typename Numbers::Scalar;
 
   /// For at most m columns.
-  HessenbergProblem(const Numbers& numbers, int64_t m) : numbers_(numbers), m_(m), h_(m * (m + 1)), columns_(m + 1) {}
+  HessenbergProblem(const Numbers& numbers, int64_t m)
+      : numbers_(numbers),
+        m_(m),
+        h_(numbers.template array<Scalar>(m * (m + 1))),
+        columns_(numbers.template array<Column>(m + 1)),
+        rhs_(numbers.template array<Scalar>(m)),
+        damped_(numbers.template array<Scalar>(m)) {}
 
   /// Before the first cycle, where ‖r‖² is given; returns 1.
   Scalar start(const Scalar& residual2) {
@@ -52,8 +59,7 @@ class HessenbergProblem {
     if (!numbers_.surely_all(short_enough)) damp(columns, short_enough);
   }
   /// z ← (RᵀR)⁻¹ z
-  void solve_normal(std::vector<Scalar>& z) {
-    const auto columns = static_cast<int64_t>(z.size());
+  void solve_normal(Scalar* z, int64_t columns) {
     for (int64_t j = 0; j < columns; ++j) {
       for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
       z[j] = z[j] * columns_[j].inverse;
@@ -115,19 +121,19 @@ class HessenbergProblem {
   /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being a few rounding errors of A: the next cycles
   /// recover what that holds back of a regular A, and along the null space of a singular one y stays short.
   void damp(int64_t columns, const Scalar& short_enough) {
-    std::vector<Scalar> g(columns), y(columns);
-    for (int64_t j = 0; j < columns; ++j) g[j] = columns_[j].g, y[j] = columns_[j].y;
-    numbers_.damp(h_.data(), m_ + 1, g.data(), columns, scale_ * 4, short_enough, y.data());
+    for (int64_t j = 0; j < columns; ++j) rhs_[j] = columns_[j].g, damped_[j] = columns_[j].y;
+    numbers_.damp(h_.data(), m_ + 1, rhs_.data(), columns, scale_ * 4, short_enough, damped_.data());
     for (int64_t j = 0; j < columns; ++j) {
-      columns_[j].y = y[j];
+      columns_[j].y = damped_[j];
       columns_[j].inverse = columns_[j].inverse * short_enough;
     }
   }
 
   const Numbers& numbers_;
   int64_t m_;
-  std::vector<Scalar> h_;  // by columns, R once rotated
-  std::vector<Column> columns_;
+  ArrayOf<Numbers, Scalar> h_;  // by columns, R once rotated
+  ArrayOf<Numbers, Column> columns_;
+  ArrayOf<Numbers, Scalar> rhs_, damped_;  // of damp()
   Scalar exhausted_{}, scale_{};
   Scalar solved2_{};  // ‖r‖² of a cycle that solves
 };

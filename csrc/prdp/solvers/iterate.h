@@ -10,6 +10,11 @@
 /// The one loop around every method: it counts, checks and decides, per sample. A method (jacobi.h,
 /// …) supplies one iteration; a space says what a vector is: one sample in padded memory
 /// (sample_space.h), or a batch of plain tensors (tensor_space.h). Both run these same lines.
+/// Before functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
+#ifndef PRDP_ONCE
+#define PRDP_ONCE
+#endif
+
 namespace prdp {
 
 namespace detail {
@@ -26,7 +31,7 @@ int64_t stride(const States& states, bool track) {
 /// At most `cap` iterations of each active sample. With `track`, every residual is looked at that may be
 /// small enough.
 template <class Space, class Method>
-void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   [[maybe_unused]] int64_t unseen = 1, watched = 0;
   method.start();
   if (track) observe(space, method, states, rtol);
@@ -62,7 +67,7 @@ void run(Space& space, Method& method, typename Space::States& states, double rt
 
 /// Recomputes the residual of what is not settled and gives it its final status.
 template <class Space, class Method>
-void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
+PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto open = [](const SampleState& s) { return !s.settled; };
   if (std::none_of(states.begin(), states.end(), open)) return;
   space.freeze_unless(states, open);

@@ -1,7 +1,7 @@
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <tuple>
-#include <vector>
 
 #include "prdp/solvers/space.h"
 
@@ -32,7 +32,10 @@ class JacobiMethod {
       space_.advance(x, next_);
       --n;
     }
-    if (n > 0) space_.sweeps(c_, x, next_, n, weights(done_ - n, n));
+    for (int64_t part; n > 0; n -= part) {
+      part = accelerated_ ? std::min(n, kWeightsAtOnce) : n;
+      space_.sweeps(c_, x, next_, part, weights(done_ - n, part));
+    }
     ready_ = false;
   }
   auto residual2() {
@@ -63,18 +66,22 @@ class JacobiMethod {
         accelerated_(accelerated),
         c_(space.vector()),
         next_(space.vector()),
-        r_(space.vector()) {}
+        r_(space.vector()),
+        omega_(space.template array<Scalar>(accelerated ? kWeightsAtOnce : 0)) {}
+
+  static constexpr int64_t kWeightsAtOnce = 64;
 
   /// ω of n iterations after the first `first`, which is at least one; null without acceleration.
   const Scalar* weights(int64_t first, int64_t n) {
     if (!accelerated_) return nullptr;
-    if (omega_.empty()) {
+    if (at_ == 0 || first < at_) {
       radius2_ = space_.radius2();
-      omega_.push_back(1 / (1 - radius2_ / 2));
+      omega_[0] = 1 / (1 - radius2_ / 2);
+      at_ = 1;
     }
-    while (static_cast<int64_t>(omega_.size()) < first + n - 1)
-      omega_.push_back(1 / (1 - radius2_ * omega_.back() / 4));
-    return omega_.data() + first - 1;
+    for (; at_ < first; ++at_) omega_[0] = 1 / (1 - radius2_ * omega_[0] / 4);
+    for (int64_t i = 1; i < n; ++i) omega_[i] = 1 / (1 - radius2_ * omega_[i - 1] / 4);
+    return omega_.data();
   }
 
   Space& space_;
@@ -83,8 +90,9 @@ class JacobiMethod {
   Scalar residual2_{};
   bool ready_ = false;  // next_ and residual2_ belong to x
   int64_t done_ = 0;
-  Scalar radius2_{};            // ρ²
-  std::vector<Scalar> omega_;  // from the second iteration on
+  Scalar radius2_{};                 // ρ²
+  ArrayOf<Space, Scalar> omega_;     // of some iterations, the first of which is
+  int64_t at_ = 0;                   // this one, counted from zero; 0: there are none yet
 };
 
 template <SweepingSpace Space>

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "prdp/solvers/iterate.h"
+#include "prdp/solvers/sample_numbers.h"
 #include "prdp/solvers/sample_system.h"
 #include "prdp/solvers/solve_damped.h"
 #include "prdp/threads/interruption.h"
@@ -17,7 +18,9 @@ namespace prdp {
 /// One sample after the other as a space for iterate(): vectors are padded memory of the thread's
 /// workspace, and every operation is a plain loop in place.
 template <class T>
-class SampleSpace {
+class SampleSpace : public SampleNumbers<T> {
+  using SampleNumbers<T>::broken_;
+
  public:
   using Vector = T*;
   using Scalar = T;
@@ -93,11 +96,13 @@ class SampleSpace {
   Vector b() { return workspace_.vector(0); }
   Scalar b2() const { return b2_; }
   int64_t unknowns() const { return system_.a().unknowns(); }
-  double epsilon() const { return std::numeric_limits<T>::epsilon() / 2; }
+  template <class X>
+  std::vector<X> array(int64_t n) const {
+    return std::vector<X>(n);
+  }
 
   void fill_zero(Vector v) { vectors_.fill_zero(v, length()); }
   void copy(const T* from, Vector to) { vectors_.copy(from, to, length()); }
-  void assign(Scalar from, Scalar& to) { to = from; }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
   void add(const T* d, Vector x) { vectors_.axpy(T(1), d, x, length()); }
   void xpby(const T* x, Scalar beta, Vector y) { vectors_.xpby(x, beta, y, length()); }
@@ -123,7 +128,6 @@ class SampleSpace {
     const auto found = apply_with_dots(v, out);
     return {v == w ? found[0] : dot(w, out), found[1]};
   }
-  static Scalar sum_of_squares(Scalar rr, Scalar beta, Scalar pp) { return rr + beta * beta * pp; }
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
@@ -187,31 +191,7 @@ class SampleSpace {
     fill_zero(d);
   }
 
-  /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
-  /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
-  Scalar step_length(Scalar num, Scalar den, Scalar a2, Scalar b2) {
-    if (num < kNegligible) return 0;
-    if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
-    if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
-    if (is_zero_beside(den, a2, b2)) {
-      broken_ = true;
-      return 0;
-    }
-    return num / den;
-  }
-  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar going) {
-    return going != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
-  }
-  Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
-  void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
-  static Scalar is_rounding(Scalar a, Scalar b2, Scalar c2, double factor) {
-    return std::abs(a) < std::sqrt(b2) * std::sqrt(c2) * static_cast<T>(factor);
-  }
-  static Scalar unless_zero(Scalar value, Scalar a, Scalar b) { return a != 0 && b != 0 ? value : 0; }
-
-  /// What GMRES needs: linear combinations of several vectors, and numbers that may vanish.
-  static constexpr int derivatives() { return 0; }
-  Scalar constant(Scalar value) const { return value; }
+  /// What GMRES needs: linear combinations of several vectors.
   void dots(const std::vector<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
     vectors_.multi_dot(v.data(), count, factor, w, h, length());
   }
@@ -222,30 +202,15 @@ class SampleSpace {
   void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector x) {
     vectors_.multi_axpy(T(1), y, v.data(), count, T(1), x, length());
   }
-  /// Whether w, of which `left2` is left beside the `taken2` that went along the basis, needs another
-  /// pass: each takes a share of the digits away, and three may be missing.
-  bool lost_orthogonality(Scalar left2, Scalar taken2, Scalar& loss) const {
-    const Scalar grown = (loss + 1) * std::sqrt((left2 + taken2) / left2);
-    if (!(grown < 1000)) return true;
-    loss = grown;
-    return false;
-  }
-  /// 1/value; 0 where value is rounding beside `scale`.
-  Scalar inverse(Scalar value, Scalar scale) const {
-    return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
-  }
   void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
-    if (keep == 0) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, y);
+    if (keep != 0) return;
+    std::vector<T> work(numbers_of_solve_damped(n));
+    solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, y, work.data());
   }
-  Scalar larger(Scalar a, Scalar b) const { return a > b ? a : b; }
-  Scalar is_larger(Scalar a, Scalar b) const { return a > b; }
+  using SampleNumbers<T>::restore;
   void restore(Scalar where, const T* from, Vector to) {
     if (where != 0) copy(from, to);
   }
-  void restore(Scalar where, Scalar from, Scalar& to) const { to = where != 0 ? from : to; }
-  Scalar is_zero(Scalar value) const { return value == 0; }
-  Scalar is_not_zero(Scalar value) const { return value != 0; }
-  bool surely_all(Scalar value) const { return value != 0; }
 
   std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
@@ -268,14 +233,6 @@ class SampleSpace {
   }
 
  private:
-  static bool is_zero_beside(Scalar den, Scalar a2, Scalar b2) {
-    return std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2);
-  }
-  /// Squared norms below this are zero to the dtype, b and A being scaled to the order of one.
-  static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
-
-  static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
-
   const kernels::Layout<T>& layout() const { return system_.a().layout(); }
   int64_t length() const { return system_.a().length(); }
   Vector start() { return workspace_.vector(2); }
@@ -298,7 +255,6 @@ class SampleSpace {
   SampleState* state_ = nullptr;
   int64_t own_, used_;
   T b2_ = 0;
-  bool broken_ = false;
   bool started_ = false;  // from start(), and then whole_b() is what b() was
 };
 

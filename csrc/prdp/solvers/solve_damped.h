@@ -1,20 +1,23 @@
 #pragma once
-#include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <vector>
 
 namespace prdp {
+
+/// Numbers that solve_damped() works with.
+constexpr int64_t numbers_of_solve_damped(int64_t n) { return n * (n + 2); }
 
 /// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of r, which lie `stride` entries
 /// apart: the rows of τ I are rotated into R, one by one.
 template <class T>
-void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y) {
-  std::vector<T> a(n * n), rhs(g, g + n), row(n);
-  for (int64_t j = 0; j < n; ++j)
+void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y, T* work) {
+  T *a = work, *rhs = a + n * n, *row = rhs + n;
+  for (int64_t j = 0; j < n; ++j) {
+    rhs[j] = g[j];
     for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+  }
   for (int64_t k = 0; k < n; ++k) {
-    std::fill(row.begin(), row.end(), T(0));
+    for (int64_t j = 0; j < n; ++j) row[j] = 0;
     row[k] = tau;
     T of_row = 0;
     for (int64_t i = k; i < n; ++i) {

@@ -2,15 +2,17 @@
 #include <array>
 #include <concepts>
 #include <cstdint>
-#include <vector>
-
-#include "prdp/solvers/solver.h"
+#include <utility>
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample in padded memory (sample_space.h), or a batch of plain tensors (tensor_space.h). An operation
 /// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new space
 /// needs all of these operations, a new method none but those that it calls.
 namespace prdp {
+
+/// A few numbers or handles of vectors that a method keeps beside its vectors, as array<X>() of the space gives them.
+template <class Space, class X>
+using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
 
 /// What every method needs.
 template <class S>
@@ -102,7 +104,7 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
 /// What GMRES needs beside: a basis, and numbers that may vanish.
 template <class S>
 concept KrylovSpace =
-    VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y, std::vector<typename S::Vector> v,
+    VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y, ArrayOf<S, typename S::Vector> v,
                                int64_t n, int64_t m, typename S::Scalar a, typename S::Scalar b,
                                const typename S::Scalar* w, const typename S::Scalar* g, typename S::Scalar* h) {
       /// h_i = v_i·(a x) for the first n of v, as constants.

@@ -17,6 +17,11 @@ struct HostNumbers {
   using Scalar = double;
   double epsilon, negligible;
 
+  template <class X>
+  std::vector<X> array(int64_t n) const {
+    return std::vector<X>(n);
+  }
+
   double inverse(double value, double scale) const {
     return value <= 16 * epsilon * std::abs(scale) || value < negligible ? 0.0 : 1.0 / value;
   }
@@ -26,7 +31,9 @@ struct HostNumbers {
   double is_not_zero(double value) const { return value != 0.0; }
   bool surely_all(double value) const { return value != 0.0; }
   void damp(const double* r, int64_t stride, const double* g, int64_t n, double scale, double keep, double* y) const {
-    if (keep == 0.0) solve_damped(r, stride, g, n, epsilon * scale, y);
+    if (keep != 0.0) return;
+    std::vector<double> work(numbers_of_solve_damped(n));
+    solve_damped(r, stride, g, n, epsilon * scale, y, work.data());
   }
 };
 

@@ -44,6 +44,10 @@ class TensorSpace {
   const Scalar& b2() const { return b2_; }
   int64_t unknowns() const { return b_.numel() / std::max<int64_t>(b_.size(0), 1); }
   double epsilon() const;
+  template <class X>
+  std::vector<X> array(int64_t n) const {
+    return std::vector<X>(n);
+  }
   /// Numbers below this are zero to the dtype.
   double negligible() const { return negligible_; }
 

@@ -1,0 +1,75 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+namespace prdp {
+
+/// What the spaces of one sample do with its numbers (space.h): quotients that tell a breakdown from a small number,
+/// and numbers that vanish where they are rounding. b and A are scaled to the order of one.
+template <class T>
+class SampleNumbers {
+ public:
+  using Scalar = T;
+
+  static constexpr double epsilon() { return std::numeric_limits<T>::epsilon() / 2; }
+  void assign(Scalar from, Scalar& to) { to = from; }
+  static Scalar sum_of_squares(Scalar rr, Scalar beta, Scalar pp) { return rr + beta * beta * pp; }
+
+  /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
+  /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
+  Scalar step_length(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+    if (num < kNegligible) return 0;
+    if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
+    if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
+    if (is_zero_beside(den, a2, b2)) {
+      broken_ = true;
+      return 0;
+    }
+    return num / den;
+  }
+  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar going) {
+    return going != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
+  }
+  Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
+  void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
+  static Scalar is_rounding(Scalar a, Scalar b2, Scalar c2, double factor) {
+    return std::abs(a) < std::sqrt(b2) * std::sqrt(c2) * static_cast<T>(factor);
+  }
+  static Scalar unless_zero(Scalar value, Scalar a, Scalar b) { return a != 0 && b != 0 ? value : 0; }
+
+  /// What GMRES needs: numbers that may vanish.
+  static constexpr int derivatives() { return 0; }
+  Scalar constant(Scalar value) const { return value; }
+  /// Whether w, of which `left2` is left beside the `taken2` that went along the basis, needs another
+  /// pass: each takes a share of the digits away, and three may be missing.
+  bool lost_orthogonality(Scalar left2, Scalar taken2, Scalar& loss) const {
+    const Scalar grown = (loss + 1) * std::sqrt((left2 + taken2) / left2);
+    if (!(grown < 1000)) return true;
+    loss = grown;
+    return false;
+  }
+  /// 1/value; 0 where value is rounding beside `scale`.
+  Scalar inverse(Scalar value, Scalar scale) const {
+    return value <= kVanishing * std::abs(scale) || value < kNegligible ? T(0) : 1 / value;
+  }
+  Scalar larger(Scalar a, Scalar b) const { return a > b ? a : b; }
+  Scalar is_larger(Scalar a, Scalar b) const { return a > b; }
+  void restore(Scalar where, Scalar from, Scalar& to) const { to = where != 0 ? from : to; }
+  Scalar is_zero(Scalar value) const { return value == 0; }
+  Scalar is_not_zero(Scalar value) const { return value != 0; }
+  bool surely_all(Scalar value) const { return value != 0; }
+
+ protected:
+  bool broken_ = false;
+
+ private:
+  static bool is_zero_beside(Scalar den, Scalar a2, Scalar b2) {
+    return std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2);
+  }
+  /// Squared norms below this are zero to the dtype.
+  static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();
+  static constexpr T kVanishing = 16 * std::numeric_limits<T>::epsilon();
+};
+
+}  // namespace prdp
