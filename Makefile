@@ -6,6 +6,7 @@
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
 # make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU; HEADERS=folder where the system has no headers)
+# make kernels  compile the kernels of all methods and operators for three cards, without a GPU, and print what each takes
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -16,7 +17,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs tidy sanitize fuzz cuda bench-peers records clean
+.PHONY: demo test docs kernels tidy sanitize fuzz cuda bench-peers records clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -34,6 +35,12 @@ test: $(STAMPS)/configure
 	[ ! -x $(BIN)/clang-tidy ] || $(MAKE) --no-print-directory tidy
 	$(BIN)/ctest --test-dir build --output-on-failure
 	$(BIN)/pytest
+
+# Without a GPU: NVRTC compiles for cards that are not there.
+kernels: $(STAMPS)/configure
+	$(BIN)/cmake --build build --parallel $$(nproc) --target python prdp_fibers
+	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
+	$(BIN)/python tests/python/kernel_table.py | tee build/kernels.md
 
 bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python

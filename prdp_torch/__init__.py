@@ -17,6 +17,7 @@ from prdp_torch import _C, fields, operators  # noqa: E402
 from prdp_torch.advice import Advice, advise  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.flow import Flow  # noqa: E402
+from prdp_torch.gpu import warm_up  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
@@ -61,6 +62,7 @@ __all__ = [
     "linear_solve",
     "load_trained",
     "operators",
+    "warm_up",
 ]
 
 

@@ -7,6 +7,7 @@
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/sum_over_axes.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 
@@ -221,6 +222,7 @@ void bind_solvers(py::module_& m) {
       "Whether `Direct` solves with A, axis by axis, without a factorisation of the whole.",
       py::call_guard<py::gil_scoped_release>(), py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
       py::arg("parameters"));
+  m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
   m.def("bytes_of_factorisations", &factor_cache::bytes_kept, "The memory of those that are kept for later solves.");
   m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");

@@ -43,6 +43,17 @@ at::Tensor AdvectionDiffusion::diagonal() const {
   return alpha_ + beta_ * sum;
 }
 
+at::Tensor AdvectionDiffusion::coefficients() const {
+  std::vector<at::Tensor> all{diagonal()};
+  for (int64_t d = 0; d < grid_.dim(); ++d) {
+    const double per_dx = 1.0 / grid_.dx(d);
+    const auto diffusion = nu_ * (per_dx * per_dx);
+    all.push_back(beta_ * (-inflow_[d].lower * per_dx - diffusion));
+    all.push_back(beta_ * (inflow_[d].upper * per_dx - diffusion));
+  }
+  return at::cat(all, 1);
+}
+
 AdvectionDiffusion::Gradients AdvectionDiffusion::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto weight = beta_ * lambda;
   Gradients gradients{{}, -total(weight * laplacian(u, grid_))};

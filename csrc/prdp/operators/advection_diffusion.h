@@ -21,6 +21,8 @@ class AdvectionDiffusion {
   at::Tensor apply_transpose(const at::Tensor& v) const;
   /// (batch or 1, 1, *shape).
   at::Tensor diagonal() const;
+  /// (batch or 1, 1 + 2 dim, *shape): the diagonal, and for each axis what couples a point to those before and after.
+  at::Tensor coefficients() const;
   /// Σ_j |C_ij|, as the diagonal.
   at::Tensor row_norms() const { return 2.0 * diagonal() - alpha_; }
 

@@ -25,6 +25,7 @@ class BurgersOperator final : public FlowOperator {
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   bool has_coarse_grids() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  private:
   /// The block of one channel, made when first wanted: the CPU loops never ask for it.

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <sstream>
 
+#include "prdp/gpu/operator_view.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
@@ -353,6 +354,11 @@ std::vector<int64_t> DiffusionOperator::vector_shape() const {
 std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
   const at::NoGradGuard no_grad;
   return StencilOperator(as_stencil()).kernels(b, /*transposed=*/false);
+}
+
+std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {
+  const at::NoGradGuard no_grad;
+  return StencilOperator(as_stencil()).gpu_view(b, /*transposed=*/false);
 }
 
 std::optional<kernels::FactorKey> DiffusionOperator::key(bool /*transposed*/) const {

@@ -47,6 +47,7 @@ class DiffusionOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override;
   bool has_coarse_grids() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
  private:

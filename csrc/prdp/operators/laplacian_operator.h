@@ -19,6 +19,7 @@ class LaplacianOperator : public Operator {
   bool has_coarse_grids() const override { return true; }
   std::vector<int64_t> vector_shape() const override;
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  protected:
   explicit LaplacianOperator(Grid grid) : grid_(std::move(grid)) {}

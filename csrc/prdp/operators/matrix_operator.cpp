@@ -2,6 +2,7 @@
 
 #include <ATen/TensorSubclassLikeUtils.h>
 
+#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
 
@@ -88,6 +89,14 @@ std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<DenseOperator>(*this);
   if (matrix_.dim() == 3) chosen->matrix_ = matrix_.index_select(0, index);
   return chosen;
+}
+
+std::optional<gpu::OperatorView> DenseOperator::gpu_view(const at::Tensor& b, bool transposed) const {
+  const auto n = matrix_.size(-1);
+  gpu::OperatorView view{"Dense<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n) + ", " +
+                         std::to_string(transposed) + ">"};
+  view.tensors = {matrix_.detach().contiguous().view({-1, n, n})};
+  return view;
 }
 
 std::shared_ptr<const kernels::Kernels> DenseOperator::kernels(const at::Tensor& b, bool transposed) const {

@@ -20,6 +20,7 @@ class DenseOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override { return {matrix_.size(-1)}; }
   bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  private:
   at::Tensor matrix_;

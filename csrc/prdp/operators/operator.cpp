@@ -2,6 +2,7 @@
 
 #include <numeric>
 
+#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/kinds.h"
 
@@ -37,6 +38,7 @@ at::Tensor Operator::dense(const at::TensorOptions& options) const {
 
 std::shared_ptr<const kernels::Kernels> Operator::kernels(const at::Tensor&, bool) const { return nullptr; }
 std::optional<kernels::FactorKey> Operator::key(bool) const { return std::nullopt; }
+std::optional<gpu::OperatorView> Operator::gpu_view(const at::Tensor&, bool) const { return std::nullopt; }
 
 at::Tensor Operator::jacobi_radius() const {
   TORCH_CHECK_VALUE(false,
@@ -81,6 +83,9 @@ class Transposed final : public Operator {
     return a_->kernels(b, !transposed);
   }
   std::optional<kernels::FactorKey> key(bool transposed) const override { return a_->key(!transposed); }
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override {
+    return a_->gpu_view(b, !transposed);
+  }
 
  private:
   std::unique_ptr<Operator> a_;

@@ -21,6 +21,9 @@ namespace kernels {
 struct FactorKey;
 struct Kernels;
 }  // namespace kernels
+namespace gpu {
+struct OperatorView;
+}
 
 /// A linear operator A(g) on batches of vectors: (batch, channel, *shape) on grids, (batch, n) for matrices. It is
 /// immutable.
@@ -79,6 +82,8 @@ class Operator {
   virtual bool has_multigrid_preconditioner() const { return has_coarse_grids(); }
   /// A, or Aᵀ, for the CPU loops on vectors with the shape and dtype of b; null if there are no such loops.
   virtual std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const;
+  /// A, or Aᵀ, for the kernels of a GPU, on vectors like b; nothing if there are none.
+  virtual std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const;
   /// Tells a kernel that all samples share from those of other operators; nothing if they do not share it, or if to
   /// make it takes no longer than to read its numbers.
   virtual std::optional<kernels::FactorKey> key(bool transposed) const;

@@ -2,6 +2,7 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
@@ -241,6 +242,17 @@ std::optional<kernels::FactorKey> SingularOperator::key(bool transposed) const {
   key.add(*regular).add(int64_t{transposed});
   for (const auto* basis : {&right_, &left_}) add_numbers(key.add(basis->given.dim()), basis->given);
   return key.key();
+}
+
+std::optional<gpu::OperatorView> SingularOperator::gpu_view(const at::Tensor& b, bool transposed) const {
+  auto view = a_->gpu_view(b, transposed);
+  if (!view) return view;
+  const auto given = [&](const Basis& basis) {
+    return basis.is_constant() ? at::empty({0}, b.options()) : orthonormal(basis, b.detach()).contiguous();
+  };
+  view->null_space = given(transposed ? left_ : right_);
+  view->left_null_space = given(transposed ? right_ : left_);
+  return view;
 }
 
 std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tensor& b, bool transposed) const {

@@ -45,6 +45,7 @@ class SingularOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
   bool has_coarse_grids() const override { return a_->has_coarse_grids(); }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
  private:

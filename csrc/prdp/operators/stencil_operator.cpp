@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
 #include "prdp/operators/dense.h"
@@ -247,6 +248,18 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
     return batch;
   };
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
+}
+
+std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, bool transposed) const {
+  std::ostringstream type;
+  type << "Stencil<" << gpu::type_of(b.scalar_type()) << ", "
+       << gpu::grid_of({grid_.shape + 3 - dim(), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", "
+       << transposed;
+  for (const bool periodic : grid_.periodic) type << ", " << periodic;
+  for (const auto& offset : offsets_)
+    type << ", Offset<" << offset.along[0] << ", " << offset.along[1] << ", " << offset.along[2] << ">";
+  type << ">";
+  return gpu::OperatorView{type.str(), {coefficients_.detach().contiguous()}};
 }
 
 std::optional<kernels::FactorKey> StencilOperator::key(bool transposed) const {

@@ -34,6 +34,7 @@ class StencilOperator final : public Operator {
   bool has_coarse_grids() const override;
   bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
  private:

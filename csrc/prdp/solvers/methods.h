@@ -47,6 +47,8 @@ struct MethodTraits {
   /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);
   /// else autograd does it, in plain tensor operations.
   bool has_tape = true;
+  /// Its class and file, from which kernels of a GPU are made; empty: there is none.
+  std::string_view kernel{}, kernel_header{};
 };
 
 /// A row with the class that iterates.
@@ -70,6 +72,8 @@ inline constexpr std::tuple kMethods{
         .nanoseconds = 0.1,
         .divides_by_diagonal = true,
         .is_polynomial = true,
+        .kernel = "JacobiMethod",
+        .kernel_header = "jacobi.h",
     }},
     MethodRow<ChebyshevMethod>{{
         .method = Method::kChebyshev,
@@ -80,6 +84,8 @@ inline constexpr std::tuple kMethods{
         .nanoseconds = 0.1,
         .is_polynomial = true,
         .has_tape = false,
+        .kernel = "ChebyshevMethod",
+        .kernel_header = "jacobi.h",
     }},
     MethodRow<SteepestDescentMethod>{{
         .method = Method::kSteepestDescent,
@@ -88,6 +94,8 @@ inline constexpr std::tuple kMethods{
         .made_for = MadeFor::kDefinite,
         .vectors = 4,
         .nanoseconds = 0.3,
+        .kernel = "SteepestDescentMethod",
+        .kernel_header = "steepest_descent.h",
     }},
     MethodRow<ConjugateGradientMethod>{{
         .method = Method::kConjugateGradient,
@@ -98,6 +106,8 @@ inline constexpr std::tuple kMethods{
         .takes_preconditioner = true,
         .nanoseconds = 0.3,
         .ends_at_unknowns = true,
+        .kernel = "ConjugateGradientMethod",
+        .kernel_header = "conjugate_gradient.h",
     }},
     MethodRow<BiCGStabMethod>{{
         .method = Method::kBiCGStab,
@@ -108,6 +118,8 @@ inline constexpr std::tuple kMethods{
         .takes_preconditioner = true,
         .nanoseconds = 0.8,
         .starts_anew = true,
+        .kernel = "BiCGStabMethod",
+        .kernel_header = "bicgstab.h",
     }},
     MethodRow<GmresMethod>{{
         .method = Method::kGmres,
@@ -117,6 +129,8 @@ inline constexpr std::tuple kMethods{
         .vectors = 4,
         .takes_preconditioner = true,
         .nanoseconds = 0.8,
+        .kernel = "GmresMethod",
+        .kernel_header = "gmres.h",
     }},
     MethodRow<MultigridMethod>{{
         .method = Method::kMultigrid,

@@ -54,7 +54,8 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
                      OnFailure on_failure) {
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
   const int64_t batch = info.status.size(0);
-  const auto* status = info.status.const_data_ptr<int64_t>();
+  const auto on_host = info.status.to(at::kCPU);
+  const auto* status = on_host.const_data_ptr<int64_t>();
   std::vector<int64_t> failed;
   for (int64_t i = 0; i < batch; ++i)
     if (is_failure(static_cast<SolveStatus>(status[i]))) failed.push_back(i);

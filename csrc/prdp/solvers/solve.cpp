@@ -5,6 +5,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/solvers/solve_samples.h"
 #include "prdp/solvers/unnamed_null_space.h"
 
@@ -90,11 +91,11 @@ int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t ite
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
-  std::optional<SolveResult> on_loops;
-  if (b.is_cpu() && runs_on_loops(request.solver))
-    on_loops =
+  auto found = gpu::solve(a, b, request);
+  if (!found && b.is_cpu() && runs_on_loops(request.solver))
+    found =
         b.scalar_type() == at::kFloat ? solve_on_loops<float>(a, b, request) : solve_on_loops<double>(a, b, request);
-  auto result = on_loops ? *std::move(on_loops) : solve_with_tensors(a, b, request);
+  auto result = found ? *std::move(found) : solve_with_tensors(a, b, request);
   find_inconsistent_constants(a, b, request, result);
   return result;
 }

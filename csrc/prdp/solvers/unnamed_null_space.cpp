@@ -37,6 +37,8 @@ double residual_of_sample(const at::Tensor& residuals, int64_t sample) {
                                                : residuals.const_data_ptr<double>()[sample];
 }
 
+constexpr auto kMaxIter = static_cast<int64_t>(SolveStatus::kMaxIter);
+constexpr auto kStagnated = static_cast<int64_t>(SolveStatus::kStagnated);
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;
 
 /// Whether rounding may have grown, after so many products.
@@ -81,7 +83,11 @@ void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const S
                                  SolveResult& result) {
   if (!request.guarded || !a.may_be_singular()) return;
   const auto& solver = request.solver;
-  if (!result.info.status.is_cpu()) return find_inconsistent_constants_there(a, b, solver, result);
+  if (!result.info.status.is_cpu()) {
+    const auto& status = result.info.status;
+    if (request.may_wait && !status.eq(kMaxIter).logical_or(status.eq(kStagnated)).any().item<bool>()) return;
+    return find_inconsistent_constants_there(a, b, solver, result);
+  }
   auto& info = result.info;
   auto* status = info.status.mutable_data_ptr<int64_t>();
   const auto* products = info.operator_applications.const_data_ptr<int64_t>();

@@ -1,0 +1,39 @@
+#include "prdp/gpu/cuda_driver.h"
+
+#include "prdp/gpu/shared_library.h"
+
+namespace prdp::gpu {
+
+const CudaDriver& CudaDriver::get() {
+  static const CudaDriver driver = [] {
+    const SharedLibrary library({"libcuda.so.1"});
+    if (!library) throw Unavailable("there is no libcuda.so.1: is NVIDIA's driver installed?");
+    CudaDriver d{};
+    library.bind(d.init, "cuInit");
+    library.bind(d.error_text, "cuGetErrorString");
+    library.bind(d.device, "cuDeviceGet");
+    library.bind(d.attribute, "cuDeviceGetAttribute");
+    library.bind(d.retain_context, "cuDevicePrimaryCtxRetain");
+    library.bind(d.current_context, "cuCtxGetCurrent");
+    library.bind(d.set_context, "cuCtxSetCurrent");
+    library.bind(d.load, "cuModuleLoadData");
+    library.bind(d.function, "cuModuleGetFunction");
+    library.bind(d.set_attribute, "cuFuncSetAttribute");
+    library.bind(d.blocks_at_once, "cuOccupancyMaxActiveBlocksPerMultiprocessor");
+    library.bind(d.is_capturing, "cuStreamIsCapturing");
+    library.bind(d.launch, "cuLaunchKernel");
+    library.bind(d.launch_cooperative, "cuLaunchCooperativeKernel");
+    d.check(d.init(0), "the driver does not start");
+    return d;
+  }();
+  return driver;
+}
+
+void CudaDriver::check(int result, const char* what) const {
+  if (result == 0) return;
+  const char* text = nullptr;
+  error_text(result, &text);
+  throw Unavailable(std::string(what) + ": " + (text ? text : "unknown error") + " (" + std::to_string(result) + ")");
+}
+
+}  // namespace prdp::gpu

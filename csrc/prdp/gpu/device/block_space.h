@@ -1,0 +1,411 @@
+#pragma once
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <utility>
+
+#include "prdp/gpu/device/team.h"
+#include "prdp/gpu/device/views.h"
+#include "prdp/kernels/scales.h"
+#include "prdp/solvers/iterate.h"
+#include "prdp/solvers/sample_numbers.h"
+#include "prdp/solvers/solve_damped.h"
+
+/// One sample as a space for iterate(), on a GPU: a team of threads owns it. A number is the same in every thread; a
+/// vector lies in the memory of the block, or of the device, and every operation is a loop over a thread's share of it.
+namespace prdp::gpu {
+
+/// Constants of a kernel.
+template <class Number, class Operator, int blocks, int threads, int vectors, int vectors_in_block, bool by_diagonal,
+          bool divides_by_diagonal, int numbers, int restart>
+struct Setting {
+  using T = Number;                                 // float or double
+  using A = Operator;                               // of views.h
+  static constexpr int kBlocks = blocks;            // that work on one sample
+  static constexpr int kThreads = threads;          // in each
+  static constexpr int kVectors = vectors;          // of a sample
+  static constexpr int kInBlock = vectors_in_block; // the first so many of them lie in the block's own memory
+  static constexpr bool kByDiagonal = by_diagonal;  // the preconditioner is the diagonal
+  static constexpr bool kDividesByDiagonal = divides_by_diagonal;  // by it, or by the method
+  static constexpr int kNumbers = numbers;          // bytes of small arrays that the method keeps
+  static constexpr int kRestart = restart;          // of GMRES
+  static_assert(blocks == 1 || vectors_in_block == 0);
+};
+
+/// A few numbers in a thread's own memory.
+template <class X>
+class Slice {
+ public:
+  Slice(X* first, int64_t n) : first_(first) {
+    for (int64_t i = 0; i < n; ++i) first_[i] = X{};
+  }
+  X& operator[](int64_t i) { return first_[i]; }
+  const X& operator[](int64_t i) const { return first_[i]; }
+  X* data() { return first_; }
+  const X* data() const { return first_; }
+
+ private:
+  X* first_;
+};
+
+template <class S>
+class BlockSpace : public SampleNumbers<typename S::T> {
+  using Numbers = SampleNumbers<typename S::T>;
+  using Numbers::broken_;
+
+ public:
+  using T = typename S::T;
+  using A = typename S::A;
+  using Vector = T*;
+  using Scalar = T;
+  using States = std::array<SampleState, 1>;
+  using TeamOfSample = Team<S::kBlocks, S::kThreads>;
+  /// Vectors that the space itself keeps: b, scratch; and of a sample with a start, the start and b - A start.
+  static constexpr int kOwn = 4;
+
+  /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
+  BlockSpace(TeamOfSample& team, const A& a, T* in_block, T* beyond)
+      : team_(team), a_(a), in_block_(in_block), beyond_(beyond) {}
+
+  // ---- a sample
+  /// y = factor · x, where x need not be a vector of the space.
+  PRDP_ONCE void load(const T* x, T factor, Vector y) {
+    each([&](int i) { return factor * x[i]; }, into(y));
+  }
+  void begin(SampleState& state, const NullSpaceArguments<T>* null_space, const NullSpaceArguments<T>* left) {
+    state_ = &state;
+    null_space_ = null_space;
+    left_null_space_ = left;
+    broken_ = started_ = false;
+  }
+  void take_b() { b2_ = dot(b(), b()); }
+  /// A as it will be used; false where it is not finite.
+  PRDP_ONCE bool prepare_operator() {
+    if constexpr (!A::kIsScaled) {
+      const T most = largest_over_rows([&](int i) { return a_.largest_in_row(i); });
+      if (!std::isfinite(most)) return false;
+      factor_ = kernels::scale_of_operator(most);
+      a_.scale(factor_);
+    } else {
+      factor_ = a_.factor();
+      if (!std::isfinite(a_.norm_of_row(0))) return false;
+    }
+    norm_ = largest_over_rows([&](int i) { return a_.norm_of_row(i); });
+    return true;
+  }
+  T factor() const { return factor_; }
+  PRDP_ONCE bool has_zero_diagonal() {
+    return largest_over_rows([&](int i) { return T(a_.diagonal(i) == T(0)); }) != 0;
+  }
+  PRDP_ONCE T largest_magnitude(const T* x) {
+    return largest_over_rows([&](int i) { return std::abs(x[i]); });
+  }
+  /// x = factor x
+  PRDP_ONCE void scale(T factor, Vector x) {
+    each([&](int i) { return factor * x[i]; }, into(x));
+  }
+  /// Onto what products with A may contain, and onto the solutions of least norm. Returns the norm of what is taken
+  /// off.
+  T project(Vector v) { return project(*left_null_space_, v); }
+  T project_solution(Vector v) { return project(*null_space_, v); }
+  bool is_singular() const { return left_null_space_->count > 0; }
+  Vector start() { return memory_of(2); }
+  Vector whole_b() { return memory_of(3); }
+  /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
+  void start_here(T left2) {
+    each([&](int i) { return Pair{b()[i], whole_b()[i]}; },
+         [&](int i, Pair both) {
+           whole_b()[i] = both.first;
+           b()[i] = both.second;
+         });
+    started_ = true;
+    b2_ = left2;
+  }
+  void add_start(Vector x) {
+    if (started_) add(start(), x);
+  }
+  bool started() const { return started_; }
+  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
+    each([&](int i) { return y[i] + alpha * x[i]; }, into(y));
+  }
+
+  // ---- what space.h asks for
+  Vector vector() { return memory_of(used_++); }
+  Vector scratch() { return memory_of(1); }
+  Vector b() { return memory_of(0); }
+  Scalar b2() const { return b2_; }
+  static constexpr int64_t unknowns() { return A::kUnknowns; }
+  template <class X>
+  Slice<X> array(int64_t n) const {
+    auto* first = reinterpret_cast<X*>(numbers_ + used_numbers_);
+    used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
+    return {first, n};
+  }
+
+  PRDP_ONCE void fill_zero(Vector v) {
+    each([](int) { return T(0); }, into(v));
+  }
+  PRDP_ONCE void copy(const T* from, Vector to) {
+    each([&](int i) { return from[i]; }, into(to));
+  }
+  void advance(Vector& x, Vector& next) { std::swap(x, next); }
+  PRDP_ONCE void add(const T* d, Vector x) {
+    each([&](int i) { return x[i] + d[i]; }, into(x));
+  }
+  PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
+    each([&](int i) { return x[i] + beta * y[i]; }, into(y));
+  }
+  void xmby(const T* x, Scalar beta, Vector y) { xpby(x, -beta, y); }
+  PRDP_ONCE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
+    return square_of([&](int i) { return x[i] + beta * y[i]; }, y);
+  }
+  PRDP_ONCE Scalar dot(const T* v, const T* w) {
+    T s = 0;
+    each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
+    return team_.sum(s);
+  }
+  PRDP_ONCE Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
+    T s = 0;
+    each([&](int i) { return Pair{x[i] + alpha * p[i], r[i] - alpha * q[i]}; },
+         [&](int i, Pair next) {
+           x[i] = next.first;
+           r[i] = next.second;
+           s += next.second * next.second;
+         });
+    const T rr = team_.sum(s);
+    if (!is_singular()) return rr;
+    project(r);  // no product takes away what rounding leaves there
+    return dot(r, r);
+  }
+  PRDP_ONCE void apply(const T* v, Vector out) {
+    product(v, [&](int i, T value) { out[i] = value; });
+    if (is_singular()) project(out);
+  }
+  PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
+    if (is_singular()) {
+      apply(v, out);
+      return {dot(v, out), dot(out, out)};
+    }
+    T s[2] = {0, 0};
+    product(v, [&](int i, T value) {
+      out[i] = value;
+      s[0] += v[i] * value;
+      s[1] += value * value;
+    });
+    team_.sum(s);
+    return {s[0], s[1]};
+  }
+  std::array<Scalar, 2> apply_along(const T* v, const T* w, Vector out) {
+    const auto found = apply_with_dots(v, out);
+    return {v == w ? found[0] : dot(w, out), found[1]};
+  }
+  /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
+  PRDP_ONCE Scalar residual(const T* x, Vector r) {
+    const T* const of = started_ ? whole_b() : b();
+    T s = 0;
+    product(solution(x), [&](int i, T value) {
+      const T left = of[i] - value;
+      r[i] = left;
+      s += left * left;
+    });
+    const T rr = team_.sum(s);
+    if (!is_singular()) return rr;
+    project(r);
+    return dot(r, r);
+  }
+  Scalar solution2(const T* x) {
+    const T* u = solution(x);
+    return dot(u, u);
+  }
+
+  static constexpr bool is_preconditioned() { return S::kByDiagonal; }
+  PRDP_ONCE Scalar precondition(const T* v, Vector out) {
+    T s = 0;
+    each([&](int i) { return v[i] / a_.diagonal(i); },
+         [&](int i, T value) {
+           out[i] = value;
+           s += v[i] * value;
+         });
+    return team_.sum(s);
+  }
+  void correct(const T* v, Vector out) { precondition(v, out); }
+
+  PRDP_ONCE void divide_by_diagonal(const T* x, Vector y) {
+    each([&](int i) { return x[i] / a_.diagonal(i); }, into(y));
+  }
+  PRDP_ONCE void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
+    for (int64_t k = 0; k < n; ++k, std::swap(x, next)) sweep(c, x, next, omega ? omega + k : nullptr, [](int, T) {});
+  }
+  PRDP_ONCE Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
+    T s = 0;
+    sweep(c, x, next, omega, [&](int i, T change) {
+      const T left = change * a_.diagonal(i);
+      s += left * left;
+    });
+    return team_.sum(s);
+  }
+  Scalar radius2() const { return static_cast<T>(a_.radius() * a_.radius()); }
+  static constexpr bool sweeps_contract() { return A::kKnowsRadius; }
+
+  PRDP_ONCE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
+    for (int64_t j = 0; j < count; j += kMostAtOnce) {
+      T s[kMostAtOnce] = {};
+      const int some = static_cast<int>(count - j < kMostAtOnce ? count - j : kMostAtOnce);
+      const T* of[kMostAtOnce];
+      PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) of[k] = v[j + (k < some ? k : 0)];
+      each([&](int i) { return factor * w[i]; },
+           [&](int i, T value) { PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) s[k] += of[k][i] * value; });
+      team_.sum(s);
+      for (int k = 0; k < some; ++k) h[j + k] = s[k];
+    }
+  }
+  PRDP_ONCE Scalar subtract_combination(const Scalar* h, const Slice<Vector>& v, int64_t count, Scalar factor,
+                                        Vector w) {
+    return square_of(
+        [&](int i) {
+          T sum = factor * w[i];
+          for (int64_t j = 0; j < count; ++j) sum -= h[j] * v[j][i];
+          return sum;
+        },
+        w);
+  }
+  PRDP_ONCE void add_combination(const Scalar* y, const Slice<Vector>& v, int64_t count, Vector x) {
+    each(
+        [&](int i) {
+          T sum = x[i];
+          for (int64_t j = 0; j < count; ++j) sum += y[j] * v[j][i];
+          return sum;
+        },
+        into(x));
+  }
+  /// Seldom: one thread computes it.
+  PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
+                      Scalar* y) const {
+    if (keep != 0) return;
+    T* const work = beyond_ + static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns;
+    T* const found = work + numbers_of_solve_damped(n);
+    if (team_.leads()) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
+    team_.meet();
+    for (int64_t j = 0; j < n; ++j) y[j] = shared_entry(found, j);
+  }
+  using Numbers::restore;
+  void restore(Scalar where, const T* from, Vector to) {
+    if (where != 0) copy(from, to);
+  }
+  void solve_directly(const T*, Vector) {}  // no method on a GPU does
+
+  // ---- what iterate.h asks for
+  std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
+  std::array<bool, 1> broken() const { return {broken_}; }
+  std::array<double, 1> operator_norm() const { return {norm_}; }
+  template <class Predicate>
+  void freeze_unless(const States&, const Predicate&) {}
+  template <class Function>
+  auto map(const States& states, const Function& f) const {
+    return std::array<decltype(f(states[0])), 1>{f(states[0])};
+  }
+  Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
+  void reset() { broken_ = false; }
+
+  /// f(i), and then store(i, f(i)), for this thread's cells.
+  template <class F, class Store>
+  void each(const F& f, const Store& store) const {
+    team_.each(A::kUnknowns, f, store);
+  }
+
+ private:
+  struct Pair {
+    T first, second;
+  };
+  static auto into(Vector v) {
+    return [v](int i, T value) { v[i] = value; };
+  }
+  /// An entry that another thread wrote. Those of other blocks are not in this block's cache.
+  static T shared_entry(const T* v, int64_t i) {
+    if constexpr (S::kBlocks > 1) return __ldcg(v + i);
+    else return v[i];
+  }
+  struct Shared {
+    const T* v;
+    T operator[](int i) const { return shared_entry(v, i); }
+  };
+
+  Vector memory_of(int i) {
+    if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
+    return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
+  }
+  template <class F>
+  T square_of(const F& f, Vector out) {
+    T s = 0;
+    each(f, [&](int i, T value) {
+      out[i] = value;
+      s += value * value;
+    });
+    return team_.sum(s);
+  }
+  template <class F>
+  auto largest_over_rows(const F& f) {
+    decltype(f(0)) most = 0;
+    each(f, [&](int, auto value) { most = larger_or_nan(most, value); });
+    return team_.largest(most);
+  }
+  /// store(i, (A v)_i) for this thread's cells. Before v is changed, a sum or another product must come: slower threads
+  /// still read it. The methods are like that; one that is not gives other bits in tests/python/test_gpu_kernels.py.
+  template <class Store>
+  void product(const T* v, const Store& store) {
+    ++state_->applications;
+    team_.meet();
+    const Shared of_all{v};
+    each([&](int i) { return a_.product(of_all, i); }, store);
+  }
+  /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
+  template <class Tell>
+  void sweep(const T* c, const T* x, Vector next, const T* omega, const Tell& tell) {
+    product(x, [&](int i, T value) {
+      const T change = c[i] - value / a_.diagonal(i);
+      const T plain = x[i] + change;
+      if constexpr (A::kKnowsRadius) next[i] = omega ? next[i] + *omega * (plain - next[i]) : plain;
+      else next[i] = plain;
+      tell(i, change);
+    });
+  }
+  PRDP_ONCE T project(const NullSpaceArguments<T>& space, Vector v) {
+    double part2 = 0;
+    const int length = static_cast<int>(space.length);
+    const T entry = T(1) / std::sqrt(static_cast<T>(length));
+    for (int field = 0; field < static_cast<int>(space.fields); ++field)
+      for (int k = 0; k < static_cast<int>(space.count); ++k) {
+        const auto q = [&](int i) {
+          const int at = i - field * length;
+          if (at < 0 || at >= length) return T(0);
+          return space.basis ? space.basis[k * length + at] : entry;
+        };
+        T s = 0;
+        each([&](int i) { return q(i) * v[i]; }, [&](int, T value) { s += value; });
+        const T along = team_.sum(s);
+        each([&](int i) { return v[i] - along * q(i); }, into(v));
+        part2 += static_cast<double>(along) * static_cast<double>(along);
+      }
+    return static_cast<T>(std::sqrt(part2));
+  }
+  PRDP_ONCE const T* solution(const T* x) {
+    if (!started_) return x;
+    each([&](int i) { return x[i] + start()[i]; }, into(scratch()));
+    return scratch();
+  }
+
+  TeamOfSample& team_;
+  A a_;
+  T *in_block_, *beyond_;
+  SampleState* state_ = nullptr;
+  const NullSpaceArguments<T>*null_space_ = nullptr, *left_null_space_ = nullptr;
+  int used_ = kOwn;
+  T factor_ = 1, b2_ = 0;
+  double norm_ = 0;
+  bool started_ = false;
+  alignas(8) mutable char numbers_[S::kNumbers > 0 ? S::kNumbers : 1];
+  mutable int64_t used_numbers_ = 0;
+};
+
+}  // namespace prdp::gpu

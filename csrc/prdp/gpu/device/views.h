@@ -1,0 +1,190 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+#include "prdp/gpu/device/arguments.h"
+
+/// Operators as a kernel knows them: what stands in a row of A. The sizes are constants. `v` is anything with v[i].
+/// What a view computes with is factor·A, where the factor is a power of two that makes the entries of order one.
+namespace prdp::gpu {
+
+/// A grid of nz planes of ny rows of nx points.
+template <int nz, int ny, int nx>
+struct Grid {
+  static constexpr int kPoints = nz * ny * nx;
+  int x, y, z;
+  explicit Grid(int point) : x(point % nx), y(point / nx % ny), z(point / (nx * ny)) {}
+
+  static constexpr int kX = nx, kY = ny, kZ = nz;
+};
+
+/// A neighbour, so many cells away along each axis.
+template <int dz, int dy, int dx>
+struct Offset {
+  static constexpr int kZ = dz, kY = dy, kX = dx;
+};
+
+/// The index after `cells` more along an axis of n; -1 beyond the end of one that is not periodic.
+template <int n, int cells, bool periodic>
+inline int moved(int index) {
+  if constexpr (cells == 0) return index;
+  if constexpr (periodic) {
+    constexpr int forward = (cells % n + n) % n;
+    const int next = index + forward;
+    return next < n ? next : next - n;
+  } else {
+    const int next = index + cells;
+    return next >= 0 && next < n ? next : -1;
+  }
+}
+
+/// The larger one; NaN if one of them is.
+template <class T>
+T larger_or_nan(T a, T b) {
+  return b > a || b != b ? b : a;
+}
+
+/// Numbers: centre, and the weight of both neighbours along z, y and x; zero outside the grid. ‖factor·A‖∞; the
+/// spectral radius of I - D⁻¹A; the factor. The host has scaled them.
+template <class T, class G>
+class Laplacian {
+ public:
+  static constexpr int kUnknowns = G::kPoints;
+  static constexpr bool kKnowsRadius = true;
+
+  Laplacian(const OperatorArguments& a, int64_t)
+      : centre_(static_cast<T>(a.numbers[0])),
+        z_(static_cast<T>(a.numbers[1])),
+        y_(static_cast<T>(a.numbers[2])),
+        x_(static_cast<T>(a.numbers[3])),
+        norm_(a.numbers[4]),
+        radius_(a.numbers[5]),
+        factor_(static_cast<T>(a.numbers[6])) {}
+
+  static constexpr bool kIsScaled = true;
+  T largest_in_row(int) const { return std::abs(centre_); }
+  T factor() const { return factor_; }
+  double norm_of_row(int) const { return norm_; }
+  double radius() const { return radius_; }
+  T diagonal(int) const { return centre_; }
+  template <class V>
+  T product(const V& v, int i) const {
+    const G at(i);
+    T sum = centre_ * v[i];
+    if constexpr (G::kX > 1) sum += x_ * ((at.x > 0 ? v[i - 1] : T(0)) + (at.x + 1 < G::kX ? v[i + 1] : T(0)));
+    if constexpr (G::kY > 1) sum += y_ * ((at.y > 0 ? v[i - G::kX] : T(0)) + (at.y + 1 < G::kY ? v[i + G::kX] : T(0)));
+    if constexpr (G::kZ > 1)
+      sum += z_ * ((at.z > 0 ? v[i - G::kX * G::kY] : T(0)) + (at.z + 1 < G::kZ ? v[i + G::kX * G::kY] : T(0)));
+    return sum;
+  }
+
+ private:
+  T centre_, z_, y_, x_;
+  double norm_, radius_;
+  T factor_;
+};
+
+/// Tensors: coefficients, one field for each offset, which all channels share. (A v)[i] = Σ_k c_k[i] v[i + offset_k],
+/// or (Aᵀ v)[i] = Σ_k c_k[i - offset_k] v[i - offset_k].
+template <class T, class G, int kChannels, bool kTransposed, bool periodic_z, bool periodic_y, bool periodic_x,
+          class... Offsets>
+class Stencil {
+ public:
+  static constexpr int kUnknowns = kChannels * G::kPoints;
+  static constexpr bool kKnowsRadius = false;
+  static constexpr bool kIsScaled = false;
+
+  Stencil(const OperatorArguments& a, int64_t sample)
+      : coefficients_(static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0]) {}
+
+  /// Of all that stands there, also of what leads out of the grid.
+  T largest_in_row(int i) const {
+    T most = 0;
+    for (int k = 0; k < kOffsets; ++k)
+      most = larger_or_nan(most, std::abs(coefficients_[k * G::kPoints + i % G::kPoints]));
+    return most;
+  }
+  void scale(T factor) { factor_ = factor; }
+  double norm_of_row(int i) const {
+    double sum = 0;
+    for_each_entry(i, [&](T c, int) { sum += static_cast<double>(std::abs(factor_ * c)); });
+    return sum;
+  }
+  double radius() const { return 0; }
+  T diagonal(int i) const {
+    T sum = 0;
+    for_each_entry(i, [&](T c, int j) { sum += j == i ? factor_ * c : T(0); });
+    return sum;
+  }
+  template <class V>
+  T product(const V& v, int i) const {
+    T sum = 0;
+    for_each_entry(i, [&](T c, int j) { sum += (factor_ * c) * v[j]; });
+    return sum;
+  }
+
+ private:
+  static constexpr int kOffsets = sizeof...(Offsets);
+
+  /// f(a_ij, j) for the neighbours j of i that are inside the grid.
+  template <class F>
+  void for_each_entry(int i, const F& f) const {
+    const int point = i % G::kPoints;
+    const G at(point);
+    int k = 0;
+    (entry<Offsets>(at, point, i - point, k++, f), ...);
+  }
+  template <class O, class F>
+  void entry(const G& at, int point, int channel, int k, const F& f) const {
+    constexpr int sign = kTransposed ? -1 : 1;
+    const int z = moved<G::kZ, sign * O::kZ, periodic_z>(at.z);
+    const int y = moved<G::kY, sign * O::kY, periodic_y>(at.y);
+    const int x = moved<G::kX, sign * O::kX, periodic_x>(at.x);
+    if ((z | y | x) < 0) return;
+    const int there = (z * G::kY + y) * G::kX + x;
+    f(coefficients_[k * G::kPoints + (kTransposed ? there : point)], channel + there);
+  }
+
+  const T* coefficients_;
+  T factor_ = 1;
+};
+
+/// Tensors: A, n rows of n entries.
+template <class T, int n, bool kTransposed>
+class Dense {
+ public:
+  static constexpr int kUnknowns = n;
+  static constexpr bool kKnowsRadius = false;
+  static constexpr bool kIsScaled = false;
+
+  Dense(const OperatorArguments& a, int64_t sample)
+      : matrix_(static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0]) {}
+
+  T largest_in_row(int i) const {
+    T most = 0;
+    for (int j = 0; j < n; ++j) most = larger_or_nan(most, std::abs(entry(i, j)));
+    return most;
+  }
+  void scale(T factor) { factor_ = factor; }
+  double norm_of_row(int i) const {
+    double sum = 0;
+    for (int j = 0; j < n; ++j) sum += static_cast<double>(std::abs(factor_ * entry(i, j)));
+    return sum;
+  }
+  double radius() const { return 0; }
+  T diagonal(int i) const { return factor_ * entry(i, i); }
+  template <class V>
+  T product(const V& v, int i) const {
+    T sum = 0;
+    for (int j = 0; j < n; ++j) sum += (factor_ * entry(i, j)) * v[j];
+    return sum;
+  }
+
+ private:
+  T entry(int i, int j) const { return kTransposed ? matrix_[j * n + i] : matrix_[i * n + j]; }
+
+  const T* matrix_;
+  T factor_ = 1;
+};
+
+}  // namespace prdp::gpu

@@ -1,0 +1,26 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "prdp/gpu/device/arguments.h"
+
+namespace prdp::gpu {
+
+/// An operator as a kernel takes it: a type of device/views.h, and the tensors and numbers of it.
+struct OperatorView {
+  std::string type;  // "Laplacian<float, Grid<1, 64, 64>>"
+  std::vector<at::Tensor> tensors{};  // contiguous; with one sample or as many as the vectors
+  std::vector<double> numbers{};
+  /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.
+  at::Tensor null_space{}, left_null_space{};
+};
+
+/// "float" or "double".
+std::string type_of(at::ScalarType dtype);
+/// "Grid<1, 64, 64>" of up to three extents.
+std::string grid_of(at::IntArrayRef shape);
+
+}  // namespace prdp::gpu

@@ -1,0 +1,57 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include <memory>
+#include <stdexcept>
+#include <string>
+
+/// Where kernels are compiled and launched: CUDA, or, in the tests, fibers on the CPU.
+namespace prdp::gpu {
+
+/// Why there is no kernel: one sentence.
+class Unavailable : public std::runtime_error {
+ public:
+  using std::runtime_error::runtime_error;
+};
+
+/// What a kernel may use of a device.
+struct Limits {
+  int64_t block_memory;     // bytes that the vectors of a block may take
+  int64_t cells_of_block;   // unknowns of a sample for each block of its team
+  int64_t threads;          // of a block, at most
+};
+
+/// A kernel in the device's language, with what its launch needs.
+struct KernelSource {
+  std::string text;
+  int64_t threads, block_memory, blocks_of_team;
+};
+
+/// A kernel on a device.
+class Kernel {
+ public:
+  virtual ~Kernel() = default;
+  /// Teams that can be at work at the same time.
+  virtual int64_t teams() const = 0;
+  /// On the device's current stream. `arguments` is a SolveArguments.
+  virtual void launch(int64_t teams, const void* arguments) const = 0;
+};
+
+class Runtime {
+ public:
+  virtual ~Runtime() = default;
+  virtual Limits limits(c10::Device device) = 0;
+  /// Compiles it, or finds it. Raises Unavailable.
+  virtual std::shared_ptr<const Kernel> kernel(c10::Device device, const KernelSource& source) = 0;
+};
+
+/// The runtime of a device; null if it has none.
+Runtime* runtime_of(c10::Device device);
+/// For tests: what runs the kernels of this kind of device from here on; null: nothing.
+void set_runtime(c10::DeviceType type, Runtime* runtime);
+
+/// PRDP_GPU: kernels where there are any; an error where there are none; none.
+enum class Use { kAuto, kRequired, kOff };
+Use use();
+
+}  // namespace prdp::gpu

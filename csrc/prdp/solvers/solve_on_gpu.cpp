@@ -1,0 +1,156 @@
+#include "prdp/solvers/solve_on_gpu.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <algorithm>
+#include <mutex>
+#include <set>
+
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve_kernel.h"
+
+namespace prdp::gpu {
+
+namespace {
+
+/// Why a solve has no kernel, which is no fault.
+std::string not_made(const Solver& solver) {
+  return std::string(traits(solver.method).label) + (solver.preconditioner ? " with this preconditioner" : "") +
+         " has no kernel";
+}
+
+/// Says why tensor operations take the place of a kernel: once for each reason.
+void fall_back(const std::string& reason) {
+  TORCH_CHECK(use() != Use::kRequired, "PRDP_GPU=required: ", reason);
+  static std::mutex mutex;
+  static auto* said = new std::set<std::string>;
+  const std::lock_guard lock(mutex);
+  if (said->insert(reason).second)
+    TORCH_WARN("prdp: no kernel on this device, so tensor operations take its place, which are slow: ", reason);
+}
+
+struct Made {
+  std::mutex mutex;
+  std::vector<std::string> names;
+};
+Made& made() {
+  static auto* all = new Made;
+  return *all;
+}
+void note_made(const std::string& name) {
+  const std::lock_guard lock(made().mutex);
+  auto& names = made().names;
+  if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
+}
+
+template <class T>
+NullSpaceArguments<T> arguments_of(const at::Tensor& basis, int64_t unknowns, int64_t length) {
+  if (!basis.defined()) return {};
+  const bool constant = basis.numel() == 0;
+  return {constant ? nullptr : basis.const_data_ptr<T>(), constant ? 1 : basis.size(0), unknowns / length, length};
+}
+
+/// Entries of a vector that a null space belongs to: those of a channel.
+int64_t length_of(const at::Tensor& basis, const at::Tensor& b) {
+  if (basis.defined() && basis.numel() > 0) return basis.size(1);
+  return b.numel() / (b.size(0) * (b.dim() < 3 ? 1 : b.size(1)));
+}
+
+template <class T>
+SolveResult launch(const Kernel& kernel, const SolveKernel& source, const OperatorView& a, const at::Tensor& b,
+                   const SolveRequest& request) {
+  const int64_t batch = b.size(0), unknowns = b.numel() / batch;
+  const auto counts = at::empty({3, batch}, b.options().dtype(at::kLong));
+  const auto reals = at::empty({2, batch}, b.options());
+  auto u = at::empty(b.sizes(), b.options());
+  const int64_t blocks = source.source.blocks_of_team;
+  const int64_t teams = std::min(batch, blocks > 1 ? kernel.teams() : 4 * kernel.teams());
+  const auto memory = at::empty({std::max<int64_t>(teams * source.memory_of_team, 1)}, b.options());
+  const auto arrived = blocks > 1 ? at::zeros({32 * teams}, b.options().dtype(at::kInt)) : at::Tensor();
+  const auto parts =
+      blocks > 1 ? at::empty({2 * kMostAtOnce * blocks * teams}, b.options().dtype(at::kDouble)) : at::Tensor();
+  const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
+  const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
+
+  SolveArguments<T> arguments{};
+  for (size_t i = 0; i < a.tensors.size(); ++i) {
+    arguments.a.tensors[i] = a.tensors[i].const_data_ptr();
+    arguments.a.sample_strides[i] = a.tensors[i].size(0) == 1 ? 0 : a.tensors[i].stride(0);
+  }
+  std::copy(a.numbers.begin(), a.numbers.end(), arguments.a.numbers);
+  arguments.null_space = arguments_of<T>(a.null_space, unknowns, length_of(a.null_space, b));
+  arguments.left_null_space = arguments_of<T>(a.left_null_space, unknowns, length_of(a.left_null_space, b));
+  arguments.b = b.const_data_ptr<T>();
+  arguments.x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr;
+  arguments.u = u.mutable_data_ptr<T>();
+  arguments.caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr;
+  arguments.counts = counts.mutable_data_ptr<int64_t>();
+  arguments.reals = reals.mutable_data_ptr<T>();
+  arguments.memory = memory.mutable_data_ptr<T>();
+  if (blocks > 1) {
+    arguments.arrived = static_cast<unsigned*>(arrived.mutable_data_ptr());
+    arguments.parts = parts.mutable_data_ptr<double>();
+  }
+  arguments.batch = batch;
+  arguments.max_iter = request.solver.max_iter.expect_int();
+  arguments.rtol = request.solver.rtol;
+  arguments.guarded = request.guarded;
+  kernel.launch(teams, &arguments);
+  return {u, {counts[0], reals[0], counts[1], counts[2], reals[1]}};
+}
+
+/// A kernel, with all that its launch needs.
+struct Prepared {
+  std::shared_ptr<const Kernel> kernel;
+  SolveKernel source;
+  OperatorView a;
+};
+
+/// Nothing where there is none.
+std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const Solver& solver) {
+  auto* const runtime = runtime_of(b.device());
+  if (!runtime || b.numel() == 0) return std::nullopt;
+  try {
+    if (!has_kernel(solver)) {
+      if (use() == Use::kRequired) throw Unavailable(not_made(solver));
+      return std::nullopt;
+    }
+    auto view = a.gpu_view(b, /*transposed=*/false);
+    if (!view) {
+      if (use() == Use::kRequired) throw Unavailable("this operator has no kernel");
+      return std::nullopt;
+    }
+    const auto source =
+        solve_kernel(*view, solver, b.scalar_type(), b.numel() / b.size(0), runtime->limits(b.device()));
+    auto kernel = runtime->kernel(b.device(), source.source);
+    note_made(std::string(traits(solver.method).label) + " of " + view->type);
+    return Prepared{std::move(kernel), source, *std::move(view)};
+  } catch (const Unavailable& reason) {
+    fall_back(reason.what());
+    return std::nullopt;
+  }
+}
+
+}  // namespace
+
+std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  if (!runtime_of(b.device())) return std::nullopt;
+  const at::NoGradGuard no_grad;
+  const auto rhs = b.contiguous();
+  const auto prepared = prepare(a, rhs, request.solver);
+  if (!prepared) return std::nullopt;
+  const auto run = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
+  try {
+    return run(*prepared->kernel, prepared->source, prepared->a, rhs, request);
+  } catch (const Unavailable& reason) {
+    fall_back(reason.what());
+    return std::nullopt;
+  }
+}
+
+std::vector<std::string> kernels_made() {
+  const std::lock_guard lock(made().mutex);
+  return made().names;
+}
+
+}  // namespace prdp::gpu

@@ -1,0 +1,14 @@
+#pragma once
+#include "prdp/solvers/solve.h"
+
+namespace prdp::gpu {
+
+/// A solve in one launch, where the device, the method and the operator have a kernel; else nothing, and tensor
+/// operations take its place: with one warning for each reason that is not the method or the operator itself. With
+/// PRDP_GPU=required, every reason is an error. The report stays on the device.
+std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
+
+/// The kernels that this process has made, in the order in which they were: "CG of Stencil<float, …>".
+std::vector<std::string> kernels_made();
+
+}  // namespace prdp::gpu

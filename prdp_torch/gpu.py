@@ -1,0 +1,33 @@
+"""Kernels of a GPU: compiled when they are first needed, or before."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from prdp_torch import _C
+
+
+def warm_up(step: Callable[[Tensor], Tensor], example: Tensor, backward: bool = True) -> list[str]:
+    """Compile and load the kernels that `step(example)` needs, and those of its backward pass.
+
+    A kernel takes seconds to compile when it is first needed, and milliseconds to load in later processes. Call this
+    before a clock starts, and before a CUDA graph is captured: meanwhile nothing can be compiled. `step` is run once;
+    gradients that are there stay as they are.
+
+    Args:
+        step: a step such as `prdp.Heat`, or any function of a state.
+        example: a state with the shape, dtype and device that the step will be called with.
+        backward: whether gradients will be taken.
+
+    Returns:
+        The kernels that were made, such as "CG of Stencil<float, Grid<1, 64, 64>, …>"; none on the CPU, and none that
+        this process had made before.
+    """
+    before = set(_C.kernels_made())
+    state = example.detach().clone().requires_grad_(backward)
+    with torch.enable_grad() if backward else torch.no_grad():
+        u = step(state)
+        if backward and u.requires_grad:
+            torch.autograd.grad(u.sum(), state, allow_unused=True)
+    return [name for name in _C.kernels_made() if name not in before]

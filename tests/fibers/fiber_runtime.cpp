@@ -1,0 +1,149 @@
+// Kernels of a GPU on the CPU: compiled by the host's compiler, run by fibers.h. With it, tensors of the CPU take the
+// way that those of a GPU take, from the operator to the report.
+
+#include <dlfcn.h>
+#include <unistd.h>
+
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <map>
+#include <mutex>
+
+#include "prdp/gpu/nvrtc.h"
+#include "prdp/gpu/runtime.h"
+
+namespace {
+
+namespace fs = std::filesystem;
+using prdp::gpu::KernelSource;
+using prdp::gpu::Limits;
+using prdp::gpu::Unavailable;
+
+struct Settings {
+  Limits limits{};
+  int order = 0;  // of fibers::Order
+  int left_out = 0;  // the line of the barrier that is left out; 0: none
+  std::string last{};  // text of a kernel
+};
+Settings settings;
+
+std::string read(const fs::path& file) {
+  std::ifstream in(file);
+  return {std::istreambuf_iterator<char>(in), {}};
+}
+
+/// Where compiled kernels are kept: a folder for each version of the text that they include.
+const fs::path& folder() {
+  static const fs::path made = [] {
+    std::string text = read(fs::path(PRDP_FIBERS) / "fibers.h");
+    for (const char* part : {"prdp/gpu/device", "prdp/solvers", "prdp/kernels"})
+      for (const auto& file : fs::directory_iterator(fs::path(PRDP_CSRC) / part))
+        if (file.path().extension() == ".h") text += read(file);
+    const auto name = "prdp-fibers-" + std::to_string(getuid()) + "-" + std::to_string(std::hash<std::string>()(text));
+    fs::create_directories(fs::temp_directory_path() / name);
+    return fs::temp_directory_path() / name;
+  }();
+  return made;
+}
+
+/// Runs the host's compiler; what it makes appears whole.
+void compile(const std::string& arguments, const fs::path& result) {
+  if (fs::exists(result)) return;
+  const auto part = result.string() + "." + std::to_string(getpid()), log = part + ".log";
+  const std::string command = "c++ -std=c++20 -O1 -ffp-contract=off -fPIC -pthread -I" + folder().string() + " -I" +
+                              PRDP_CSRC + " " + arguments + " -o " + part + " 2> " + log;
+  if (std::system(command.c_str()) != 0) throw Unavailable("the host's compiler fails: " + read(log));
+  fs::remove(log);
+  fs::rename(part, result);
+}
+
+/// Compiles `text`; returns the library's file.
+std::string compiled(const std::string& text) {
+  const auto header = folder() / "fibers.h",
+             source = folder() / (std::to_string(std::hash<std::string>()(text)) + ".cpp");
+  if (!fs::exists(header)) fs::copy_file(fs::path(PRDP_FIBERS) / "fibers.h", header, fs::copy_options::skip_existing);
+  compile("-x c++-header " + header.string(), header.string() + ".gch");
+  std::ofstream(source) << text;
+  const auto library = source.string() + ".so";
+  compile("-shared " + source.string(), library);
+  return library;
+}
+
+class FiberKernel final : public prdp::gpu::Kernel {
+ public:
+  explicit FiberKernel(const KernelSource& source) : source_(source) {
+    const auto text =
+        "#include \"fibers.h\"\n" + source.text +
+        "extern \"C\" int run(const void* arguments, int blocks, int threads, long memory, int order, int "
+        "left_out) {\n"
+        "  fibers::left_out = left_out;\n"
+        "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
+        "    prdp_kernel(*static_cast<const SolveArguments<S::T>*>(arguments)); });\n}\n";
+    void* const library = dlopen(compiled(text).c_str(), RTLD_NOW);
+    if (!library) throw Unavailable(dlerror());
+    run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));
+  }
+  int64_t teams() const override { return 2; }
+  void launch(int64_t teams, const void* arguments) const override {
+    constexpr long spare = 64;
+    const bool regular =
+        run_(arguments, static_cast<int>(teams * source_.blocks_of_team), static_cast<int>(source_.threads),
+             source_.block_memory + spare, settings.order, settings.left_out);
+    TORCH_CHECK(regular, "fibers: some wait where others do not");
+  }
+
+ private:
+  KernelSource source_;
+  int (*run_)(const void*, int, int, long, int, int);
+};
+
+class FiberRuntime final : public prdp::gpu::Runtime {
+ public:
+  Limits limits(c10::Device) override { return settings.limits; }
+  std::shared_ptr<const prdp::gpu::Kernel> kernel(c10::Device, const KernelSource& source) override {
+    const std::lock_guard lock(mutex_);
+    settings.last = source.text;
+    auto& kernel = kernels_[source.text];
+    if (!kernel) kernel = std::make_shared<FiberKernel>(source);
+    return kernel;
+  }
+
+ private:
+  std::mutex mutex_;
+  std::map<std::string, std::shared_ptr<const prdp::gpu::Kernel>> kernels_;
+};
+
+}  // namespace
+
+/// From here on, kernels serve tensors of the CPU; and no longer.
+extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
+                                  int left_out) {
+  static auto* runtime = new FiberRuntime;
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, settings.last};
+  prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
+}
+/// Compiles the text of the last kernel for devices of this compute capability by NVRTC. Returns what went wrong, or
+/// nothing; the length of the binary goes to `size`.
+extern "C" const char* prdp_compile_last(int capability, int64_t* size) {
+  static std::string error;
+  error.clear();
+  try {
+    *size = std::ssize(prdp::gpu::nvrtc::compile(settings.last, capability));
+  } catch (const std::exception& e) {
+    error = e.what();
+  }
+  return error.c_str();
+}
+/// What the compiler says of it.
+extern "C" const char* prdp_resources_of_last(int capability) {
+  static std::string said;
+  try {
+    said = prdp::gpu::nvrtc::resources(settings.last, capability);
+  } catch (const std::exception& e) {
+    said = e.what();
+  }
+  return said.c_str();
+}
+extern "C" void prdp_fibers_end() { prdp::gpu::set_runtime(c10::DeviceType::CPU, nullptr); }

@@ -1,0 +1,190 @@
+#pragma once
+#include <ucontext.h>
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <numeric>
+#include <random>
+#include <thread>
+#include <vector>
+
+/// The text of a GPU kernel on a CPU, without a GPU: the threads of a block are fibers of one host thread, which give
+/// way at barriers and shuffles, and the blocks are host threads. Between two barriers the fibers run in a given order:
+/// forward, backward or shuffled. What depends on the order shows in the bits; memory of a block begins as NaN; fibers
+/// that wait at different barriers are an error.
+#define __device__
+#define __global__
+#define __launch_bounds__(threads)
+#define __shared__ static thread_local
+#define PRDP_UNROLL
+#define PRDP_ONCE
+#define PRDP_SPIN fibers::spin(turns)
+#define PRDP_BLOCK_MEMORY(name) double* const name = reinterpret_cast<double*>(fibers::block->memory.data())
+// One barrier may be left out, to see that a test notices: that of a line of team.h, or of a line that calls meet().
+#define __syncthreads() (__LINE__ == fibers::left_out ? void() : fibers::meet())
+#define PRDP_LEAVES_OUT(line) (fibers::kLinesOfTeam + (line) == fibers::left_out)
+#define __threadfence() std::atomic_thread_fence(std::memory_order_seq_cst)
+
+namespace fibers {
+
+enum class Order { kForward, kBackward, kShuffled };
+
+struct Fiber {
+  ucontext_t context;
+  std::unique_ptr<char[]> stack;
+  bool done = false;
+};
+/// Where fibers wait for each other.
+struct Gate {
+  int64_t opened = 0;
+  int waiting = 0;
+};
+struct Block {
+  std::vector<Fiber> fibers;
+  ucontext_t scheduler;
+  int now = 0;
+  std::vector<char> memory;
+  std::vector<double> of_lanes;
+  Gate all;
+  std::vector<Gate> warps;
+  bool moved = false;  // somebody has, in this round
+};
+inline thread_local Block* block = nullptr;
+inline thread_local std::function<void()>* body = nullptr;
+inline int left_out = 0;
+inline std::atomic<bool> stuck = false;  // some block is: the others must not wait for it
+inline std::atomic<int> ended = 0;       // blocks
+struct Stuck {};
+constexpr int kLinesOfTeam = 10000;
+constexpr int kLanesOfWarp = 32;
+
+inline void give_way() {
+  auto& fiber = block->fibers[block->now];
+  swapcontext(&fiber.context, &block->scheduler);
+}
+inline void wait_at(Gate& gate, int fibers) {
+  block->moved = true;
+  const int64_t before = gate.opened;
+  if (++gate.waiting == fibers) {
+    gate.waiting = 0;
+    ++gate.opened;
+    return give_way();
+  }
+  do give_way();
+  while (gate.opened == before);
+  block->moved = true;
+}
+inline void meet() { wait_at(block->all, static_cast<int>(block->fibers.size())); }
+/// Gives up where a block ended that should have come.
+inline void spin(int64_t& turns) {
+  constexpr int64_t patience = 20000;
+  if (ended > 0 && ++turns > patience) stuck = true;
+  if (stuck) throw Stuck();
+  std::this_thread::yield();
+}
+inline void enter() {
+  try {
+    (*body)();
+  } catch (const Stuck&) {
+  }
+  block->fibers[block->now].done = true;
+  give_way();
+}
+
+}  // namespace fibers
+
+struct Index {
+  unsigned x;
+};
+inline thread_local Index threadIdx, blockDim, blockIdx, gridDim;
+
+/// All lanes meet twice: when each has written, and when each has read.
+template <class T>
+T __shfl_xor_sync(unsigned, T value, int lane) {
+  auto& b = *fibers::block;
+  auto& warp = b.warps[threadIdx.x / fibers::kLanesOfWarp];
+  b.of_lanes[threadIdx.x] = static_cast<double>(value);
+  fibers::wait_at(warp, fibers::kLanesOfWarp);
+  const T other = static_cast<T>(b.of_lanes[threadIdx.x ^ static_cast<unsigned>(lane)]);
+  fibers::wait_at(warp, fibers::kLanesOfWarp);
+  return other;
+}
+template <class T>
+T __ldcg(const T* p) {
+  return *const_cast<const volatile T*>(p);
+}
+inline unsigned atomicAdd(unsigned* p, unsigned v) { return __atomic_fetch_add(p, v, __ATOMIC_SEQ_CST); }
+
+namespace fibers {
+
+/// Runs a block to its end; false where its fibers wait at different barriers.
+inline bool run_block(int index, int blocks, int threads, int64_t memory, Order order, unsigned seed,
+                      std::function<void()> kernel) {
+  Block mine;
+  block = &mine;
+  body = &kernel;
+  mine.memory.assign(static_cast<size_t>(memory), char(0xff));
+  mine.of_lanes.assign(static_cast<size_t>(threads), NAN);
+  mine.warps.resize(static_cast<size_t>(threads / kLanesOfWarp));
+  mine.fibers.resize(static_cast<size_t>(threads));
+  blockDim.x = static_cast<unsigned>(threads);
+  gridDim.x = static_cast<unsigned>(blocks);
+  blockIdx.x = static_cast<unsigned>(index);
+  constexpr size_t stack = size_t{1} << 17;
+  for (auto& fiber : mine.fibers) {
+    fiber.stack = std::make_unique<char[]>(stack);
+    getcontext(&fiber.context);
+    fiber.context.uc_stack = {fiber.stack.get(), 0, stack};
+    fiber.context.uc_link = &mine.scheduler;
+    makecontext(&fiber.context, enter, 0);
+  }
+  std::vector<int> turns(static_cast<size_t>(threads));
+  std::iota(turns.begin(), turns.end(), 0);
+  if (order == Order::kBackward) std::reverse(turns.begin(), turns.end());
+  std::mt19937 random(seed);
+  for (;;) {
+    if (order == Order::kShuffled) std::shuffle(turns.begin(), turns.end(), random);
+    bool any = false;
+    mine.moved = false;
+    for (const int turn : turns) {
+      auto& fiber = mine.fibers[static_cast<size_t>(turn)];
+      if (fiber.done) continue;
+      any = true;
+      mine.now = turn;
+      threadIdx.x = static_cast<unsigned>(turn);
+      swapcontext(&mine.scheduler, &fiber.context);
+      mine.moved = mine.moved || fiber.done;
+    }
+    if (!any) {
+      ++ended;
+      return true;
+    }
+    if (!mine.moved || stuck) {
+      stuck = true;
+      return false;
+    }
+  }
+}
+
+/// Runs all blocks at the same time, each on a thread of the host.
+inline bool launch(int blocks, int threads, int64_t memory, Order order, unsigned seed,
+                   const std::function<void()>& kernel) {
+  stuck = false;
+  ended = 0;
+  std::vector<char> regular(static_cast<size_t>(blocks));
+  std::vector<std::thread> hosts;
+  for (int k = 0; k < blocks; ++k)
+    hosts.emplace_back([&, k] {
+      regular[static_cast<size_t>(k)] =
+          run_block(k, blocks, threads, memory, order, seed + static_cast<unsigned>(k), kernel);
+    });
+  for (auto& host : hosts) host.join();
+  return std::all_of(regular.begin(), regular.end(), [](char one) { return one != 0; });
+}
+
+}  // namespace fibers

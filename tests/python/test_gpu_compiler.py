@@ -1,0 +1,95 @@
+"""Kernels are compiled by NVRTC, without a GPU, for the cards that are about; and what happens where they cannot be."""
+
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from fibers import ROOT, Fibers
+from test_gpu_kernels import OPERATORS, right_hand_sides, solve, solver
+
+import prdp_torch as prdp
+
+F32 = torch.float32
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "kernels"))
+    return tmp_path / "kernels"
+
+
+def run_once(name="diffusion", method=prdp.CG):
+    """A solve on the fibers, whose text is then compiled."""
+    solve(OPERATORS[name](F32), right_hand_sides(name, F32), solver(method), {})
+    return Fibers()
+
+
+def test_kernels_compile_for_the_cards_that_are_about(cache):
+    fibers = run_once()
+    for capability in (80, 90, 120):
+        size, error = fibers.compile_last(capability)
+        assert not error and size > 10_000
+    for name, method in (("stencil", prdp.GMRES), ("heat 2D", prdp.Chebyshev)):
+        size, error = run_once(name, method).compile_last(90)
+        assert not error and size > 10_000
+    newer, error = run_once().compile_last(199)  # of tomorrow: PTX, which its driver compiles
+    assert not error and newer > 0
+    assert "knows no device of compute capability 1.0" in fibers.compile_last(10)[1]
+
+
+def test_a_damaged_file_is_made_again_and_no_folder_is_no_fault(cache, monkeypatch):
+    fibers = run_once("heat 1D", prdp.SteepestDescent)
+    size, _ = fibers.compile_last(90)
+    (file,) = cache.iterdir()
+    whole = file.read_bytes()
+    for damaged in (whole[:100], whole[:-1] + b"?", b""):
+        file.write_bytes(damaged)
+        assert fibers.compile_last(90) == (size, "") and file.read_bytes() == whole
+    assert [f.name for f in cache.iterdir()] == [file.name]
+    monkeypatch.setenv("PRDP_CACHE", str(file / "below a file"))
+    assert fibers.compile_last(90) == (size, "")
+
+
+def test_what_has_no_kernel_is_said_where_kernels_are_required():
+    a, b = OPERATORS["heat 2D"](F32), right_hand_sides("heat 2D", F32)
+    with pytest.raises(RuntimeError, match=r"PRDP_GPU=required: Multigrid.* has no kernel"):
+        solve(a, b, prdp.Multigrid(max_iter=5), {})
+    with pytest.raises(RuntimeError, match="PRDP_GPU=required: this operator has no kernel"):
+        solve(prdp.operators.Function(lambda v: 2 * v, symmetric=True), b, prdp.CG(max_iter=5), {})
+    with Fibers(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for value in ("auto", "off", ""):
+            os.environ["PRDP_GPU"] = value
+            u, _ = prdp.linear_solve(a, b, solver=prdp.Multigrid(max_iter=20))
+        assert (a.apply(u) - b).norm() <= 1e-4 * b.norm()
+        os.environ["PRDP_GPU"] = "perhaps"
+        with pytest.raises(ValueError, match='PRDP_GPU: expected "auto", "required" or "off", got "perhaps"'):
+            prdp.linear_solve(a, b, solver=prdp.CG(max_iter=20))
+
+
+def test_warm_up_names_what_it_made():
+    step = prdp.Heat((23,), nu=1e-3, dt=1.0, solver=prdp.CG(max_iter=5))
+    state = torch.randn(2, 1, 23, requires_grad=True)
+    assert prdp.warm_up(step, state) == []  # on the CPU there is nothing to make
+    with Fibers():
+        assert prdp.warm_up(step, state) == ["CG of Laplacian<float, Grid<1, 1, 23>>"]
+        assert prdp.warm_up(step, state) == []
+    assert state.grad is None
+
+
+WITHOUT_NVRTC = """
+import sys
+sys.path.insert(0, "tests/python")
+from test_gpu_compiler import run_once
+print(run_once().compile_last(90)[1])
+"""
+
+
+def test_a_machine_without_nvrtc_is_told_what_to_install():
+    environment = {**os.environ, "PRDP_NVRTC": "/nowhere/libnvrtc.so"}
+    command = [sys.executable, "-c", WITHOUT_NVRTC]
+    said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    assert "there is no NVRTC: pip install nvidia-cuda-nvrtc" in said

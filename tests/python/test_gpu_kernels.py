@@ -1,0 +1,226 @@
+"""The kernels of a GPU, run as fibers on the CPU, beside the CPU's own loops: the same methods and verdicts."""
+
+import re
+
+import pytest
+import torch
+from fibers import BACKWARD, FORWARD, ROOT, SHUFFLED, Fibers
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+F32, F64 = torch.float32, torch.float64
+SHAPE = (6, 7)
+OFFSETS = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+TEAMS = {"cells": 16}  # three blocks for a sample of SHAPE
+
+
+def noise(*shape, seed=0, dtype=F64):
+    return torch.randn(*shape, dtype=F64, generator=torch.Generator().manual_seed(seed)).to(dtype)
+
+
+def coefficients(dtype, rows=3):
+    """Dominant, not symmetric, far from the order of one, one set for each sample."""
+    c = noise(rows, 5, *SHAPE, seed=1)
+    c[:, 0] = 5.0 + c[:, 0].abs()
+    return (c * torch.tensor([1.0, 2.0**40, 2.0**-30])[:rows, None, None, None]).to(dtype)
+
+
+def symmetric(dtype):
+    return operators.Diffusion(noise(3, *SHAPE, seed=2, dtype=dtype).exp(), shift=50.0, boundary=("flux", "periodic"))
+
+
+FAR = [(0, 0), (2, -1), (-1, 2)]
+
+
+def far_stencil():
+    return torch.stack([noise(*SHAPE).abs() + 4, noise(*SHAPE), noise(*SHAPE)])[None]
+
+
+def nearly_singular():
+    """In float32: GMRES damps its least squares."""
+    left, right = (torch.linalg.qr(noise(4, 4, seed=seed))[0] for seed in (7, 8))
+    return left @ torch.diag(torch.tensor([1.0, 0.7, 0.5, 4e-7], dtype=F64)) @ right
+
+
+OPERATORS = {
+    "heat 1D": lambda dtype: operators.Heat((11,), torch.tensor(0.03, dtype=dtype), 1.0),
+    "heat 2D": lambda dtype: operators.Heat(SHAPE, torch.tensor(0.03, dtype=dtype), 1.0, length=(1.0, 2.0)),
+    "poisson 3D": lambda dtype: operators.Poisson((3, 4, 5)),
+    "diffusion": symmetric,
+    "stencil": lambda dtype: operators.Stencil(coefficients(dtype), OFFSETS, ("zero", "periodic")),
+    "far stencil": lambda dtype: operators.Stencil(far_stencil().to(dtype), FAR, "zero"),
+    "burgers": lambda dtype: operators.Burgers(noise(3, 2, *SHAPE, dtype=dtype), 0.05, 0.02),
+    "matrix": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(9, 9, dtype=dtype),
+    "singular": lambda dtype: nearly_singular().to(dtype),
+    "matrices": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(3, 9, 9, dtype=dtype),
+}  # fmt: skip
+SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion"]
+ANY = prdp.Jacobi, prdp.BiCGStab, prdp.GMRES
+
+
+def right_hand_sides(name, dtype):
+    if name.startswith("matri") or name == "singular":
+        return noise(3, 4 if name == "singular" else 9, seed=3, dtype=dtype)
+    shape = {"heat 1D": (11,), "poisson 3D": (3, 4, 5)}.get(name, SHAPE)
+    return noise(3, 2 if name in ("burgers", "stencil") else 1, *shape, seed=3, dtype=dtype)
+
+
+def solver(method, **settings):
+    settings = {"max_iter": 200, **settings}
+    return method(restart=4, **settings) if method is prdp.GMRES else method(**settings)
+
+
+def solve(a, b, solver, device=None, **options):
+    """u and the report; on the fibers with the settings `device`."""
+    if device is None:
+        return prdp.linear_solve(a, b, solver=solver, on_failure="return", **options)
+    with Fibers(**device):
+        return prdp.linear_solve(a, b, solver=solver, on_failure="return", **options)
+
+
+def agree(mine, other, dtype, slack=300.0):
+    (u, info), (v, report) = mine, other
+    assert info.status.tolist() == report.status.tolist()
+    assert (info.iterations - report.iterations).abs().max() <= 1
+    scale = v.flatten(1).norm(dim=1).clamp(min=torch.finfo(dtype).tiny)
+    assert ((u - v).flatten(1).norm(dim=1) <= slack * torch.finfo(dtype).eps * scale).all()
+
+
+CASES = [(name, method) for name in OPERATORS if name != "singular" for method in ANY]
+CASES += [(name, method) for name in SYMMETRIC for method in (prdp.CG, prdp.SteepestDescent)]
+CASES += [("heat 1D", prdp.Chebyshev), ("heat 2D", prdp.Chebyshev)]
+
+
+@pytest.mark.parametrize("name, method, dtype", [(*case, (F32, F64)[n % 2]) for n, case in enumerate(CASES)])
+def test_methods_and_operators_are_those_of_the_cpu(name, method, dtype):
+    if method is prdp.Jacobi and name == "far stencil":
+        method = prdp.GMRES
+    a, b = OPERATORS[name](dtype), right_hand_sides(name, dtype)
+    rtol = 1e-5 if dtype == F32 else 1e-12
+    mine, other = (solve(a, b, solver(method, rtol=rtol), device) for device in ({}, None))
+    agree(mine, other, dtype, slack=5 * rtol / torch.finfo(dtype).eps)
+    # After as many iterations as are asked for, the iterates are the same but for rounding.
+    few = solver(method, rtol=0.0, max_iter=3)
+    agree(solve(a, b, few, TEAMS), solve(a, b, few), dtype, slack=1e4)
+
+
+@pytest.mark.parametrize("method", [prdp.CG, prdp.Jacobi, prdp.GMRES])
+@pytest.mark.parametrize("name", ["heat 2D", "diffusion"])
+def test_bits_depend_neither_on_the_order_of_threads_nor_on_neighbours(name, method):
+    a, b = OPERATORS[name](F32), right_hand_sides(name, F32)
+    for device in ({}, TEAMS, {"block_memory": 2 * 4 * 42}):  # a few vectors in the block, the others beyond
+        wanted, report = solve(a, b, solver(method), device)
+        for order in (BACKWARD, SHUFFLED):
+            u, info = solve(a, b, solver(method), {**device, "order": order})
+            assert torch.equal(u, wanted) and torch.equal(info.residual, report.residual)
+        alone, _ = (
+            solve(OPERATORS["heat 2D"](F32), b[1:2], solver(method), device) if name == "heat 2D" else (None, None)
+        )
+        assert alone is None or torch.equal(alone[0], wanted[1])
+
+
+STENCIL = {"singular": 4.0, "indefinite": 1.0, "definite": 4.3}
+
+
+def periodic(centre, dtype, **options):
+    c = -torch.ones(4, 5, *SHAPE, dtype=dtype)
+    c[:, 0] = centre
+    return operators.Stencil(c, OFFSETS, "periodic", **options)
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("method", [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES])
+@pytest.mark.parametrize("kind", STENCIL)
+def test_what_fails_is_told_as_on_the_cpu(kind, method, dtype):
+    a = periodic(STENCIL[kind], dtype)
+    b = noise(4, 1, *SHAPE, dtype=dtype)
+    b[0], b[1, 0, 2, 2], b[2] = 0.0, torch.nan, b[2] * 1e-30
+    few = solver(method, rtol=0.0, max_iter=12)
+    assert solve(a, b, few, {})[1].status.tolist() == solve(a, b, few)[1].status.tolist()
+    # Where iterations grow, rounding decides how they fail. What is said of u must be true.
+    (u, info), (_, report) = (solve(a, b, solver(method, rtol=1e-4), device) for device in ({}, None))
+    assert (info.solved == report.solved).all() and u.isfinite().all()
+    left = (b - a.apply(u)).flatten(1).norm(dim=1) / b.flatten(1).norm(dim=1)
+    told = info.residual[3].item()
+    assert abs(left[3].item() - told) <= 1e-2 * told + 100 * torch.finfo(dtype).eps or info.status[3] == -7
+
+
+@pytest.mark.parametrize("method", [prdp.CG, prdp.GMRES, prdp.BiCGStab])
+def test_null_spaces_and_starts(method):
+    basis = torch.ones(1, *SHAPE, dtype=F64)
+    b = noise(4, 1, *SHAPE)
+    b -= b.mean((-2, -1), keepdim=True)
+    b[3] += 1.0  # outside of the range
+    for named in ("constant", basis):
+        a = periodic(4.0, F64, nullspace=named)
+        mine, other = (solve(a, b, solver(method, rtol=1e-10), device) for device in (TEAMS, None))
+        agree(mine, other, F64, slack=1e7)
+        x0 = other[0] + 1e-3 * noise(4, 1, *SHAPE, seed=5)
+        mine, other = (solve(a, b, solver(method, rtol=1e-10), device, x0=x0) for device in ({}, None))
+        agree(mine, other, F64, slack=1e7)
+
+
+def test_zero_on_the_diagonal_and_infinite_entries():
+    c = coefficients(F64)
+    c[1, 0, 2, 3], c[2, 1, 0, 0] = 0.0, torch.inf
+    a, b = operators.Stencil(c, OFFSETS, "zero"), noise(3, 1, *SHAPE)
+    for method in (prdp.Jacobi, prdp.GMRES):
+        mine, other = (solve(a, b, solver(method), device) for device in ({}, None))
+        assert mine[1].status.tolist() == other[1].status.tolist()
+    preconditioned = prdp.BiCGStab(max_iter=50, preconditioner="diagonal")
+    mine, other = (solve(a, b, preconditioned, device) for device in ({}, None))
+    agree(mine, other, F64, slack=1e11)
+
+
+@pytest.mark.parametrize("name", ["diffusion", "stencil"])
+def test_gradients_are_those_of_finite_differences(name):
+    b = right_hand_sides(name, F64).requires_grad_()
+    if name == "diffusion":
+        field = noise(3, *SHAPE, seed=2).exp().requires_grad_()
+        make, method = (lambda t: operators.Diffusion(t, shift=1.0)), prdp.CG
+    else:
+        field = coefficients(F64, rows=1).requires_grad_()
+        make, method = (lambda t: operators.Stencil(t, OFFSETS, "zero")), prdp.BiCGStab
+
+    def u(t, rhs):
+        return prdp.linear_solve(make(t), rhs, solver=solver(method, rtol=1e-13))[0]
+
+    with Fibers(threads=32):
+        assert torch.autograd.gradcheck(u, (field, b), fast_mode=True, atol=1e-6)
+
+
+def barriers():
+    """Every barrier of the text, by its line: of team.h, or, plus 10,000, of a line that calls meet()."""
+    folder = ROOT / "csrc" / "prdp" / "gpu" / "device"
+    lines = (folder / "team.h").read_text().splitlines()
+    found = [n for n, line in enumerate(lines, 1) if "__syncthreads()" in line and "//" not in line]
+    for name in ("team.h", "block_space.h", "solve.h"):
+        lines = (folder / name).read_text().splitlines()
+        found += [10000 + n for n, line in enumerate(lines, 1) if re.search(r"\bmeet\(\)", line)]
+    return found
+
+
+def outcomes(left_out):
+    """What methods give with this barrier left out, on one block and on teams, in three orders."""
+    found = []
+    cases = [("heat 2D", prdp.CG), ("diffusion", prdp.GMRES), ("heat 2D", prdp.Chebyshev), ("singular", prdp.GMRES)]
+    for name, method in cases:
+        a, b = OPERATORS[name](F32), right_hand_sides(name, F32)
+        for device in ({"block_memory": 0}, TEAMS):
+            for order in (FORWARD, BACKWARD, SHUFFLED):
+                try:
+                    u, info = solve(
+                        a, b, solver(method, rtol=0.0, max_iter=4), {**device, "order": order, "left_out": left_out}
+                    )
+                except RuntimeError:
+                    found.append("irregular")
+                    continue
+                found.append((u.nan_to_num(7.0).flatten().tolist(), info.residual.nan_to_num(7.0).tolist()))
+    return found
+
+
+def test_every_barrier_is_needed():
+    wanted = outcomes(left_out=0)
+    unnoticed = [line for line in barriers() if outcomes(line) == wanted]
+    assert not unnoticed
