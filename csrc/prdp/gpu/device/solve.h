@@ -26,20 +26,24 @@ class SampleSolve {
     if (refused(magnitude)) return;
     const T scale = kernels::power_of_two_scale(magnitude);
     space_.load(b_, scale, space_.b());
+    const double rounding = rounding_of_least_numbers<T>(scale, Space::unknowns());
     bool consistent = true;
     if (space_.is_singular()) {
       const T whole = std::sqrt(space_.dot(space_.b(), space_.b()));
-      consistent = space_.project(space_.b()) <= consistency_bound<T>(of_.rtol) * whole;
+      const T outside = space_.project(space_.b());
+      consistent = outside <= std::max(consistency_bound<T>(of_.rtol) * whole, static_cast<T>(rounding));
       if (std::sqrt(space_.dot(space_.b(), space_.b())) <= std::numeric_limits<T>::epsilon() * whole)
-        return hand_out_zeros(SolveStatus::kInconsistent, 1.0);
+        return hand_out_zeros(consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent, 1.0);
     }
     space_.take_b();
     state.b2 = space_.b2();
+    state.rounding2 = rounding * rounding;
     if (x0_) start();
     auto method = make();
     iterate(space_, method, states_, of_.rtol, of_.guarded != 0);
     space_.add_start(method.x);
     if (space_.is_singular()) space_.project_solution(method.x);
+    if (of_.guarded != 0) excuse_rounding_of_b(state);
     if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
     hand_out(method.x, scale);
   }
@@ -64,13 +68,18 @@ class SampleSolve {
     if (magnitude == T(0)) return refuse(SolveStatus::kConverged, 0.0);
     return false;
   }
-  /// From α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better than zero.
+  /// From α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better than zero, or A
+  /// x0 is rounding.
   void start() {
     const T magnitude = space_.largest_magnitude(x0_);
     if (magnitude == T(0)) return;
     T *x = space_.start(), *product = space_.scratch(), *r = space_.whole_b();
     space_.load(x0_, kernels::power_of_two_scale(magnitude), x);
-    if (space_.is_singular()) space_.project_solution(x);
+    if (space_.is_singular()) {
+      const T whole2 = space_.dot(x, x);
+      space_.project_solution(x);
+      if (leaves_rounding(space_.dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
+    }
     space_.apply(x, product);
     const T largest = space_.largest_magnitude(product);
     if (!std::isfinite(largest) || !(largest > T(0))) return;
@@ -82,7 +91,10 @@ class SampleSolve {
     space_.scale(scale, x);
     space_.scale(alpha, x);
     const T left2 = space_.dot(r, r);
-    if (left2 < space_.b2() && std::isfinite(space_.largest_magnitude(x))) space_.start_here(left2);
+    const T b2 = space_.b2();
+    if (!(left2 < b2) || !std::isfinite(space_.largest_magnitude(x))) return;
+    const double size = Space::epsilon() * space_.operator_norm()[0] * std::sqrt(space_.dot(x, x));
+    if (left2 <= b2 / 4 || outdoes_rounding<double>(b2, left2, size)) space_.start_here(left2);
   }
   /// With A' = factor A and b' = scale b, u = factor/scale u'.
   void hand_out(T* x, T scale) {
@@ -106,7 +118,7 @@ class SampleSolve {
   }
   void hand_out_zeros(SolveStatus status, double residual, int64_t applications = 0) {
     space_.fill_zero(of_.u + sample_ * Space::unknowns());
-    report(status, 0, residual, applications, 0.0);
+    report(status, 0, residual, applications, status == SolveStatus::kStagnated ? residual : 0.0);
   }
   void report(SolveStatus status, int64_t iterations, double residual, int64_t applications, double floor) {
     if (!team_.leads()) return;
