@@ -194,6 +194,26 @@ def test_an_obstacle_may_move(change):
     assert torch.equal(flow(u), other(u)) and torch.equal(flow.divergence(u), other.divergence(u))
 
 
+@pytest.mark.parametrize("rtol", [0.1, 1e-2, 1e-5])
+@pytest.mark.parametrize("shape", [(16, 12), (4, 14, 11)])
+def test_solid_faces_carry_no_velocity_and_solid_cells_no_pressure(shape, rtol):
+    """Not even of the rounding of a preconditioner."""
+    d, mask = len(shape), torch.zeros(shape, dtype=torch.bool)
+    mask[..., 2:5, 1:3] = mask[..., 9:, 6:9] = True
+    kinds = ["periodic", "wall", "open"][-d:]
+    solver = prdp.CG(100, rtol=rtol, preconditioner="multigrid")
+    flow = prdp.Flow(shape, 0.5, 0.02, boundary=kinds, obstacle=mask, inflow=(0.3,) * d, solver=solver)
+    u, p = flow.step_and_pressure(0.1 * random_velocity(shape, batch=2, dtype=torch.float32))
+    for axis in range(d):
+        on_solid = mask | mask.roll(1, axis)
+        if kinds[axis] == "wall":
+            on_solid = on_solid | (torch.arange(shape[axis]) == 0).view(-1, *(1,) * (d - 1 - axis))
+        elif kinds[axis] == "open":  # no cells before the first faces
+            on_solid = torch.where(torch.arange(shape[axis]) == 0, mask, on_solid)
+        assert (u[:, d - 1 - axis] * on_solid == 0).all()
+    assert (p * mask == 0).all() and (p[..., -1] == 0).all()
+
+
 def test_boundary_and_length_may_be_set():
     flow = prdp.Flow((8, 6), 0.1, 0.01)
     u = 0.1 * random_velocity((8, 6))

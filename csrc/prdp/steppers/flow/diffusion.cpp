@@ -35,7 +35,9 @@ at::Tensor diffuse(const FlowEquation& equation, const at::Tensor& change, const
     const auto b = change.narrow(1, static_cast<int64_t>(k) * width, width);
     parts.push_back(solve(diffusion_operator(equation, patterns[k]), b, options, info));
   }
-  return parts.size() == 1 ? parts[0] : at::cat(parts, 1);
+  const auto& free = equation.box->fields(change.options()).free;
+  const auto all = parts.size() == 1 ? parts[0] : at::cat(parts, 1);
+  return free.defined() ? all * free : all;  // a preconditioner may leave something on the faces of solids
 }
 
 DiffuseVjp diffuse_vjp(const FlowEquation& equation, const at::Tensor& cotangent, const at::Tensor& result,

@@ -81,9 +81,12 @@ at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double facto
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
+  const auto& fields = box.fields(u.options());
   const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of(box))));
-  const auto phi = without_means(box, solve(pressure_operator(box, u, options), b, options, info));
-  return {add_gradient(box, u, phi, -1.0, box.fields(u.options()).free), phi};
+  // A preconditioner may leave something in the cells of solids.
+  const auto found = masked(solve(pressure_operator(box, u, options), b, options, info), fields.cells);
+  const auto phi = without_means(box, found);
+  return {add_gradient(box, u, phi, -1.0, fields.free), phi};
 }
 
 at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at::Tensor& of_potential,
