@@ -44,7 +44,7 @@ class FlowEquation:
     """
     A flow and how it is stepped.
     """
-    def __init__(self, box: FlowBox, dt: typing.SupportsFloat | typing.SupportsIndex, nu: torch.Tensor, force: torch.Tensor | None, inflow: torch.Tensor | None, advection: str, diffusion: str) -> None:
+    def __init__(self, box: FlowBox, dt: typing.SupportsFloat | typing.SupportsIndex, nu: torch.Tensor, force: torch.Tensor | None, inflow: torch.Tensor | None, wall_velocity: collections.abc.Sequence[torch.Tensor | None], advection: str, diffusion: str, pressure: str) -> None:
         ...
     def check(self) -> None:
         ...

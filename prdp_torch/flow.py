@@ -1,18 +1,22 @@
 """`Flow`: incompressible flow by projection."""
 
-from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, Unpack
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Unpack
 
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, flow_walls
+from prdp_torch.flow_walls import Side, WallVelocity
 from prdp_torch.operators.base import full_precision, real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
 from prdp_torch.stepper import Stepper, forgets_if_it_raises
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
 Boundary: TypeAlias = Literal["periodic", "wall", "open"]
+# What may be set for the next steps.
+TENSORS = {"nu", "force", "inflow", *flow_walls.NAMES.values()}
 
 
 class Flow(Stepper):
@@ -25,7 +29,7 @@ class Flow(Stepper):
     Args:
         shape: the cells, (Ny, Nx) or (Nz, Ny, Nx), at least 3 per axis.
         nu: viscosity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of the module,
-            and another tensor a buffer. The same holds for `force` and `inflow`.
+            and another tensor a buffer. The same holds for `force`, `inflow` and `wall_velocity`.
         dt: time step > 0. The advection needs dt Σ |u|/dx <= 1; a longer step raises an error.
         boundary: one for all axes, or one per axis in the order of `shape`.
             "periodic".
@@ -35,11 +39,21 @@ class Flow(Stepper):
         obstacle: bool (*shape), True in solid cells. Their faces carry no velocity.
         force: acceleration, (d,) or (batch or 1, d, *shape).
         inflow: velocity at the low end of the open axis, (d,), or (batch or 1, d, *shape) with extent 1 along it.
+        wall_velocity: the velocity of walls that move along themselves: a dict from a side, such as (0, "high"), to a
+            number (in 2D), (d,), or (batch or 1, d, *side), where side is shape without the axis. The component through
+            the wall must be 0.
         advection: "central" is of second order and conserves the energy; it needs about dt <= 2 nu/|u|². "upwind" is of
             first order and stable without viscosity.
         diffusion: "implicit" solves with `solver`, and "explicit" needs nu dt Σ 2/dx² <= 1.
+        pressure: "incremental" takes the pressure of all forces off before the implicit diffusion, by one more solve.
+            Steady flows then do not depend on dt, up to nu dt/dx² = 4. "plain" leaves the pressure to the projection
+            after it. The two are the same with explicit diffusion, and in a periodic box without obstacle.
         solver: for the pressure and the implicit diffusion, both symmetric. CG(100) with multigrid by default.
         backward and the other options: as in `Stepper`, but `start` must be "zero".
+
+    `nu`, `force`, `inflow` and `wall_velocity` may be set at any time. A tensor that is set later is for the steps that
+    follow, as the output of a network is: it is no state, so that copies and `state_dict` have what was there before.
+    A Parameter, a `torch.nn.Buffer` and numbers are state.
 
     `info` combines the solves of a step: it has the sum of their iterations, the worst status and the largest residual.
     Each step stores one state for the backward pass, and computes the rest again.
@@ -52,8 +66,10 @@ class Flow(Stepper):
         >>> flow = prdp.Flow((64, 64), nu=1e-3, dt=1e-2)
         >>> states = flow.rollout(flow.project(u0), 50)  # (batch, 2, 64, 64) -> (batch, 51, 2, 64, 64)
         >>> channel = prdp.Flow((24, 96), nu=1e-2, dt=1e-2, boundary=("wall", "open"), length=(1, 4), inflow=profile)
+        >>> cavity = prdp.Flow((64, 64), nu=1e-2, dt=1e-2, boundary="wall", wall_velocity={(0, "high"): 1.0})
 
-    Source: Harlow and Welch (1965) for the grid, Chorin (1968) for the step.
+    Source: Harlow and Welch (1965) for the grid, Chorin (1968) for the step, Guermond, Minev and Shen (2006) for the
+    forms of the pressure.
     """
 
     shape: tuple[int, ...]
@@ -62,6 +78,7 @@ class Flow(Stepper):
     length: Length
     advection: str
     diffusion: str
+    pressure_form: str
     nu: Number
     force: Tensor | None
     inflow: Tensor | None
@@ -81,6 +98,8 @@ class Flow(Stepper):
         diffusion: Literal["implicit", "explicit"] = "implicit",
         solver: Solver | None = None,
         backward: Backward = "implicit",
+        wall_velocity: WallVelocity | None = None,
+        pressure: Literal["incremental", "plain"] = "incremental",
         **options: Unpack[StepOptions],
     ) -> None:
         solver = CG(max_iter=100, preconditioner="multigrid") if solver is None else solver
@@ -90,22 +109,62 @@ class Flow(Stepper):
         self.boundary, self.length = boundary, length
         self.advection = _check.string("Flow", "advection", advection)
         self.diffusion = _check.string("Flow", "diffusion", diffusion)
+        self.pressure_form = _check.string("Flow", "pressure", pressure)
+        self._lent: dict[str, list[Any]] = {}
         self._keep_tensor("nu", nu if isinstance(nu, Tensor) else _check.real("Flow", "nu", nu))
-        self._keep_tensor("force", force)
-        self._keep_tensor("inflow", inflow)
+        for name, given in (("force", force), ("inflow", inflow)):
+            self._keep_tensor(name, given if given is None or isinstance(given, Tensor) else _of_numbers(name, given))
+        for name, velocity in flow_walls.by_name(wall_velocity, len(self.shape)).items():
+            self._keep_tensor(name, velocity)
         self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
         self._kept_box = Kept(_make_box)
         self._equation().check()
 
-    def _keep_tensor(self, name: str, value: Tensor | Sequence[float] | float | None) -> None:
+    def _keep_tensor(self, name: str, value: object) -> None:
+        """Make it state, in place of what is there."""
+        for place in (self.__dict__, self._lent, self._buffers, self._parameters):
+            place.pop(name, None)
         if isinstance(value, torch.nn.Parameter):
             self.register_parameter(name, value)
         elif isinstance(value, Tensor):
             self.register_buffer(name, _check.dense("Flow", name, value))
-        elif value is None or isinstance(value, float):
-            setattr(self, name, value)
+        elif value is None or isinstance(value, (tuple, list)):
+            self.register_buffer(name, None if value is None else _of_numbers(name, value))
         else:
-            self.register_buffer(name, _of_numbers(name, value))
+            self.__dict__[name] = value
+
+    if not TYPE_CHECKING:
+
+        def __setattr__(self, name: str, value: object) -> None:
+            if name not in TENSORS:
+                super().__setattr__(name, value)
+            elif isinstance(value, Tensor) and not isinstance(value, (torch.nn.Parameter, torch.nn.Buffer)):
+                # Attributes hide buffers and parameters, which stay.
+                self._lent.setdefault(name, [self.__dict__[name]] if name in self.__dict__ else [])
+                self.__dict__[name] = value
+            else:
+                self._keep_tensor(name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles hold: not what was set for the next steps."""
+        state = {name: value for name, value in self.__dict__.items() if name not in self._lent}
+        state |= {name: kept[0] for name, kept in self._lent.items() if kept}
+        return state | {"_lent": {}}
+
+    @property
+    def wall_velocity(self) -> Mapping[Side, Tensor]:
+        places: tuple[dict[str, Any], ...] = self.__dict__, self._parameters, self._buffers
+        values: dict[Side, Tensor] = {}
+        for side, name in flow_walls.NAMES.items():
+            velocity = next((place[name] for place in places if place.get(name) is not None), None)
+            if velocity is not None:
+                values[side] = velocity
+        return MappingProxyType(values)
+
+    @wall_velocity.setter
+    def wall_velocity(self, given: WallVelocity | None) -> None:
+        for name, value in flow_walls.by_name(given, len(self.shape)).items():
+            setattr(self, name, value)
 
     @property
     def start(self) -> Start:
@@ -166,12 +225,14 @@ class Flow(Stepper):
         force = _check.optional(_field, "Flow", "force", self.force)
         inflow = _check.optional(_field, "Flow", "inflow", self.inflow)
         d = len(self.shape)
+        moving = self.wall_velocity
+        walls = flow_walls.vectors(moving, d) if moving else []
         boundary, length = _of_axes("boundary", self.boundary, d), _of_axes("length", self.length, d)
         if not all(isinstance(name, str) for name in boundary):
             raise TypeError(f"Flow: boundary must be a name or one per axis, got {self.boundary!r}")
         sides = tuple(_check.real("Flow", "length", side) for side in length)
         box = self._kept_box.of(tuple(self.shape), boundary, sides, _Mask(self.obstacle))
-        return _C.FlowEquation(box, dt, nu, force, inflow, self.advection, self.diffusion)
+        return _C.FlowEquation(box, dt, nu, force, inflow, walls, self.advection, self.diffusion, self.pressure_form)
 
     def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
@@ -182,16 +243,32 @@ def _field(who: str, name: str, value: object) -> Tensor:
 
 
 class _Mask:
-    """An obstacle, which equals another one only if it is the same tensor and nobody wrote to it since."""
+    """An obstacle, which equals another one if it is solid in the same cells. What is written through .data or NumPy
+    leaves no trace but the values."""
 
     def __init__(self, obstacle: Tensor | None) -> None:
         self.obstacle = obstacle
-        counts = obstacle is not None and not obstacle.is_inference()  # nobody counts what is written to others
-        self.version = obstacle._version if obstacle is not None and counts else None
+
+    def keep(self) -> None:
+        """Hold the values of now, whatever is written later."""
+        self.obstacle = None if self.obstacle is None else self.obstacle.clone()
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, _Mask) and self.obstacle is other.obstacle and self.version == other.version
-        return same and (self.obstacle is None or self.version is not None)
+        if not isinstance(other, _Mask) or self.obstacle is None or other.obstacle is None:
+            return isinstance(other, _Mask) and self.obstacle is other.obstacle
+        a, b = self.obstacle, other.obstacle
+        if a.shape != b.shape or a.dtype != torch.bool or a.dtype != b.dtype or a.device != b.device:
+            return False
+        pairs = zip(_words(a), _words(b), strict=True)
+        return all(torch.equal(*pair) for pair in pairs)
+
+
+def _words(mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Eight cells at once, which are compared as fast as one; and the last cells."""
+    flat = mask.flatten()
+    flat = flat.clone() if flat.storage_offset() % 8 else flat
+    whole = len(flat) // 8 * 8
+    return flat[:whole].view(torch.int64), flat[whole:]
 
 
 def _of_axes(name: str, values: Any, dim: int) -> tuple[Any, ...]:
@@ -204,7 +281,9 @@ def _of_axes(name: str, values: Any, dim: int) -> tuple[Any, ...]:
 
 
 def _make_box(shape: tuple[int, ...], boundary: tuple[str, ...], length: tuple[float, ...], mask: _Mask) -> _C.FlowBox:
-    return _C.FlowBox(list(shape), list(boundary), list(length), mask.obstacle)
+    box = _C.FlowBox(list(shape), list(boundary), list(length), mask.obstacle)
+    mask.keep()
+    return box
 
 
 def _of_numbers(name: str, value: object) -> Tensor:

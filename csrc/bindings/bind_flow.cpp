@@ -19,14 +19,19 @@ std::shared_ptr<FlowBox> make_box(std::vector<int64_t> shape, const std::vector<
 
 FlowEquation make_equation(std::shared_ptr<const FlowBox> box, double dt, at::Tensor nu,
                            std::optional<at::Tensor> force, std::optional<at::Tensor> inflow,
-                           const std::string& advection, const std::string& diffusion) {
+                           const std::vector<std::optional<at::Tensor>>& wall_velocity, const std::string& advection,
+                           const std::string& diffusion, const std::string& pressure) {
+  std::vector<at::Tensor> walls;
+  for (const auto& velocity : wall_velocity) walls.push_back(velocity.value_or(at::Tensor()));
   return {std::move(box),
           dt,
           std::move(nu),
           force.value_or(at::Tensor()),
           inflow.value_or(at::Tensor()),
+          std::move(walls),
           flow_advection_from_name(advection),
-          flow_diffusion_from_name(diffusion)};
+          flow_diffusion_from_name(diffusion),
+          flow_pressure_from_name(pressure)};
 }
 
 SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
@@ -58,7 +63,7 @@ void bind_flow(py::module_& m) {
       .def(py::init(&make_box), py::arg("shape"), py::arg("boundary"), py::arg("length"), py::arg("obstacle"));
   py::class_<FlowEquation>(m, "FlowEquation", "A flow and how it is stepped.")
       .def(py::init(&make_equation), py::arg("box"), py::arg("dt"), py::arg("nu"), py::arg("force"), py::arg("inflow"),
-           py::arg("advection"), py::arg("diffusion"))
+           py::arg("wall_velocity"), py::arg("advection"), py::arg("diffusion"), py::arg("pressure"))
       .def("check", [](const FlowEquation& e) { e.check(); })
       .def(
           "step",

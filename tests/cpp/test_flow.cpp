@@ -45,4 +45,31 @@ TEST(Flow, StatesHaveNoDivergenceAndNoVelocityOnTheObstacle) {
   EXPECT_TRUE(at::equal(pressure, flow.pressure(u)) && at::equal(next, flow(u)));
 }
 
+TEST(Flow, CouetteFlowStaysAndTheLidHasItsGradient) {
+  const auto lid = at::tensor({0.7, 0.0}, at::kDouble).requires_grad_();
+  prdp::Flow flow({6, 4}, /*nu=*/0.1, /*dt=*/0.02,
+                  {.boundary = {prdp::FlowBoundary::kWall, prdp::FlowBoundary::kPeriodic},
+                   .wall_velocity = {{{0, prdp::FlowEnd::kHigh}, lid}}},
+                  prdp::CG{200, 1e-12, prdp::Preconditioner::multigrid()});
+  const auto height = (at::arange(6, at::kDouble) + 0.5) / 6.0;
+  const auto u = at::stack({(0.7 * height).unsqueeze(1).expand({6, 4}), at::zeros({6, 4}, at::kDouble)}).unsqueeze(0);
+  const auto next = flow(u);
+  EXPECT_LT((next - u).abs().max().item<double>(), 1e-12);
+  // The flow is linear in the lid: the gradient of a sum is what a lid of speed 1 drives.
+  const auto gradient = torch::autograd::grad({flow(at::zeros_like(u)).sum()}, {lid})[0];
+  EXPECT_NEAR(gradient[0].item<double>() * 0.7, flow(at::zeros_like(u)).sum().item<double>(), 1e-9);
+}
+
+TEST(Flow, WallVelocitiesThatDoNotFitAreNamed) {
+  const auto make = [](int64_t axis, const at::Tensor& velocity) {
+    prdp::Flow({6, 4}, 0.1, 0.02,
+               {.boundary = {prdp::FlowBoundary::kWall, prdp::FlowBoundary::kPeriodic},
+                .wall_velocity = {{{axis, prdp::FlowEnd::kLow}, velocity}}});
+  };
+  const auto along = at::tensor({1.0, 0.0}, at::kDouble);
+  EXPECT_THROW(make(1, along), c10::ValueError);  // periodic
+  EXPECT_THROW(make(2, along), c10::ValueError);
+  EXPECT_THROW(make(0, along.flip(0)), c10::ValueError);  // through the wall
+}
+
 }  // namespace

@@ -175,7 +175,7 @@ def test_a_force_that_is_not_finite_is_named_and_leaves_other_samples_alone(unif
     assert torch.equal(u.grad[:1], v.grad) and (u.grad[1] == 0).all()
 
 
-@pytest.mark.parametrize("change", ["set", "write", "load", "remove"])
+@pytest.mark.parametrize("change", ["set", "write", "data", "numpy", "load", "remove"])
 def test_an_obstacle_may_move(change):
     """The box that the library keeps is that of the obstacle as it is now."""
     before, after = solid((8, 6), (3, 3)), solid((8, 6), (2, 1), (5, 4))
@@ -186,6 +186,12 @@ def test_an_obstacle_may_move(change):
         flow.obstacle = after
     elif change == "write":
         flow.obstacle.copy_(after)
+    elif change == "data":
+        flow.obstacle.data = after
+        flow.obstacle.data[5, 5] = True
+        flow.obstacle.data[5, 5] = False
+    elif change == "numpy":
+        flow.obstacle.numpy()[:] = after.numpy()
     elif change == "load":
         flow.load_state_dict({"obstacle": after})
     else:
@@ -245,6 +251,15 @@ def test_what_is_set_wrongly_is_named_in_the_next_step(name, value, words):
         flow(torch.zeros(1, 2, 8, 6))
 
 
+def test_an_obstacle_may_be_part_of_a_larger_tensor():
+    masks = torch.stack([solid((7, 5), (3, 3)), solid((7, 5), (2, 1), (4, 4))])
+    flow = prdp.Flow((7, 5), 0.1, 0.01, obstacle=masks[1])
+    u = 0.1 * random_velocity((7, 5))
+    assert torch.equal(flow(u), prdp.Flow((7, 5), 0.1, 0.01, obstacle=masks[1].clone())(u))
+    masks.numpy()[1, 6, 4] = True
+    assert torch.equal(flow(u), prdp.Flow((7, 5), 0.1, 0.01, obstacle=masks[1].clone())(u))
+
+
 def test_an_obstacle_in_inference_mode_may_move():
     with torch.inference_mode():
         flow = prdp.Flow((8, 6), 0.1, 0.01, obstacle=solid((8, 6), (3, 3)))
@@ -293,6 +308,60 @@ def test_copies_pickles_and_parameters():
         assert torch.equal(other(0.1 * u), flow(0.1 * u))
 
 
+GIVEN = {"nu": 0.1, "force": (0.8, 0.0), "inflow": (0.5, 0.0), "wall_velocity": {(0, "high"): 0.4}}
+STATE = {"force", "inflow", "wall_velocity_0_high"}
+
+
+def with_all(**changed):
+    return prdp.Flow((8, 6), dt=0.01, boundary=("wall", "open"), **{**GIVEN, **changed})
+
+
+@pytest.mark.parametrize("kept", ["nothing", "numbers", "parameters"])
+def test_what_is_set_for_the_next_steps_is_no_state(kept):
+    """Copies, averages and files have what was there before."""
+    u = 0.1 * random_velocity((8, 6), batch=2)
+    if kept == "nothing":
+        flow = with_all(force=None, wall_velocity=None)
+    elif kept == "numbers":
+        flow = with_all()
+    else:
+        nu, force = (torch.nn.Parameter(torch.tensor(value)) for value in (0.1, (0.8, 0.0)))
+        flow = with_all(nu=nu, force=force)
+    before, state, names = flow(u), set(flow.state_dict()), [name for name, _ in flow.named_parameters()]
+    assert state == {"nothing": {"inflow"}, "numbers": STATE, "parameters": STATE | {"nu"}}[kept]
+    net = torch.nn.Linear(1, 2 * 8 * 6).double()
+    made = net(torch.ones(2, 1).double()).view(2, 2, 8, 6)
+    flow.force, flow.nu = made, made.square().mean()
+    flow.inflow = made[..., :1]
+    flow.wall_velocity = {(0, "high"): made[:, :, 0] * torch.tensor([1.0, 0.0])[:, None]}
+    flow(u).square().sum().backward()
+    assert net.weight.grad.abs().sum() > 0
+    assert flow.force is made
+    assert set(flow.state_dict()) == state and [name for name, _ in flow.named_parameters()] == names
+    saved = pickle.loads(pickle.dumps(flow.state_dict()))
+    others = copy.deepcopy(flow), copy.copy(flow), pickle.loads(pickle.dumps(flow))
+    average = torch.optim.swa_utils.AveragedModel(flow)
+    average.update_parameters(flow)
+    for other in (*others, average.module):
+        assert torch.equal(other(u), before)
+        other.load_state_dict(saved)
+        assert torch.equal(other(u), before)
+
+
+def test_numbers_parameters_and_buffers_that_are_set_are_state():
+    flow = with_all()
+    flow.force = torch.ones(2, 2, 8, 6)
+    flow.force = (0.1, 0.2)
+    assert flow.state_dict()["force"].tolist() == [0.1, 0.2]
+    flow.force = torch.nn.Parameter(torch.zeros(2))
+    flow.nu = torch.tensor(0.3)
+    flow.nu = 0.2
+    flow.inflow = torch.nn.Buffer(torch.ones(2))
+    assert [name for name, _ in flow.named_parameters()] == ["force"] and copy.deepcopy(flow).nu == 0.2
+    flow.force = None
+    assert set(flow.state_dict()) == STATE - {"force"} and not list(flow.parameters())
+
+
 def test_controllers_set_the_tolerance():
     flow = prdp.Flow((16, 16), 0.1, 0.01)
     controller = prdp.ToleranceController([flow], ratio=0.1)
@@ -309,6 +378,6 @@ def test_controllers_set_the_tolerance():
 def test_reports_combine_the_solves_of_a_step():
     flow = prdp.Flow((16, 12), 0.1, 0.01, boundary="wall", solver=prdp.CG(3, rtol=0.0))
     flow(0.1 * random_velocity((16, 12), batch=2))
-    assert flow.info.iterations.tolist() == [9, 9]  # of two components and the pressure
+    assert flow.info.iterations.tolist() == [12, 12]  # of two components, and of the pressure before and after
     assert statuses(flow.info) == ["MAX_ITER"] * 2
     assert not flow.converged

@@ -34,6 +34,24 @@ std::vector<int64_t> shape_of_inflow(const FlowBox& box) {
   return shape;
 }
 
+std::vector<int64_t> shape_of_wall(const FlowBox& box, int64_t axis) {
+  auto shape = shape_of_force(box);
+  shape.erase(shape.begin() + 1 + axis);
+  return shape;
+}
+
+/// Raises ValueError or TypeError unless it is the velocity of a wall at an end of an axis, along the wall.
+void check_wall(const FlowBox& box, size_t i, const at::Tensor& velocity) {
+  const auto name = name_of_wall(i);
+  const auto axis = static_cast<int64_t>(i) / 2;
+  TORCH_CHECK_VALUE(box.boundary(axis) == FlowBoundary::kWall, "Flow: ", name,
+                    " is on an axis whose boundary is not 'wall'");
+  check_field(name.c_str(), velocity, shape_of_wall(box, axis));
+  const auto through = velocity.detach().select(velocity.dim() == 1 ? 0 : 1, box.channel_of(axis));
+  TORCH_CHECK_VALUE(!through.any().item<bool>(), "Flow: ", name, " must be along the wall: its component ",
+                    box.channel_of(axis), " must be 0");
+}
+
 /// (d,) → (1, d, 1, …).
 at::Tensor with_all_axes(at::Tensor t, const at::Tensor& u) {
   if (!t.defined()) return t;
@@ -59,6 +77,16 @@ FlowDiffusion flow_diffusion_from_name(const std::string& name) {
   return FlowDiffusion::kExplicit;
 }
 
+FlowPressure flow_pressure_from_name(const std::string& name) {
+  if (name == "incremental") return FlowPressure::kIncremental;
+  TORCH_CHECK_VALUE(name == "plain", "Flow: pressure must be 'incremental' or 'plain', got '", name, "'");
+  return FlowPressure::kPlain;
+}
+
+std::string name_of_wall(size_t i) {
+  return c10::str("wall_velocity of side (", i / 2, ", '", i % 2 ? "high" : "low", "')");
+}
+
 void FlowEquation::check() const {
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0, "Flow: dt must be finite and > 0, got ", dt);
   TORCH_CHECK_VALUE(nu.dim() == 0, "Flow: nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
@@ -73,23 +101,45 @@ void FlowEquation::check() const {
                     inflow.defined() ? "Flow: inflow is for an 'open' axis, and boundary has none"
                                      : "Flow: an 'open' axis needs inflow, the velocity at its low end");
   if (inflow.defined()) check_field("inflow", inflow, shape_of_inflow(*box));
+  for (size_t i = 0; i < wall_velocity.size(); ++i)
+    if (wall_velocity[i].defined()) check_wall(*box, i, wall_velocity[i]);
 }
 
 void FlowEquation::check(const at::Tensor& u) const {
-  const std::vector<at::Tensor> all{u, nu, force, inflow};
+  auto all = tensors();
+  all.push_back(u);
   TORCH_CHECK_NOT_IMPLEMENTED(!in_torch_func() || !at::areAnyTensorSubclassLike(all),
                               "Flow: takes no transform of torch.func; use autograd.grad and batches");
   TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(all), "Flow: takes no dual tensors of forward mode; use autograd.grad");
   box->check_velocity(u);
   check();
-  for (const auto* t : {&force, &inflow})
-    TORCH_CHECK_VALUE(!t->defined() || t->dim() == 1 || t->size(0) == 1 || t->size(0) == u.size(0),
-                      "Flow: ", t == &force ? "force" : "inflow", " holds ", t->size(0), " samples, u holds ",
-                      u.size(0));
+  const auto check_batch = [&](const std::string& name, const at::Tensor& t) {
+    TORCH_CHECK_VALUE(!t.defined() || t.dim() == 1 || t.size(0) == 1 || t.size(0) == u.size(0), "Flow: ", name,
+                      " holds ", t.size(0), " samples, u holds ", u.size(0));
+  };
+  check_batch("force", force);
+  check_batch("inflow", inflow);
+  for (size_t i = 0; i < wall_velocity.size(); ++i) check_batch(name_of_wall(i), wall_velocity[i]);
 }
 
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
-  return with_tensors({nu.to(u.options()), with_all_axes(force, u), with_all_axes(inflow, u)});
+  auto all = tensors();
+  all[0] = nu.to(u.options());
+  for (size_t i = 1; i < all.size(); ++i) {
+    if (i > 2 && all[i].defined() && all[i].dim() > 1) all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - 3) / 2);
+    all[i] = with_all_axes(all[i], u);
+  }
+  return with_tensors(all);
+}
+
+std::vector<at::Tensor> FlowEquation::tensors() const {
+  std::vector<at::Tensor> all{nu, force, inflow};
+  all.insert(all.end(), wall_velocity.begin(), wall_velocity.end());
+  return all;
+}
+
+at::Tensor FlowEquation::velocity_of_wall(int64_t axis, bool high) const {
+  return wall_velocity.empty() ? at::Tensor() : wall_velocity[2 * axis + high];
 }
 
 FlowEquation FlowEquation::with_tensors(at::TensorList tensors) const {
@@ -97,6 +147,7 @@ FlowEquation FlowEquation::with_tensors(at::TensorList tensors) const {
   other.nu = tensors[0];
   other.force = tensors[1];
   other.inflow = tensors[2];
+  other.wall_velocity = tensors.slice(3).vec();
   return other;
 }
 

@@ -10,9 +10,14 @@ enum class FlowAdvection {
   kUpwind,   // first order, monotone
 };
 enum class FlowDiffusion { kImplicit, kExplicit };
+enum class FlowPressure {
+  kIncremental,  // the explicit part is projected before the implicit diffusion, too
+  kPlain,        // only the velocity after it
+};
 /// Raise ValueError for names that do not exist.
 FlowAdvection flow_advection_from_name(const std::string& name);
 FlowDiffusion flow_diffusion_from_name(const std::string& name);
+FlowPressure flow_pressure_from_name(const std::string& name);
 
 /// u_t + (u·∇)u + ∇p = ν Δu + f with ∇·u = 0 in a box, and how a time step treats it.
 struct FlowEquation {
@@ -21,18 +26,29 @@ struct FlowEquation {
   at::Tensor nu;          // 0-dimensional
   at::Tensor force = {};  // (d,) or (batch or 1, d, *shape); undefined: none
   at::Tensor inflow = {}; // (d,) or (batch or 1, d, *shape with one cell along the open axis)
+  /// Of the walls that move along themselves, low and high along each axis: (d,) or (batch or 1, d, *shape without the
+  /// axis), undefined where a wall is at rest; empty if all are.
+  std::vector<at::Tensor> wall_velocity = {};
   FlowAdvection advection = FlowAdvection::kCentral;
   FlowDiffusion diffusion = FlowDiffusion::kImplicit;
+  FlowPressure pressure = FlowPressure::kIncremental;
 
   /// Raises ValueError or TypeError for what is out of range or does not fit the box.
   void check() const;
   /// And for what does not fit the state.
   void check(const at::Tensor& u) const;
-  /// nu, force and inflow in the dtype and on the device of a state; force and inflow with all their axes.
+  /// The tensors in the dtype and on the device of a state; all but nu with all their axes.
   FlowEquation for_state(const at::Tensor& u) const;
   /// The tensors that may have a gradient.
-  std::vector<at::Tensor> tensors() const { return {nu, force, inflow}; }
+  std::vector<at::Tensor> tensors() const;
   FlowEquation with_tensors(at::TensorList tensors) const;
+  /// The velocity of the wall at an end of an axis; undefined at rest.
+  at::Tensor velocity_of_wall(int64_t axis, bool high) const;
+  /// How much of the pressure of the explicit part is taken off before the implicit diffusion.
+  double incremental_share() const;
 };
+
+/// "wall_velocity of side (0, 'high')", for the i-th of FlowEquation::wall_velocity.
+std::string name_of_wall(size_t i);
 
 }  // namespace prdp

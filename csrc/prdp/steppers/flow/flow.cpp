@@ -10,7 +10,14 @@ namespace {
 
 FlowEquation make_equation(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings s) {
   auto box = std::make_shared<FlowBox>(std::move(shape), s.boundary, s.length.sides, s.obstacle);
-  return {std::move(box), dt, std::move(nu.tensor), s.force, s.inflow, s.advection, s.diffusion};
+  std::vector<at::Tensor> walls(s.wall_velocity.empty() ? 0 : 2 * box->dim());
+  for (const auto& [side, velocity] : s.wall_velocity) {
+    TORCH_CHECK_VALUE(side.axis >= 0 && side.axis < box->dim(),
+                      "Flow: a side of wall_velocity must have an axis below ", box->dim(), ", got ", side.axis);
+    walls[2 * side.axis + (side.end == FlowEnd::kHigh)] = velocity;
+  }
+  return {std::move(box),   dt,          std::move(nu.tensor), s.force,   s.inflow,
+          std::move(walls), s.advection, s.diffusion,          s.pressure};
 }
 
 SolveOptions without_log(SolveOptions options) {

@@ -1,4 +1,5 @@
 #pragma once
+#include <map>
 #include <utility>
 
 #include "prdp/steppers/flow/equation.h"
@@ -6,6 +7,14 @@
 #include "prdp/steppers/steppers.h"
 
 namespace prdp {
+
+/// An end of an axis of the box.
+enum class FlowEnd { kLow, kHigh };
+struct FlowSide {
+  int64_t axis;
+  FlowEnd end;
+  auto operator<=>(const FlowSide&) const = default;
+};
 
 /// What a flow has beside its grid, viscosity and time step.
 struct FlowSettings {
@@ -16,6 +25,9 @@ struct FlowSettings {
   at::Tensor inflow{};  // for an open axis: (d,) or (batch or 1, d, *shape with one cell along it); may get a gradient
   FlowAdvection advection = FlowAdvection::kCentral;
   FlowDiffusion diffusion = FlowDiffusion::kImplicit;
+  /// Of walls that move along themselves: (d,) or (batch or 1, d, *shape without the axis); may get a gradient.
+  std::map<FlowSide, at::Tensor> wall_velocity{};
+  FlowPressure pressure = FlowPressure::kIncremental;
 };
 
 /// One step of incompressible flow by projection (Chorin 1968) in 2D or 3D: u_t + (u·∇)u + ∇p = ν Δu + f, ∇·u = 0.

@@ -21,12 +21,16 @@ double largest_courant_number(const FlowEquation& e) {
       1.0, std::sqrt(e.nu.item<double>() * e.dt * e.box->sum_of_couplings() / static_cast<double>(e.box->dim())));
 }
 
-/// What is not finite in sample i: the inflow that makes the boundary values of u, the force, or u.
+/// What is not finite in sample i: the inflow that makes the boundary values of u, the force, a wall, or u.
 std::string nonfinite_part(const FlowEquation& e, const at::Tensor& u, int64_t i) {
-  const auto said = [](const char* name, const at::Tensor& bad) {
+  const auto said = [](const std::string& name, const at::Tensor& bad) {
     return c10::str(name, " is not finite at index ", at::IntArrayRef(first_true(bad)));
   };
-  for (const auto& [name, t] : {std::pair("inflow", e.inflow), std::pair("force", e.force)}) {
+  std::vector<std::pair<std::string, at::Tensor>> given{{"inflow", e.inflow}, {"force", e.force}};
+  for (size_t k = 0; k < e.wall_velocity.size(); ++k)
+    if (const auto& t = e.wall_velocity[k]; t.defined())
+      given.emplace_back(name_of_wall(k), t.squeeze(2 + static_cast<int64_t>(k) / 2));
+  for (const auto& [name, t] : given) {
     if (!t.defined()) continue;
     const auto bad = nonfinite(t.select(0, t.size(0) == 1 ? 0 : i));
     if (bad.any().item<bool>()) return said(name, bad);
@@ -40,7 +44,10 @@ RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
   const at::NoGradGuard no_grad;
   const auto courant = courant_numbers(equation, u);
   auto finite = courant.isfinite();
-  if (equation.force.defined()) finite = finite.logical_and(equation.force.isfinite().flatten(1).all(1));
+  auto given = equation.wall_velocity;
+  given.push_back(equation.force);
+  for (const auto& t : given)
+    if (t.defined()) finite = finite.logical_and(t.isfinite().flatten(1).all(1));
   const auto fine = courant.le(largest_courant_number(equation)).logical_and_(finite);
   if (fine.all().item<bool>()) return {};
   const auto diverged = at::full_like(courant, static_cast<double>(SolveStatus::kDiverged)).to(at::kLong);

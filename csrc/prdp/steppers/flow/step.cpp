@@ -6,6 +6,7 @@
 #include <limits>
 
 #include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/balance.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 #include "prdp/steppers/flow/limits.h"
@@ -68,8 +69,8 @@ std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Ten
   return gradients({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed, /*create_graph=*/true);
 }
 
-/// The gradients of u, ν, force and inflow from the cotangents of the velocity with its boundary values, of its change,
-/// and of ν in the diffusion.
+/// The gradients of u and the tensors of the equation from the cotangents of the velocity with its boundary values, of
+/// its change, and of ν in the diffusion.
 std::vector<at::Tensor> explicit_vjp_recorded(const FlowEquation& equation, const at::Tensor& u,
                                               const at::Tensor& refused, const at::Tensor& velocity_bar,
                                               const DiffuseVjp& back, at::IntArrayRef needed) {
@@ -94,10 +95,11 @@ std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Ten
   auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
   add_to(of_boundary.inflow, found.inflow);
   std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
+  all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
   const auto given = equation.tensors();
   for (size_t i = 0; i < all.size(); ++i) {
     if (!needed[i]) all[i] = at::Tensor();
-    else if (i > 0) all[i] = all[i].reshape(given[i - 1].sizes()).to(given[i - 1].options());
+    else if (i > 0 && all[i].defined()) all[i] = all[i].reshape(given[i - 1].sizes()).to(given[i - 1].options());
   }
   return all;
 }
@@ -111,8 +113,10 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
     report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
   const auto [velocity, change] = explicit_part(e, u, refused.mask);
   CombinedInfo info;
-  const auto diffused = is_implicit(e) ? diffuse(e, change, options, info) : change;
-  const auto [next, potential] = project(*e.box, velocity + diffused, options, info);
+  const auto balanced = balance(e, change, options, info);
+  const auto diffused = is_implicit(e) ? diffuse(e, balanced.u, options, info) : change;
+  auto [next, potential] = project(*e.box, velocity + diffused, options, info);
+  add_to(potential, balanced.potential);
   FlowStep step{cleared(next, refused.mask), cleared(potential, refused.mask), info.info()};
   if (refused.mask.defined()) {
     step.info.status = at::where(refused.mask, refused.status, step.info.status);
@@ -128,14 +132,18 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
   const auto& box = *e.box;
   CombinedInfo adjoint;
-  const auto velocity_bar =
-      project_vjp(box, cleared(cotangent.u, refused), cleared(cotangent.potential, refused), options, adjoint);
+  const auto of_potential = cleared(cotangent.potential, refused);
+  const auto velocity_bar = project_vjp(box, cleared(cotangent.u, refused), of_potential, options, adjoint);
   const auto& free = box.fields(u.options()).free;
   DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
   if (is_implicit(e)) {
     CombinedInfo again;
-    const auto diffused = needed[1] ? diffuse(e, explicit_part(e, u, refused).change, options, again) : at::Tensor();
+    const auto change = needed[1] ? explicit_part(e, u, refused).change : at::Tensor();
+    const auto diffused = needed[1] ? diffuse(e, balance(e, change, options, again).u, options, again) : at::Tensor();
     back = diffuse_vjp(e, back.change, diffused, options, adjoint);
+    auto balanced = balance_vjp(e, back.change, of_potential, change, options, adjoint);
+    back.change = balanced.change;
+    add_to(back.nu, balanced.nu);
   }
   info = adjoint.info();
   const auto by_loops = flow_has_loops(u);

@@ -3,7 +3,8 @@
 
 namespace prdp {
 
-/// One time step (Chorin 1968): advect, diffuse, project. `potential` is dt times its pressure, (batch, 1, *shape).
+/// One time step (Chorin 1968): advect, take the pressure off, diffuse, project. `potential` is dt times its pressure,
+/// (batch, 1, *shape).
 struct FlowStep {
   at::Tensor u, potential;
   SolveInfo info;
@@ -20,8 +21,8 @@ struct FlowCotangent {
   at::Tensor u, potential{};
 };
 
-/// The gradients of u, ν, force and inflow from these, in implicit mode: undefined where `needed` holds 0. Needs the
-/// state u alone. Where autograd records, they are differentiable. `info`: the report of the adjoint solves.
+/// The gradients of u and the tensors of the equation from these, in implicit mode: undefined where `needed` holds 0.
+/// Needs the state u alone. Where autograd records, they are differentiable. `info`: the report of the adjoint solves.
 std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info);
 

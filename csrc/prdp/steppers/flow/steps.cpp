@@ -32,8 +32,17 @@ struct Call : torch::CustomClassHolder {
 };
 
 /// Functions of autograd take no undefined tensors: an empty one stands for none.
-at::Tensor or_empty(const at::Tensor& t, const at::Tensor& u) { return t.defined() ? t : at::empty({0}, u.options()); }
-at::Tensor or_undefined(const at::Tensor& t) { return t.numel() == 0 ? at::Tensor() : t; }
+std::vector<at::Tensor> or_empty(std::vector<at::Tensor> tensors, const at::Tensor& u) {
+  for (auto& t : tensors)
+    if (!t.defined()) t = at::empty({0}, u.options());
+  return tensors;
+}
+std::vector<at::Tensor> or_undefined(at::TensorList given) {
+  auto tensors = given.vec();
+  for (auto& t : tensors)
+    if (t.numel() == 0) t = at::Tensor();
+  return tensors;
+}
 
 at::Tensor with_pressure(const FlowStep& step, double dt) { return at::cat({step.u, step.potential / dt}, 1); }
 
@@ -63,16 +72,18 @@ SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps
 
 class FlowSteps : public torch::autograd::Function<FlowSteps> {
  public:
-  static variable_list forward(AutogradContext* ctx, const at::Tensor& u, const at::Tensor& nu, const at::Tensor& force,
-                               const at::Tensor& inflow, const c10::intrusive_ptr<Call>& call) {
+  /// `tensors`: those of the equation, empty ones for none.
+  static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
+                               const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
-    const auto equation = call->equation.with_tensors({nu, or_undefined(force), or_undefined(inflow)});
+    const auto equation = call->equation.with_tensors(or_undefined(tensors));
     const auto [out, info] = run(equation, u, call->steps, call->returned, call->options);
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
-    ctx->save_for_backward({call->returned == Returned::kStates ? out : u, nu, force, inflow,
-                            may_have_failed ? info.status : at::Tensor()});
+    variable_list saved{call->returned == Returned::kStates ? out : u, may_have_failed ? info.status : at::Tensor()};
+    saved.insert(saved.end(), tensors.begin(), tensors.end());
+    ctx->save_for_backward(std::move(saved));
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
     return {out, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
   }
@@ -80,15 +91,16 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
     const auto saved = ctx->get_saved_variables();
     const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
-    variable_list out(5);
+    const auto tensors = at::TensorList(saved).slice(2);
+    variable_list out(tensors.size() + 2);
     if (!grads[0].defined()) return out;
-    const auto equation = call->equation.with_tensors({saved[1], or_undefined(saved[2]), or_undefined(saved[3])});
-    std::vector<int64_t> needed(4);
+    const auto equation = call->equation.with_tensors(or_undefined(tensors));
+    std::vector<int64_t> needed(tensors.size() + 1);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
       return call->returned == Returned::kStates
-                 ? back_through_all(equation, saved[0], saved[4], cotangent, *call, needed)
-                 : back(equation, saved[0], saved[4], cotangent, *call, needed);
+                 ? back_through_all(equation, saved[0], saved[1], cotangent, *call, needed)
+                 : back(equation, saved[0], saved[1], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
     const auto found =
@@ -156,12 +168,13 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
     return run(equation, u.detach(), steps, returned, options);
   }
   auto call = c10::make_intrusive<Call>();
-  call->equation = equation.with_tensors({at::Tensor(), at::Tensor(), at::Tensor()});
+  const auto tensors = or_empty(equation.tensors(), u);
+  call->equation = equation.with_tensors(std::vector<at::Tensor>(tensors.size()));
   call->steps = steps;
   call->returned = returned;
   call->options = options;
   call->products = products_of(options.solver.preconditioner.spec());
-  const auto out = FlowSteps::apply(u, equation.nu, or_empty(equation.force, u), or_empty(equation.inflow, u), call);
+  const auto out = FlowSteps::apply(u, at::TensorList(tensors), call);
   return {out[0], {out[1], out[2], out[3], out[4], out[5]}};
 }
 

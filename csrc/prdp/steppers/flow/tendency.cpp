@@ -83,13 +83,35 @@ std::vector<int64_t> axes_of_ghosts(const FlowBox& box) {
   return axes;
 }
 
-/// The cotangents of u and of the inflow from that of the field with ghosts, which is overwritten.
-std::pair<at::Tensor, at::Tensor> ghosts_back(const FlowEquation& equation, at::Tensor padded) {
+/// What the velocity of a wall adds to the ghosts beyond it, twice itself: zero in the corners, beyond the ends of the
+/// axes that have their ghosts already. No difference reads the corners.
+at::Tensor add_wall(const FlowEquation& equation, int64_t axis, bool high, const at::Tensor& ghosts) {
+  const auto velocity = equation.velocity_of_wall(axis, high);
+  if (!velocity.defined()) return ghosts;
+  std::vector<int64_t> pads;
+  for (int64_t a = ghosts.dim() - 1; a > 1; --a)
+    pads.insert(pads.end(), 2, a == axis + 2 || velocity.size(a) == 1 ? 0 : (ghosts.size(a) - velocity.size(a)) / 2);
+  return ghosts + 2 * at::constant_pad_nd(velocity, pads);
+}
+
+/// Its cotangent from that of the ghosts.
+at::Tensor add_wall_back(const FlowEquation& equation, int64_t axis, bool high, at::Tensor ghosts) {
+  const auto velocity = equation.velocity_of_wall(axis, high);
+  if (!velocity.defined()) return velocity;
+  for (int64_t a = 2; a < ghosts.dim(); ++a) {
+    const int64_t n = a == axis + 2 ? 1 : equation.box->shape()[a - 2];
+    ghosts = ghosts.narrow(a, (ghosts.size(a) - n) / 2, n);
+  }
+  return at::sum_to(2 * ghosts, velocity.sizes());
+}
+
+/// The cotangents of u, of the inflow and of the walls from that of the field with ghosts, which is overwritten.
+void ghosts_back(const FlowEquation& equation, at::Tensor padded, TendencyVjp& found) {
   const auto& box = *equation.box;
   const auto& fields = box.fields(padded.options());
   auto axes = axes_of_ghosts(box);
   std::reverse(axes.begin(), axes.end());
-  at::Tensor inflow;
+  found.wall_velocity.resize(equation.wall_velocity.size());
   for (const int64_t axis : axes) {
     const int64_t d = axis + 2, n = box.shape()[axis];
     const auto low = padded.narrow(d, 0, 1), high = padded.narrow(d, n + 1, 1);
@@ -101,17 +123,21 @@ std::pair<at::Tensor, at::Tensor> ghosts_back(const FlowEquation& equation, at::
         first.add_(high);
         break;
       case FlowBoundary::kWall:
+        if (!found.wall_velocity.empty()) {
+          found.wall_velocity[2 * axis] = add_wall_back(equation, axis, false, low);
+          found.wall_velocity[2 * axis + 1] = add_wall_back(equation, axis, true, high);
+        }
         first.sub_(low);
         last.add_(fields.high_sign[axis] * high);
         break;
       case FlowBoundary::kOpen:
-        inflow = at::sum_to(2 * low, equation.inflow.sizes());
+        found.inflow = at::sum_to(2 * low, equation.inflow.sizes());
         first.sub_(low);
         last.add_(high);
         break;
     }
   }
-  return {padded, inflow};
+  found.u = padded;
 }
 
 }  // namespace
@@ -137,7 +163,11 @@ at::Tensor with_ghosts(const FlowEquation& equation, const at::Tensor& u) {
     const auto first = padded.narrow(d, 0, 1), last = padded.narrow(d, n - 1, 1);
     switch (box.boundary(axis)) {
       case FlowBoundary::kPeriodic: padded = at::cat({last, padded, first}, d); break;
-      case FlowBoundary::kWall: padded = at::cat({-first, padded, fields.high_sign[axis] * last}, d); break;
+      case FlowBoundary::kWall:
+        padded = at::cat({add_wall(equation, axis, false, -first), padded,
+                          add_wall(equation, axis, true, fields.high_sign[axis] * last)},
+                         d);
+        break;
       case FlowBoundary::kOpen: padded = at::cat({2 * equation.inflow - first, padded, last}, d); break;
     }
   }
@@ -158,9 +188,9 @@ TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, cons
   const auto& fields = equation.box->fields(u.options());
   const auto g = fields.free.defined() ? cotangent * fields.free : cotangent;
   auto [padded_bar, nu_bar] = advect_and_diffuse_vjp(equation, with_ghosts(equation, u).contiguous(), g);
-  TendencyVjp found{{}, nu_bar, {}, {}};
+  TendencyVjp found{{}, nu_bar, {}, {}, {}};
   if (equation.force.defined()) found.force = at::sum_to(g, equation.force.sizes());
-  std::tie(found.u, found.inflow) = ghosts_back(equation, padded_bar);
+  ghosts_back(equation, padded_bar, found);
   if (fields.friction.defined()) {
     const auto held = fields.friction * g;
     found.u = found.u - equation.nu * held;

@@ -15,6 +15,7 @@ at::Tensor tendency(const FlowEquation& equation, const at::Tensor& u);
 /// The cotangents of u and of what the equation is made of from that of the tendency, by loops. With all their axes.
 struct TendencyVjp {
   at::Tensor u, nu, force, inflow;
+  std::vector<at::Tensor> wall_velocity;
 };
 TendencyVjp tendency_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& cotangent);
 /// The same for with_boundary_values(): of u and of the inflow.

@@ -1,0 +1,21 @@
+#pragma once
+#include "prdp/steppers/flow/projection.h"
+
+namespace prdp {
+
+/// The change of the velocity by the explicit part, without the pressure that balances it, and dt times this pressure:
+/// undefined where it is left to the projection after the diffusion. Differentiable.
+///
+/// A change that is all pressure, as that of a steady flow, must not be diffused: beside walls, what is left of a
+/// gradient after diffusion is none. Where all faces are free, the two commute, and the step is the same without this.
+Projected balance(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
+                  CombinedInfo& info);
+
+/// The cotangents of the change and of ν from those of the result. ν's needs the change; both are undefined without.
+struct BalanceVjp {
+  at::Tensor change, nu;
+};
+BalanceVjp balance_vjp(const FlowEquation& equation, const at::Tensor& cotangent, const at::Tensor& of_potential,
+                       const at::Tensor& change, const SolveOptions& options, CombinedInfo& info);
+
+}  // namespace prdp
