@@ -42,6 +42,26 @@ def flow_around_cylinder(figure):
     right.set(xlabel="∂ drag / ∂ inflow of a row", title="where the inflow matters", ylim=(0, height))
 
 
+def lid_driven_cavity(figure):
+    left, middle, right = figure.subplots(1, 3)
+    for reynolds, colour in ((100, BLUE), (400, "#009e73"), (1000, RED)):
+        ran = run("lid_driven_cavity", 128, reynolds)
+        n, u = ran["n"], ran["u"][0]
+        at = (np.arange(n) + 0.5) / n
+        left.plot(u[0, :, n // 2], at, color=colour, label=f"Re = {reynolds}")
+        left.plot(ran["GHIA"][reynolds], ran["HEIGHTS"], "o", ms=4, color=colour)
+        right.plot(at - 0.5 / n, n * ran["gradient"], color=colour)
+    left.set(xlabel="u in the middle; points: Ghia et al.", ylabel="y")
+    left.legend(frameon=False, fontsize="small")
+    centres = (u + torch.stack([u[0].roll(-1, 1), u[1].roll(-1, 0)])) / 2
+    centres[0, :, -1] /= 2  # the wall on the right is at rest
+    image = middle.imshow(centres.square().sum(0).sqrt(), cmap="viridis", origin="lower", extent=(0, 1, 0, 1))
+    middle.streamplot(at, at, *centres.numpy(), color="white", linewidth=0.6, density=1.1, arrowsize=0.6)
+    middle.set(title="speed, Re = 1000", xticks=[], yticks=[], xlim=(0, 1), ylim=(0, 1))
+    figure.colorbar(image, ax=middle, shrink=0.7)
+    right.set(title="∂ u(centre) / ∂ speed of the lid", xlabel="x along the lid")
+
+
 def passive_scalar(figure):
     ran = run("passive_scalar")
     n, u = ran["n"], ran["u"].detach()[0]
@@ -92,7 +112,7 @@ def force_network(figure):
 
 
 def main():
-    for draw in (flow_around_cylinder, passive_scalar, force_network):
+    for draw in (flow_around_cylinder, lid_driven_cavity, passive_scalar, force_network):
         figure = Figure(figsize=(8.5, 3.6), layout="constrained")
         draw(figure)
         path = DOCS / "results" / f"{draw.__name__}.png"

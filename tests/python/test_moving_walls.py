@@ -183,7 +183,7 @@ def test_rollouts_and_second_derivatives():
     def states(u, *walls):
         return make("cavity", along("cavity", walls)).rollout(u, 2)
 
-    assert gradcheck(states, (u, *walls)) and gradgradcheck(states, (u, *walls), fast_mode=True)
+    assert gradcheck(states, (u, *walls), fast_mode=True) and gradgradcheck(states, (u, *walls), fast_mode=True)
 
 
 def test_unrolled_gradients():
@@ -193,7 +193,8 @@ def test_unrolled_gradients():
     def step(u, *walls):
         return make("cavity", along("cavity", walls), solver=few, backward="unrolled")(u)
 
-    assert gradcheck(step, (random_velocity((4, 5), batch=2).requires_grad_(), *walls_of("cavity")))
+    u = random_velocity((4, 5), batch=2).requires_grad_()
+    assert gradcheck(step, (u, *walls_of("cavity")), fast_mode=True)
 
 
 @pytest.mark.parametrize("name", CASES)

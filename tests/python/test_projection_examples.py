@@ -25,6 +25,12 @@ def test_the_drag_of_a_cylinder_and_its_gradient():
     assert in_all > 0  # more inflow, more drag
 
 
+def test_the_lid_driven_cavity_beside_published_values():
+    centre, error = numbers("lid_driven_cavity.py", 24, 100)
+    assert centre == pytest.approx(-0.2058, abs=0.01)
+    assert error < 0.01
+
+
 def test_the_passive_scalar_is_conserved_and_traced_back():
     before, after, largest, *_, column, row = numbers("passive_scalar.py", 24, 20)
     assert after == pytest.approx(before, rel=1e-3)
