@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _check
+from prdp_torch.operators.base import full_precision
 
 Side: TypeAlias = tuple[int, Literal["low", "high"]]
 """An end of an axis, in the order of `shape`."""
@@ -41,7 +42,7 @@ def vectors(velocities: Mapping[Side, Tensor], dim: int) -> list[Tensor | None]:
         if velocity is not None and velocity.dim() == 0 and dim == 2:
             still = torch.zeros_like(velocity)
             velocity = torch.stack((velocity, still) if side[0] == 0 else (still, velocity))
-        found.append(velocity)
+        found.append(None if velocity is None else full_precision(velocity))
     return found
 
 
