@@ -172,6 +172,7 @@ class TapeSpace {
     return number(Kind::kSquare, rr, r.version);
   }
   Scalar solution2(const Vector& x) { return values_.solution2(value(x)); }
+  Scalar terms2(const Vector& x) { return values_.terms2(value(x)); }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {

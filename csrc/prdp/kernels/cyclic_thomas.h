@@ -38,9 +38,10 @@ class CyclicThomas {
     border_first_ = last > 0 ? border[0] : 0.0;
     border_last_ = last > 1 ? border[last - 1] : 0.0;
     solve_tridiagonal(column_.data());
-    const double last_pivot = corner - border_product(column_.data());
+    const double taken_off = border_product(column_.data()), last_pivot = corner - taken_off;
     inverse_corner_ = 1.0 / last_pivot;
-    is_regular_ = std::abs(last_pivot) > std::numeric_limits<double>::epsilon() * static_cast<double>(n_) * a.norm();
+    is_regular_ = std::abs(last_pivot) > std::numeric_limits<double>::epsilon() * static_cast<double>(n_) *
+                                             (std::abs(corner) + std::abs(taken_off));
   }
   bool is_dominant() const { return is_dominant_; }
   /// Whether the last pivot, the only one that a dominant matrix may lose, is larger than its rounding errors.

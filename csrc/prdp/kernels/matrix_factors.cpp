@@ -1,6 +1,8 @@
 #include <Eigen/Dense>
 #include <limits>
+#include <optional>
 
+#include "prdp/kernels/equilibration.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/kernels/sparse_factors.h"
 
@@ -11,17 +13,47 @@ namespace {
 template <class T>
 using Values = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 
-/// LU with partial pivoting, in double whatever the dtype of the matrix.
-struct DenseLU {
-  Eigen::PartialPivLU<Eigen::MatrixXd> lu;
-  bool is_regular;
+/// LU with partial pivoting, in double whatever the dtype of the matrix. Where that finds no regular matrix, the rows
+/// and columns may only differ much in size: they are scaled, and factored again.
+class DenseLU {
+ public:
+  explicit DenseLU(const Eigen::MatrixXd& m) {
+    factor(m);
+    if (is_regular_) return;
+    const auto scales = equilibrate(m.rows(), [&](const auto& body) {
+      for (Eigen::Index j = 0; j < m.cols(); ++j)
+        for (Eigen::Index i = 0; i < m.rows(); ++i) body(i, j, m(i, j));
+    });
+    if (!scales.matters()) return;
+    factor(scales.rows.asDiagonal() * m * scales.columns.asDiagonal());
+    scales_ = scales;
+  }
+  bool is_regular() const { return is_regular_; }
+  /// A⁻¹ b, or A⁻ᵀ b
+  Eigen::VectorXd solve(const Eigen::VectorXd& b, bool transposed) const {
+    if (!scales_) return solve_factors(b, transposed);
+    const auto &before = transposed ? scales_->columns : scales_->rows,
+               &behind = transposed ? scales_->rows : scales_->columns;
+    return behind.cwiseProduct(solve_factors(before.cwiseProduct(b), transposed));
+  }
+  int64_t bytes() const { return lu_.rows() * lu_.rows() * static_cast<int64_t>(sizeof(double)); }
 
-  explicit DenseLU(const Eigen::MatrixXd& m)
-      : lu(m),
-        is_regular(lu.matrixLU().diagonal().cwiseAbs().minCoeff() > std::numeric_limits<double>::epsilon() *
-                                                                        static_cast<double>(m.rows()) *
-                                                                        m.cwiseAbs().rowwise().sum().maxCoeff()) {}
-  int64_t bytes() const { return lu.rows() * lu.rows() * static_cast<int64_t>(sizeof(double)); }
+ private:
+  /// A pivot is rounding beside its own column: how large the others are does not matter.
+  void factor(const Eigen::MatrixXd& m) {
+    lu_.compute(m);
+    const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows());
+    const Eigen::ArrayXd pivots = lu_.matrixLU().diagonal().cwiseAbs();
+    is_regular_ = (pivots > rounding * m.cwiseAbs().colwise().sum().transpose().array()).all();
+  }
+  Eigen::VectorXd solve_factors(const Eigen::VectorXd& b, bool transposed) const {
+    if (transposed) return lu_.transpose().solve(b);
+    return lu_.solve(b);
+  }
+
+  Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
+  std::optional<Equilibration> scales_;
+  bool is_regular_ = false;
 };
 
 /// A null space that is named is filled: A + s Σ l_k r_kᵀ is regular.
@@ -42,11 +74,8 @@ class DenseFactors final : public Factors<T> {
     else lu_ = factor_cache::find_or_make<DenseLU>(FactorKeyMaker().add(n_).add(a.values(), n_ * n_).key(), make);
   }
   bool solve(const T* r, T* d) const override {
-    if (!lu_->is_regular) return false;
-    const Eigen::VectorXd rhs = Eigen::Map<const Values<T>>(r, n_).template cast<double>();
-    Eigen::VectorXd x;
-    if (transposed_) x = lu_->lu.transpose().solve(rhs);
-    else x = lu_->lu.solve(rhs);
+    if (!lu_->is_regular()) return false;
+    const Eigen::VectorXd x = lu_->solve(Eigen::Map<const Values<T>>(r, n_).template cast<double>(), transposed_);
     Eigen::Map<Values<T>>(d, n_) = x.template cast<T>();
     return x.template cast<T>().allFinite();
   }

@@ -7,6 +7,7 @@
 #include <limits>
 #include <numeric>
 
+#include "prdp/kernels/equilibration.h"
 #include "prdp/threads/thread_to_leave.h"
 
 namespace prdp::kernels {
@@ -15,29 +16,35 @@ namespace {
 
 using Matrix = SparseFactors::Matrix;
 
-/// LU that tells its least pivot.
+/// LU that tells its pivots.
 class PivotedLU : public Eigen::SparseLU<Matrix> {
  public:
-  double least_pivot() const {
-    double least = std::numeric_limits<double>::infinity();
+  /// Whether the pivot of every column is larger than its share of the sum of that column's magnitudes.
+  bool pivots_exceed(double share, const Eigen::VectorXd& sums) const {
+    Eigen::VectorXd pivot = Eigen::VectorXd::Zero(this->cols());
     for (Eigen::Index j = 0; j < this->cols(); ++j)
       for (SCMatrix::InnerIterator it(this->m_Lstore, j); it; ++it)
         if (it.index() == j) {
-          least = std::min(least, std::abs(it.value()));
+          pivot[j] = std::abs(it.value());
           break;
         }
-    return least;
+    const auto& place = this->colsPermutation().indices();
+    for (Eigen::Index j = 0; j < this->cols(); ++j)
+      if (!(pivot[place[j]] > share * sums[j])) return false;
+    return true;
   }
 };
 
-double least_pivot(const Eigen::SimplicialLLT<Matrix>& cholesky) {
+/// Whether every pivot is larger than this share of what it was before anything was taken off, Σ l² of its row.
+bool pivots_exceed(double share, const Eigen::SimplicialLLT<Matrix>& cholesky) {
   const auto& l = cholesky.matrixL().nestedExpression();
-  double least = std::numeric_limits<double>::infinity();
+  Eigen::VectorXd pivot(l.rows()), whole = Eigen::VectorXd::Zero(l.rows());
   for (Eigen::Index j = 0; j < l.cols(); ++j) {  // the diagonal comes first in each column
-    const double d = l.valuePtr()[l.outerIndexPtr()[j]];
-    least = std::min(least, d * d);
+    pivot[j] = std::pow(l.valuePtr()[l.outerIndexPtr()[j]], 2);
+    for (auto k = l.outerIndexPtr()[j]; k < l.outerIndexPtr()[j + 1]; ++k)
+      whole[l.innerIndexPtr()[k]] += std::pow(l.valuePtr()[k], 2);
   }
-  return least;
+  return (pivot.array() > share * whole.array()).all();
 }
 
 bool is_symmetric(const Matrix& m) {
@@ -89,28 +96,42 @@ struct SparseFactors::Factorised {
   double sign = 1.0;
   std::optional<Eigen::SimplicialLLT<Matrix>> cholesky;
   mutable PivotedLU lu;
+  std::optional<Equilibration> scales;  // of what lu belongs to
   bool is_regular = false;
 
   explicit Factorised(const Matrix& m) {
-    double largest = 0.0;  // Σ|a| of a column
-    for (Eigen::Index j = 0; j < m.outerSize(); ++j) {
-      double sum = 0.0;
-      for (Matrix::InnerIterator it(m, j); it; ++it) sum += std::abs(it.value());
-      largest = std::max(largest, sum);
-    }
-    const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows()) * largest;
     if (m.rows() > 0 && has_empty_line(m)) return;
     if (is_symmetric(m)) {
       if (m.rows() > 0 && m.coeff(0, 0) < 0.0) sign = -1.0;
       cholesky.emplace(Matrix(sign * m));
       if (cholesky->info() == Eigen::Success) {
-        is_regular = least_pivot(*cholesky) > rounding;
+        is_regular = pivots_exceed(rounding_of(m), *cholesky);
         return;
       }
       cholesky.reset();
     }
+    factor(m);
+    if (is_regular) return;
+    // Its rows and columns may only differ much in size.
+    auto found = equilibrate(m.rows(), [&](const auto& body) {
+      for (Eigen::Index j = 0; j < m.outerSize(); ++j)
+        for (Matrix::InnerIterator it(m, j); it; ++it) body(it.row(), it.col(), it.value());
+    });
+    if (!found.matters()) return;
+    factor(found.rows.asDiagonal() * m * found.columns.asDiagonal());
+    scales = std::move(found);
+  }
+
+ private:
+  static double rounding_of(const Matrix& m) {
+    return std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows());
+  }
+  void factor(const Matrix& m) {
+    Eigen::VectorXd sums = Eigen::VectorXd::Zero(m.cols());
+    for (Eigen::Index j = 0; j < m.outerSize(); ++j)
+      for (Matrix::InnerIterator it(m, j); it; ++it) sums[j] += std::abs(it.value());
     lu.compute(m);
-    is_regular = lu.info() == Eigen::Success && lu.least_pivot() > rounding;
+    is_regular = lu.info() == Eigen::Success && lu.pivots_exceed(rounding_of(m), sums);
   }
 };
 
@@ -138,10 +159,13 @@ void SparseFactors::solve(Eigen::VectorXd& x, bool transposed) const {
   Eigen::VectorXd rhs(to_take.size() == 0 ? 0 : to_take.maxCoeff() + 1);
   for (int64_t i = 0; i < n; ++i)
     if (to_take[i] >= 0) rhs[to_take[i]] = x[i];
+  const auto& scales = factorised_->scales;
+  if (scales) rhs.array() *= (transposed ? scales->columns : scales->rows).array();
   Eigen::VectorXd found;
   if (factorised_->cholesky) found = factorised_->sign * factorised_->cholesky->solve(rhs);
   else if (transposed) found = factorised_->lu.transpose().solve(rhs);
   else found = factorised_->lu.solve(rhs);
+  if (scales) found.array() *= (transposed ? scales->rows : scales->columns).array();
   for (int64_t i = 0; i < n; ++i) x[i] = to_give[i] >= 0 ? found[to_give[i]] : 0.0;
 }
 

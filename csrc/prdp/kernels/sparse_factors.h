@@ -32,7 +32,8 @@ Pins pins_of(const std::optional<NullSpace<T>>& right, const std::optional<NullS
 }
 
 /// Factors of a sparse matrix in double by Eigen: Cholesky's if the matrix is symmetric and definite of either sign,
-/// which takes a quarter of the time, otherwise LU with pivoting. Any thread may solve with them.
+/// which takes a quarter of the time, otherwise LU with pivoting. Any thread may solve with them. Pivots are judged
+/// beside their own rows or columns, whose sizes may differ by any factor.
 class SparseFactors {
  public:
   using Matrix = Eigen::SparseMatrix<double>;

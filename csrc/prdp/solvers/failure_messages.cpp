@@ -55,6 +55,26 @@ bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tenso
          maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
 }
 
+/// Where the rows of A, or its columns, differ so much in size that the dtype loses the small ones beside the large
+/// ones: that, in words. Else empty.
+std::string badly_scaled(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  for (const bool columns : {false, true}) {
+    const auto sizes = row_sizes(a, b, /*transposed=*/columns).select(0, sample);
+    const auto there = sizes.masked_select(sizes.gt(0));
+    if (there.numel() == 0) continue;
+    const double spread = (there.max() / there.min()).item<double>();
+    if (!(spread > 1.0 / (64.0 * epsilon_of(b)))) continue;
+    const bool direct = traits(solver.method).is_direct, single = b.scalar_type() == at::kFloat;
+    return std::string(direct ? "A is singular, or has " : "A has ") + "badly scaled " +
+           (columns ? "columns" : "rows") + ": the largest is " + number(spread) +
+           " times the smallest, which is lost beside it; scale A and b" +
+           (single   ? ", or take float64"
+            : direct ? ""
+                     : ", or take Direct");
+  }
+  return {};
+}
+
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
   const double share = asymmetry(a, b, sample);
@@ -102,10 +122,12 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
          "take a b without that part, or add a multiple of the identity to A";
 }
 
-std::string zero_diagonal(const SolveRole& role) {
-  const std::string why = operator_kind(role.a.kind).has_pressure
-                              ? "the pressure rows have a zero diagonal"
-                              : "it divides by the diagonal of A, which has a zero there";
+std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const bool has_zero = a.diagonal().expand_as(b).select(0, sample).eq(0).any().item<bool>();
+  const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
+                          : has_zero ? "it divides by the diagonal of A, which has a zero there"
+                                     : "multigrid finds no coarse grid for A: a diagonal vanishes, or a number leaves "
+                                       "the range of the dtype, on one of them";
   return why + (role.solver.preconditioner.is_diagonal() && traits(role.solver.method).made_for == MadeFor::kAny
                     ? "; take " + std::string(traits(role.solver.method).label) + " without it"
                     : "; take GMRES");
@@ -136,11 +158,13 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         forgets_constants(role, a, b, sample))
       return "A maps the constant to zero, so it is singular; give nullspace=\"constant\"";
+    if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown)
+      if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {
       case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
       case SolveStatus::kOverflow: return overflow(role.solver, a, b, sample);
       case SolveStatus::kBreakdown: return breakdown(role.solver, a, b, sample);
-      case SolveStatus::kZeroDiagonal: return zero_diagonal(role);
+      case SolveStatus::kZeroDiagonal: return zero_diagonal(role, a, b, sample);
       case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);
       case SolveStatus::kNonfiniteInput:
         if (!b.select(0, sample).isfinite().all().item<bool>())

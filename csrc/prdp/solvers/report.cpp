@@ -34,7 +34,9 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor
          << position(first_true(in_b ? of_b : nonfinite(x0.select(0, sample))));
   }
   if (status == SolveStatus::kZeroDiagonal)
-    text << " in row " << position(first_true(a.diagonal().expand_as(b).select(0, sample).eq(0)));
+    // None where it is the diagonal of a coarse grid.
+    if (const auto zero = a.diagonal().expand_as(b).select(0, sample).eq(0); zero.any().item<bool>())
+      text << " in row " << position(first_true(zero));
   if (status == SolveStatus::kNonfiniteOperator)
     if (const auto index = a.first_nonfinite(sample); !index.empty()) text << " at index " << position(index);
   return text.str();

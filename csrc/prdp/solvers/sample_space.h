@@ -10,6 +10,7 @@
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
 #include "prdp/solvers/sample_system.h"
+#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 #include "prdp/threads/interruption.h"
 
@@ -184,6 +185,17 @@ class SampleSpace : public SampleNumbers<T> {
   Scalar solution2(const T* x) {
     const T* u = solution(x);
     return dot(u, u);
+  }
+  Scalar terms2(const T* x) {
+    std::vector<T> values(unknowns());
+    layout().store(solution(x), T(1), values.data());
+    for (int64_t i = 0; i < unknowns(); ++i)
+      if (is_negated(i)) values[i] = -values[i];
+    kernels::Workspace<T> memory;
+    memory.prepare(2, length(), layout().halo);
+    layout().load(values.data(), T(1), memory.vector(0));
+    system_.a().apply(memory.vector(0), memory.vector(1));
+    return dot(memory.vector(1), memory.vector(1));
   }
   void solve_directly(const T* r, Vector d) {
     if (system_.factors().solve(r, d)) return;

@@ -151,6 +151,9 @@ concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S
                            s.broken();
                            s.operator_norm();
                            { s.solution2(x) } -> std::same_as<typename S::Scalar>;
+                           /// ‖A v‖² for u with its signs changed without a pattern: about ‖|A| |u|‖², as the terms of
+                           /// a product do not cancel.
+                           { s.terms2(x) } -> std::same_as<typename S::Scalar>;
                            /// From here on, operations write to the samples alone that are wanted.
                            s.freeze_unless(states, wanted);
                            /// Forgets breakdowns and frozen samples, before the iterations run again.

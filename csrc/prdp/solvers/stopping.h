@@ -180,20 +180,32 @@ inline void judge_progress(SampleState& s, bool exhausted) {
 
 /// Stops those of the `doubtful` samples whose residual is rounding, floor = ε ‖A‖ ‖u‖: one that is no larger, or up to
 /// eight times as large where rtol lies below the floor. An exhausted space is judged with more slack. A floor near ‖b‖
-/// says nothing: there u is garbage.
+/// says nothing: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a product rounds: columns of A
+/// that differ much in size make ‖A‖ ‖u‖ large without.
 template <class Space, class Method, class Predicate>
 void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                             const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
   const auto u2 = space.lanes(space.solution2(method.x));
+  const auto slack_of = [&](const SampleState& s, double floor) {
+    return s.status == SolveStatus::kBreakdown ? 100.0 : rtol * std::sqrt(s.b2) <= floor ? 8.0 : 1.0;
+  };
+  auto floors = space.map(states, [](const SampleState&) { return 0.0; });
+  for (size_t i = 0; i < states.size(); ++i) {
+    const auto& s = states[i];
+    const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
+    if (doubtful(s) && floor <= 0.25 * b && std::sqrt(s.residual2) <= slack_of(s, floor) * floor) floors[i] = floor;
+  }
+  if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
+  constexpr double far = 64.0;
+  const auto terms2 = space.lanes(space.terms2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
-    const double slack = s.status == SolveStatus::kBreakdown ? 100.0 : rtol * b <= floor ? 8.0 : 1.0;
-    if (!doubtful(s) || !(floor <= 0.25 * b) || !(std::sqrt(s.residual2) <= slack * floor)) continue;
+    const double of_product = far * space.epsilon() * std::sqrt(terms2[i]);
+    if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * of_product)) continue;
     s.stop(SolveStatus::kStagnated);
-    s.floor2 = floor * floor;
+    s.floor2 = floors[i] * floors[i];
   }
 }
 

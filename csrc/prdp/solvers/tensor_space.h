@@ -10,6 +10,7 @@
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
+#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/unseen_numbers.h"
 #include "prdp/threads/interruption.h"
@@ -138,6 +139,10 @@ class TensorSpace {
   Scalar solution2(const Vector& x) const {
     const auto u = solution(x);
     return dot(u, u);
+  }
+  Scalar terms2(const Vector& x) const {
+    const auto terms = laid_out(system_.a.apply(with_signs_changed(solution(x).detach())));
+    return dot(terms, terms);
   }
   void solve_directly(const Vector& r, Vector& d);
 

@@ -14,13 +14,6 @@ namespace prdp {
 
 namespace {
 
-/// The norm of each sample, whatever its order of magnitude.
-at::Tensor norm_of_samples(const at::Tensor& v) {
-  const auto rows = v.to(at::kDouble).flatten(1);
-  const auto largest = rows.abs().amax(1, /*keepdim=*/true), unit = at::where(largest.gt(0), largest, 1.0);
-  return unit.squeeze(1) * (rows / unit).norm(2, 1);
-}
-
 /// The share of each sample of v that is constant in a channel, (batch,) in double; 0 where it may be the rounding of v
 /// to the least numbers of its dtype.
 at::Tensor constant_shares(const at::Tensor& v) {
@@ -50,9 +43,20 @@ bool worked_for_long(const Solver& solver, int64_t products) {
 
 }  // namespace
 
+at::Tensor row_sizes(const Operator& a, const at::Tensor& b, bool transposed) {
+  const auto channels = by_channel(b);
+  const auto squares = at::arange(1, channels.size(-1) + 1, b.options().dtype(at::kDouble)).square();
+  const auto size = [&](const at::Tensor& v) {
+    return apply_on_loops(a, v.to(b.scalar_type()).expand_as(channels).reshape_as(b), transposed).to(at::kDouble).abs();
+  };
+  return at::maximum(size(squares.sin()), size(squares.cos()));
+}
+
 at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool transposed) {
-  const auto product = [&](const at::Tensor& v) { return norm_of_samples(apply_on_loops(a, v, transposed)); };
-  return product(at::ones_like(b)) <= 16.0 * epsilon_of(b) * product(alternating(b));
+  const auto sizes = row_sizes(a, b, transposed);
+  const auto constant = apply_on_loops(a, at::ones_like(b), transposed).to(at::kDouble);
+  const auto share = at::where(sizes.gt(0), constant.abs() / sizes, constant.ne(0).to(at::kDouble));
+  return share.flatten(1).square().mean(1).sqrt() <= 32.0 * epsilon_of(b);
 }
 
 namespace {

@@ -3,7 +3,10 @@
 
 namespace prdp {
 
-/// Whether A, or Aᵀ if `transposed`, maps the constant to zero up to rounding: bool, (batch,).
+/// How large each row of A, or of Aᵀ, is, as products with two vectors of no structure tell it: like b, in double.
+at::Tensor row_sizes(const Operator& a, const at::Tensor& b, bool transposed);
+
+/// Whether A, or Aᵀ if `transposed`, maps the constant to zero, each row up to its own rounding: bool, (batch,).
 at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool transposed);
 
 /// Calls those unsolved samples INCONSISTENT whose b has a constant part, beyond rounding, that A cannot reach, as Aᵀ
