@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import field, statuses
+from stand_in_device import StandIn
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
@@ -78,6 +79,44 @@ def test_the_number_of_iterations_does_not_grow_with_the_grid(case):
         assert info.solved.all(), info
     _, info = prdp.linear_solve(a, b, prdp.Multigrid(3 * most[0], rtol=1e-6))
     assert info.solved.all(), info
+
+
+@pytest.mark.parametrize("boundary", ["zero", "flux", "periodic", ("flux", "zero"), (("zero", "flux"), "periodic")])
+@pytest.mark.parametrize("ratio", [3, 10, 30, 100, 1000])
+@pytest.mark.parametrize("shape", [(48, 64), (64, 16), (8, 16, 24)])
+def test_cells_that_are_stretched(shape, ratio, boundary):
+    """What is constant along the short sides of the cells was neither smoothed nor coarsened where nothing held it: 300
+    cycles and as many iterations of CG did not solve it."""
+    if len(shape) == 3:
+        boundary, length = "flux" if boundary == "flux" else "periodic", (1.0, ratio, ratio**2)
+    else:
+        length = (1.0, ratio * shape[1] / shape[0])
+    kappa = torch.exp(0.5 * noise(shape)[0, 0])
+    b = noise(shape)
+    b = (b - b.mean()).requires_grad_()
+    a = operators.Diffusion(kappa[None], 1e-6, boundary, length)
+    for solver in (prdp.Multigrid(30, 1e-6), prdp.CG(13, 1e-6, **MULTIGRID)):
+        u, info = prdp.linear_solve(a, b, solver)
+        assert info.solved.all(), info
+    (u * b.detach().flip(-1)).sum().backward()
+    assert u.grad_fn is not None and b.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("boundary", ["flux", "periodic", "zero"])
+@pytest.mark.parametrize("shape, ratio", [((12, 16), 100.0), ((5, 24), 30.0), ((24, 4), 0.01), ((4, 6, 9), 20.0)])
+def test_stretched_cells_equal_lapack_and_other_devices(shape, ratio, boundary):
+    length = (1.0,) * (len(shape) - 1) + (ratio * shape[-1],)
+    kappa, b = torch.exp(noise(shape)[0]), noise(shape)
+    a = operators.Diffusion(kappa, 0.1, boundary, length)
+    u, here = prdp.linear_solve(a, b, prdp.CG(20, 1e-10, **MULTIGRID))
+    exact, _ = prdp.linear_solve(a, b, prdp.Direct())
+    torch.testing.assert_close(u, exact, rtol=1e-7, atol=1e-7 * exact.abs().max().item())
+    with StandIn() as device:
+        there = operators.Diffusion(device.send(kappa), 0.1, boundary, length)
+        v, info = prdp.linear_solve(there, device.send(b), prdp.CG(20, 1e-10, **MULTIGRID))
+        v, iterations = device.fetch(v), int(device.fetch(info.iterations))
+    torch.testing.assert_close(v, u, rtol=1e-7, atol=1e-7 * exact.abs().max().item())
+    assert abs(iterations - int(here.iterations)) <= 1
 
 
 def windy(shape, peclet, shift=100.0):

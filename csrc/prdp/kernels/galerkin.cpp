@@ -4,6 +4,8 @@
 #include <array>
 #include <atomic>
 #include <cmath>
+#include <limits>
+#include <utility>
 
 #include "prdp/kernels/loops.h"
 #include "prdp/kernels/whole_vectors.h"
@@ -205,6 +207,49 @@ AxisTransfer<T> make_transfer(const RawStencil<T>& a, int axis, bool symmetric) 
   return {weights_of(a, own, &of_transpose), weights_of(a, of_transpose)};
 }
 
+namespace {
+
+/// See kVanishing.
+template <class T>
+void keep_vanishing_diagonals(const RawStencil<T>& a, int axis, RawStencil<T>& coarse) {
+  const T* const fine = a.coefficients[RawStencil<T>::kCentre];
+  T* const diagonal = const_cast<T*>(coarse.coefficients[RawStencil<T>::kCentre]);  // in its own memory
+  const auto is_alone = [&](int64_t i) {
+    for (int k = 0; k < 27; ++k)
+      if (k != RawStencil<T>::kCentre && coarse.coefficients[k] && coarse.coefficients[k][i] != T(0)) return false;
+    return true;
+  };
+  const auto roundings = [](double n) { return static_cast<T>(n) * std::numeric_limits<T>::epsilon(); };
+  const T tiny = roundings(kVanishing), tiny_alone = roundings(kVanishingAlone);
+  const auto of_coarse = [&](int d, int64_t i) { return d == axis ? 2 * i + !a.grid.periodic[d] : i; };
+  const int64_t step = axis == 2 ? 2 : 1;
+  for_each_row(coarse.grid, [&](int64_t z, int64_t y, int64_t at) {
+    const int64_t first = (of_coarse(0, z) * a.grid.shape[1] + of_coarse(1, y)) * a.grid.shape[2] + of_coarse(2, 0);
+    for (int64_t i = 0; i < coarse.grid.shape[2]; ++i) {
+      const T kept = fine[first + step * i], size = std::abs(diagonal[at + i]);
+      if (size > tiny_alone * std::abs(kept)) continue;
+      if (size <= tiny * std::abs(kept) || is_alone(at + i)) diagonal[at + i] = kept;
+    }
+  });
+}
+
+/// The only point of a periodic axis is its own neighbour.
+template <class T>
+void fold_onto_centre(RawStencil<T>& a, int axis) {
+  for (int k = 0; k < 27; ++k) {
+    auto to = RawStencil<T>::offset(k);
+    if (!a.coefficients[k] || to.along[axis] == 0) continue;
+    to.along[axis] = 0;
+    const int centre = RawStencil<T>::place(to);
+    const T* const more = std::exchange(a.coefficients[k], nullptr);
+    const T* const own = a.coefficients[centre];
+    T* const sum = a.add(centre);
+    for (int64_t i = 0; i < a.points(); ++i) sum[i] = own[i] + more[i];
+  }
+}
+
+}  // namespace
+
 template <class T>
 RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer) {
   const bool periodic = a.grid.periodic[axis];
@@ -227,6 +272,8 @@ RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& 
       if (count > 1) part.points(z, y, 0, 1, count - 1, to + count - 1);
     });
   }
+  if (periodic && count == 1) fold_onto_centre(coarse, axis);
+  keep_vanishing_diagonals(a, axis, coarse);
   return coarse;
 }
 

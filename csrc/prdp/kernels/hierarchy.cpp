@@ -30,15 +30,34 @@ double radius_of(const RawStencil<T>& a) {
 template <class T>
 std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
-  double coupling[3] = {};
+  Couplings couplings{std::vector<double>(3), std::vector<double>(3), 0.0};
   for (int k = 0; k < 27; ++k) {
     if (!a.coefficients[k]) continue;
     double sum = 0;
     for (int64_t i = 0; i < n; i += step) sum += std::abs(static_cast<double>(a.coefficients[k][i]));
     for (int d = 0; d < 3; ++d)
-      if (RawStencil<T>::offset(k).along[d] != 0) coupling[d] += sum;
+      if (RawStencil<T>::offset(k).along[d] != 0) couplings.along[d] += sum;
   }
-  return kernels::axes_to_coarsen(a.grid.shape, coupling);
+  const auto& [nz, ny, nx] = a.grid.shape;
+  if (!may_need_one_point(a.grid.shape, 3)) return kernels::axes_to_coarsen(a.grid.shape, couplings);
+  for (int64_t i = 0; i < n; i += step) {
+    const int64_t at[3] = {i / (ny * nx), i / nx % ny, i % nx};
+    double net[3][2] = {}, row = 0;
+    for (int k = 0; k < 27; ++k) {
+      if (!a.coefficients[k]) continue;
+      const double value = static_cast<double>(a.coefficients[k][i]);
+      bool inside = true;
+      for (int d = 0; d < 3; ++d) {
+        const auto o = RawStencil<T>::offset(k).along[d];
+        if (o != 0) net[d][o > 0] += value;
+        inside = inside && neighbour(at[d], o, a.grid.shape[d], a.grid.periodic[d]) >= 0;
+      }
+      if (inside) row += value;
+    }
+    for (int d = 0; d < 3; ++d) couplings.net[d] += std::abs(net[d][0]) + std::abs(net[d][1]);
+    couplings.rows += std::abs(row);
+  }
+  return kernels::axes_to_coarsen(a.grid.shape, couplings);
 }
 
 template <class T>
@@ -59,6 +78,69 @@ bool all_finite(const RawStencil<T>& a) {
   return std::all_of(a.memory.begin(), a.memory.end(), [](const auto& field) {
     return std::isfinite(largest_magnitude(field.data(), static_cast<int64_t>(field.size())));
   });
+}
+
+using Eigen::MatrixXd;
+
+/// How many parts of at least two points there are that nothing couples to each other.
+int64_t count_parts(const MatrixXd& m) {
+  std::vector<char> seen(m.rows());
+  int64_t parts = 0;
+  for (Eigen::Index first = 0; first < m.rows(); ++first) {
+    if (seen[first]) continue;
+    std::vector<Eigen::Index> part{first};
+    seen[first] = true;
+    for (size_t k = 0; k < part.size(); ++k)
+      for (Eigen::Index j = 0; j < m.cols(); ++j)
+        if (!seen[j] && (m(part[k], j) != 0.0 || m(j, part[k]) != 0.0)) {
+          seen[j] = true;
+          part.push_back(j);
+        }
+    parts += part.size() > 1;
+  }
+  return parts;
+}
+
+/// The inverse without what is tiny.
+struct PseudoInverse {
+  MatrixXd matrix;
+  bool is_whole;  // nothing was left out but the null space
+
+  /// For a null space of `nullity` dimensions: rounding of the coefficients may have made the matrix regular, and its
+  /// inverse would be rounding all the same. The null vectors of pockets may be gone on so coarse a grid.
+  PseudoInverse(const MatrixXd& m, int64_t nullity, double tiny) {
+    const Eigen::JacobiSVD<MatrixXd> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
+    const auto& singular = svd.singularValues();
+    const bool all_are_there = count_parts(m) >= nullity;
+    Eigen::VectorXd inverse = Eigen::VectorXd::Zero(m.rows());
+    is_whole = true;
+    for (int64_t i = 0; i < m.rows(); ++i) {
+      const double size = singular[i] / singular[0];
+      if (i >= m.rows() - nullity && (all_are_there || size < 1e-3)) continue;
+      if (size > tiny) inverse[i] = 1.0 / singular[i];
+      else is_whole = false;
+    }
+    matrix = svd.matrixV() * inverse.asDiagonal() * svd.matrixU().transpose();
+  }
+};
+
+MatrixXd invert(const MatrixXd& m, int64_t nullity, double tiny) {
+  if (nullity > 0) {
+    PseudoInverse found(m, nullity, tiny);
+    if (found.is_whole) return std::move(found.matrix);
+  } else {
+    const Eigen::PartialPivLU<MatrixXd> lu(m);
+    const auto pivots = lu.matrixLU().diagonal().cwiseAbs();
+    if (pivots.minCoeff() > tiny * pivots.maxCoeff()) return lu.inverse();
+  }
+  // What is tiny may only be so beside a larger diagonal: it is brought to the order of one.
+  const Eigen::VectorXd d = m.diagonal().unaryExpr(
+      [](double a) { return a == 0.0 ? 1.0 : std::exp2(-std::round(std::log2(std::abs(a)) / 2)); });
+  const MatrixXd scaled = d.asDiagonal() * m * d.asDiagonal();
+  if (nullity > 0) return d.asDiagonal() * PseudoInverse(scaled, nullity, tiny).matrix * d.asDiagonal();
+  Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
+  decomposition.setThreshold(tiny);
+  return d.asDiagonal() * decomposition.compute(scaled).pseudoInverse() * d.asDiagonal();
 }
 
 }  // namespace
@@ -95,26 +177,10 @@ template <class T>
 bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a, int64_t nullity) {
   const auto rows = rows_of(a, false);
   const int64_t n = a.points();
-  Eigen::MatrixXd m = Eigen::MatrixXd::Zero(n, n);
+  MatrixXd m = MatrixXd::Zero(n, n);
   rows->for_each_entry([&](int64_t i, int64_t j, T value) { m(i, j) += static_cast<double>(value); });
   const double tiny = 10.0 * static_cast<double>(n) * static_cast<double>(std::numeric_limits<T>::epsilon());
-  const Eigen::PartialPivLU<Eigen::MatrixXd> lu(m);
-  const auto pivots = lu.matrixLU().diagonal().cwiseAbs();
-  Eigen::MatrixXd inverse;
-  if (nullity > 0) {
-    // Rounding of the coefficients may have made the matrix regular; its inverse would be rounding all the same.
-    const Eigen::JacobiSVD<Eigen::MatrixXd> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
-    Eigen::VectorXd values = Eigen::VectorXd::Zero(n);
-    for (int64_t i = 0; i < n - nullity; ++i)
-      if (svd.singularValues()[i] > tiny * svd.singularValues()[0]) values[i] = 1.0 / svd.singularValues()[i];
-    inverse = svd.matrixV() * values.asDiagonal() * svd.matrixU().transpose();
-  } else if (pivots.minCoeff() > tiny * pivots.maxCoeff()) {
-    inverse = lu.inverse();
-  } else {
-    Eigen::CompleteOrthogonalDecomposition<Eigen::MatrixXd> decomposition;
-    decomposition.setThreshold(tiny);
-    inverse = decomposition.compute(m).pseudoInverse();
-  }
+  const MatrixXd inverse = invert(m, nullity, tiny);
   coarsest_inverse_.resize(n * n);
   for (int64_t i = 0; i < n; ++i)
     for (int64_t j = 0; j < n; ++j) coarsest_inverse_[i * n + j] = static_cast<T>(inverse(i, j));

@@ -10,13 +10,45 @@ namespace prdp {
 
 namespace {
 
+/// One look at the device.
 std::vector<int> axes_to_coarsen(const TensorStencil& a, const at::Tensor& magnitudes) {
-  const auto host = magnitudes.flatten(1).sum(1).to(at::kCPU, at::kDouble);
-  std::vector<double> coupling(a.dim());
-  for (size_t e = 0; e < a.entries.size(); ++e)
-    for (int64_t d = 0; d < a.dim(); ++d)
-      if (a.entries[e].offset[d] != 0) coupling[d] += host.const_data_ptr<double>()[e];
-  return kernels::axes_to_coarsen(a.shape, coupling);
+  const int dim = static_cast<int>(a.dim());
+  const auto entries = static_cast<int64_t>(a.entries.size());
+  auto sums = magnitudes;
+  const bool all_couplings = kernels::may_need_one_point(a.shape, dim);
+  if (all_couplings) {
+    std::vector<at::Tensor> more{a.coefficients().sum(0)};  // what reaches beyond the grid is zero
+    for (int d = 0; d < dim; ++d)
+      for (const int64_t step : {-1, 1}) {
+        auto net = at::zeros_like(a.diagonal());
+        for (const auto& [offset, coefficient] : a.entries)
+          if (offset[d] == step) net = net + coefficient;
+        more.push_back(net);
+      }
+    sums = at::cat({sums, at::stack(more).abs()});
+  }
+  const auto host = sums.flatten(1).sum(1).to(at::kCPU, at::kDouble);
+  const double* number = host.const_data_ptr<double>();
+  kernels::Couplings couplings{std::vector<double>(dim), std::vector<double>(dim), 0.0};
+  for (int64_t e = 0; e < entries; ++e)
+    for (int d = 0; d < dim; ++d)
+      if (a.entries[e].offset[d] != 0) couplings.along[d] += number[e];
+  if (all_couplings) {
+    couplings.rows = number[entries];
+    for (int d = 0; d < dim; ++d) couplings.net[d] = number[entries + 1 + 2 * d] + number[entries + 2 + 2 * d];
+  }
+  return kernels::axes_to_coarsen(a.shape, couplings);
+}
+
+/// See kernels::kVanishing.
+void keep_vanishing_diagonal(TensorStencil& coarse, const at::Tensor& fine) {
+  auto& own = coarse.entries[0].coefficient;
+  auto tiny = fine.abs() * (kernels::kVanishingAlone * epsilon_of(fine));
+  if (const auto others = static_cast<int64_t>(coarse.entries.size()) - 1; others > 0) {
+    const auto has_neighbours = coarse.coefficients().narrow(0, 1, others).any(0);
+    tiny = at::where(has_neighbours, tiny * (kernels::kVanishing / kernels::kVanishingAlone), tiny);
+  }
+  own = at::where(own.abs() <= tiny, fine, own);
 }
 
 /// A v, or Aᵀ v, for v (batch, 1, *shape) that every channel takes; its first channel.
@@ -85,11 +117,14 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
       level.steps.push_back({p, (q * per_radius).unsqueeze(1)});
     const auto axes = axes_to_coarsen(stencil, magnitudes);
     if (axes.empty()) break;
+    auto fine = stencil.diagonal();
     for (const auto axis : axes) {
       const auto& transfer =
           level.transfers.emplace_back(stencil, axis == axes.front() ? level.transpose : stencil.transposed(), axis);
       stencil = transfer.coarse_operator(stencil);
+      fine = transfer.at_coarse(fine);
     }
+    keep_vanishing_diagonal(stencil, fine);
   }
   const auto& last = levels_.back().a;
   const int64_t n = last.diagonal().numel() / last.diagonal().size(0);
@@ -97,7 +132,12 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
   unit.insert(unit.begin(), {1, n});
   const auto columns = last.apply(at::eye(n, b.options()).view(unit)).flatten(2).mT();
   const double tiny = 10.0 * static_cast<double>(n) * epsilon_of(b);
-  coarsest_inverse_ = at::linalg_pinv(columns.to(at::kDouble).nan_to_num(0.0, 0.0, 0.0), tiny).to(b.scalar_type());
+  // What is tiny may only be so beside a larger diagonal: it is brought to the order of one.
+  const auto coarsest = columns.to(at::kDouble).nan_to_num(0.0, 0.0, 0.0);
+  const auto diagonal = coarsest.diagonal(0, -2, -1);
+  const auto d = at::where(diagonal.eq(0), 1.0, diagonal.abs()).log2().div(-2.0).round().exp2();
+  const auto scales = d.unsqueeze(-1) * d.unsqueeze(-2);
+  coarsest_inverse_ = (scales * at::linalg_pinv(scales * coarsest, tiny)).to(b.scalar_type());
 }
 
 int64_t TensorCycles::bytes() const {

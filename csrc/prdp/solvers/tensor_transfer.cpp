@@ -124,6 +124,8 @@ TensorStencil TensorTransfer::coarse_operator(const TensorStencil& a) const {
       add_to(coarse.own, before_coarse(restriction_.after * between.after));
     }
     if (is_pair) add_to(coarse.after, std::exchange(coarse.before, {}));
+    if (coarse_ == 1 && periodic_)  // and is its own neighbour
+      for (const auto& around : {coarse.before, coarse.after}) add_to(coarse.own, around);
     if (coarse_ == 1) coarse.before = coarse.after = at::Tensor();
     for (const int64_t offset : {0, 1, -1}) {
       auto there = others;

@@ -15,6 +15,8 @@ class TensorTransfer {
   at::Tensor restrict(const at::Tensor& fine, bool transposed) const;
   /// R A P. No product is taken: it is put together from the coefficients.
   TensorStencil coarse_operator(const TensorStencil& a) const;
+  /// The points of a field (…, *shape) that are coarse.
+  at::Tensor at_coarse(const at::Tensor& fine) const { return fine.slice(axis_, periodic_ ? 0 : 1, fine_, 2); }
 
  private:
   /// The weights of the points between, for the coarse point before and for the one after: (batch or 1, …).
@@ -25,7 +27,6 @@ class TensorTransfer {
   /// followed by a coarse one, as the last of an odd ring is, gets `without`.
   at::Tensor after_coarse(const at::Tensor& between, double without = 0.0) const;
   at::Tensor before_coarse(const at::Tensor& between, double without = 0.0) const;
-  at::Tensor at_coarse(const at::Tensor& fine) const { return fine.slice(axis_, periodic_ ? 0 : 1, fine_, 2); }
   at::Tensor at_between(const at::Tensor& fine) const { return fine.slice(axis_, periodic_ ? 1 : 0, fine_, 2); }
 
   int64_t axis_, fine_, coarse_, between_;  // the axis from the end; points along it
