@@ -10,7 +10,6 @@
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
-#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/unseen_numbers.h"
 #include "prdp/threads/interruption.h"
@@ -140,10 +139,7 @@ class TensorSpace {
     const auto u = solution(x);
     return dot(u, u);
   }
-  Scalar terms2(const Vector& x) const {
-    const auto terms = laid_out(system_.a.apply(with_signs_changed(solution(x).detach())));
-    return dot(terms, terms);
-  }
+  Scalar terms2(const Vector& x) const;
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);

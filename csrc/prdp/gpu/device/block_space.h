@@ -10,6 +10,7 @@
 #include "prdp/kernels/scales.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
+#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 
 /// One sample as a space for iterate(), on a GPU: a team of threads owns it. A number is the same in every thread; a
@@ -217,6 +218,16 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   Scalar solution2(const T* x) {
     const T* u = solution(x);
     return dot(u, u);
+  }
+
+  Scalar terms2(const T* x) {
+    const T* const u = solution(x);
+    Vector signed_u = scratch();
+    each([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
+    T s = 0;
+    product(signed_u, [&](int, T value) { s += value * value; });
+    --state_->applications;  // no part of the method
+    return team_.sum(s);
   }
 
   static constexpr bool is_preconditioned() { return S::kByDiagonal; }
