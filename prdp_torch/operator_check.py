@@ -108,9 +108,10 @@ def _null_space(A: Operator, v: Tensor) -> Iterator[str]:
         except ValueError as error:
             yield str(error).removeprefix(f"{type(A).__name__}: ")
         return
-    constant = torch.ones_like(v)
-    left = _norm(A.apply(constant)) / _norm(constant)
-    if (left <= 1e3 * torch.finfo(v.dtype).eps * _norm(A.apply(v)) / _norm(v)).any():
+    # Beside each row's own size: a row of one holds the constant, whatever stands in the others.
+    constant, sizes = A.apply(torch.ones_like(v)).abs(), A.apply(v).abs()
+    shares = torch.where(sizes > 0, constant / sizes, constant.ne(0).to(v.dtype))
+    if (shares.flatten(1).square().mean(1).sqrt() <= 1e3 * torch.finfo(v.dtype).eps).any():
         yield "A maps the constant to zero, so it is singular: give nullspace='constant'"
 
 

@@ -174,6 +174,15 @@ def test_no_method_says_that_a_regular_bar_maps_the_constant_to_zero(solver):
         assert "INCONSISTENT" not in statuses(info)
 
 
+def test_the_check_of_an_operator_sees_the_row_that_holds_the_constant():
+    m = bar()[0]
+    assert prdp.check_operator(operators.Matrix(m), noise(1, len(m)))
+    m[0, 0] = 0.0
+    m[0, :2] = torch.tensor([1.0, -1.0])
+    with pytest.raises(ValueError, match="A maps the constant to zero"):
+        prdp.check_operator(operators.Matrix(m), noise(1, len(m)))
+
+
 @pytest.mark.parametrize("restart", [5, 10, 20])
 @pytest.mark.parametrize("seed", range(6))
 def test_what_is_called_solved_is_so_where_columns_differ_by_nine_decades(seed, restart):
