@@ -3,7 +3,6 @@
 #include <ATen/core/grad_mode.h>
 
 #include <cmath>
-#include <numbers>
 
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/laplacian.h"
@@ -52,18 +51,14 @@ std::shared_ptr<const kernels::Kernels> LaplacianOperator::kernels(const at::Ten
 }
 
 std::optional<gpu::OperatorView> LaplacianOperator::gpu_view(const at::Tensor& b, bool) const {
-  const auto [alpha, beta] = coefficients();
-  const double centre = alpha + beta * laplacian_diagonal(grid_), factor = kernels::scale_of_operator(std::abs(centre));
-  double off[3] = {}, norm = std::abs(centre), around = 0.0;  // along z, y and x
+  const auto [alpha, beta, nu] = factors();
   const auto dim = grid_.dim();
-  for (int64_t d = 0; d < dim; ++d) {
-    const double weight = beta / (grid_.dx(d) * grid_.dx(d));
-    off[3 - dim + d] = weight * factor;
-    norm += 2.0 * std::abs(weight);
-    around += 2.0 * std::abs(weight) * std::cos(std::numbers::pi / static_cast<double>(grid_.shape()[d] + 1));
-  }
   gpu::OperatorView view{"Laplacian<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(grid_.shape()) + ">"};
-  view.numbers = {centre * factor, off[0], off[1], off[2], norm * factor, around / std::abs(centre), factor};
+  view.numbers = {alpha, beta, 0.0, 0.0, 0.0};  // 1/h² along z, y and x
+  for (int64_t d = 0; d < dim; ++d) view.numbers[5 - dim + d] = 1.0 / (grid_.dx(d) * grid_.dx(d));
+  if (!nu.defined()) return view;
+  if (nu.is_cpu()) view.numbers[1] *= nu.item<double>();
+  else view.tensors = {nu.detach().to(b.scalar_type()).reshape({1})};  // nobody waits for it
   return view;
 }
 

@@ -29,6 +29,12 @@ class LaplacianOperator : public Operator {
     double alpha, beta;
   };
   virtual Coefficients coefficients() const = 0;
+  /// The same with β as a number times nu; without nu, the number alone.
+  struct Factors {
+    double alpha, beta;
+    at::Tensor nu{};
+  };
+  virtual Factors factors() const = 0;
   /// α + β x for a tensor x in L's place (its diagonal, its eigenvalues); differentiable.
   virtual at::Tensor symbol(const at::Tensor& x) const = 0;
 
@@ -48,6 +54,7 @@ class PoissonOperator final : public LaplacianOperator {
 
  private:
   Coefficients coefficients() const override { return {0.0, 1.0}; }
+  Factors factors() const override { return {0.0, 1.0}; }
   at::Tensor symbol(const at::Tensor& x) const override { return x; }
 };
 
@@ -63,6 +70,7 @@ class HeatOperator final : public LaplacianOperator {
 
  private:
   Coefficients coefficients() const override { return {1.0, -step_.nu.item<double>() * step_.dt}; }
+  Factors factors() const override { return {1.0, -step_.dt, step_.nu}; }
   at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (step_.nu * step_.dt) * x; }
 
   StepParameters step_;

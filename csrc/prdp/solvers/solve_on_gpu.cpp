@@ -148,6 +148,8 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   }
 }
 
+bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }
+
 std::vector<std::string> kernels_made() {
   const std::lock_guard lock(made().mutex);
   return made().names;

@@ -8,6 +8,9 @@ namespace prdp::gpu {
 /// PRDP_GPU=required, every reason is an error. The report stays on the device.
 std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
+/// Whether solve() takes a kernel for vectors like b, if the operator has one: then the host need not wait for it.
+bool takes(const at::Tensor& b, const Solver& solver);
+
 /// The kernels that this process has made, in the order in which they were: "CG of Stencil<float, …>".
 std::vector<std::string> kernels_made();
 

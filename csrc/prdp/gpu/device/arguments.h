@@ -16,7 +16,7 @@ struct NullSpaceArguments {
 struct OperatorArguments {
   const void* tensors[3];
   int64_t sample_strides[3];  // entries between two samples; 0: they share the tensor
-  double numbers[7];
+  double numbers[5];
 };
 
 template <class T>

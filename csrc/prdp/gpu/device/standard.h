@@ -19,7 +19,7 @@ using ::abs;
 using ::int32_t;
 using ::int64_t;
 using ::size_t;
-using ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
+using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
 inline bool isfinite(float x) { return ::isfinite(x); }
 inline bool isfinite(double x) { return ::isfinite(x); }
 inline bool isnan(double x) { return ::isnan(x); }

@@ -3,6 +3,7 @@
 #include <cstdint>
 
 #include "prdp/gpu/device/arguments.h"
+#include "prdp/kernels/scales.h"
 
 /// Operators as a kernel knows them: what stands in a row of A. The sizes are constants. `v` is anything with v[i].
 /// What a view computes with is factor·A, where the factor is a power of two that makes the entries of order one.
@@ -44,25 +45,37 @@ T larger_or_nan(T a, T b) {
   return b > a || b != b ? b : a;
 }
 
-/// Numbers: centre, and the weight of both neighbours along z, y and x; zero outside the grid. ‖factor·A‖∞; the
-/// spectral radius of I - D⁻¹A; the factor. The host has scaled them.
+/// α I + β L with the Laplacian L of a box, zero outside the grid. Numbers: α, β, and 1/h² along z, y and x. Tensor,
+/// where it is there: a number that β is multiplied by.
 template <class T, class G>
 class Laplacian {
  public:
   static constexpr int kUnknowns = G::kPoints;
   static constexpr bool kKnowsRadius = true;
-
-  Laplacian(const OperatorArguments& a, int64_t)
-      : centre_(static_cast<T>(a.numbers[0])),
-        z_(static_cast<T>(a.numbers[1])),
-        y_(static_cast<T>(a.numbers[2])),
-        x_(static_cast<T>(a.numbers[3])),
-        norm_(a.numbers[4]),
-        radius_(a.numbers[5]),
-        factor_(static_cast<T>(a.numbers[6])) {}
-
   static constexpr bool kIsScaled = true;
-  T largest_in_row(int) const { return std::abs(centre_); }
+
+  Laplacian(const OperatorArguments& a, int64_t) {
+    const T* const by = static_cast<const T*>(a.tensors[0]);
+    const double beta = by ? a.numbers[1] * static_cast<double>(*by) : a.numbers[1];
+    constexpr int kExtents[3] = {G::kZ, G::kY, G::kX};
+    constexpr double kPi = 3.141592653589793;
+    double centre = a.numbers[0], off[3] = {0, 0, 0}, around = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      off[axis] = beta * a.numbers[2 + axis];
+      centre -= 2 * off[axis];
+      around += 2 * std::abs(off[axis]) * std::cos(kPi / (kExtents[axis] + 1));
+      norm_ += 2 * std::abs(off[axis]);
+    }
+    const double factor = kernels::scale_of_operator(std::abs(centre));
+    factor_ = static_cast<T>(factor);
+    centre_ = static_cast<T>(centre * factor);
+    z_ = static_cast<T>(off[0] * factor);
+    y_ = static_cast<T>(off[1] * factor);
+    x_ = static_cast<T>(off[2] * factor);
+    norm_ = (norm_ + std::abs(centre)) * factor;
+    radius_ = around / std::abs(centre);
+  }
+
   T factor() const { return factor_; }
   double norm_of_row(int) const { return norm_; }
   double radius() const { return radius_; }
@@ -79,9 +92,8 @@ class Laplacian {
   }
 
  private:
-  T centre_, z_, y_, x_;
-  double norm_, radius_;
-  T factor_;
+  T factor_, centre_, z_, y_, x_;
+  double norm_ = 0, radius_;
 };
 
 /// Tensors: coefficients, one field for each offset, which all channels share. (A v)[i] = Σ_k c_k[i] v[i + offset_k],
