@@ -6,6 +6,10 @@ import warnings
 
 import pytest
 import torch
+from test_gpu_kernels import CASES as OF_KERNELS
+from test_gpu_kernels import OPERATORS as WITH_KERNELS
+from test_gpu_kernels import agree, right_hand_sides
+from test_gpu_kernels import solver as solver_of
 from test_no_waiting import OPERATORS as MADE_OF_A_FIELD
 from test_no_waiting import SOLVERS
 from test_other_devices import F64, SHAPE, noise
@@ -154,6 +158,39 @@ def test_a_solve_with_its_gradient_in_a_cuda_graph(name, solver):
     for seed in (1, 2):
         b = noise(3, 1, *SHAPE, seed=seed)
         torch.testing.assert_close(replay(b.to(DEVICE)).cpu(), gradient(b, "cpu"), rtol=1e-7, atol=1e-9)
+
+
+def there(a):
+    return a.to(DEVICE) if isinstance(a, torch.Tensor) else a.of([t.to(DEVICE) for t in a.tensors])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(("name", "method"), OF_KERNELS)
+def test_kernels_solve_as_the_loops_of_the_cpu(name, method, dtype, monkeypatch):
+    if CUDA:
+        monkeypatch.setenv("PRDP_GPU", "required")
+    a, b = WITH_KERNELS[name](dtype), right_hand_sides(name, dtype)
+    rtol = 1e-5 if dtype == torch.float32 else 1e-12
+    of = solver_of(method, rtol=rtol)
+    u, info = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")
+    found = u.cpu(), prdp.SolveInfo(*(part.cpu() for part in info))
+    agree(found, prdp.linear_solve(a, b, of, on_failure="return"), dtype, slack=5 * rtol / torch.finfo(dtype).eps)
+    again = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")[0]
+    assert torch.equal(again, u)
+
+
+def test_a_solve_with_a_tolerance_in_a_cuda_graph():
+    make, g = OPERATORS["stencil"]
+    a = make(g.to(DEVICE))
+    of = prdp.CG(60, 1e-9)
+
+    def gradient(b):
+        leaf = b.detach().requires_grad_()
+        return torch.autograd.grad(prdp.linear_solve(a, leaf, of, on_failure="return")[0].square().sum(), leaf)[0]
+
+    replay = captured(gradient, noise(3, 1, *SHAPE).to(DEVICE))
+    b = noise(3, 1, *SHAPE, seed=1).to(DEVICE)
+    torch.testing.assert_close(replay(b), gradient(b), rtol=0, atol=0)
 
 
 def test_a_rollout_with_its_gradient_in_a_cuda_graph():
