@@ -9,17 +9,19 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, flow_walls
 from prdp_torch.flow_walls import Side, WallVelocity
+from prdp_torch.held_tensors import HoldsTensors
 from prdp_torch.operators.base import full_precision, real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
 from prdp_torch.stepper import Stepper, forgets_if_it_raises
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
 Boundary: TypeAlias = Literal["periodic", "wall", "open"]
+VECTORS = {"force", "inflow"}
 # What may be set for the next steps.
-TENSORS = {"nu", "force", "inflow", *flow_walls.NAMES.values()}
+TENSORS = {"nu", *VECTORS, *flow_walls.NAMES.values()}
 
 
-class Flow(Stepper):
+class Flow(HoldsTensors, Stepper):
     """Make one time step of incompressible flow, u_t + (u·∇)u + ∇p = nu Δu + force with ∇·u = 0, in 2D or 3D.
 
     The state u is (batch, d, *shape). The grid is staggered: channel 0 is the velocity along x, the last axis, and each
@@ -110,46 +112,21 @@ class Flow(Stepper):
         self.advection = _check.string("Flow", "advection", advection)
         self.diffusion = _check.string("Flow", "diffusion", diffusion)
         self.pressure_form = _check.string("Flow", "pressure", pressure)
-        self._lent: dict[str, list[Any]] = {}
-        self._keep_tensor("nu", nu if isinstance(nu, Tensor) else _check.real("Flow", "nu", nu))
-        for name, given in (("force", force), ("inflow", inflow)):
-            self._keep_tensor(name, given if given is None or isinstance(given, Tensor) else _of_numbers(name, given))
-        for name, velocity in flow_walls.by_name(wall_velocity, len(self.shape)).items():
-            self._keep_tensor(name, velocity)
+        self._hold("nu", nu if isinstance(nu, Tensor) else _check.real("Flow", "nu", nu))
+        walls = flow_walls.by_name(wall_velocity, len(self.shape))
+        for name, given in {"force": force, "inflow": inflow, **walls}.items():
+            self._hold(name, _checked(name, given))
         self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
         self._kept_box = Kept(_make_box)
         self._equation().check()
 
-    def _keep_tensor(self, name: str, value: object) -> None:
-        """Make it state, in place of what is there."""
-        for place in (self.__dict__, self._lent, self._buffers, self._parameters):
-            place.pop(name, None)
-        if isinstance(value, torch.nn.Parameter):
-            self.register_parameter(name, value)
-        elif isinstance(value, Tensor):
-            self.register_buffer(name, _check.dense("Flow", name, value))
-        elif value is None or isinstance(value, (tuple, list)):
-            self.register_buffer(name, None if value is None else _of_numbers(name, value))
-        else:
-            self.__dict__[name] = value
-
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if name not in TENSORS:
-                super().__setattr__(name, value)
-            elif isinstance(value, Tensor) and not isinstance(value, (torch.nn.Parameter, torch.nn.Buffer)):
-                # Attributes hide buffers and parameters, which stay.
-                self._lent.setdefault(name, [self.__dict__[name]] if name in self.__dict__ else [])
-                self.__dict__[name] = value
+            if name in TENSORS:
+                self._set(name, _checked(name, value))
             else:
-                self._keep_tensor(name, value)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What copies and pickles hold: not what was set for the next steps."""
-        state = {name: value for name, value in self.__dict__.items() if name not in self._lent}
-        state |= {name: kept[0] for name, kept in self._lent.items() if kept}
-        return state | {"_lent": {}}
+                super().__setattr__(name, value)
 
     @property
     def wall_velocity(self) -> Mapping[Side, Tensor]:
@@ -236,6 +213,14 @@ class Flow(Stepper):
 
     def extra_repr(self) -> str:
         return f"shape={self.shape}, dt={self.dt:g}, boundary={self.boundary}, {super().extra_repr()}"
+
+
+def _checked(name: str, value: object) -> object:
+    """What may be set, with the numbers of a vector as a tensor."""
+    if isinstance(value, Tensor):
+        return _check.dense("Flow", name, value)
+    is_vector = name in VECTORS or isinstance(value, (tuple, list))
+    return _of_numbers(name, value) if is_vector and value is not None else value
 
 
 def _field(who: str, name: str, value: object) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, operators, torch_private
+from prdp_torch.held_tensors import HoldsTensors
 from prdp_torch.operators.base import real_tensor
 from prdp_torch.solvers import Kept, Solver
 from prdp_torch.stepper import Stepper, forgets_if_it_raises
@@ -27,11 +28,12 @@ def _kept_length(length: Length) -> Length:
     return tuple(length) if isinstance(length, list) else length
 
 
-class EquationStepper(Stepper):
+class EquationStepper(HoldsTensors, Stepper):
     """A stepper of a built-in equation, whose rollout is a single operation.
 
     If nu is given as a Parameter, it becomes a Parameter of the module. A tensor becomes a buffer, and a number
-    stays a number. nu, dt and length may be set at any time.
+    stays a number. nu, dt and length may be set at any time. A nu that is set later as a plain tensor, such as the
+    output of a network, is for the steps that follow and no state.
     """
 
     kind: ClassVar[str]
@@ -56,7 +58,7 @@ class EquationStepper(Stepper):
         parameters = _check.lengths(who, length, len(extents))
         if nu_and_dt is not None:
             nu, dt = nu_and_dt
-            self._keep_nu(nu)
+            self._hold("nu", self._checked_nu(nu))
             parameters.insert(0, _check.real(who, "dt", dt))
         self.equation = Equation(self.kind, extents, parameters, _check.whole(who, "picard_steps", picard_steps))
         self._kept_equation = Kept(_C.Equation)
@@ -93,23 +95,13 @@ class EquationStepper(Stepper):
 
         def __setattr__(self, name: str, value: object) -> None:
             if name == "nu" and "equation" in vars(self) and not torch.compiler.is_compiling():
-                self._keep_nu(value)
+                self._set("nu", self._checked_nu(value))
             else:
                 super().__setattr__(name, value)
 
-    def _keep_nu(self, nu: Number) -> None:
-        """As what it is, whatever it was before; a Module lets no number take the place of a tensor."""
-        if not isinstance(nu, torch.Tensor):
-            nu = _check.real(type(self).__name__, "nu", nu)
-        for kept in (vars(self), self._parameters, self._buffers):
-            kept.pop("nu", None)
-        if isinstance(nu, torch.nn.Parameter):
-            self.register_parameter("nu", nu)
-        elif isinstance(nu, torch.Tensor):
-            self.register_buffer("nu", nu)
-        else:
-            vars(self)["nu"] = nu
+    def _checked_nu(self, nu: Number) -> Number:
         self._number: tuple[float, Tensor] | None = None  # nu as a number, and as the tensor that the library takes
+        return nu if isinstance(nu, torch.Tensor) else _check.real(type(self).__name__, "nu", nu)
 
     def _refuse_own_system(self) -> None:
         """forward calls the compiled library, not operator(u) and rhs(u) of a subclass."""

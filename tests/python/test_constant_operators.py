@@ -260,11 +260,17 @@ def test_nu_set_later_is_kept_as_what_it_is():
     heat, u = prdp.Heat((6,), 1e-2, 0.1, prdp.CG(9)), torch.ones(2, 1, 6, dtype=F64)
     number, buffer, parameter = 2e-2, rand(), torch.nn.Parameter(rand())
     for before in (number, buffer, parameter):
-        for nu in (number, buffer, parameter):
+        for nu in (number, buffer, parameter, 2 * parameter):
             heat.nu = before
+            state, parameters = list(heat.state_dict()), list(heat.parameters())
             heat.nu = nu
-            assert list(heat.parameters()) == ([nu] if nu is parameter else [])
-            assert list(heat.state_dict()) == ([] if nu is number else ["nu"])
+            if isinstance(nu, torch.Tensor) and nu is not parameter:  # for the next steps alone
+                assert (list(heat.state_dict()), list(heat.parameters())) == (state, parameters)
+                copied = copy.deepcopy(heat).nu
+                assert copied is not nu and torch.is_tensor(copied) == bool(state)
+            else:
+                assert list(heat.parameters()) == ([nu] if nu is parameter else [])
+                assert list(heat.state_dict()) == ([] if nu is number else ["nu"])
             assert heat.nu is nu and torch.equal(heat(u), prdp.Heat((6,), nu, 0.1, prdp.CG(9))(u))
     with pytest.raises(TypeError, match="Heat: nu must be a real number, got 'large'"):
         heat.nu = "large"

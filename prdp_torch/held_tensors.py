@@ -1,0 +1,45 @@
+"""Tensors of a step that are state, and those that were set for the next steps alone."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class HoldsTensors(torch.nn.Module):
+    """A module with attributes that are tensors or numbers, and may be set at any time.
+
+    A Parameter, a `torch.nn.Buffer`, a number and what the module was made of are state. Another tensor that is set
+    later is for the steps that follow, as the output of a network is: copies, pickles and `state_dict` have what was
+    there before.
+    """
+
+    def _hold(self, name: str, value: object) -> None:
+        """Make it state, in place of what is there."""
+        for place in (vars(self), self._lent(), self._buffers, self._parameters):
+            place.pop(name, None)
+        if isinstance(value, torch.nn.Parameter):
+            self.register_parameter(name, value)
+        elif value is None or isinstance(value, Tensor):
+            self.register_buffer(name, value)
+        else:
+            vars(self)[name] = value
+
+    def _set(self, name: str, value: object) -> None:
+        """As it is set by a user."""
+        if not isinstance(value, Tensor) or isinstance(value, (torch.nn.Parameter, torch.nn.Buffer)):
+            return self._hold(name, value)
+        # Attributes hide buffers and Parameters, which stay.
+        self._lent().setdefault(name, [vars(self)[name]] if name in vars(self) else [])
+        vars(self)[name] = value
+
+    def _lent(self) -> dict[str, list[Any]]:
+        """The names of what was set for the next steps, with the attribute that it replaces, if it is one."""
+        lent: dict[str, list[Any]] = vars(self).setdefault("_lent_tensors", {})
+        return lent
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles hold."""
+        state = {name: value for name, value in vars(self).items() if name not in self._lent()}
+        state |= {name: kept[0] for name, kept in self._lent().items() if kept}
+        return state | {"_lent_tensors": {}}
