@@ -37,17 +37,19 @@ def hollow(shape, generator):
     seed=st.integers(0, 2**20),
     boundary=st.sampled_from(["periodic", "wall", ("wall", "periodic")]),
     shape=st.sampled_from([(16, 16), (21, 32)]),
-    length=st.sampled_from([1.0, 2 * np.pi]),
+    length=st.sampled_from([1.0, 2 * np.pi, (1.0, 7.0)]),
     dtype=st.sampled_from([F32, F64]),
 )
-def test_a_flow_round_hollow_obstacles_takes_its_step_and_its_gradient(seed, boundary, shape, length, dtype):
+def test_a_flow_round_hollow_obstacles_takes_its_steps_and_their_gradient(seed, boundary, shape, length, dtype):
+    """In the second step there is little divergence left, beside which rounding counts: with cells that are not square
+    float32 makes the operator of the pressure indefinite."""
     mask = hollow(shape, np.random.default_rng(seed))
     flow = prdp.Flow(shape, 1e-3, 1e-2, boundary=boundary, length=length, obstacle=mask, force=(0.1, 0.0))
     u = (0.1 * noise(1, 2, *shape, seed=seed, dtype=dtype)).requires_grad_()
-    after = flow(u)
+    after = flow(flow(u))
     after.square().sum().backward()
     assert flow.info.solved.all() and flow.info.iterations.max() <= 40
-    assert flow.divergence(after).abs().max() <= 1e-3 * u.abs().max() * max(shape)
+    assert flow.divergence(after).abs().max() <= 1e-2 * flow.divergence(u).abs().max()
     assert u.grad.isfinite().all()
 
 

@@ -20,11 +20,20 @@ namespace {
 /// the sums of its rows are zero to the last bit in any dtype.
 double scale_of(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
 
-/// A direct solver is told of the null space. Iterations do not meet it: no right-hand side has a part there.
+/// Whether the sums of rows are zero to the last bit, as all coefficients are whole numbers.
+bool has_square_cells(const FlowBox& box) {
+  for (int64_t axis = 0; axis < box.dim(); ++axis)
+    if (box.dx(axis) != box.dx(box.dim() - 1)) return false;
+  return true;
+}
+
+/// A direct solver is told of the null space. Iterations with square cells do not meet it: no right-hand side has a
+/// part there, and no product. With others, rounding makes A regular there or even indefinite.
 OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const SolveOptions& options) {
   const auto& fields = box.fields(u.options());
   auto a = stencil_of(box, fields.pressure);
-  if (options.solver.method != Method::kDirect || !fields.closed_parts.defined()) return a;
+  const bool meets_it = options.solver.method == Method::kDirect || !has_square_cells(box);
+  if (!meets_it || !fields.closed_parts.defined()) return a;
   return with_null_space(std::move(a), fields.closed_parts);
 }
 
