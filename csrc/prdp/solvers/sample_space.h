@@ -74,7 +74,7 @@ class SampleSpace : public SampleNumbers<T> {
       const T left2 = dot(r, r);
       started_ = left2 < b2_ && std::isfinite(vectors_.largest_magnitude(x, length()));
       if (started_ && left2 > b2_ / 4)  // less is no rounding's doing
-        started_ = outdoes_rounding<double>(b2_, left2, epsilon() * system_.a().norm() * std::sqrt(dot(x, x)));
+        started_ = outdoes_rounding<double>(b2_, left2, this->epsilon() * system_.a().norm() * std::sqrt(dot(x, x)));
       if (started_) {
         std::swap_ranges(b(), b() + length(), r);
         b2_ = left2;
