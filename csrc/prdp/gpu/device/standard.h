@@ -16,10 +16,10 @@ using int32_t = int;
 namespace std {
 
 using ::abs;
+using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
 using ::int32_t;
 using ::int64_t;
 using ::size_t;
-using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
 inline bool isfinite(float x) { return ::isfinite(x); }
 inline bool isfinite(double x) { return ::isfinite(x); }
 inline bool isnan(double x) { return ::isnan(x); }
