@@ -40,6 +40,7 @@ class HoldsTensors(torch.nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """What copies and pickles hold."""
-        state = {name: value for name, value in vars(self).items() if name not in self._lent()}
-        state |= {name: kept[0] for name, kept in self._lent().items() if kept}
+        lent = self._lent()
+        state = {name: value for name, value in vars(self).items() if name not in lent}
+        state |= {name: kept[0] for name, kept in lent.items() if kept}
         return state | {"_lent_tensors": {}}

@@ -148,7 +148,7 @@ def test_a_solver_that_takes_too_long_is_marked_and_bounded():
     advice = advise(prdp.Poisson((3000,), prdp.CG(1)), field((3000,), batch=1), seconds=0.2)
     (jacobi,) = rows(advice, "Jacobi", torch.float64).values()
     assert jacobi.rtol == 1e-2 and jacobi.status == "MAX_ITER" and "MAX_ITER" in str(advice)
-    assert jacobi.forward.seconds + jacobi.adjoint.seconds < 2.0
+    assert sum(solve.seconds for solve in jacobi.solves) < 2.0  # on a busy machine the forward solve takes it all
     assert rows(advice, "Direct", torch.float64)[1e-5].solved and "Direct" in advice.recommendation
 
 

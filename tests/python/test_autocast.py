@@ -214,7 +214,8 @@ ENTRIES = {
     "fields.rollout": (lambda u: prdp.fields.rollout(prdp.Heat(SHAPE, 0.1, 0.1, prdp.CG(9)), u, 2), [SCALAR]),
 }  # fmt: skip
 WITHOUT_TENSORS = {"Advice", "LinearSchedule", "PRDPController", "SolveInfo", "SolveStatus", "Solver", "Stepper",
-                   "ToleranceController", "experiments", "load_trained"} | {"fields", "operators"}  # fmt: skip
+                   "ToleranceController", "experiments", "load_trained"}  # fmt: skip
+WITHOUT_TENSORS |= {"fields", "operators", "warm_up"}
 CHECKED_BELOW = {"advise", "check_operator"}
 
 

@@ -274,4 +274,4 @@ def test_nu_set_later_is_kept_as_what_it_is():
             assert heat.nu is nu and torch.equal(heat(u), prdp.Heat((6,), nu, 0.1, prdp.CG(9))(u))
     with pytest.raises(TypeError, match="Heat: nu must be a real number, got 'large'"):
         heat.nu = "large"
-    assert heat.nu is parameter
+    assert heat.nu is nu

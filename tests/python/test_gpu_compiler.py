@@ -17,7 +17,7 @@ F32 = torch.float32
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("PRDP_CACHE", str(tmp_path / "kernels"))
+    monkeypatch.setenv("PRDP_CACHE", str(tmp_path))
     return tmp_path / "kernels"
 
 

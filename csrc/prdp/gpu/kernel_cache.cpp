@@ -28,10 +28,9 @@ std::string hash(const std::string& text) {
 
 /// Empty: there is none.
 fs::path folder() {
-  if (const char* named = std::getenv("PRDP_CACHE")) return named;
-  if (const char* cache = std::getenv("XDG_CACHE_HOME"); cache && *cache) return fs::path(cache) / "prdp";
-  const char* home = std::getenv("HOME");
-  return home && *home ? fs::path(home) / ".cache" / "prdp" : fs::path();
+  const char *chosen = std::getenv("PRDP_CACHE"), *home = std::getenv("HOME");
+  if (chosen && *chosen) return fs::path(chosen) / "kernels";
+  return home && *home ? fs::path(home) / ".cache" / "prdp_torch" / "kernels" : fs::path();
 }
 
 constexpr size_t kHashLength = 32;
