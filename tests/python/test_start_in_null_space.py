@@ -60,13 +60,16 @@ def same(found, expected):
     )
 
 
+def has_diagonal(kind):
+    return not kind.startswith("function")
+
+
 @pytest.mark.parametrize("dtype", [F32, F64])
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "name"), [(k, n) for k in KINDS for n in SOLVERS if n != "cg, diagonal" or has_diagonal(k)]
+)
 def test_a_constant_is_no_start(kind, name, dtype):
     a, shape = KINDS[kind](dtype)
-    if name == "cg, diagonal" and kind.startswith("function"):
-        pytest.skip("its diagonal is not known")
     b = mean_free(3, *shape, dtype=dtype)
     expected = prdp.linear_solve(a, b, SOLVERS[name])
     for size in (1.0, 1 / 3, -1e20, 1e-20):
@@ -100,11 +103,7 @@ def test_a_start_near_the_null_space_is_never_worse_than_zero(n, name, single, s
     from_zero = prdp.linear_solve(a, b, solver)[1]
     u, info = prdp.linear_solve(a, b, solver, x0=x0)
     assert (from_zero.status > 0).all() and (info.status > 0).all()
-    exact = (
-        diffusion((n, n), seed, F64)
-        if not single
-        else operators.Diffusion(a.tensors[0][:, 0].double(), boundary="flux")
-    )
+    exact = diffusion((n, n), seed, F64) if not single else operators.Diffusion(a.tensors[0].double(), boundary="flux")
     left = (b.double() - exact.apply(u.double())).flatten(1).norm(dim=1) / b.double().flatten(1).norm(dim=1)
     assert (left < (1e-3 if single else 1.1e-9)).all()  # of single precision, the rounding of u counts as well
 
