@@ -115,7 +115,8 @@ class Flow(HoldsTensors, Stepper):
         self._hold("nu", nu if isinstance(nu, Tensor) else _check.real("Flow", "nu", nu))
         walls = flow_walls.by_name(wall_velocity, len(self.shape))
         for name, given in {"force": force, "inflow": inflow, **walls}.items():
-            self._hold(name, _checked(name, given))
+            numbers = name in VECTORS and given is not None and not isinstance(given, Tensor)
+            self._hold(name, _of_numbers(name, given) if numbers else _checked(name, given))
         self.register_buffer("obstacle", obstacle if obstacle is None else _check.dense("Flow", "obstacle", obstacle))
         self._kept_box = Kept(_make_box)
         self._equation().check()
@@ -123,8 +124,10 @@ class Flow(HoldsTensors, Stepper):
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if name in TENSORS:
+            if isinstance(value, Tensor) and name in TENSORS:
                 self._set(name, _checked(name, value))
+            elif name in TENSORS:
+                self._hold(name, _checked(name, value))
             else:
                 super().__setattr__(name, value)
 
@@ -219,8 +222,7 @@ def _checked(name: str, value: object) -> object:
     """What may be set, with the numbers of a vector as a tensor."""
     if isinstance(value, Tensor):
         return _check.dense("Flow", name, value)
-    is_vector = name in VECTORS or isinstance(value, (tuple, list))
-    return _of_numbers(name, value) if is_vector and value is not None else value
+    return _of_numbers(name, value) if isinstance(value, (tuple, list)) else value
 
 
 def _field(who: str, name: str, value: object) -> Tensor:

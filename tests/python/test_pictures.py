@@ -11,7 +11,7 @@ OF_TRAININGS = {  # their records are not in the repository
     "burgers_1d_metric", "kolmogorov_error", "kolmogorov_vorticity", "snapshots",
 }  # fmt: skip
 OF_EXAMPLES = {"first_emulator", "coarse_corrector", "inverse_permeability", "pdebench_data",
-               "flow_around_cylinder", "passive_scalar", "force_network"}  # fmt: skip
+               "flow_around_cylinder", "lid_driven_cavity", "passive_scalar", "force_network"}  # fmt: skip
 
 
 def tracked(pattern):
