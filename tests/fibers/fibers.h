@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -23,7 +24,7 @@
 #define __shared__ static thread_local
 #define PRDP_UNROLL
 #define PRDP_ONCE
-#define PRDP_SPIN fibers::spin(turns)
+#define PRDP_SPIN fibers::spin(since)
 #define PRDP_BLOCK_MEMORY(name) double* const name = reinterpret_cast<double*>(fibers::block->memory.data())
 // One barrier may be left out, to see that a test notices: that of a line of team.h, or of a line that calls meet().
 #define __syncthreads() (__LINE__ == fibers::left_out ? void() : fibers::meet())
@@ -80,10 +81,12 @@ inline void wait_at(Gate& gate, int fibers) {
   block->moved = true;
 }
 inline void meet() { wait_at(block->all, static_cast<int>(block->fibers.size())); }
-/// Gives up where a block ended that should have come.
-inline void spin(int64_t& turns) {
-  constexpr int64_t patience = 20000;
-  if (ended > 0 && ++turns > patience) stuck = true;
+/// Gives up, after a while, where a block ended that should have come.
+inline void spin(int64_t& since) {
+  constexpr int64_t patience = 3000;  // ms: on a busy machine the others may be late
+  const auto now = std::chrono::steady_clock::now().time_since_epoch() / std::chrono::milliseconds(1);
+  if (ended > 0 && since == 0) since = now;
+  if (since > 0 && now - since > patience) stuck = true;
   if (stuck) throw Stuck();
   std::this_thread::yield();
 }

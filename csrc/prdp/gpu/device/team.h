@@ -48,7 +48,7 @@ class Team {
         awaited_ += kBlocks;
         __threadfence();
         atomicAdd(arrived_, 1u);
-        [[maybe_unused]] int64_t turns = 0;
+        [[maybe_unused]] int64_t since = 0;
         while (static_cast<int>(*static_cast<volatile unsigned*>(arrived_) - awaited_) < 0) PRDP_SPIN;
         __threadfence();
       }
