@@ -3,8 +3,8 @@
 #include <optional>
 #include <string>
 
-/// Compiled kernels on disk, for the next process, in the folder `kernels` of PRDP_CACHE, else of ~/.cache/prdp_torch. A
-/// file that is damaged is made again, and a folder that cannot be written to is as good as none.
+/// Compiled kernels on disk, for the next process, in the folder `kernels` of PRDP_CACHE, else of ~/.cache/prdp_torch.
+/// A file that is damaged is made again, and a folder that cannot be written to is as good as none.
 namespace prdp::gpu::kernel_cache {
 
 /// The hash of all that decides on the result: text, options, versions, architecture.
