@@ -194,3 +194,19 @@ def test_what_is_called_solved_is_so_where_columns_differ_by_nine_decades(seed, 
     exact = torch.linalg.solve(m.double(), b.double())
     assert not info.solved or (u - exact).norm() <= 1e-2 * exact.norm()
     assert not info.solved or info.residual <= 0.1
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-11), (torch.float32, 1e-3)])
+@pytest.mark.parametrize("penalty", [1e6, 1e14, 1e30])
+def test_a_penalty_along_a_whole_line_is_no_constant_coefficient(penalty, dtype, tolerance):
+    """A is a sum over the axes then, but what one of them holds is rounding beside the penalty."""
+    shift = torch.zeros(1, 12, 12, dtype=dtype)
+    shift[0, 0] = penalty
+    a = operators.Diffusion(torch.ones_like(shift), shift=shift)
+    b = torch.ones(2, 1, 12, 12, dtype=dtype)
+    u, info = prdp.linear_solve(a, b, prdp.Direct(2), on_failure="return")
+    dense = operators.Diffusion(torch.ones_like(shift).double(), shift=shift.double()).dense()
+    expected = torch.linalg.solve(dense, b.double().flatten(1).mT).mT.view_as(b)
+    inner = slice(1, None)  # where u is not of the order of 1/penalty
+    error = (u.double() - expected)[..., inner, :].abs().max() / expected.abs().max()
+    assert error <= tolerance and not info.failed.any()

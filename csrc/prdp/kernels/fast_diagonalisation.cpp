@@ -46,6 +46,19 @@ class Reader {
     }
     return true;
   }
+  /// Whether the rows are of one size. Else what is rounding beside the largest may be all that another one holds.
+  bool has_even_rows() const {
+    constexpr T widest = 1e3;
+    T least = std::numeric_limits<T>::infinity(), most = 0;
+    for (int64_t r = 0; r < a_.rows(); ++r) {
+      const T* diagonal = a_.coefficient(r, 0);
+      for (int64_t i = 0; i < n_[2]; ++i) {
+        least = std::min(least, std::abs(diagonal[i]));
+        most = std::max(most, std::abs(diagonal[i]));
+      }
+    }
+    return most <= widest * least;
+  }
   bool is_symmetric(const Eigen::MatrixXd& matrix) const {
     return (matrix - matrix.transpose()).cwiseAbs().maxCoeff() <= slack_;
   }
@@ -172,6 +185,7 @@ std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
   }
   if (!a.pattern().nearest) return std::nullopt;
   const Reader<T> reader(a);
+  if (!reader.has_even_rows()) return std::nullopt;
   SumOverAxes sum;
   for (int d = 0; d < 3; ++d) {
     const bool is_there = d >= 3 - grid.dim;
