@@ -39,10 +39,11 @@ def vectors(velocities: Mapping[Side, Tensor], dim: int) -> list[Tensor | None]:
     found: list[Tensor | None] = []
     for side in list(NAMES)[: 2 * dim]:
         velocity = velocities.get(side)
+        velocity = None if velocity is None else full_precision(velocity)
         if velocity is not None and velocity.dim() == 0 and dim == 2:
             still = torch.zeros_like(velocity)
             velocity = torch.stack((velocity, still) if side[0] == 0 else (still, velocity))
-        found.append(None if velocity is None else full_precision(velocity))
+        found.append(velocity)
     return found
 
 

@@ -160,11 +160,18 @@ def failed():
 
 
 VELOCITY, SCALAR, VECTOR = (2, 2, *SHAPE), (2, 1, *SHAPE), (2, N)
+
+
+def with_lid(speed):
+    return prdp.Flow(SHAPE, 1.0, 1e-3, boundary="wall", wall_velocity={(0, "high"): speed})
+
+
 ENTRIES = {
     "Flow": (lambda u, nu: prdp.Flow(SHAPE, nu.abs(), 1e-3)(u), [VELOCITY, ()]),
     "Flow, unrolled": (lambda u: prdp.Flow(SHAPE, 1.0, 1e-3, backward="unrolled")(u), [VELOCITY]),
     "Flow, force": (lambda u, f: prdp.Flow(SHAPE, 1.0, 1e-3, force=f)(u), [VELOCITY, VELOCITY]),
     "Flow, inflow": (lambda u, f: prdp.Flow(SHAPE, 1.0, 1e-3, inflow=f, **BOX)(u), [VELOCITY, (2,)]),
+    "Flow.wall_velocity": (lambda u, w: with_lid(w)(u), [VELOCITY, ()]),
     "Flow.rollout": (lambda u: prdp.Flow(SHAPE, 1.0, 1e-3).rollout(u, 2), [VELOCITY]),
     "Flow.step_and_pressure": (lambda u: prdp.Flow(SHAPE, 1.0, 1e-3).step_and_pressure(u), [VELOCITY]),
     "Flow.project": (lambda u: prdp.Flow(SHAPE, 1.0, 1e-3).project(u), [VELOCITY]),
