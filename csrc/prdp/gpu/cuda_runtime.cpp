@@ -105,10 +105,16 @@ class CudaRuntime final : public Runtime {
   }
   std::shared_ptr<const Kernel> kernel(c10::Device device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
-    auto& kernel = kernels_[{device.index(), source.text}];
+    auto& [kernel, failure] = kernels_[{device.index(), source.text}];
+    if (!failure.empty()) throw Unavailable(failure);
     if (!kernel) {
-      const OnDevice here(device);
-      kernel = std::make_shared<CudaKernel>(device, source);
+      try {
+        const OnDevice here(device);
+        kernel = std::make_shared<CudaKernel>(device, source);
+      } catch (const Unavailable& reason) {  // not tried again, as that may take seconds in every solve
+        failure = reason.what();
+        throw;
+      }
     }
     return kernel;
   }
@@ -116,7 +122,11 @@ class CudaRuntime final : public Runtime {
  private:
   std::mutex mutex_;
   std::map<c10::DeviceIndex, Limits> limits_;
-  std::map<std::pair<c10::DeviceIndex, std::string>, std::shared_ptr<const Kernel>> kernels_;
+  struct Made {
+    std::shared_ptr<const Kernel> kernel{};
+    std::string failure{};  // why there is none
+  };
+  std::map<std::pair<c10::DeviceIndex, std::string>, Made> kernels_;
 };
 
 }  // namespace

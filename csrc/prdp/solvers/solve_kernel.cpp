@@ -1,5 +1,7 @@
 #include "prdp/solvers/solve_kernel.h"
 
+#include <ATen/Parallel.h>
+
 #include <algorithm>
 #include <limits>
 #include <sstream>
@@ -13,10 +15,6 @@ namespace {
 constexpr int64_t kWarp = 32;
 /// Of GMRES: a thread keeps its triangle, so longer bases would fill the device with copies of it.
 constexpr int64_t kLongestBasis = 50;
-/// Vectors that BlockSpace itself keeps.
-constexpr int64_t kOwnVectors = 4;
-
-int64_t divided_up(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
 /// Bytes of the small arrays of a method, each of whole eight bytes.
 int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
@@ -45,8 +43,8 @@ SolveKernel solve_kernel(const OperatorView& a, const Solver& solver, at::Scalar
   const bool has_cycles = row.counts == Counts::kCycles;
   const int64_t restart = has_cycles ? std::min(solver.restart, unknowns) : 0;
   const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart);
-  const int64_t blocks = divided_up(unknowns, limits.cells_of_block);
-  const int64_t threads = std::min(limits.threads, divided_up(divided_up(unknowns, blocks), kWarp) * kWarp);
+  const int64_t blocks = at::divup(unknowns, limits.cells_of_block);
+  const int64_t threads = std::min(limits.threads, at::divup(at::divup(unknowns, blocks), kWarp) * kWarp);
   const int64_t in_block = blocks > 1 ? 0 : std::min(vectors, limits.block_memory / (unknowns * number));
   const bool by_diagonal = solver.preconditioner.is_diagonal();
 

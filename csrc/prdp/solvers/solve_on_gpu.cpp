@@ -110,16 +110,14 @@ struct Prepared {
 std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const Solver& solver) {
   auto* const runtime = runtime_of(b.device());
   if (!runtime || b.numel() == 0) return std::nullopt;
+  const auto by_design = [](const std::string& reason) {
+    TORCH_CHECK(use() != Use::kRequired, "PRDP_GPU=required: ", reason);
+    return std::nullopt;
+  };
+  if (!has_kernel(solver)) return by_design(not_made(solver));
+  auto view = a.gpu_view(b, /*transposed=*/false);
+  if (!view) return by_design("this operator has no kernel");
   try {
-    if (!has_kernel(solver)) {
-      if (use() == Use::kRequired) throw Unavailable(not_made(solver));
-      return std::nullopt;
-    }
-    auto view = a.gpu_view(b, /*transposed=*/false);
-    if (!view) {
-      if (use() == Use::kRequired) throw Unavailable("this operator has no kernel");
-      return std::nullopt;
-    }
     const auto source =
         solve_kernel(*view, solver, b.scalar_type(), b.numel() / b.size(0), runtime->limits(b.device()));
     auto kernel = runtime->kernel(b.device(), source.source);

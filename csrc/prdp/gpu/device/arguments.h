@@ -39,6 +39,9 @@ struct SolveArguments {
 /// Numbers of a team beyond its vectors: for the damped least squares of GMRES.
 constexpr int64_t numbers_beyond(int64_t restart) { return restart * (restart + 3); }
 
+/// Vectors of a sample that the space itself keeps: b, scratch; and with a start, the start and b - A start.
+inline constexpr int kOwnVectors = 4;
+
 /// Blocks of a team keep their parts of so many sums at once.
 inline constexpr int kMostAtOnce = 4;
 

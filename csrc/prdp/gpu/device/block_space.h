@@ -62,8 +62,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   using Scalar = T;
   using States = std::array<SampleState, 1>;
   using TeamOfSample = Team<S::kBlocks, S::kThreads>;
-  /// Vectors that the space itself keeps: b, scratch; and of a sample with a start, the start and b - A start.
-  static constexpr int kOwn = 4;
 
   /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
   BlockSpace(TeamOfSample& team, const A& a, T* in_block, T* beyond)
@@ -411,7 +409,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   T *in_block_, *beyond_;
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>*null_space_ = nullptr, *left_null_space_ = nullptr;
-  int used_ = kOwn;
+  int used_ = kOwnVectors;
   T factor_ = 1, b2_ = 0;
   double norm_ = 0;
   bool started_ = false;
