@@ -1,11 +1,7 @@
 #include "prdp/operators/burgers_operator.h"
 
-#include <ATen/core/grad_mode.h>
-
-#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/burgers.h"
 #include "prdp/operators/dense.h"
-#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
 
 namespace prdp {
@@ -46,15 +42,7 @@ std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tenso
 }
 
 std::optional<gpu::OperatorView> BurgersOperator::gpu_view(const at::Tensor& b, bool transposed) const {
-  const at::NoGradGuard no_grad;
-  const auto& shape = grid_.shape();
-  OperatorSpec spec{"stencil", shape, {}, {block().coefficients().to(b.scalar_type())}};
-  spec.parameters.assign(shape.size(), 1.0);  // periodic
-  spec.parameters.insert(spec.parameters.end(), shape.size(), 0.0);
-  for (size_t axis = 0; axis < shape.size(); ++axis)
-    for (const double cells : {-1.0, 1.0})
-      for (size_t d = 0; d < shape.size(); ++d) spec.parameters.push_back(d == axis ? cells : 0.0);
-  return StencilOperator(spec).gpu_view(b, transposed);
+  return upwind_view(b, "Burgers", std::to_string(channels_) + ", " + std::to_string(transposed), 1.0, step_.dt);
 }
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {

@@ -4,15 +4,16 @@
 /// What a kernel is called with. The host and the kernel read the same text.
 namespace prdp::gpu {
 
-/// Vectors that A, or Aᵀ, maps to zero: orthonormal ones of `length` entries, in each of `fields` parts of a sample.
+/// Vectors that A, or Aᵀ, maps to zero: orthonormal ones of `length` entries, in each of `fields` parts of a sample
+/// from the `first` on.
 template <class T>
 struct NullSpaceArguments {
   const T* basis;  // (count, length); null: the constant vector
   int64_t count;   // 0: there is none
-  int64_t fields, length;
+  int64_t first, fields, length;
 };
 
-/// The tensors and numbers of an operator; views.h says what each of them is made of.
+/// The tensors and numbers of an operator; views.h and upwind.h say what each of them is.
 struct OperatorArguments {
   const void* tensors[3];
   int64_t sample_strides[3];  // entries between two samples; 0: they share the tensor
@@ -34,6 +35,7 @@ struct SolveArguments {
   int64_t batch, max_iter;
   double rtol;
   int64_t guarded;
+  int64_t leaks;  // products leave the range of A by their rounding, and are projected
 };
 
 /// Numbers of a team beyond its vectors: for the damped least squares of GMRES.
