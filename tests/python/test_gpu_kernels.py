@@ -63,6 +63,14 @@ OPERATORS = {
     "heat 2D": lambda dtype: operators.Heat(SHAPE, torch.tensor(0.03, dtype=dtype), 1.0, length=(1.0, 2.0)),
     "poisson 3D": lambda dtype: operators.Poisson((3, 4, 5)),
     "diffusion": symmetric,
+    "robin": lambda dtype: operators.Diffusion(
+        noise(3, 3, 4, 5, seed=2, dtype=dtype).exp(),
+        shift=20 + noise(1, 3, 4, 5, seed=4, dtype=dtype),
+        boundary=("periodic", ("zero", ("robin", 3.0)), (("robin", noise(3, 3, 4, seed=6, dtype=dtype).exp()), "flux")),
+        length=(1.0, 2.0, 0.5),
+        faces="arithmetic",
+    ),
+    "closed": lambda dtype: operators.Diffusion(noise(1, 8, seed=2, dtype=dtype).exp(), boundary="flux"),
     "stencil": lambda dtype: operators.Stencil(coefficients(dtype), OFFSETS, ("zero", "periodic")),
     "far stencil": lambda dtype: operators.Stencil(far_stencil().to(dtype), FAR, "zero"),
     "burgers": lambda dtype: operators.Burgers(noise(3, 2, *SHAPE, dtype=dtype), 0.05, 0.02),
@@ -75,14 +83,21 @@ OPERATORS = {
     "singular": lambda dtype: nearly_singular().to(dtype),
     "matrices": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(3, 9, 9, dtype=dtype),
 }  # fmt: skip
-SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion"]
+SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion", "robin"]
 ANY = prdp.Jacobi, prdp.BiCGStab, prdp.GMRES
 
 
 def right_hand_sides(name, dtype):
     if name.startswith(("matri", "sparse")) or name == "singular":
         return noise(3, 4 if name == "singular" else 9, seed=3, dtype=dtype)
-    shape = {"heat 1D": (11,), "burgers 1D": (11,), "poisson 3D": (3, 4, 5), "two rows": (2, 7)}.get(name, SHAPE)
+    shape = {
+        "heat 1D": (11,),
+        "burgers 1D": (11,),
+        "poisson 3D": (3, 4, 5),
+        "robin": (3, 4, 5),
+        "closed": (8,),
+        "two rows": (2, 7),
+    }.get(name, SHAPE)
     channels = {"burgers": 2, "stencil": 2, "navier-stokes": 3, "two rows": 3}.get(name, 1)
     return noise(3, channels, *shape, seed=3, dtype=dtype)
 
@@ -109,8 +124,9 @@ def agree(mine, other, dtype, slack=300.0):
 
 
 SADDLES = ["navier-stokes", "two rows"]  # zeros on the diagonal
-CASES = [(name, method) for name in OPERATORS if name not in ("singular", *SADDLES) for method in ANY]
+CASES = [(name, method) for name in OPERATORS if name not in ("singular", "closed", *SADDLES) for method in ANY]
 CASES += [(name, prdp.GMRES) for name in SADDLES]
+CASES += [("closed", method) for method in (prdp.CG, prdp.GMRES)]
 CASES += [(name, method) for name in SYMMETRIC for method in (prdp.CG, prdp.SteepestDescent)]
 CASES += [("heat 1D", prdp.Chebyshev), ("heat 2D", prdp.Chebyshev)]
 

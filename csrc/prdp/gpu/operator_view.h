@@ -9,10 +9,12 @@
 
 namespace prdp::gpu {
 
-/// An operator as a kernel takes it: a type of device/views.h or upwind.h, and the tensors and numbers of it.
+/// An operator as a kernel takes it: a type of device/views.h, upwind.h or diffusion.h, and the tensors and numbers of
+/// it.
 struct OperatorView {
   std::string type;  // "Laplacian<float, Grid<1, 64, 64>>"
-  std::vector<at::Tensor> tensors{};  // contiguous; with one sample or as many as the vectors
+  /// Contiguous, with one sample or as many as the vectors; undefined: there is none.
+  std::vector<at::Tensor> tensors{};
   std::vector<double> numbers{};
   /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.
   at::Tensor null_space{}, left_null_space{};

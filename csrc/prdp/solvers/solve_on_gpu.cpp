@@ -79,6 +79,7 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
 
   SolveArguments<T> arguments{};
   for (size_t i = 0; i < a.tensors.size(); ++i) {
+    if (!a.tensors[i].defined()) continue;
     arguments.a.tensors[i] = a.tensors[i].const_data_ptr();
     arguments.a.sample_strides[i] = a.tensors[i].size(0) == 1 ? 0 : a.tensors[i].stride(0);
   }

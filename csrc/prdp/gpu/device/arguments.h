@@ -13,11 +13,12 @@ struct NullSpaceArguments {
   int64_t first, fields, length;
 };
 
-/// The tensors and numbers of an operator; views.h and upwind.h say what each of them is.
+inline constexpr int kMostTensors = 8, kMostNumbers = 10;
+/// The tensors and numbers of an operator; its view says what each of them is.
 struct OperatorArguments {
-  const void* tensors[3];
-  int64_t sample_strides[3];  // entries between two samples; 0: they share the tensor
-  double numbers[5];
+  const void* tensors[kMostTensors];         // null where there is none
+  int64_t sample_strides[kMostTensors];      // entries between two samples; 0: they share the tensor
+  double numbers[kMostNumbers];
 };
 
 template <class T>

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/gpu/device/block_space.h"
+#include "prdp/gpu/device/diffusion.h"
 #include "prdp/gpu/device/upwind.h"
 #include "prdp/solvers/solve_sample.h"
 

@@ -110,6 +110,7 @@ class Rows {
     return most;
   }
   void scale(T factor) { factor_ = factor; }
+  T factor() const { return factor_; }
   double norm_of_row(int i) const {
     double sum = 0;
     view().for_each_entry(i, [&](T a, int) { sum += static_cast<double>(std::abs(factor_ * a)); });
