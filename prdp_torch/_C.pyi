@@ -136,6 +136,7 @@ def is_sum_over_axes(b: torch.Tensor, tensors: collections.abc.Sequence[torch.Te
     """
 def join_adjoint_logs(logs: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex]) -> tuple | None:
     ...
+def way_of_last_solve() -> str: ...
 def kernels_made() -> list[str]:
     """
     The kernels of GPUs that this process has made, by name.

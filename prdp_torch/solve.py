@@ -87,6 +87,9 @@ class SolveInfo(NamedTuple):
     Such a sample is STAGNATED: its residual is as small as the dtype allows. u may be further off where A is badly
     conditioned; float64 tells. 0 for all other samples, those that failed among them."""
     log: AdjointLog | AdjointLogs | None = None
+    way: str = ""
+    """How it was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors", in operations of torch,
+    which are slow on a GPU. Empty where that is not known: in an adjoint's report, and under `torch.compile`."""
 
     def __repr__(self) -> str:
         if self.status.is_meta:
@@ -98,7 +101,8 @@ class SolveInfo(NamedTuple):
             for name in ("iterations", "residual", "operator_applications")
             if (values := getattr(self, name).flatten().tolist())
         )
-        return f"SolveInfo({statuses}; {ranges})"
+        way = f"; {self.way}" if self.way == "kernel" or self.status.device.type != "cpu" else ""
+        return f"SolveInfo({statuses}; {ranges}{way})"
 
     @property
     def failed(self) -> Tensor:
@@ -236,4 +240,5 @@ def linear_solve(
             start,
         )
         found = solution
-    return found[0].squeeze(0) if lone_vector else found[0], SolveInfo(*found[1:], log)
+    way = "" if compiling else _C.way_of_last_solve()
+    return found[0].squeeze(0) if lone_vector else found[0], SolveInfo(*found[1:], log, way)

@@ -216,8 +216,9 @@ class Stepper(torch_private.HearsOfMoves):
 
     def _keep(self, report: Report, log: AdjointLog | AdjointLogs) -> None:
         kept = outlive_transforms(report)
-        info = None if kept is None else SolveInfo(*kept, log)
-        if torch.compiler.is_compiling():
+        compiling = torch.compiler.is_compiling()
+        info = None if kept is None else SolveInfo(*kept, log, "" if compiling else _C.way_of_last_solve())
+        if compiling:
             self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve
             self.__dict__["info"] = info

@@ -13,6 +13,8 @@ namespace prdp {
 
 namespace {
 
+thread_local const char* way = "";
+
 /// Past the dispatcher: small solves take no longer than a few of its calls.
 at::Tensor empty(at::IntArrayRef sizes, at::ScalarType dtype) { return at::detail::empty_cpu(sizes, dtype); }
 
@@ -79,6 +81,8 @@ std::optional<SolveResult> solve_on_loops(const Operator& a, const at::Tensor& b
 
 }  // namespace
 
+const char* way_of_last_solve() { return way; }
+
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
   const double steps = steps_of(method, iterations, std::min(restart, unknowns));
@@ -92,12 +96,19 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
   auto found = gpu::solve(a, b, request);
-  if (!found && b.is_cpu() && runs_on_loops(request.solver))
+  const char* how = "kernel";
+  if (!found && b.is_cpu() && runs_on_loops(request.solver)) {
+    how = "loops";
     found =
         b.scalar_type() == at::kFloat ? solve_on_loops<float>(a, b, request) : solve_on_loops<double>(a, b, request);
-  auto result = found ? *std::move(found) : solve_with_tensors(a, b, request);
-  find_inconsistent_constants(a, b, request, result);
-  return result;
+  }
+  if (!found) {
+    how = "tensors";
+    found = solve_with_tensors(a, b, request);
+  }
+  way = how;
+  find_inconsistent_constants(a, b, request, *found);
+  return *std::move(found);
 }
 
 }  // namespace prdp

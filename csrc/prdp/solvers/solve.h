@@ -28,6 +28,9 @@ struct SolveRequest {
 /// Samples do not influence each other; in the CPU loops not even in the last bit.
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
+/// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors".
+const char* way_of_last_solve();
+
 /// The same in plain tensor operations, for other devices and as a reference for the tests of the CPU loops.
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 

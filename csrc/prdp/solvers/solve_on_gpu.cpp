@@ -65,9 +65,11 @@ template <class T>
 SolveResult launch(const Kernel& kernel, const SolveKernel& source, const OperatorView& a, const at::Tensor& b,
                    const SolveRequest& request) {
   const int64_t batch = b.size(0);
-  const auto counts = at::empty({3, batch}, b.options().dtype(at::kLong));
-  const auto reals = at::empty({2, batch}, b.options());
-  auto u = at::empty(b.sizes(), b.options());
+  const auto counts = b.options().dtype(at::kLong);
+  // Memory of their own: a compiled graph takes no results that share theirs.
+  SolveResult result{at::empty(b.sizes(), b.options()),
+                     {at::empty({batch}, counts), at::empty({batch}, b.options()), at::empty({batch}, counts),
+                      at::empty({batch}, counts), at::empty({batch}, b.options())}};
   const int64_t blocks = source.source.blocks_of_team;
   const int64_t teams = std::min(batch, blocks > 1 ? kernel.teams() : 4 * kernel.teams());
   const auto memory = at::empty({std::max<int64_t>(teams * source.memory_of_team, 1)}, b.options());
@@ -88,10 +90,13 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
   arguments.left_null_space = arguments_of<T>(a.left_null_space, b, a.null_field);
   arguments.b = b.const_data_ptr<T>();
   arguments.x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr;
-  arguments.u = u.mutable_data_ptr<T>();
+  arguments.u = result.u.mutable_data_ptr<T>();
   arguments.caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr;
-  arguments.counts = counts.mutable_data_ptr<int64_t>();
-  arguments.reals = reals.mutable_data_ptr<T>();
+  arguments.iterations = result.info.iterations.mutable_data_ptr<int64_t>();
+  arguments.status = result.info.status.mutable_data_ptr<int64_t>();
+  arguments.applications = result.info.operator_applications.mutable_data_ptr<int64_t>();
+  arguments.residual = result.info.residual.mutable_data_ptr<T>();
+  arguments.floor = result.info.floor.mutable_data_ptr<T>();
   arguments.memory = memory.mutable_data_ptr<T>();
   if (blocks > 1) {
     arguments.arrived = static_cast<unsigned*>(arrived.mutable_data_ptr());
@@ -103,7 +108,7 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
   arguments.guarded = request.guarded;
   arguments.leaks = a.leaks;
   kernel.launch(teams, &arguments);
-  return {u, {counts[0], reals[0], counts[1], counts[2], reals[1]}};
+  return result;
 }
 
 /// A kernel, with all that its launch needs.

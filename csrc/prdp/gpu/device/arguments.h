@@ -28,8 +28,9 @@ struct SolveArguments {
   const T *b, *x0;      // (batch, unknowns); no start: null
   T* u;                 // (batch, unknowns)
   const int64_t* caps;  // (batch,); null: all have max_iter
-  int64_t* counts;      // (3, batch): iterations, status, products
-  T* reals;             // (2, batch): relative residual, floor
+  // The report, (batch,) each.
+  int64_t *iterations, *status, *applications;
+  T *residual, *floor;
   T* memory;            // vectors that do not fit into a block, and what damping needs, for each team
   unsigned* arrived;    // of each team, 32 apart
   double* parts;        // of the sums of each team

@@ -50,11 +50,11 @@ void solve_batch(const SolveArguments<typename S::T>& of, typename S::T* in_bloc
     const SampleOutcome outcome = solve_sample_of<Method, S>(of, sample, space);
     if (outcome.is_zero) space.fill_zero(of.u + sample * Space::unknowns());
     if (!threads.leads()) continue;
-    of.counts[sample] = outcome.iterations;
-    of.counts[of.batch + sample] = static_cast<int64_t>(outcome.status);
-    of.counts[2 * of.batch + sample] = outcome.applications;
-    of.reals[sample] = static_cast<T>(outcome.residual);
-    of.reals[of.batch + sample] = static_cast<T>(outcome.floor);
+    of.iterations[sample] = outcome.iterations;
+    of.status[sample] = static_cast<int64_t>(outcome.status);
+    of.applications[sample] = outcome.applications;
+    of.residual[sample] = static_cast<T>(outcome.residual);
+    of.floor[sample] = static_cast<T>(outcome.floor);
   }
 }
 

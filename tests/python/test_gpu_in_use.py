@@ -1,0 +1,93 @@
+"""Kernels as programs use them: compiled graphs, transforms, autocast, threads; and what a report says of them."""
+
+import threading
+
+import pytest
+import torch
+from fibers import Fibers
+from test_gpu_kernels import noise
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+F32, F64 = torch.float32, torch.float64
+SHAPE = (6, 7)
+
+
+def heat(**options):
+    return prdp.Heat(SHAPE, nu=1e-2, dt=1.0, solver=prdp.CG(max_iter=60, rtol=1e-10), **options)
+
+
+def test_a_report_says_which_way_its_solve_went():
+    step, u = heat(), noise(3, 1, *SHAPE)
+    with Fibers():
+        states = step.rollout(u, 2)
+        assert step.info.way == "kernel" and "kernel" in repr(step.info)
+    torch.testing.assert_close(step.rollout(u, 2), states, rtol=1e-9, atol=1e-12)
+    assert step.info.way == "loops" and "loops" not in repr(step.info)
+    own = operators.Function(lambda v: 2 * v, symmetric=True)
+    assert prdp.linear_solve(own, u, prdp.CG(max_iter=5))[1].way == "tensors"
+
+
+@pytest.mark.parametrize("start", ["zero", "state"])
+def test_in_a_compiled_program(start):
+    step, u = heat(start=start), noise(3, 1, *SHAPE).requires_grad_()
+
+    def loss(u):
+        return step(step(u)).square().sum()
+
+    expected = torch.autograd.grad(loss(u), u)[0]
+    with Fibers():
+        compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+        found = torch.autograd.grad(compiled(u), u)[0]
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")
+def test_in_transforms():
+    """A batch of batches is one launch; a derivative along a direction is a solve of its own."""
+    a, solver = operators.Heat(SHAPE, 1e-2, 1.0), prdp.CG(max_iter=60, rtol=1e-11)
+
+    def u(b):
+        return prdp.linear_solve(a, b, solver)[0]
+
+    b, direction = noise(2, 3, 1, *SHAPE), noise(3, 1, *SHAPE, seed=1)
+    expected = torch.stack([u(of) for of in b])
+    tangent = u(direction)
+    with Fibers():
+        torch.testing.assert_close(torch.func.vmap(u)(b), expected, rtol=1e-8, atol=1e-10)
+        found, along = torch.func.jvp(u, (b[0],), (direction,))
+    torch.testing.assert_close(found, expected[0], rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(along, tangent, rtol=1e-8, atol=1e-10)
+
+
+def test_under_autocast_and_from_another_thread():
+    network, step = torch.nn.Conv2d(1, 1, 3, padding=1), prdp.Heat(SHAPE, nu=1e-2, dt=1.0, solver=prdp.CG(max_iter=9))
+    u = noise(3, 1, *SHAPE, dtype=F32)
+    gradients = []
+
+    def train():
+        network.zero_grad()
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            loss = step(network(u)).square().sum()
+        loss.backward()
+        gradients.append(network.weight.grad.clone())
+
+    train()
+    with Fibers():
+        thread = threading.Thread(target=train)
+        thread.start()
+        thread.join()
+    assert gradients[1].dtype == F32
+    torch.testing.assert_close(*gradients, rtol=1e-2, atol=1e-3)
+
+
+def test_caps_of_their_own_and_long_bases():
+    """Samples of different caps in one launch; a basis that no kernel holds is left to operations of torch."""
+    a, b = operators.Heat(SHAPE, 1e-2, 1.0), noise(3, 1, *SHAPE)
+    with Fibers():
+        with pytest.raises(RuntimeError, match="PRDP_GPU=required: GMRES has no kernel"):
+            prdp.linear_solve(a, b, prdp.GMRES(max_iter=2, restart=51))
+        u, info = prdp.linear_solve(a, b, prdp.GMRES(max_iter=2, restart=50, rtol=1e-10))
+    assert info.solved.all() and info.way == "kernel"
+    torch.testing.assert_close(a.apply(u), b, rtol=1e-8, atol=1e-8)
