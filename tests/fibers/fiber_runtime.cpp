@@ -11,8 +11,10 @@
 #include <map>
 #include <mutex>
 
+#include "prdp/gpu/cuda_runtime.h"
 #include "prdp/gpu/nvrtc.h"
 #include "prdp/gpu/runtime.h"
+#include "prdp/solvers/solve_kernel.h"
 
 namespace {
 
@@ -41,6 +43,7 @@ const fs::path& folder() {
     for (const char* part : {"prdp/gpu/device", "prdp/solvers", "prdp/kernels"})
       for (const auto& file : fs::directory_iterator(fs::path(PRDP_CSRC) / part))
         if (file.path().extension() == ".h") text += read(file);
+    if (std::getenv("PRDP_FIBERS_TSAN")) text += "watched";
     const auto name = "prdp-fibers-" + std::to_string(getuid()) + "-" + std::to_string(std::hash<std::string>()(text));
     fs::create_directories(fs::temp_directory_path() / name);
     return fs::temp_directory_path() / name;
@@ -52,8 +55,9 @@ const fs::path& folder() {
 void compile(const std::string& arguments, const fs::path& result) {
   if (fs::exists(result)) return;
   const auto part = result.string() + "." + std::to_string(getpid()), log = part + ".log";
-  const std::string command = "c++ -std=c++20 -O1 -ffp-contract=off -fPIC -pthread -I" + folder().string() + " -I" +
-                              PRDP_CSRC + " " + arguments + " -o " + part + " 2> " + log;
+  static const std::string watch = std::getenv("PRDP_FIBERS_TSAN") ? " -fsanitize=thread -g" : "";
+  const std::string command = "c++ -std=c++20 -O1 -ffp-contract=off -fPIC -pthread" + watch + " -I" +
+                              folder().string() + " -I" + PRDP_CSRC + " " + arguments + " -o " + part + " 2> " + log;
   if (std::system(command.c_str()) != 0) throw Unavailable("the host's compiler fails: " + read(log));
   fs::remove(log);
   fs::rename(part, result);
@@ -135,6 +139,27 @@ extern "C" const char* prdp_compile_last(int capability, int64_t* size) {
     error = e.what();
   }
   return error.c_str();
+}
+/// Why CUDA cannot be used here; nothing where it can.
+extern "C" const char* prdp_why_no_cuda() {
+  static std::string said;
+  said.clear();
+  try {
+    prdp::gpu::cuda_runtime().limits(c10::Device(c10::DeviceType::CUDA, 0));
+  } catch (const std::exception& e) {
+    said = e.what();
+  }
+  return said.c_str();
+}
+/// Why a sample of this size has no kernel.
+extern "C" const char* prdp_why_too_large(int64_t unknowns) {
+  static std::string said;
+  try {
+    prdp::gpu::solve_kernel({"A"}, prdp::CG{}, at::kFloat, unknowns, {96 << 10, 16384, 1024});
+  } catch (const Unavailable& e) {
+    said = e.what();
+  }
+  return said.c_str();
 }
 /// What the compiler says of it.
 extern "C" const char* prdp_resources_of_last(int capability) {

@@ -31,6 +31,45 @@
 #define PRDP_LEAVES_OUT(line) (fibers::kLinesOfTeam + (line) == fibers::left_out)
 #define __threadfence() std::atomic_thread_fence(std::memory_order_seq_cst)
 
+// Under ThreadSanitizer, fibers are threads that only barriers and shuffles put into an order. What this file keeps for
+// itself is no part of that.
+#ifdef __SANITIZE_THREAD__
+#include <sanitizer/tsan_interface.h>
+extern "C" void AnnotateIgnoreReadsBegin(const char*, int);
+extern "C" void AnnotateIgnoreReadsEnd(const char*, int);
+extern "C" void AnnotateIgnoreWritesBegin(const char*, int);
+extern "C" void AnnotateIgnoreWritesEnd(const char*, int);
+namespace fibers {
+constexpr unsigned kWithoutOrder = 1;
+struct Unwatched {
+  Unwatched() {
+    AnnotateIgnoreReadsBegin(__FILE__, __LINE__);
+    AnnotateIgnoreWritesBegin(__FILE__, __LINE__);
+  }
+  ~Unwatched() {
+    AnnotateIgnoreWritesEnd(__FILE__, __LINE__);
+    AnnotateIgnoreReadsEnd(__FILE__, __LINE__);
+  }
+};
+inline void* made_fiber() { return __tsan_create_fiber(0); }
+inline void* this_fiber() { return __tsan_get_current_fiber(); }
+inline void switch_to(void* fiber, bool ordered) { __tsan_switch_to_fiber(fiber, ordered ? 0 : kWithoutOrder); }
+inline void came_to(void* gate) { __tsan_release(gate); }
+inline void left(void* gate) { __tsan_acquire(gate); }
+}  // namespace fibers
+#else
+namespace fibers {
+struct Unwatched {
+  Unwatched() {}
+};
+inline void* made_fiber() { return nullptr; }
+inline void* this_fiber() { return nullptr; }
+inline void switch_to(void*, bool) {}
+inline void came_to(void*) {}
+inline void left(void*) {}
+}  // namespace fibers
+#endif
+
 namespace fibers {
 
 enum class Order { kForward, kBackward, kShuffled };
@@ -39,6 +78,7 @@ struct Fiber {
   ucontext_t context;
   std::unique_ptr<char[]> stack;
   bool done = false;
+  void* watched = nullptr;  // by ThreadSanitizer
 };
 /// Where fibers wait for each other.
 struct Gate {
@@ -48,6 +88,7 @@ struct Gate {
 struct Block {
   std::vector<Fiber> fibers;
   ucontext_t scheduler;
+  void* watched = nullptr;
   int now = 0;
   std::vector<char> memory;
   std::vector<double> of_lanes;
@@ -66,9 +107,11 @@ constexpr int kLanesOfWarp = 32;
 
 inline void give_way() {
   auto& fiber = block->fibers[block->now];
+  switch_to(block->watched, /*ordered=*/false);
   swapcontext(&fiber.context, &block->scheduler);
 }
-inline void wait_at(Gate& gate, int fibers) {
+inline void wait_among(Gate& gate, int fibers) {
+  const Unwatched here;
   block->moved = true;
   const int64_t before = gate.opened;
   if (++gate.waiting == fibers) {
@@ -79,6 +122,11 @@ inline void wait_at(Gate& gate, int fibers) {
   do give_way();
   while (gate.opened == before);
   block->moved = true;
+}
+inline void wait_at(Gate& gate, int fibers) {
+  came_to(&gate);
+  wait_among(gate, fibers);
+  left(&gate);
 }
 inline void meet() { wait_at(block->all, static_cast<int>(block->fibers.size())); }
 /// Gives up, after a while, where a block ended that should have come.
@@ -95,6 +143,8 @@ inline void enter() {
     (*body)();
   } catch (const Stuck&) {
   }
+  const Unwatched here;
+  came_to(block);
   block->fibers[block->now].done = true;
   give_way();
 }
@@ -128,8 +178,10 @@ namespace fibers {
 /// Runs a block to its end; false where its fibers wait at different barriers.
 inline bool run_block(int index, int blocks, int threads, int64_t memory, Order order, unsigned seed,
                       std::function<void()> kernel) {
+  const Unwatched here;
   Block mine;
   block = &mine;
+  mine.watched = this_fiber();
   body = &kernel;
   mine.memory.assign(static_cast<size_t>(memory), char(0xff));
   mine.of_lanes.assign(static_cast<size_t>(threads), NAN);
@@ -145,6 +197,7 @@ inline bool run_block(int index, int blocks, int threads, int64_t memory, Order 
     fiber.context.uc_stack = {fiber.stack.get(), 0, stack};
     fiber.context.uc_link = &mine.scheduler;
     makecontext(&fiber.context, enter, 0);
+    fiber.watched = made_fiber();
   }
   std::vector<int> turns(static_cast<size_t>(threads));
   std::iota(turns.begin(), turns.end(), 0);
@@ -160,10 +213,12 @@ inline bool run_block(int index, int blocks, int threads, int64_t memory, Order 
       any = true;
       mine.now = turn;
       threadIdx.x = static_cast<unsigned>(turn);
+      switch_to(fiber.watched, /*ordered=*/true);
       swapcontext(&mine.scheduler, &fiber.context);
       mine.moved = mine.moved || fiber.done;
     }
     if (!any) {
+      left(&mine);
       ++ended;
       return true;
     }

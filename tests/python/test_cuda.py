@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from fibers import Fibers
 from test_gpu_kernels import CASES as OF_KERNELS
 from test_gpu_kernels import OPERATORS as WITH_KERNELS
 from test_gpu_kernels import agree, right_hand_sides
@@ -180,6 +181,21 @@ def test_kernels_solve_as_the_loops_of_the_cpu(name, method, dtype, monkeypatch)
     agree(found, prdp.linear_solve(a, b, of, on_failure="return"), dtype, slack=5 * rtol / torch.finfo(dtype).eps)
     again = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")[0]
     assert torch.equal(again, u)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(("name", "method"), OF_KERNELS)
+def test_kernels_give_the_bits_of_the_fibers(name, method, dtype):
+    """As many iterations, without what a library of mathematics rounds as it likes: the same text, the same order."""
+    a, b = WITH_KERNELS[name](dtype), right_hand_sides(name, dtype)
+    of = solver_of(method, rtol=0.0, max_iter=3)
+    with Fibers():
+        expected, report = prdp.linear_solve(a, b, of, on_failure="return")
+        if not CUDA:
+            u, info = prdp.linear_solve(a, b, of, on_failure="return")
+    if CUDA:
+        u, info = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")
+    assert torch.equal(u.cpu(), expected) and torch.equal(info.residual.cpu(), report.residual)
 
 
 def test_a_solve_with_a_tolerance_in_a_cuda_graph():

@@ -1,5 +1,6 @@
 """Kernels are compiled by NVRTC, without a GPU, for the cards that are about; and what happens where they cannot be."""
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -92,3 +93,34 @@ def test_a_machine_without_nvrtc_is_told_what_to_install():
     command = [sys.executable, "-c", WITHOUT_NVRTC]
     said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
     assert "there is no NVRTC: pip install nvidia-cuda-nvrtc" in said
+
+
+WHY = """
+import sys
+sys.path.insert(0, "tests/python")
+import ctypes
+from fibers import Fibers
+library = Fibers.library()
+library.prdp_why_no_cuda.restype = ctypes.c_char_p
+print(library.prdp_why_no_cuda().decode())
+"""
+
+
+def test_a_driver_that_refuses_is_quoted(tmp_path):
+    def why(*options):
+        driver = tmp_path / "libcuda.so.1"
+        fake = ROOT / "tests/fibers/fake_driver.c"
+        subprocess.run(["cc", "-shared", "-fPIC", *options, str(fake), "-o", str(driver)], check=True)
+        environment = {**os.environ, "LD_LIBRARY_PATH": str(tmp_path)}
+        command = [sys.executable, "-c", WHY]
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert "the driver does not start: CUDA driver version is insufficient for CUDA runtime version (35)" in why()
+    assert "cuLaunchCooperativeKernel" in why("-DWITHOUT_NEWER")
+
+
+def test_a_sample_that_no_kernel_holds_is_named():
+    library = Fibers.library()
+    library.prdp_why_too_large.argtypes = [ctypes.c_int64]
+    library.prdp_why_too_large.restype = ctypes.c_char_p
+    assert library.prdp_why_too_large(1 << 31).decode() == ("a sample of 2147483648 unknowns is too large for a kernel")

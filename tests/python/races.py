@@ -1,0 +1,25 @@
+"""Solves of kernels on the fibers, under ThreadSanitizer: `python races.py LEFT_OUT`, the line of a barrier or 0. The
+library of the sanitizer is preloaded; the compiler of the kernels must not get it."""
+
+import os
+import sys
+
+os.environ.pop("LD_PRELOAD", None)
+
+import torch
+from fibers import Fibers
+from test_gpu_kernels import OPERATORS, right_hand_sides, solver
+
+import prdp_torch as prdp
+
+
+def main():
+    for name, method in (("heat 2D", prdp.CG), ("diffusion", prdp.GMRES), ("closed", prdp.CG)):
+        a, b = OPERATORS[name](torch.float32), right_hand_sides(name, torch.float32)
+        few = solver(method, rtol=0.0, max_iter=2)
+        with Fibers(left_out=int(sys.argv[1]), block_memory=0):
+            prdp.linear_solve(a, b, solver=few, on_failure="return")
+
+
+if __name__ == "__main__":
+    main()
