@@ -21,7 +21,18 @@ from prdp_torch.gpu import warm_up  # noqa: E402
 from prdp_torch.implicit_step import ImplicitStep  # noqa: E402
 from prdp_torch.operator_check import check_operator  # noqa: E402
 from prdp_torch.solve import SolveInfo, SolveStatus, detach_failed, linear_solve  # noqa: E402
-from prdp_torch.solvers import CG, GMRES, BiCGStab, Chebyshev, Direct, Jacobi, Multigrid, Solver, SteepestDescent  # noqa: E402
+from prdp_torch.solvers import (  # noqa: E402
+    CG,
+    GMRES,
+    MINRES,
+    BiCGStab,
+    Chebyshev,
+    Direct,
+    Jacobi,
+    Multigrid,
+    Solver,
+    SteepestDescent,
+)
 from prdp_torch.stepper import Stepper  # noqa: E402
 from prdp_torch.steppers import Burgers, Heat, NavierStokes, Poisson  # noqa: E402
 
@@ -34,6 +45,7 @@ __version__: str = _C.VERSION
 __all__ = [
     "CG",
     "GMRES",
+    "MINRES",
     "Advice",
     "BiCGStab",
     "Burgers",

@@ -164,7 +164,7 @@ def linear_solve(
         A: an operator of `prdp_torch.operators`, or a tensor (n, n) or (batch, n, n), dense or sparse CSR.
         b: (batch, channel, *shape) for stencil operators, (n,) or (batch, n) for matrices; float32 or
             float64, any strides.
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `Multigrid` or `Direct`.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `MINRES`, `Multigrid` or `Direct`.
         backward: how the gradient is computed.
             "implicit" solves one adjoint system, Aᵀλ = ū, with the same method. Then b̄ = λ, and a tensor g
             in A gets ḡ = -λᵀ ∂(A u)/∂g. "unrolled" differentiates the iterations that ran. "none" gives no

@@ -16,6 +16,7 @@ from prdp_torch.solve import AdjointLog, SolveInfo, SolveStatus
 from prdp_torch.solvers import (
     CG,
     GMRES,
+    MINRES,
     BiCGStab,
     Chebyshev,
     Direct,
@@ -118,7 +119,8 @@ def candidates(step: Stepper) -> list[Solver]:
     """The solvers to try on a step."""
     own = [step.restart] if step.method.startswith("gmres") else []
     restarts = sorted({*RESTARTS, *own})
-    every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), *(GMRES(1, restart=m) for m in restarts)]
+    every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), MINRES(1)]
+    every += [GMRES(1, restart=m) for m in restarts]
     kind = getattr(step, "kind", None)
     if kind not in ("heat", "poisson", "navier_stokes"):  # whose diagonals are constant
         every += [CG(1, preconditioner="diagonal"), GMRES(1, restart=8, preconditioner="diagonal")]

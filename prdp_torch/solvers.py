@@ -28,7 +28,7 @@ class Solver:
     Args:
         max_iter: K >= 0, the maximum number of iterations.
         rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
-        preconditioner: only for `CG`, `BiCGStab` and `GMRES`. M ≈ A, whose inverse they apply in every iteration:
+        preconditioner: only for `CG`, `BiCGStab`, `GMRES` and `MINRES`. M ≈ A, whose inverse they apply in every iteration:
             None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of
             `prdp_torch.operators` whose product is M⁻¹ r, such as `Function(apply, transpose)`. The adjoint solve
             applies its transpose. Derivatives take it for a constant, except the diagonal in unrolled mode.
@@ -130,6 +130,20 @@ class BiCGStab(Solver):
     """
 
     method: ClassVar[str] = "bicgstab"
+
+
+@dataclass
+class MINRES(Solver):
+    """The minimal residual for symmetric operators, definite or not, as a Helmholtz equation or a saddle point.
+
+    An iteration has one product with A, and memory does not grow with their number, as it does in a cycle of `GMRES`.
+    Where A is definite, `CG` takes less work per iteration. A preconditioner must be positive definite, also where A is
+    not; where it is not, a sample ends with BREAKDOWN.
+
+    Source: Paige and Saunders 1975; in the form of Ashby, Manteuffel and Saylor 1990.
+    """
+
+    method: ClassVar[str] = "minres"
 
 
 @dataclass(kw_only=True)

@@ -83,6 +83,15 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
   return "A is symmetric but not definite; take GMRES";
 }
 
+/// Why MINRES finds no direction.
+std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (solver.preconditioner)
+    return "q·M⁻¹ q is not positive for a q = A p: its preconditioner is not positive definite, or A p vanishes";
+  const double share = asymmetry(a, b, sample);
+  if (share > 100.0 * epsilon_of(b)) return not_definite(a, b, sample);
+  return "A p vanishes for a direction p: A is singular, and b lies outside its range; take a b without that part";
+}
+
 std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDominant)
@@ -117,6 +126,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
            "or A is not; prdp.check_operator(A, b, solver) looks at both";
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
+  if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(solver, a, b, sample);
   if (traits(solver.method).counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
   return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
          "take a b without that part, or add a multiple of the identity to A";

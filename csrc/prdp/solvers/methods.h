@@ -9,6 +9,7 @@
 #include "prdp/solvers/correction.h"
 #include "prdp/solvers/gmres.h"
 #include "prdp/solvers/jacobi.h"
+#include "prdp/solvers/minres.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/steepest_descent.h"
 
@@ -22,6 +23,7 @@ enum class Counts { kIterations, kCycles };
 enum class MadeFor {
   kAny,
   kDefinite,       // symmetric and definite
+  kSymmetric,
   kDominant,       // the spectral radius of I - D⁻¹A is below 1
   kKnownSpectrum   // the operator knows that radius: Heat and Poisson
 };
@@ -129,6 +131,18 @@ inline constexpr std::tuple kMethods{
         .nanoseconds = 0.8,
         .kernel = "GmresMethod",
         .kernel_header = "gmres.h",
+    }},
+    MethodRow<MinresMethod>{{
+        .method = Method::kMinres,
+        .name = "minres",
+        .label = "MINRES",
+        .made_for = MadeFor::kSymmetric,
+        .vectors = 8,
+        .takes_preconditioner = true,
+        .nanoseconds = 0.6,
+        .has_tape = false,
+        .kernel = "MinresMethod",
+        .kernel_header = "minres.h",
     }},
     MethodRow<MultigridMethod>{{
         .method = Method::kMultigrid,

@@ -20,6 +20,7 @@ constexpr int64_t kLongestBasis = 50;
 int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
   constexpr int64_t pointer = 8, weights_at_once = 64, numbers_of_column = 6, arrays = 8;
   if (method == Method::kChebyshev) return weights_at_once * number;
+  if (method == Method::kMinres) return 3 * pointer + 3 * 8;
   if (traits(method).counts != Counts::kCycles) return 0;
   const int64_t columns = restart + 1;
   const int64_t numbers = restart * columns + numbers_of_column * columns + 2 * columns + 2 * restart;

@@ -81,7 +81,7 @@ void Solver::check(const char* who) const {
     TORCH_CHECK_VALUE(preconditioner.is_multigrid(), who, ": the method multigrid needs Preconditioner::multigrid()");
   } else {
     TORCH_CHECK_VALUE(!preconditioner || traits(method).takes_preconditioner, who, ": the method ",
-                      traits(method).label, " takes no preconditioner; CG, BiCGStab and GMRES take one");
+                      traits(method).label, " takes no preconditioner; CG, BiCGStab, GMRES and MINRES take one");
   }
   TORCH_CHECK_VALUE(preconditioner.smoothing() >= 1, who, ": smoothing must be >= 1, got ", preconditioner.smoothing());
 }

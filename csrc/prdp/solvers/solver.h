@@ -12,13 +12,23 @@
 namespace prdp {
 
 /// What each of them is, methods.h says.
-enum class Method { kJacobi, kChebyshev, kSteepestDescent, kConjugateGradient, kBiCGStab, kGmres, kMultigrid, kDirect };
+enum class Method {
+  kJacobi,
+  kChebyshev,
+  kSteepestDescent,
+  kConjugateGradient,
+  kBiCGStab,
+  kGmres,
+  kMinres,
+  kMultigrid,
+  kDirect
+};
 
 /// Smoothing steps of multigrid before and after each coarse grid.
 inline constexpr int64_t kDefaultSmoothing = 2;
 
-/// M ≈ A, whose inverse CG, BiCGStab and GMRES may apply in every iteration; the adjoint solve applies the transpose.
-/// In unrolled derivatives M is a constant, unless it is the diagonal.
+/// M ≈ A, whose inverse CG, BiCGStab, GMRES and MINRES may apply in every iteration; the adjoint solve applies the
+/// transpose. In unrolled derivatives M is a constant, unless it is the diagonal.
 class Preconditioner {
  public:
   Preconditioner() = default;  // none
@@ -104,6 +114,13 @@ struct GMRES {
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kGmres, max_iter, rtol, restart, preconditioner}; }
+};
+/// For symmetric operators, definite or not. A preconditioner must be positive definite.
+struct MINRES {
+  int64_t max_iter;
+  double rtol = kDefaultRtol;
+  Preconditioner preconditioner{};
+  operator Solver() const { return {Method::kMinres, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
 /// V-cycles, u ← u + M⁻¹(b - A u); max_iter counts them. For the operators that Preconditioner::multigrid() is for.
 struct Multigrid {
