@@ -35,10 +35,17 @@ std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, 
 }
 
 at::Tensor BurgersOperator::solve_directly(const at::Tensor& b) const {
+  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_directly(b);
   return solve_channels(channel_matrix(*this, winds_.options()), b);
 }
 at::Tensor BurgersOperator::solve_transpose_directly(const at::Tensor& b) const {
+  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_transpose_directly(b);
   return solve_channels(channel_matrix(*this, winds_.options()).mT(), b);
+}
+
+OperatorSpec BurgersOperator::as_stencil(const at::Tensor& b) const {
+  const std::vector<bool> periodic(grid_.dim(), true);
+  return nearest_stencil(block().coefficients().to(b.scalar_type()), grid_.shape(), periodic);
 }
 
 std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tensor& b, bool transposed) const {
@@ -47,14 +54,7 @@ std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tenso
 
 std::optional<gpu::OperatorView> BurgersOperator::gpu_view(const at::Tensor& b, bool transposed) const {
   const at::NoGradGuard no_grad;
-  const auto& shape = grid_.shape();
-  OperatorSpec spec{"stencil", shape, {}, {block().coefficients().to(b.scalar_type())}};
-  spec.parameters.assign(shape.size(), 1.0);  // periodic
-  spec.parameters.insert(spec.parameters.end(), shape.size(), 0.0);
-  for (size_t axis = 0; axis < shape.size(); ++axis)
-    for (const double cells : {-1.0, 1.0})
-      for (size_t d = 0; d < shape.size(); ++d) spec.parameters.push_back(d == axis ? cells : 0.0);
-  return StencilOperator(spec).gpu_view(b, transposed);
+  return StencilOperator(as_stencil(b)).gpu_view(b, transposed);
 }
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {

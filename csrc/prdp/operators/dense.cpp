@@ -11,6 +11,21 @@ at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b) {
   return solutions.empty() ? at::empty_like(b) : at::stack(solutions);
 }
 
+void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices) {
+  // Beyond that the factors take longer than any iteration of the same system, whose vectors are n times smaller.
+  constexpr int64_t most_unknowns = 4096, most_numbers = int64_t{1} << 26;
+  if (b.is_cpu() || (n <= most_unknowns && matrices * n * n <= most_numbers)) return;
+  TORCH_CHECK_NOT_IMPLEMENTED(
+      false, "linear_solve: Direct on ", b.device(),
+      " solves equations in 1D, stencils with constant coefficients in a box (sums of symmetric operators along the "
+      "axes), and others of at most ",
+      most_unknowns, " unknowns with ", most_numbers, " numbers in all matrices of a batch, got ", matrices,
+      matrices == 1 ? " matrix" : " matrices", " of ", n,
+      " unknowns; take CG (if A is symmetric) or GMRES, with preconditioner=\"multigrid\" where the operator has it, "
+      "or "
+      "solve on the CPU");
+}
+
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options) {
   // Unit vectors as the channels of one field: row j of the product is column j of the matrix.
   auto shape = a.vector_shape();

@@ -6,6 +6,9 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/stencil_direct.h"
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
@@ -194,11 +197,19 @@ void SingularOperator::check_null_spaces(const at::Tensor& b) const {
 
 namespace {
 
+/// The regular operator of a singular one as a stencil, if it is one.
+std::optional<OperatorSpec> stencil_of(const Operator& a) {
+  if (const auto* stencil = dynamic_cast<const StencilOperator*>(&a)) return stencil->spec();
+  if (const auto* diffusion = dynamic_cast<const DiffusionOperator*>(&a)) return diffusion->as_stencil();
+  return std::nullopt;
+}
+
 /// P_r (A + ‖A‖ Q_l Q_rᵀ)⁻¹ P_l b, where the columns of Q_l and Q_r span the null spaces of Aᵀ and A.
 template <class Product>
 at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const at::Tensor& q_left,
                          const Product& product) {
   const int64_t batch = b.size(0), n = b.numel() / batch, channels = n / q_right.size(-1);
+  check_dense_fits(b, n, batch);
   std::vector<at::Tensor> columns;
   for (int64_t j = 0; j < n; ++j) {
     auto unit = at::zeros({batch, n}, b.options());
@@ -213,12 +224,24 @@ at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const a
 
 }  // namespace
 
+std::optional<at::Tensor> SingularOperator::solve_on_axes(const at::Tensor& b, bool transposed) const {
+  if (b.is_cpu() || right_.spans_channels(b)) return std::nullopt;
+  auto a = stencil_of(*a_);
+  if (!a) return std::nullopt;
+  a->transposed = transposed;
+  const NamedNullSpace named{right_.count().expect_int(), right_.is_constant() && left_.is_constant()};
+  const auto u = solve_stencil_on_axes(*a, transposed ? project_solution(b) : project(b), named);
+  return u ? std::optional(transposed ? project(*u) : project_solution(*u)) : std::nullopt;
+}
+
 at::Tensor SingularOperator::solve_directly(const at::Tensor& b) const {
+  if (auto u = solve_on_axes(b, /*transposed=*/false)) return *std::move(u);
   const auto like = b.detach();
   return project_solution(solve_regular(project(b), orthonormal(right_, like), orthonormal(left_, like),
                                         [this](const at::Tensor& v) { return apply(v); }));
 }
 at::Tensor SingularOperator::solve_transpose_directly(const at::Tensor& b) const {
+  if (auto u = solve_on_axes(b, /*transposed=*/true)) return *std::move(u);
   const auto like = b.detach();
   return project(solve_regular(project_solution(b), orthonormal(left_, like), orthonormal(right_, like),
                                [this](const at::Tensor& v) { return apply_transpose(v); }));
