@@ -1,9 +1,26 @@
 #include "prdp/operators/dense.h"
 
+#include "prdp/operators/tensors.h"
+
 namespace prdp {
 
+namespace {
+
+/// With rows and columns brought to one size by powers of two, which change no digit but the choice of pivots: on the
+/// CPU the factorisations of the loops do that.
+at::Tensor solve_equilibrated(const at::Tensor& matrix, const at::Tensor& b) {
+  const auto scale_of = [](const at::Tensor& a, int64_t along) {
+    return power_of_two_scale(a.detach().abs().amax(along, /*keepdim=*/true));
+  };
+  const auto rows = scale_of(matrix, -1), columns = scale_of(rows * matrix, -2);
+  return columns.mT() * std::get<0>(at::linalg_solve_ex(rows * matrix * columns, rows * b));
+}
+
+}  // namespace
+
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b) {
-  if (matrix.dim() < 3 || matrix.size(0) == 1 || !matrix.is_cpu()) return std::get<0>(at::linalg_solve_ex(matrix, b));
+  if (!matrix.is_cpu()) return solve_equilibrated(matrix, b);
+  if (matrix.dim() < 3 || matrix.size(0) == 1) return std::get<0>(at::linalg_solve_ex(matrix, b));
   // One at a time: after torch.set_num_threads, torch factors the matrices of a batch in threads that
   // spoil each other's pivots (pytorch issue 142815).
   std::vector<at::Tensor> solutions;

@@ -10,6 +10,7 @@
 
 #include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/remembered.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/tensor_axes.h"
 #include "prdp/operators/tensors.h"
@@ -36,6 +37,15 @@ Way way_but_for(const std::vector<bool>& rest, const at::Device& device, decltyp
   return {std::move(solve), mask.to(device)};
 }
 
+std::vector<bool> periodic_axes(const OperatorSpec& a) {
+  return {a.parameters.begin(), a.parameters.begin() + std::ssize(a.shape)};
+}
+
+OperatorSpec detached(OperatorSpec a) {
+  a.tensors[0] = a.tensors[0].detach();
+  return a;
+}
+
 Way solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space) {
   if (null_space.vectors > 0 && !null_space.is_constant) return {};
   const CyclicReduction line(coefficients.to(at::kDouble), 8.0 * epsilon_of(coefficients));
@@ -48,160 +58,249 @@ Way solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space)
   });
 }
 
-/// The coefficients (batch or 1, 1 + 2 dim, *shape) on the line of points through the first one: (batch or 1, k, n).
-at::Tensor line_along(const at::Tensor& coefficients, int64_t axis) {
-  auto line = coefficients;
-  for (int64_t d = coefficients.dim() - 1; d >= 2; --d)
-    if (d != 2 + axis) line = line.select(d, 0);
-  return line;
+/// t (batch or 1, n) as a field that varies along this axis alone.
+at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
+  std::vector<int64_t> sizes(dim + 1, 1);
+  sizes[0] = t.size(0);
+  sizes[1 + axis] = t.size(1);
+  return t.reshape(sizes);
 }
 
-/// How far, at most, the coefficients of each sample are from those of the sum that these lines tell.
-at::Tensor distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) {
-  const auto dim = static_cast<int64_t>(lines.size());
-  at::Tensor diagonal;
-  std::vector<at::Tensor> sides;
-  for (int64_t axis = 0; axis < dim; ++axis) {
-    std::vector<int64_t> along(dim + 1, 1);
-    along[0] = coefficients.size(0);
-    along[1 + axis] = coefficients.size(2 + axis);
-    const auto field = [&](int64_t k) { return lines[axis].select(1, k).reshape(along); };
-    add_to(diagonal, axis == 0 ? field(0) : field(0) - per_sample(lines[axis].select(1, 0).select(1, 0), diagonal));
-    for (const int64_t k : {1 + 2 * axis, 2 + 2 * axis}) sides.push_back(coefficients.select(1, k) - field(k));
-  }
-  sides.push_back(coefficients.select(1, 0) - diagonal);
-  return at::stack(sides, 1).abs().flatten(1).amax(1);
-}
-
-/// A sum over axes from its lines on the host, as `host` has them one behind the other.
-kernels::SumOverAxes sum_of(const double* host, at::IntArrayRef shape, const std::vector<bool>& periodic) {
-  const auto dim = static_cast<int64_t>(shape.size());
-  kernels::SumOverAxes sum;
-  for (int64_t axis = dim - 3; axis < dim; ++axis) {
-    const int64_t n = axis < 0 ? 1 : shape[axis];
-    auto& a = sum[3 - dim + axis];
-    a.setZero(n, n);
-    if (axis < 0) continue;
-    const double *diagonal = host, *before = host + (1 + 2 * axis) * n, *behind = before + n;
-    for (int64_t i = 0; i < n; ++i) {
-      a(i, i) = diagonal[i] - (axis + 1 == dim ? 0.0 : diagonal[0]);
-      if (const auto j = kernels::neighbour(i, -1, n, periodic[axis]); j >= 0) a(i, j) = before[i];
-      if (const auto j = kernels::neighbour(i, 1, n, periodic[axis]); j >= 0) a(i, j) = behind[i];
-    }
-    host += (1 + 2 * dim) * n;
-  }
-  return sum;
-}
-
-/// What is read of a sum on the host: its lines, how far the coefficients are from it, the norm, and the diagonal.
+/// What the host reads of coefficients (batch or 1, 1 + 2 dim, *shape), by one copy: those on the line through the
+/// middle point along each axis, which planes at the ends of the axes A is diagonal on, and how far, at most, it is
+/// from the sum that the lines tell on the other points, which are the inner ones.
 class SumOnHost {
  public:
   SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic)
       : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
-    std::vector<at::Tensor> lines, told;
-    for (int64_t axis = 0; axis < std::ssize(shape_); ++axis) {
-      lines.push_back(line_along(coefficients, axis));
-      told.push_back(lines.back().flatten(1));
+    std::vector<at::Tensor> told;
+    at::Tensor inner;
+    for (int64_t axis = 0; axis < dim(); ++axis) {
+      lines_.push_back(middle_line(coefficients, axis));
+      told.push_back(lines_.back().flatten(1));
     }
-    const auto diagonal = coefficients.select(1, 0).abs().flatten(1);
-    told.push_back(at::stack({distance_from_sum(coefficients, lines), coefficients.abs().sum(1).flatten(1).amax(1),
-                              diagonal.amin(1), diagonal.amax(1)},
-                             1));
+    for (int64_t axis = 0; axis < dim(); ++axis) {
+      const auto ends = decoupled_ends(coefficients, axis);
+      told.push_back(ends.to(coefficients.scalar_type()));
+      if (periodic_[axis]) continue;
+      const auto between = ends.new_zeros({ends.size(0), shape_[axis] - 2});
+      const auto of_axis =
+          along(at::cat({ends.narrow(1, 0, 1), between, ends.narrow(1, 1, 1)}, 1).logical_not(), axis, dim());
+      inner = inner.defined() ? inner.logical_and(of_axis) : of_axis;
+    }
+    const auto largest = [&](const at::Tensor& t) {
+      return (inner.defined() ? t.masked_fill(inner.logical_not(), 0.0) : t).flatten(1).amax(1, /*keepdim=*/true);
+    };
+    const auto size = coefficients.abs();
+    told.push_back(largest(distance_from_sum(coefficients)));
+    told.push_back(largest(size.sum(1)));
+    told.push_back(largest(size.select(1, 0)));
+    told.push_back(largest(size.select(1, 0).reciprocal()));
+    told.push_back(size.sum(1).flatten(1).amax(1, /*keepdim=*/true));
     host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
   }
   int64_t samples() const { return host_.size(0); }
-  bool is_finite(int64_t s) const { return std::isfinite(norm(s)); }
-  bool is_sum(int64_t s) const {
-    const double distance = rest(s)[0], least = rest(s)[2], most = rest(s)[3];
-    return distance <= slack(s) && most <= kernels::kWidestRows * least;
-  }
-  /// Nothing unless it is symmetric.
+  bool is_finite(int64_t s) const { return std::isfinite(rest(s)[4]); }
+  /// The sum on the inner points; nothing if A is none, or not symmetric.
   std::optional<kernels::SumOverAxes> sum(int64_t s) const {
-    const auto a = sum_of(lines(s), shape_, periodic_);
+    const double slack = kernels::slack_of_sum(rest(s)[1], epsilon_);
+    const auto box = inner_box(s);
+    const bool has_axes = std::all_of(box.shape.begin(), box.shape.end(), [](int64_t n) { return n >= 3; });
+    if (!has_axes || !(rest(s)[0] <= slack && rest(s)[2] * rest(s)[3] <= kernels::kWidestRows)) return std::nullopt;
+    const auto a = sum_of_lines(s, box);
     const bool symmetric =
-        std::all_of(a.begin(), a.end(), [&](const auto& m) { return kernels::is_symmetric(m, slack(s)); });
+        std::all_of(a.begin(), a.end(), [&](const auto& m) { return kernels::is_symmetric(m, slack); });
     return symmetric ? std::optional(a) : std::nullopt;
+  }
+  InnerBox inner_box(int64_t s) const {
+    InnerBox box{std::vector<int64_t>(dim()), shape_};
+    for (int64_t axis = 0; axis < dim(); ++axis) {
+      box.first[axis] = ends(s)[2 * axis] != 0.0;
+      box.shape[axis] -= box.first[axis] + (ends(s)[2 * axis + 1] != 0.0);
+    }
+    return box;
   }
   kernels::FactorKey key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
     const auto device = options.device();
     const auto dtype = c10::typeMetaToScalarType(options.dtype());
     kernels::FactorKeyMaker key;
-    key.add(lines(s), host_.size(1) - 4).add(shape_.data(), std::ssize(shape_)).add(null_vectors);
+    key.add(of_sample(s), host_.size(1) - 5).add(shape_.data(), dim()).add(null_vectors);
     for (const bool closed : periodic_) key.add(int64_t{closed});
-    return key.add(static_cast<int64_t>(dtype))
-        .add(static_cast<int64_t>(device.type()))
-        .add(int64_t{device.index()})
-        .key();
+    key.add(static_cast<int64_t>(dtype)).add(static_cast<int64_t>(device.type())).add(int64_t{device.index()});
+    return key.key();
   }
   double epsilon() const { return epsilon_; }
-  const std::vector<int64_t>& shape() const { return shape_; }
 
  private:
-  const double* lines(int64_t s) const { return host_.const_data_ptr<double>() + s * host_.size(1); }
-  const double* rest(int64_t s) const { return lines(s) + host_.size(1) - 4; }
-  double norm(int64_t s) const { return rest(s)[1]; }
-  double slack(int64_t s) const { return kernels::slack_of_sum(norm(s), epsilon_); }
+  int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
+  int64_t middle(int64_t axis) const { return shape_[axis] / 2; }
+
+  /// (batch or 1, k, n)
+  at::Tensor middle_line(const at::Tensor& coefficients, int64_t axis) const {
+    auto line = coefficients;
+    for (int64_t d = dim() - 1; d >= 0; --d)
+      if (d != axis) line = line.select(2 + d, middle(d));
+    return line;
+  }
+  /// Whether nothing couples the points of the first, and of the last plane to any others: (batch or 1, 2).
+  at::Tensor decoupled_ends(const at::Tensor& coefficients, int64_t axis) const {
+    if (periodic_[axis]) return at::zeros({coefficients.size(0), 2}, coefficients.options().dtype(at::kBool));
+    std::vector<at::Tensor> ends;
+    for (const int64_t end : {0, 1}) {
+      const int64_t place = end == 0 ? 0 : shape_[axis] - 1, beside = end == 0 ? 1 : shape_[axis] - 2;
+      const auto of_plane = coefficients.select(2 + axis, place).narrow(1, 1, 2 * dim()).ne(0).flatten(1);
+      const auto of_beside = coefficients.select(2 + axis, beside).select(1, 1 + 2 * axis + end).ne(0).flatten(1);
+      ends.push_back(at::cat({of_plane, of_beside}, 1).any(1).logical_not());
+    }
+    return at::stack(ends, 1);
+  }
+  /// The largest of all coefficients of a point.
+  at::Tensor distance_from_sum(const at::Tensor& coefficients) const {
+    at::Tensor diagonal;
+    std::vector<at::Tensor> apart;
+    for (int64_t axis = 0; axis < dim(); ++axis) {
+      const auto field = [&](int64_t k) { return along(lines_[axis].select(1, k), axis, dim()); };
+      const auto more =
+          axis == 0 ? field(0) : field(0) - along(lines_[axis].select(1, 0).narrow(1, middle(axis), 1), axis, dim());
+      add_to(diagonal, more);
+      for (const int64_t k : {1 + 2 * axis, 2 + 2 * axis}) apart.push_back(coefficients.select(1, k) - field(k));
+    }
+    apart.push_back(coefficients.select(1, 0) - diagonal);
+    return at::stack(apart, 1).abs().amax(1);
+  }
+  kernels::SumOverAxes sum_of_lines(int64_t s, const InnerBox& box) const {
+    kernels::SumOverAxes sum;
+    const double* line = of_sample(s);
+    for (int64_t axis = dim() - 3; axis < dim(); ++axis) {
+      const int64_t n = axis < 0 ? 1 : box.shape[axis];
+      auto& a = sum[3 - dim() + axis];
+      a.setZero(n, n);
+      if (axis < 0) continue;
+      const int64_t whole = shape_[axis];
+      const double *diagonal = line + box.first[axis], *before = diagonal + (1 + 2 * axis) * whole,
+                   *behind = before + whole;
+      const double of_others = axis + 1 == dim() ? 0.0 : line[middle(axis)];
+      for (int64_t i = 0; i < n; ++i) {
+        a(i, i) = diagonal[i] - of_others;
+        if (const auto j = kernels::neighbour(i, -1, n, periodic_[axis]); j >= 0) a(i, j) = before[i];
+        if (const auto j = kernels::neighbour(i, 1, n, periodic_[axis]); j >= 0) a(i, j) = behind[i];
+      }
+      line += (1 + 2 * dim()) * whole;
+    }
+    return sum;
+  }
+
+  const double* of_sample(int64_t s) const { return host_.const_data_ptr<double>() + s * host_.size(1); }
+  const double* rest(int64_t s) const { return of_sample(s) + host_.size(1) - 5; }
+  const double* ends(int64_t s) const { return rest(s) - 2 * dim(); }
 
   std::vector<int64_t> shape_;
   std::vector<bool> periodic_;
   double epsilon_;
+  std::vector<at::Tensor> lines_;
   at::Tensor host_;
 };
 
 using Inverse = std::shared_ptr<const TensorAxes>;
 
+/// The keys of what the last few coefficients led to on this thread, which need not be looked at again: those of a flow
+/// are the same tensors in every step.
+class LastSums {
+ public:
+  /// Empty if any of them is not known any more.
+  std::vector<Inverse> find(const OperatorSpec& a, int64_t null_vectors) const {
+    for (const auto& known : known_) {
+      if (known.null_vectors != null_vectors || !known.of.is(a, a.tensors[0].scalar_type())) continue;
+      std::vector<Inverse> inverses;
+      for (const auto& key : known.keys)
+        if (auto kept = factor_cache::find(key, typeid(TensorAxes)))
+          inverses.push_back(std::static_pointer_cast<const TensorAxes>(std::move(kept)));
+      if (inverses.size() == known.keys.size()) return inverses;
+    }
+    return {};
+  }
+  void keep(const OperatorSpec& a, int64_t null_vectors, std::vector<kernels::FactorKey> keys) {
+    auto& oldest = known_[next_++ % known_.size()];
+    oldest.of.take(a, a.tensors[0].scalar_type());
+    oldest.null_vectors = null_vectors;
+    oldest.keys = std::move(keys);
+  }
+  static LastSums& local() {
+    static thread_local LastSums last;
+    return last;
+  }
+
+ private:
+  struct Known {
+    Remembered of;
+    int64_t null_vectors = 0;
+    std::vector<kernels::FactorKey> keys;
+  };
+  std::array<Known, 4> known_;
+  size_t next_ = 0;
+};
+
 /// Null if the sample is no such sum.
-Inverse inverse_of(const SumOnHost& told, int64_t s, int64_t null_vectors, const at::TensorOptions& options) {
-  if (!told.is_finite(s) || !told.is_sum(s)) return nullptr;
-  const auto sum = told.sum(s);
+Inverse inverse_of(const SumOnHost& told, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
+                   const at::TensorOptions& options) {
+  const auto sum = told.is_finite(s) ? told.sum(s) : std::nullopt;
   if (!sum) return nullptr;
-  return factor_cache::find_or_make<TensorAxes>(told.key(s, null_vectors, options), [&] {
-    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, told.epsilon(), null_vectors), told.shape(),
+  return factor_cache::find_or_make<TensorAxes>(key, [&] {
+    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, told.epsilon(), null_vectors), told.inner_box(s),
                                         options);
   });
 }
 
 /// Samples of the same inverse at once.
-at::Tensor solve_by(const std::vector<Inverse>& inverses, const at::Tensor& b) {
-  const auto solve = [](const Inverse& inverse, const at::Tensor& part) {
-    return inverse ? inverse->solve(part) : at::full_like(part, NAN);
+at::Tensor solve_by(const std::vector<Inverse>& inverses, const at::Tensor& b, const at::Tensor& diagonal) {
+  const auto solve = [&](const Inverse& inverse, const at::Tensor& part, const at::Tensor& its_diagonal) {
+    return inverse ? inverse->solve(part, its_diagonal) : at::full_like(part, NAN);
   };
   if (std::all_of(inverses.begin(), inverses.end(), [&](const auto& i) { return i == inverses[0]; }))
-    return solve(inverses[0], b);
+    return solve(inverses[0], b, diagonal);
   std::map<Inverse, std::vector<int64_t>> groups;
   for (size_t s = 0; s < inverses.size(); ++s) groups[inverses[s]].push_back(static_cast<int64_t>(s));
   auto u = at::empty_like(b);
   for (const auto& [inverse, samples] : groups) {
     const auto index = at::tensor(samples, at::kLong).to(b.device());
-    u.index_copy_(0, index, solve(inverse, b.index_select(0, index)));
+    u.index_copy_(0, index, solve(inverse, b.index_select(0, index), diagonal.index_select(0, index)));
   }
   return u;
 }
 
-Way solve_sum(const at::Tensor& coefficients, const std::vector<bool>& periodic, int64_t null_vectors) {
-  const SumOnHost told(coefficients, periodic);
-  std::vector<Inverse> inverses;
-  std::vector<bool> rest;
-  for (int64_t s = 0; s < told.samples(); ++s) {
-    inverses.push_back(inverse_of(told, s, null_vectors, coefficients.options()));
-    rest.push_back(!inverses.back() && told.is_finite(s));
+Way solve_sum(const OperatorSpec& a, int64_t null_vectors) {
+  auto inverses = LastSums::local().find(a, null_vectors);
+  std::vector<bool> rest(inverses.size());
+  if (inverses.empty()) {
+    const auto coefficients =
+        StencilOperator(detached(a)).nearest_coefficients(/*transposed=*/false);  // sums are symmetric
+    if (!coefficients.defined()) return {};
+    const SumOnHost told(coefficients, periodic_axes(a));
+    std::vector<kernels::FactorKey> keys;
+    for (int64_t s = 0; s < told.samples(); ++s) {
+      keys.push_back(told.key(s, null_vectors, coefficients.options()));
+      inverses.push_back(inverse_of(told, s, keys.back(), null_vectors, coefficients.options()));
+      rest.push_back(!inverses.back() && told.is_finite(s));
+    }
+    const auto is_null = [](const Inverse& inverse) { return !inverse; };
+    if (std::none_of(inverses.begin(), inverses.end(), is_null))
+      LastSums::local().keep(a, null_vectors, std::move(keys));
   }
-  return way_but_for(rest, coefficients.device(), [inverses](const at::Tensor& b) { return solve_by(inverses, b); });
+  const auto diagonal = StencilOperator(detached(a)).diagonal();
+  return way_but_for(rest, a.tensors[0].device(),
+                     [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
 }
 
 Way find_way(const OperatorSpec& a, const NamedNullSpace& null_space) {
   const at::NoGradGuard no_grad;
-  auto plain = a;
-  plain.tensors[0] = a.tensors[0].detach();
   const auto dim = static_cast<int64_t>(a.shape.size());
+  if (dim == 1) {
+    const auto coefficients = StencilOperator(detached(a)).nearest_coefficients(a.transposed);
+    return coefficients.defined() ? solve_line(coefficients, null_space) : Way{};
+  }
   std::array<int64_t, 3> shape{1, 1, 1};
   std::copy(a.shape.begin(), a.shape.end(), shape.end() - dim);
-  if (dim > 1 && !kernels::has_axes_to_diagonalise(dim, shape.data())) return {};
-  const auto coefficients =
-      StencilOperator(plain).nearest_coefficients(a.transposed && dim == 1);  // sums are symmetric
-  if (!coefficients.defined()) return {};
-  if (dim == 1) return solve_line(coefficients, null_space);
-  return solve_sum(coefficients, {a.parameters.begin(), a.parameters.begin() + dim}, null_space.vectors);
+  return kernels::has_axes_to_diagonalise(dim, shape.data()) ? solve_sum(a, null_space.vectors) : Way{};
 }
 
 at::Tensor solve_densely(const OperatorSpec& a, const at::Tensor& b) {

@@ -28,28 +28,42 @@ at::Tensor along_axes(const at::Tensor& v, at::TensorList matrices, bool transpo
   return w;
 }
 
-TensorAxes::TensorAxes(const kernels::DiagonalisedSum& a, at::IntArrayRef shape, const at::TensorOptions& options)
-    : shape_(shape.vec()) {
+at::Tensor InnerBox::of(at::Tensor t) const {
+  const auto axes = static_cast<int64_t>(shape.size());
+  for (int64_t axis = 0; axis < axes; ++axis) t = t.narrow(t.dim() - axes + axis, first[axis], shape[axis]);
+  return t;
+}
+
+TensorAxes::TensorAxes(const kernels::DiagonalisedSum& a, InnerBox box, const at::TensorOptions& options)
+    : box_(std::move(box)) {
   if (!a.inverse) return;
-  const auto here = at::tensor(*a.inverse, at::kDouble).view(shape);
+  const auto here = at::tensor(*a.inverse, at::kDouble).view(box_.shape);
   if (a.eigenvectors) {
-    for (size_t axis = 3 - shape_.size(); axis < 3; ++axis)
+    for (size_t axis = 3 - box_.shape.size(); axis < 3; ++axis)
       eigenvectors_.push_back(on_device((*a.eigenvectors)[axis], options));
     inverse_ = here.to(options.device());
   } else {
-    const int64_t kept = shape_.back() / 2 + 1;  // of the waves, by a real transform
+    const int64_t kept = box_.shape.back() / 2 + 1;  // of the waves, by a real transform
     inverse_ = here.narrow(-1, 0, kept).contiguous().to(options.dtype()).to(options.device());
   }
 }
 
-at::Tensor TensorAxes::solve(const at::Tensor& b) const {
+at::Tensor TensorAxes::solve(const at::Tensor& b, const at::Tensor& diagonal) const {
+  const auto inside = box_.of(b);
+  if (inside.sizes() == b.sizes()) return solve_inside(b);
+  auto u = b / diagonal;
+  box_.of(u).copy_(solve_inside(inside));
+  return u;
+}
+
+at::Tensor TensorAxes::solve_inside(const at::Tensor& b) const {
   if (!inverse_.defined()) return at::full_like(b, std::numeric_limits<double>::quiet_NaN());
   if (!eigenvectors_.empty())
     return along_axes(along_axes(b, eigenvectors_, /*transposed=*/true) * inverse_, eigenvectors_, false)
         .to(b.scalar_type());
-  std::vector<int64_t> axes(shape_.size());
+  std::vector<int64_t> axes(box_.shape.size());
   std::iota(axes.begin(), axes.end(), 2);
-  return at::fft_irfftn(at::fft_rfftn(b, std::nullopt, axes) * inverse_, at::IntArrayRef(shape_), axes);
+  return at::fft_irfftn(at::fft_rfftn(b, std::nullopt, axes) * inverse_, at::IntArrayRef(box_.shape), axes);
 }
 
 int64_t TensorAxes::bytes() const {

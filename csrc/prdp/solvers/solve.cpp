@@ -5,6 +5,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve_direct.h"
 #include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/solvers/solve_samples.h"
 #include "prdp/solvers/unnamed_null_space.h"
@@ -95,6 +96,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   if (!found && b.is_cpu() && runs_on_loops(request.solver))
     found =
         b.scalar_type() == at::kFloat ? solve_on_loops<float>(a, b, request) : solve_on_loops<double>(a, b, request);
+  if (!found) found = solve_direct_at_once(a, b, request);
   auto result = found ? *std::move(found) : solve_with_tensors(a, b, request);
   find_inconsistent_constants(a, b, request, result);
   return result;
