@@ -1,6 +1,8 @@
 #include "prdp/operators/cyclic_reduction.h"
 
-#include <limits>
+#include <cmath>
+
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -71,7 +73,7 @@ at::Tensor CyclicReduction::solve(const at::Tensor& b) const {
   const auto column = reduced.narrow(1, 0, 1), v = reduced.narrow(1, 1, rows.size(1));
   const auto border_product = [&](const at::Tensor& t) { return (border_.unsqueeze(1) * t).sum(2, /*keepdim=*/true); };
   const auto corner = corner_.unsqueeze(1), taken_off = border_product(column), pivot = corner - taken_off;
-  const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(n_);
+  const double rounding = epsilon_of(coefficients_) * static_cast<double>(n_);
   const auto regular = pivot.abs().gt((corner.abs() + taken_off.abs()) * rounding);
   const auto last = (rows.narrow(2, n_ - 1, 1) - border_product(v)) / pivot.masked_fill(regular.logical_not(), NAN);
   return at::cat({at::addcmul(v, column, last, -1), last}, 2).view_as(b);

@@ -8,14 +8,14 @@ namespace prdp {
 /// stable for the same matrices: those that are diagonally dominant by rows or by columns.
 class CyclicReduction {
  public:
-  /// `coefficients`: (batch or 1, 3, n) in double, the diagonal and what couples a point to those before and behind it;
+  /// `coefficients`: (batch or 1, 3, n), the diagonal and what couples a point to those before and behind it;
   /// zero where there is none. `slack`: what rounding may hide of the dominance.
   CyclicReduction(const at::Tensor& coefficients, double slack);
 
   /// Which matrices are dominant, or not finite: (batch or 1,).
   at::Tensor is_dominant() const;
-  /// A⁻¹ b for b (batch, channels, n) in double; NaN where A is singular: where its last pivot, the only one that a
-  /// dominant matrix may lose, is rounding.
+  /// A⁻¹ b for b (batch, channels, n) in their dtype; NaN where A is singular: where its last pivot, the only one that
+  /// a dominant matrix may lose, is rounding.
   at::Tensor solve(const at::Tensor& b) const;
   /// The same where A and Aᵀ map the constant to zero: a solution of mean zero, for b of mean zero.
   at::Tensor solve_with_constant(const at::Tensor& b) const;

@@ -21,13 +21,14 @@ at::Tensor LaplacianOperator::diagonal() const {
 
 namespace {
 
-/// The sine bases of all axes and the eigenvalues of L, in double.
+/// The sine bases of all axes and the eigenvalues of L, on a device.
 struct SineAxes {
   std::vector<at::Tensor> bases;
   at::Tensor eigenvalues;
 
-  SineAxes(const Grid& grid, const at::TensorOptions& real) : eigenvalues(laplacian_eigenvalues(grid, real)) {
-    for (const int64_t n : grid.shape()) bases.push_back(sine_basis(n, real));
+  SineAxes(const Grid& grid, const at::TensorOptions& real)
+      : eigenvalues(laplacian_eigenvalues(grid, at::kDouble).to(real)) {
+    for (const int64_t n : grid.shape()) bases.push_back(sine_basis(n, at::kDouble).to(real));
   }
   int64_t bytes() const {
     auto sum = static_cast<int64_t>(eigenvalues.nbytes());
@@ -45,7 +46,7 @@ struct SineAxes {
 }  // namespace
 
 at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
-  const auto real = b.options().dtype(at::kDouble);
+  const auto real = b.options().dtype(widest_real(b.device()));
   constexpr int64_t longest_alone = 4096;  // a longer basis takes more memory than the vectors of a large batch
   if (grid_.dim() == 1 && grid_.shape()[0] > longest_alone) {
     const double per_cell2 = 1.0 / (grid_.dx(0) * grid_.dx(0));
@@ -53,7 +54,7 @@ at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
     const auto beside = (of(per_cell2) - of(0.0)).expand({grid_.shape()[0] - 1});
     const auto coefficients = at::stack({of(-2.0 * per_cell2).expand({grid_.shape()[0]}),
                                          at::constant_pad_nd(beside, {1, 0}), at::constant_pad_nd(beside, {0, 1})});
-    return CyclicReduction(coefficients.unsqueeze(0), 0.0).solve(b.to(at::kDouble)).to(b.scalar_type());
+    return CyclicReduction(coefficients.unsqueeze(0), 0.0).solve(b.to(real)).to(b.scalar_type());
   }
   const auto axes = SineAxes::find_or_make(grid_, real);
   const auto waves = along_axes(b, axes->bases, /*transposed=*/false) / symbol(axes->eigenvalues);

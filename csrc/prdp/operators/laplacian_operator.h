@@ -41,7 +41,7 @@ class LaplacianOperator : public Operator {
   Grid grid_;
 
  private:
-  /// The exact solve without loops: sine transforms in double, and cyclic reduction on a long line.
+  /// The exact solve without loops: sine transforms, and cyclic reduction on a long line.
   at::Tensor solve_on_device(const at::Tensor& b) const;
 };
 

@@ -12,7 +12,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/remembered.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/operators/tensor_axes.h"
+#include "prdp/operators/sum_on_host.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -48,158 +48,16 @@ OperatorSpec detached(OperatorSpec a) {
 
 Way solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space) {
   if (null_space.vectors > 0 && !null_space.is_constant) return {};
-  const CyclicReduction line(coefficients.to(at::kDouble), 8.0 * epsilon_of(coefficients));
+  const auto real = widest_real(coefficients.device());
+  const CyclicReduction line(coefficients.to(real), 8.0 * epsilon_of(coefficients));
   const auto dominant = line.is_dominant().to(at::kCPU);
   std::vector<bool> rest;
   for (int64_t s = 0; s < dominant.size(0); ++s) rest.push_back(!dominant.const_data_ptr<bool>()[s]);
-  return way_but_for(rest, coefficients.device(), [line, null_space](const at::Tensor& b) {
-    const auto rhs = b.to(at::kDouble);
+  return way_but_for(rest, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
+    const auto rhs = b.to(real);
     return (null_space.is_constant ? line.solve_with_constant(rhs) : line.solve(rhs)).to(b.scalar_type());
   });
 }
-
-/// t (batch or 1, n) as a field that varies along this axis alone.
-at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
-  std::vector<int64_t> sizes(dim + 1, 1);
-  sizes[0] = t.size(0);
-  sizes[1 + axis] = t.size(1);
-  return t.reshape(sizes);
-}
-
-/// What the host reads of coefficients (batch or 1, 1 + 2 dim, *shape), by one copy: those on the line through the
-/// middle point along each axis, which planes at the ends of the axes A is diagonal on, and how far, at most, it is
-/// from the sum that the lines tell on the other points, which are the inner ones.
-class SumOnHost {
- public:
-  SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic)
-      : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
-    std::vector<at::Tensor> told;
-    at::Tensor inner;
-    for (int64_t axis = 0; axis < dim(); ++axis) {
-      lines_.push_back(middle_line(coefficients, axis));
-      told.push_back(lines_.back().flatten(1));
-    }
-    for (int64_t axis = 0; axis < dim(); ++axis) {
-      const auto ends = decoupled_ends(coefficients, axis);
-      told.push_back(ends.to(coefficients.scalar_type()));
-      if (periodic_[axis]) continue;
-      const auto between = ends.new_zeros({ends.size(0), shape_[axis] - 2});
-      const auto of_axis =
-          along(at::cat({ends.narrow(1, 0, 1), between, ends.narrow(1, 1, 1)}, 1).logical_not(), axis, dim());
-      inner = inner.defined() ? inner.logical_and(of_axis) : of_axis;
-    }
-    const auto largest = [&](const at::Tensor& t) {
-      return (inner.defined() ? t.masked_fill(inner.logical_not(), 0.0) : t).flatten(1).amax(1, /*keepdim=*/true);
-    };
-    const auto size = coefficients.abs();
-    told.push_back(largest(distance_from_sum(coefficients)));
-    told.push_back(largest(size.sum(1)));
-    told.push_back(largest(size.select(1, 0)));
-    told.push_back(largest(size.select(1, 0).reciprocal()));
-    told.push_back(size.sum(1).flatten(1).amax(1, /*keepdim=*/true));
-    host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
-  }
-  int64_t samples() const { return host_.size(0); }
-  bool is_finite(int64_t s) const { return std::isfinite(rest(s)[4]); }
-  /// The sum on the inner points; nothing if A is none, or not symmetric.
-  std::optional<kernels::SumOverAxes> sum(int64_t s) const {
-    const double slack = kernels::slack_of_sum(rest(s)[1], epsilon_);
-    const auto box = inner_box(s);
-    const bool has_axes = std::all_of(box.shape.begin(), box.shape.end(), [](int64_t n) { return n >= 3; });
-    if (!has_axes || !(rest(s)[0] <= slack && rest(s)[2] * rest(s)[3] <= kernels::kWidestRows)) return std::nullopt;
-    const auto a = sum_of_lines(s, box);
-    const bool symmetric =
-        std::all_of(a.begin(), a.end(), [&](const auto& m) { return kernels::is_symmetric(m, slack); });
-    return symmetric ? std::optional(a) : std::nullopt;
-  }
-  InnerBox inner_box(int64_t s) const {
-    InnerBox box{std::vector<int64_t>(dim()), shape_};
-    for (int64_t axis = 0; axis < dim(); ++axis) {
-      box.first[axis] = ends(s)[2 * axis] != 0.0;
-      box.shape[axis] -= box.first[axis] + (ends(s)[2 * axis + 1] != 0.0);
-    }
-    return box;
-  }
-  kernels::FactorKey key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
-    const auto device = options.device();
-    const auto dtype = c10::typeMetaToScalarType(options.dtype());
-    kernels::FactorKeyMaker key;
-    key.add(of_sample(s), host_.size(1) - 5).add(shape_.data(), dim()).add(null_vectors);
-    for (const bool closed : periodic_) key.add(int64_t{closed});
-    key.add(static_cast<int64_t>(dtype)).add(static_cast<int64_t>(device.type())).add(int64_t{device.index()});
-    return key.key();
-  }
-  double epsilon() const { return epsilon_; }
-
- private:
-  int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
-  int64_t middle(int64_t axis) const { return shape_[axis] / 2; }
-
-  /// (batch or 1, k, n)
-  at::Tensor middle_line(const at::Tensor& coefficients, int64_t axis) const {
-    auto line = coefficients;
-    for (int64_t d = dim() - 1; d >= 0; --d)
-      if (d != axis) line = line.select(2 + d, middle(d));
-    return line;
-  }
-  /// Whether nothing couples the points of the first, and of the last plane to any others: (batch or 1, 2).
-  at::Tensor decoupled_ends(const at::Tensor& coefficients, int64_t axis) const {
-    if (periodic_[axis]) return at::zeros({coefficients.size(0), 2}, coefficients.options().dtype(at::kBool));
-    std::vector<at::Tensor> ends;
-    for (const int64_t end : {0, 1}) {
-      const int64_t place = end == 0 ? 0 : shape_[axis] - 1, beside = end == 0 ? 1 : shape_[axis] - 2;
-      const auto of_plane = coefficients.select(2 + axis, place).narrow(1, 1, 2 * dim()).ne(0).flatten(1);
-      const auto of_beside = coefficients.select(2 + axis, beside).select(1, 1 + 2 * axis + end).ne(0).flatten(1);
-      ends.push_back(at::cat({of_plane, of_beside}, 1).any(1).logical_not());
-    }
-    return at::stack(ends, 1);
-  }
-  /// The largest of all coefficients of a point.
-  at::Tensor distance_from_sum(const at::Tensor& coefficients) const {
-    at::Tensor diagonal;
-    std::vector<at::Tensor> apart;
-    for (int64_t axis = 0; axis < dim(); ++axis) {
-      const auto field = [&](int64_t k) { return along(lines_[axis].select(1, k), axis, dim()); };
-      const auto more =
-          axis == 0 ? field(0) : field(0) - along(lines_[axis].select(1, 0).narrow(1, middle(axis), 1), axis, dim());
-      add_to(diagonal, more);
-      for (const int64_t k : {1 + 2 * axis, 2 + 2 * axis}) apart.push_back(coefficients.select(1, k) - field(k));
-    }
-    apart.push_back(coefficients.select(1, 0) - diagonal);
-    return at::stack(apart, 1).abs().amax(1);
-  }
-  kernels::SumOverAxes sum_of_lines(int64_t s, const InnerBox& box) const {
-    kernels::SumOverAxes sum;
-    const double* line = of_sample(s);
-    for (int64_t axis = dim() - 3; axis < dim(); ++axis) {
-      const int64_t n = axis < 0 ? 1 : box.shape[axis];
-      auto& a = sum[3 - dim() + axis];
-      a.setZero(n, n);
-      if (axis < 0) continue;
-      const int64_t whole = shape_[axis];
-      const double *diagonal = line + box.first[axis], *before = diagonal + (1 + 2 * axis) * whole,
-                   *behind = before + whole;
-      const double of_others = axis + 1 == dim() ? 0.0 : line[middle(axis)];
-      for (int64_t i = 0; i < n; ++i) {
-        a(i, i) = diagonal[i] - of_others;
-        if (const auto j = kernels::neighbour(i, -1, n, periodic_[axis]); j >= 0) a(i, j) = before[i];
-        if (const auto j = kernels::neighbour(i, 1, n, periodic_[axis]); j >= 0) a(i, j) = behind[i];
-      }
-      line += (1 + 2 * dim()) * whole;
-    }
-    return sum;
-  }
-
-  const double* of_sample(int64_t s) const { return host_.const_data_ptr<double>() + s * host_.size(1); }
-  const double* rest(int64_t s) const { return of_sample(s) + host_.size(1) - 5; }
-  const double* ends(int64_t s) const { return rest(s) - 2 * dim(); }
-
-  std::vector<int64_t> shape_;
-  std::vector<bool> periodic_;
-  double epsilon_;
-  std::vector<at::Tensor> lines_;
-  at::Tensor host_;
-};
 
 using Inverse = std::shared_ptr<const TensorAxes>;
 

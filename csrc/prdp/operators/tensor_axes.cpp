@@ -9,14 +9,14 @@ namespace {
 at::Tensor on_device(const Eigen::MatrixXd& matrix, const at::TensorOptions& options) {
   const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> rows = matrix;
   const auto here = at::from_blob(const_cast<double*>(rows.data()), {rows.rows(), rows.cols()}, at::kDouble).clone();
-  return here.to(options.device());
+  return here.to(options.device(), widest_real(options.device()));
 }
 
 }  // namespace
 
 at::Tensor along_axes(const at::Tensor& v, at::TensorList matrices, bool transposed) {
   const int64_t samples = v.size(0), first = v.dim() - static_cast<int64_t>(matrices.size());
-  auto w = v.to(at::kDouble);
+  auto w = v.to(matrices[0].scalar_type());
   for (int64_t axis = v.dim() - 1; axis >= first; --axis) {
     const auto& matrix = matrices[axis - first];
     // A product for each sample: that of all rows at once would add up in an order that depends on how many there are.
@@ -41,7 +41,7 @@ TensorAxes::TensorAxes(const kernels::DiagonalisedSum& a, InnerBox box, const at
   if (a.eigenvectors) {
     for (size_t axis = 3 - box_.shape.size(); axis < 3; ++axis)
       eigenvectors_.push_back(on_device((*a.eigenvectors)[axis], options));
-    inverse_ = here.to(options.device());
+    inverse_ = here.to(options.device(), widest_real(options.device()));
   } else {
     const int64_t kept = box_.shape.back() / 2 + 1;  // of the waves, by a real transform
     inverse_ = here.narrow(-1, 0, kept).contiguous().to(options.dtype()).to(options.device());

@@ -5,9 +5,14 @@
 
 namespace prdp {
 
+/// float64, where a device has it.
+inline at::ScalarType widest_real(const at::Device& device) {
+  return device.type() == at::kMPS ? at::kFloat : at::kDouble;
+}
+
 /// v (batch, channel, *shape) with a matrix (n, n) along each axis of the grid, or with its transpose: one product with
-/// small matrices an axis. A float32 v is taken in double: its products would round to TF32 where a program allows
-/// that.
+/// small matrices an axis. v takes the dtype of the matrices: products in float32 would round to TF32 where a program
+/// allows that.
 at::Tensor along_axes(const at::Tensor& v, at::TensorList matrices, bool transposed);
 
 /// The points of a grid without some planes at the ends of its axes: those from `first` on.
@@ -34,7 +39,7 @@ class TensorAxes {
   at::Tensor solve_inside(const at::Tensor& b) const;
 
   InnerBox box_;
-  std::vector<at::Tensor> eigenvectors_;  // of each axis, in double; none: the waves of a periodic box
+  std::vector<at::Tensor> eigenvectors_;  // of each axis, in widest_real(); none: the waves of a periodic box
   at::Tensor inverse_;                    // of the eigenvalues; undefined: A is singular
 };
 

@@ -29,14 +29,14 @@ std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Ten
   if (!is_for(b, request)) return std::nullopt;
   const at::NoGradGuard no_grad;
   const auto batch = prepare_batch(a, b, request, at::zeros_like(b));
-  const auto x = a.project_solution(a.solve_directly(batch.rhs));
+  const auto x = a.solve_directly(batch.rhs);
   const auto r = a.project(batch.rhs - a.apply(x));
-  auto u = x / batch.scale;
-  const auto number = [](const at::Tensor& t) { return t.flatten().to(at::kDouble); };
+  auto u = a.project_solution(x) / batch.scale;
+  const auto number = [&](const at::Tensor& t) { return t.flatten().to(b.scalar_type()); };
   const auto host =
       at::stack({number(batch.status), number(batch.inconsistent), number(dot_in_order(batch.rhs, batch.rhs)),
                  number(dot_in_order(r, r)), number(largest_magnitude(u))})
-          .to(at::kCPU);
+          .to(at::kCPU, at::kDouble);
   const int64_t samples = b.size(0);
   const auto status = host[0].to(at::kLong), inconsistent = host[1], b2 = host[2], r2 = host[3], largest = host[4];
   const auto solved = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
