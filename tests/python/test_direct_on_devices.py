@@ -231,6 +231,13 @@ def test_samples_of_all_kinds_beside_each_other(boundary):
         assert torch.equal(alone.residual[0], found.residual[s])
 
 
+def test_a_penalty_along_a_whole_line_of_cells_is_no_constant_coefficient():
+    c, b = box(1), random(1, 1, 6, 7)
+    c[0, 0, :, 3] += 1e20
+    found = there(in_a_box("zero"), c, b)
+    assert_close(found.u, lapack(operators.Stencil(c, FIVE, "zero"), b), F64)
+
+
 def test_lines_of_all_kinds_beside_each_other():
     c, b = line(12, "rows", "periodic", F64, batch=7), random(7, 2, 12)
     c[1] = line(12, "neither", "periodic", F64)[0]
