@@ -37,6 +37,21 @@ def far_stencil():
     return torch.stack([noise(*SHAPE).abs() + 4, noise(*SHAPE), noise(*SHAPE)])[None]
 
 
+def sparse(matrices, dtype):
+    """Dominant, a third of the entries, each matrix with as many but in other places; one row is its diagonal alone."""
+    a = 9.0 * torch.eye(9, dtype=dtype).repeat(matrices, 1, 1)
+    for m in range(matrices):
+        places = torch.randperm(72, generator=torch.Generator().manual_seed(m))[:18]
+        rows, cols = places // 8 + 1, places % 9
+        keep = (rows < 9) & (rows != cols)
+        a[m, rows[keep], cols[keep]] = noise(18, seed=m, dtype=dtype)[keep]
+    stored = (a != 0).sum((1, 2))
+    for m in range(matrices):  # as many in each
+        free = (a[m, 1:] == 0).nonzero()[: int(stored.max() - stored[m])]
+        a[m, free[:, 0] + 1, free[:, 1]] = 0.5
+    return a
+
+
 def nearly_singular():
     """In float32: GMRES damps its least squares."""
     left, right = (torch.linalg.qr(noise(4, 4, seed=seed))[0] for seed in (7, 8))
@@ -48,22 +63,43 @@ OPERATORS = {
     "heat 2D": lambda dtype: operators.Heat(SHAPE, torch.tensor(0.03, dtype=dtype), 1.0, length=(1.0, 2.0)),
     "poisson 3D": lambda dtype: operators.Poisson((3, 4, 5)),
     "diffusion": symmetric,
+    "robin": lambda dtype: operators.Diffusion(
+        noise(3, 3, 4, 5, seed=2, dtype=dtype).exp(),
+        shift=20 + noise(1, 3, 4, 5, seed=4, dtype=dtype),
+        boundary=("periodic", ("zero", ("robin", 3.0)), (("robin", noise(3, 3, 4, seed=6, dtype=dtype).exp()), "flux")),
+        length=(1.0, 2.0, 0.5),
+        faces="arithmetic",
+    ),
+    "closed": lambda dtype: operators.Diffusion(noise(1, 8, seed=2, dtype=dtype).exp(), boundary="flux"),
     "stencil": lambda dtype: operators.Stencil(coefficients(dtype), OFFSETS, ("zero", "periodic")),
     "far stencil": lambda dtype: operators.Stencil(far_stencil().to(dtype), FAR, "zero"),
     "burgers": lambda dtype: operators.Burgers(noise(3, 2, *SHAPE, dtype=dtype), 0.05, 0.02),
+    "burgers 1D": lambda dtype: operators.Burgers(noise(1, 1, 11, dtype=dtype), torch.tensor(0.05), 0.02),
+    "navier-stokes": lambda dtype: operators.NavierStokes(noise(3, 3, *SHAPE, dtype=dtype), 0.05, 0.02),
+    "two rows": lambda dtype: operators.NavierStokes(noise(1, 2, 2, 7, dtype=dtype), 0.05, 0.2),
+    "sparse": lambda dtype: sparse(3, dtype)[0].to_sparse_csr(),
+    "sparse matrices": lambda dtype: sparse(3, dtype).to_sparse_csr(),
     "matrix": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(9, 9, dtype=dtype),
     "singular": lambda dtype: nearly_singular().to(dtype),
     "matrices": lambda dtype: 9 * torch.eye(9, dtype=dtype) + noise(3, 9, 9, dtype=dtype),
 }  # fmt: skip
-SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion"]
+SYMMETRIC = ["heat 1D", "heat 2D", "poisson 3D", "diffusion", "robin"]
 ANY = prdp.Jacobi, prdp.BiCGStab, prdp.GMRES
 
 
 def right_hand_sides(name, dtype):
-    if name.startswith("matri") or name == "singular":
+    if name.startswith(("matri", "sparse")) or name == "singular":
         return noise(3, 4 if name == "singular" else 9, seed=3, dtype=dtype)
-    shape = {"heat 1D": (11,), "poisson 3D": (3, 4, 5)}.get(name, SHAPE)
-    return noise(3, 2 if name in ("burgers", "stencil") else 1, *shape, seed=3, dtype=dtype)
+    shape = {
+        "heat 1D": (11,),
+        "burgers 1D": (11,),
+        "poisson 3D": (3, 4, 5),
+        "robin": (3, 4, 5),
+        "closed": (8,),
+        "two rows": (2, 7),
+    }.get(name, SHAPE)
+    channels = {"burgers": 2, "stencil": 2, "navier-stokes": 3, "two rows": 3}.get(name, 1)
+    return noise(3, channels, *shape, seed=3, dtype=dtype)
 
 
 def solver(method, **settings):
@@ -87,7 +123,10 @@ def agree(mine, other, dtype, slack=300.0):
     assert ((u - v).flatten(1).norm(dim=1) <= slack * torch.finfo(dtype).eps * scale).all()
 
 
-CASES = [(name, method) for name in OPERATORS if name != "singular" for method in ANY]
+SADDLES = ["navier-stokes", "two rows"]  # zeros on the diagonal
+CASES = [(name, method) for name in OPERATORS if name not in ("singular", "closed", *SADDLES) for method in ANY]
+CASES += [(name, prdp.GMRES) for name in SADDLES]
+CASES += [("closed", method) for method in (prdp.CG, prdp.GMRES)]
 CASES += [(name, method) for name in SYMMETRIC for method in (prdp.CG, prdp.SteepestDescent)]
 CASES += [("heat 1D", prdp.Chebyshev), ("heat 2D", prdp.Chebyshev)]
 
@@ -177,21 +216,49 @@ def test_zero_on_the_diagonal_and_infinite_entries():
     agree(mine, other, F64, slack=1e11)
 
 
-@pytest.mark.parametrize("name", ["diffusion", "stencil"])
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_a_gradient_beyond_the_range_of_its_dtype_is_zero_and_named(dtype):
+    b = noise(3, 1, *SHAPE).to(dtype)
+    b[1] *= 1e25 if dtype == F32 else 1e200
+    c = periodic(4.3, dtype).tensors[0][:1].clone().requires_grad_()
+    b.requires_grad_()
+    with Fibers():
+        a = operators.Stencil(c.expand(3, -1, -1, -1), OFFSETS, "periodic")
+        u, info = prdp.linear_solve(a, b, solver=prdp.CG(9, 0.0), on_failure="zero_grad")
+        gradients = torch.autograd.grad(u.square().sum(), (c, b))
+        status = info.adjoint.status.tolist()
+    assert all(t.isfinite().all() for t in gradients) and (gradients[1][1] == 0).all()
+    assert [prdp.SolveStatus(s).name for s in status] == ["MAX_ITER", "OVERFLOW", "MAX_ITER"]
+
+
+PATTERN = sparse(1, F64)[0].to_sparse_csr()
+FIELDS = {  # made of one tensor, which gets a gradient
+    "diffusion": (lambda t: operators.Diffusion(t, shift=1.0), lambda: noise(3, *SHAPE, seed=2).exp(), prdp.CG),
+    "stencil": (lambda t: operators.Stencil(t, OFFSETS, "zero"), lambda: coefficients(F64, rows=1), prdp.BiCGStab),
+    "burgers": (lambda t: operators.Burgers(t, 0.05, 0.02), lambda: noise(3, 2, *SHAPE), prdp.GMRES),
+    "navier-stokes": (lambda t: operators.NavierStokes(t, 0.05, 0.02), lambda: noise(3, 2, *SHAPE), prdp.GMRES),
+    "sparse": (
+        lambda t: operators.Matrix.csr(PATTERN.crow_indices(), PATTERN.col_indices(), t, 9),
+        lambda: PATTERN.values().clone(),
+        prdp.BiCGStab,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
 def test_gradients_are_those_of_finite_differences(name):
-    b = right_hand_sides(name, F64).requires_grad_()
-    if name == "diffusion":
-        field = noise(3, *SHAPE, seed=2).exp().requires_grad_()
-        make, method = (lambda t: operators.Diffusion(t, shift=1.0)), prdp.CG
-    else:
-        field = coefficients(F64, rows=1).requires_grad_()
-        make, method = (lambda t: operators.Stencil(t, OFFSETS, "zero")), prdp.BiCGStab
+    make, field, method = FIELDS[name]
+    b = right_hand_sides(name, F64)
 
     def u(t, rhs):
-        return prdp.linear_solve(make(t), rhs, solver=solver(method, rtol=1e-13))[0]
+        if name != "navier-stokes":
+            return prdp.linear_solve(make(t), rhs, solver=solver(method, rtol=1e-13))[0]
+        rhs = rhs - rhs.mean((-2, -1), keepdim=True) * torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)  # of the pressure
+        return prdp.linear_solve(make(t), rhs, solver=prdp.GMRES(40, 1e-13, restart=40))[0][:, :2]
 
     with Fibers(threads=32):
-        assert torch.autograd.gradcheck(u, (field, b), fast_mode=True, atol=1e-6)
+        inputs = (field().requires_grad_(), b.requires_grad_())
+        assert torch.autograd.gradcheck(u, inputs, fast_mode=True, atol=1e-6)
 
 
 def barriers():

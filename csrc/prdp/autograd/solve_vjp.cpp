@@ -11,7 +11,6 @@
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve_on_gpu.h"
-#include "prdp/solvers/solve_unseen.h"
 
 namespace prdp {
 
@@ -80,8 +79,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
-  const bool unseen = never_waits(cotangent, o.solver) || (!cotangent.is_cpu() && gpu::takes(cotangent, o.solver));
-  if (!waits_for_report(o) && unseen && !in_torch_func()) {
+  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
     const auto rows = may_overflow(lambda, u);
     lambda = lambda.masked_fill(per_sample(rows, lambda), 0.0);
     if (needed[0]) found.gradients[0] = lambda;

@@ -4,6 +4,7 @@
 #include "prdp/autograd/tape_run.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/sample_space.h"
+#include "prdp/solvers/solve_sample.h"
 
 namespace prdp {
 
@@ -57,11 +58,12 @@ void reverse_sample(const Pair<T>& pair, Memory<T>& memory, const ReverseBatch<T
   // With A' = factor A and b' = scale b, u = factor/scale u'.
   const T lambda_scale = bar_scale / a.factor(), v_scale = scale / a.factor();
   SampleSpace<T> values(pair.system, memory.workspace, batch.x0 != nullptr);
-  layout.load(b, scale, values.b());
-  values.project(values.b());
   values.begin(state);
+  values.load(b, scale, values.b());
+  values.project(values.b());
+  values.take_b();
   const double b2 = values.b2();
-  if (batch.x0) values.start_from(batch.x0 + s * n);
+  if (batch.x0) start_from(values, batch.x0 + s * n);
   tape.begin();
   TapeSpace<T> space(tape, values);
   TapeBack<T> back(tape, values, a, *pair.transpose, state, space.b().version,

@@ -9,13 +9,17 @@
 
 namespace prdp::gpu {
 
-/// An operator as a kernel takes it: a type of device/views.h, and the tensors and numbers of it.
+/// An operator as a kernel takes it: a type of device/views.h, upwind.h or diffusion.h, and the tensors and numbers of
+/// it.
 struct OperatorView {
   std::string type;  // "Laplacian<float, Grid<1, 64, 64>>"
-  std::vector<at::Tensor> tensors{};  // contiguous; with one sample or as many as the vectors
+  /// Contiguous, with one sample or as many as the vectors; undefined: there is none.
+  std::vector<at::Tensor> tensors{};
   std::vector<double> numbers{};
   /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.
   at::Tensor null_space{}, left_null_space{};
+  int64_t null_field = -1;  // the one channel that these belong to; -1: each has its own
+  bool leaks = false;       // Operator::leaks()
 };
 
 /// "float" or "double".

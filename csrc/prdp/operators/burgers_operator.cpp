@@ -1,8 +1,5 @@
 #include "prdp/operators/burgers_operator.h"
 
-#include <ATen/core/grad_mode.h>
-
-#include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/burgers.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/stencil_operator.h"
@@ -53,8 +50,7 @@ std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tenso
 }
 
 std::optional<gpu::OperatorView> BurgersOperator::gpu_view(const at::Tensor& b, bool transposed) const {
-  const at::NoGradGuard no_grad;
-  return StencilOperator(as_stencil(b)).gpu_view(b, transposed);
+  return upwind_view(b, "Burgers", std::to_string(channels_) + ", " + std::to_string(transposed), 1.0, step_.dt);
 }
 
 std::unique_ptr<Operator> BurgersOperator::select(const at::Tensor& index) const {

@@ -353,8 +353,35 @@ std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Ten
 }
 
 std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {
-  const at::NoGradGuard no_grad;
-  return StencilOperator(as_stencil()).gpu_view(b, /*transposed=*/false);
+  static_assert(static_cast<int>(Side::kZero) == 0 && static_cast<int>(Side::kPeriodic) == 2 &&
+                static_cast<int>(Side::kRobin) == 3);
+  std::string sides;
+  gpu::OperatorView view;
+  view.tensors.resize(8);
+  view.numbers.resize(10);
+  // A single number of the host is an argument; one of the device becomes a field.
+  const auto take = [&](const at::Tensor& t, at::IntArrayRef field, size_t tensor, size_t number) {
+    if (t.dim() == 0 && t.is_cpu()) view.numbers[number] = t.item<double>();
+    else view.tensors[tensor] = (t.dim() == 0 ? t.detach().expand(field) : t.detach()).contiguous();
+  };
+  view.tensors[0] = kappa_.detach().contiguous();
+  auto field = kappa_.sizes().vec();
+  field[0] = 1;
+  take(shift_, field, 1, 0);
+  for (size_t axis = 0; axis < 3; ++axis) {
+    const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
+    for (size_t end = 0; end < 2; ++end) {
+      const auto side = d < 0 ? Side::kFlux : sides_[d][end];
+      sides += ", " + std::to_string(static_cast<int>(side));
+      auto on_side = field;
+      if (d >= 0) on_side[2 + d] = 1;
+      if (side == Side::kRobin) take(robin(d, end), on_side, 2 + 2 * axis + end, 4 + 2 * axis + end);
+    }
+    view.numbers[1 + axis] = d < 0 ? 0.0 : per_cell(d);
+  }
+  view.type = "Diffusion<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(shape_) + ", " +
+              std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + sides + ">";
+  return view;
 }
 
 std::optional<kernels::FactorKey> DiffusionOperator::key(bool /*transposed*/) const {

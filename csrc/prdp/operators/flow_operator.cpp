@@ -40,4 +40,17 @@ at::Tensor FlowOperator::largest(const at::Tensor& row_norms) const {
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
 }
 
+gpu::OperatorView FlowOperator::upwind_view(const at::Tensor& b, const std::string& name, const std::string& others,
+                                            double alpha, double beta) const {
+  gpu::OperatorView view{name + "<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(grid_.shape()) + ", " +
+                         others + ">"};
+  const auto dim = grid_.dim();
+  view.tensors = {winds_.detach().to(b.scalar_type()).contiguous()};
+  view.numbers = {alpha, beta, 1.0, dim > 1 ? 1.0 / grid_.dx(0) : 0.0, 1.0 / grid_.dx(dim - 1)};
+  const auto& nu = step_.nu;
+  if (nu.is_cpu()) view.numbers[2] = nu.item<double>();
+  else view.tensors.push_back(nu.detach().to(b.scalar_type()).reshape({1}));  // nobody waits for it
+  return view;
+}
+
 }  // namespace prdp

@@ -1,4 +1,5 @@
 #pragma once
+#include "prdp/gpu/operator_view.h"
 #include "prdp/grid/grid.h"
 #include "prdp/operators/operator.h"
 #include "prdp/operators/step_parameters.h"
@@ -24,6 +25,9 @@ class FlowOperator : public Operator {
   /// template.
   template <class Make>
   std::shared_ptr<const kernels::Kernels> upwind_kernels(const at::Tensor& b, bool transposed, const Make& make) const;
+  /// What device/upwind.h makes of the winds: `type` is the name of its class with what follows the grid.
+  gpu::OperatorView upwind_view(const at::Tensor& b, const std::string& name, const std::string& others, double alpha,
+                                double beta) const;
   /// Of the channel that blows along a grid axis: (batch or 1, 1, *shape).
   at::Tensor wind_along(int64_t axis) const { return winds_.narrow(1, grid_.dim() - 1 - axis, 1); }
   /// The gradient of the winds from those of its channels, summed over the samples that share them.

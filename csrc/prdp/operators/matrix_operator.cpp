@@ -243,4 +243,21 @@ std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b
   return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
 }
 
+std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool transposed) const {
+  auto crow = crow_.contiguous(), col = col_.contiguous(), values = values_.detach().contiguous();
+  if (transposed) {  // columns as rows
+    const auto order = col.argsort(/*stable=*/true, /*dim=*/-1, /*descending=*/false);
+    const auto along = [&](const at::Tensor& t) { return t.gather(-1, order); };
+    auto bounds = at::arange(n() + 1, crow.options());
+    if (col.dim() == 2) bounds = bounds.expand({col.size(0), -1}).contiguous();
+    crow = at::searchsorted(along(col), bounds);
+    col = along(rows());
+    values = along(values);
+  }
+  gpu::OperatorView view{"Csr<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n()) + ">"};
+  const auto matrices = values.dim() == 2 ? values.size(0) : 1;
+  for (const auto& t : {crow, col, values}) view.tensors.push_back(t.view({matrices, -1}));
+  return view;
+}
+
 }  // namespace prdp

@@ -48,6 +48,7 @@ class CsrOperator final : public Operator {
   std::vector<int64_t> vector_shape() const override { return {n()}; }
   bool may_be_singular() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  private:
   int64_t n() const { return crow_.size(-1) - 1; }

@@ -109,6 +109,13 @@ std::shared_ptr<const kernels::Kernels> NavierStokesOperator::kernels(const at::
   return upwind_kernels(b, transposed, [](const auto& p) { return kernels::navier_stokes(p); });
 }
 
+std::optional<gpu::OperatorView> NavierStokesOperator::gpu_view(const at::Tensor& b, bool transposed) const {
+  auto view = upwind_view(b, "NavierStokes", std::to_string(transposed), 1.0 / step_.dt, 1.0);
+  view.null_space = view.left_null_space = at::empty({0}, b.options());
+  view.null_field = 2;  // the pressure
+  return view;
+}
+
 std::unique_ptr<Operator> NavierStokesOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<NavierStokesOperator>(*this);
   chosen->winds_ = winds_of(index);

@@ -37,6 +37,7 @@ class NavierStokesOperator final : public FlowOperator {
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   bool has_multigrid_preconditioner() const override { return true; }
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
+  std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  private:
   /// C₁ and C₂, made when first wanted: the CPU loops never ask for them.

@@ -17,13 +17,6 @@ inline at::Tensor per_sample(at::Tensor t, const at::Tensor& like) {
 /// The unknowns of one channel of v, as its last axis: (…, n).
 inline at::Tensor by_channel(const at::Tensor& v) { return v.dim() < 3 ? v : v.flatten(2); }
 
-/// A vector like b that changes its sign from point to point: its product shows how large products can be.
-inline at::Tensor alternating(const at::Tensor& b) {
-  const auto channels = by_channel(b);
-  const auto signs = 1.0 - 2.0 * at::arange(channels.size(-1), b.options()).remainder(2.0);
-  return signs.expand_as(channels).reshape_as(b);
-}
-
 /// The distance from 1 to the next number of a float32 or float64 tensor.
 inline double epsilon_of(const at::Tensor& t) {
   return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();

@@ -58,10 +58,6 @@ class ConjugateGradientMethod {
   /// What the next iteration starts from, beside x; resume() once it has been put back.
   auto carried() { return std::tie(r_, p_, rr_, rz_, pp_, sign_); }
   void resume(int64_t) {}
-  /// After iterations that nobody watched.
-  void end_unseen() {
-    if (!space_.is_preconditioned()) pp_ = space_.dot(p_, p_);
-  }
 
   typename Space::Vector x;
 

@@ -4,7 +4,6 @@
 #include <cstdint>
 #include <limits>
 
-#include "prdp/solvers/run_unseen.h"
 #include "prdp/solvers/stopping.h"
 
 // Functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
@@ -32,7 +31,6 @@ int64_t stride(const States& states, bool track) {
 /// small enough.
 template <class Space, class Method>
 PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
-  [[maybe_unused]] int64_t unseen = 1, watched = 0;
   method.start();
   if (track) observe(space, method, states, rtol);
   for (;;) {
@@ -44,16 +42,6 @@ PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states,
     if (!any_active) return;
     space.freeze_unless(states, [](const SampleState& s) { return s.active; });
     int64_t n = 1;
-    if constexpr (kMayGoUnseen<Space, Method> && !kContracts<Method>) {  // whose iterations are many and cheap
-      if (space.is_far() && track && watched <= 0 &&
-          (rtol == 0.0 || std::none_of(states.begin(), states.end(), is_idle<Method>))) {
-        const int64_t some = std::min(stride(states, /*track=*/false), unseen);
-        unseen = std::min(2 * unseen, kLongestUnseen);
-        watched = run_unseen(space, method, states, rtol, some) ? 0 : some;
-        continue;
-      }
-      --watched;
-    }
     if constexpr (kTakesStrides<Method>) {
       n = stride(states, track);
       method.step(n);
@@ -103,54 +91,43 @@ auto worse_than_zero(Space& space, const typename Space::States& states) {
   return space.map(states, [&](const SampleState& s) { return is_unsolved(s.status) && is_above_b(space, s); });
 }
 
-/// What energy_falls() is told by: products of two of u, x; b; r, its residual; and A r. One per sample, or all.
-template <class Number>
+/// What energy_falls() is told by: products of x; b; r, its residual; and A r.
 struct Energies {
-  Number xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2;
+  double xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2;
 };
 
 /// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
 /// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
 /// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in the null
 /// space of A, and says nothing.
-template <class Number>
-auto energy_falls(const Energies<Number>& e, double epsilon) {
-  using std::abs;
-  using std::sqrt;
-  const auto positive = [](const Number& v) -> Number { return 0.5 * (v + abs(v)); };
-  const Number scale = sqrt(e.rr) * sqrt(positive(e.bb - 2 * e.rb + e.rr)) + sqrt(e.xx) * sqrt(e.ar2);
-  const Number energy = e.xb - e.xr, across = positive(abs(e.x_ar) - 2e3 * epsilon * scale);
-  const auto symmetric = abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
-  const auto nearer = e.xb * e.xb > e.xr * e.xr;
-  const auto not_rounding = abs(energy) > 2e3 * epsilon * abs(e.xb);
-  const auto definite = e.r_ar * energy > across * across;
-  return symmetric & definite & nearer & not_rounding;
+inline bool energy_falls(const Energies& e, double epsilon) {
+  const auto positive = [](double v) { return std::max(v, 0.0); };
+  const double scale =
+      std::sqrt(e.rr) * std::sqrt(positive(e.bb - 2 * e.rb + e.rr)) + std::sqrt(e.xx) * std::sqrt(e.ar2);
+  const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - 2e3 * epsilon * scale);
+  const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
+  const bool nearer = e.xb * e.xb > e.xr * e.xr;
+  const bool not_rounding = std::abs(energy) > 2e3 * epsilon * std::abs(e.xb);
+  const bool definite = e.r_ar * energy > across * across;
+  return symmetric && definite && nearer && not_rounding;
 }
 
-/// Takes them with read(number), where the method's residual is the true one. One product.
-template <class Space, class Method, class Read>
-auto energies(Space& space, Method& method, const Read& read) {
+/// The same for each sample, where the method's residual is the true one. One product.
+template <class Space, class Method>
+auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
   const auto& x = method.x;
   const auto &r = method.residual(), &b = space.b();
   auto ar = space.scratch();
   space.apply(r, ar);
-  const auto number = [&](const auto& v, const auto& w) { return read(space.dot(v, w)); };
-  Energies<decltype(number(x, x))> found{number(x, b),  number(x, r),  number(r, b), number(r, r),  number(b, b),
-                                         number(x, ar), number(r, ar), number(x, x), number(ar, ar)};
+  const auto lanes = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
+  const auto xb = lanes(x, b), xr = lanes(x, r), rb = lanes(r, b), rr = lanes(r, r), bb = lanes(b, b);
+  const auto x_ar = lanes(x, ar), r_ar = lanes(r, ar), xx = lanes(x, x), ar2 = lanes(ar, ar);
   space.fill_zero(ar);
-  return found;
-}
-
-/// The same for each sample.
-template <class Space, class Method>
-auto energy_falls(Space& space, Method& method, const typename Space::States& states) {
-  const auto e = energies(space, method, [&](const auto& dot) { return space.lanes(dot); });
   size_t i = 0;
   return space.map(states, [&](const SampleState&) {
-    const Energies<double> of_sample{e.xb[i],   e.xr[i],   e.rb[i], e.rr[i], e.bb[i],
-                                     e.x_ar[i], e.r_ar[i], e.xx[i], e.ar2[i]};
+    const Energies e{xb[i], xr[i], rb[i], rr[i], bb[i], x_ar[i], r_ar[i], xx[i], ar2[i]};
     ++i;
-    return static_cast<bool>(energy_falls(of_sample, space.epsilon()));
+    return energy_falls(e, space.epsilon());
   });
 }
 

@@ -43,7 +43,6 @@ struct MethodTraits {
   /// linear in b, and the transposed map is as many iterations with Aᵀ.
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
-  bool starts_anew = false;  // where rounding has taken over, which the host decides on other devices
   /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);
   /// else autograd does it, in plain tensor operations.
   bool has_tape = true;
@@ -117,7 +116,6 @@ inline constexpr std::tuple kMethods{
         .vectors = 6,
         .takes_preconditioner = true,
         .nanoseconds = 0.8,
-        .starts_anew = true,
         .kernel = "BiCGStabMethod",
         .kernel_header = "bicgstab.h",
     }},

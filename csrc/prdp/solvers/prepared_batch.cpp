@@ -35,16 +35,15 @@ at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::
   return status;
 }
 
-/// b with its rows scaled, and `others` in place of the rows that do not take part.
+/// b with its rows scaled, and zero in the rows that do not take part.
 struct ScaledRhs {
   at::Tensor b, scale;
 };
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part,
-                    const at::Tensor& others) {
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
   const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
   const auto scale = per_sample(power_of_two_scale(safe), b);
   const auto rows = per_sample(takes_part, b);
-  return {at::where(rows, b, others) * scale, scale};
+  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
 }
 
 /// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol and than
@@ -80,7 +79,7 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   const auto of_order_one = [](const at::Tensor& v) {
     const auto magnitude = largest_magnitude(v);
     const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
-    return scale_rhs(v, magnitude, usable, at::zeros_like(v));
+    return scale_rhs(v, magnitude, usable);
   };
   const auto y = of_order_one(x0.detach()).b;
   auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
@@ -110,14 +109,13 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(), takes_product};
 }
 
-PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request,
-                            const at::Tensor& others) {
+PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto& solver = request.solver;
   const bool starts = takes_start(solver.method, request.x0);
   const auto magnitude = largest_magnitude(b);
   auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
   auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
-  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part, others);
+  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part);
   const auto rhs = a.project(whole);
   const auto rounding = rounding_of_least_numbers(scale, b);
   auto inconsistent = at::zeros_like(takes_part);

@@ -1,7 +1,7 @@
 #pragma once
 #include "prdp/solvers/solve.h"
 
-/// A batch of systems before its first iteration, in plain tensor operations that read nothing back.
+/// A batch of systems before its first iteration, in plain tensor operations.
 namespace prdp {
 
 /// Where the iterations of a batch start, and whether that took a product. All undefined: at zero.
@@ -19,9 +19,7 @@ struct PreparedBatch {
   TensorStart start;
 };
 
-/// `others`, of the shape of b, takes the place of the right-hand sides that do not take part.
-PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request,
-                            const at::Tensor& others);
+PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
 bool takes_start(Method method, const at::Tensor& x0);
 /// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an

@@ -34,53 +34,41 @@ class SampleSpace : public SampleNumbers<T> {
   SampleSpace(const SampleSystem<T>& system, kernels::Workspace<T>& workspace, bool starts = false)
       : system_(system), workspace_(workspace), own_(vectors(starts)), used_(own_) {}
 
-  /// Takes over a sample, whose b the caller has put into b().
+  // ---- a sample (solve_sample.h)
   void begin(SampleState& state) {
     state_ = &state;
     broken_ = started_ = false;
-    b2_ = dot(b(), b());
   }
-  /// Onto what products with A may contain; and onto the solutions of least norm.
-  void project(Vector v) {
-    if (const auto& space = system_.a().left_null_space()) space->project(v);
+  /// y = factor x, of memory of the caller, and the other way round, which returns max |u|.
+  void load(const T* x, T factor, Vector y) { layout().load(x, factor, y); }
+  T store(const T* x, T factor, T* u) {
+    layout().store(x, factor, u);
+    return largest_given(u);
+  }
+  T largest_given(const T* x) const { return kernels::largest_magnitude(x, unknowns()); }
+  /// b() is complete.
+  void take_b() { b2_ = dot(b(), b()); }
+  T factor() const { return system_.a().factor(); }
+  bool is_singular() const { return system_.a().null_space().has_value(); }
+  /// Onto what products with A may contain, which returns the norm of what is taken off; and onto the solutions of
+  /// least norm.
+  T project(Vector v) {
+    const auto& space = system_.a().left_null_space();
+    return space ? space->project(v) : T(0);
   }
   void project_solution(Vector v) {
     if (const auto& space = system_.a().null_space()) space->project(v);
   }
-  /// Starts the sample from α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better
-  /// than zero, or A x0 is rounding. From here on b() is the residual of the start, and what the method looks for is
-  /// added to it.
-  void start_from(const T* x0) {
-    const T magnitude = kernels::largest_magnitude(x0, unknowns());
-    if (magnitude == T(0)) return;
-    Vector x = start(), product = scratch(), r = whole_b();
-    layout().load(x0, kernels::power_of_two_scale(magnitude), x);
-    if (system_.a().null_space()) {
-      const T whole2 = dot(x, x);
-      project_solution(x);
-      if (leaves_rounding(dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
-    }
-    apply(x, product);
-    project(product);
-    const T largest = vectors_.largest_magnitude(product, length());
-    if (std::isfinite(largest) && largest > T(0)) {
-      const T scale = kernels::power_of_two_scale(largest);
-      vectors_.scale(scale, product, product, length());
-      const T alpha = dot(b(), product) / dot(product, product);
-      copy(b(), r);
-      vectors_.axpy(-alpha, product, r, length());
-      vectors_.scale(scale, x, x, length());
-      vectors_.scale(alpha, x, x, length());
-      const T left2 = dot(r, r);
-      started_ = left2 < b2_ && std::isfinite(vectors_.largest_magnitude(x, length()));
-      if (started_ && left2 > b2_ / 4)  // less is no rounding's doing
-        started_ = outdoes_rounding<double>(b2_, left2, this->epsilon() * system_.a().norm() * std::sqrt(dot(x, x)));
-      if (started_) {
-        std::swap_ranges(b(), b() + length(), r);
-        b2_ = left2;
-      }
-    }
-    fill_zero(product);
+  T largest_magnitude(const T* x) const { return vectors_.largest_magnitude(x, length()); }
+  void scale(T factor, Vector x) { vectors_.scale(factor, x, x, length()); }
+  void axpy(T alpha, const T* x, Vector y) { vectors_.axpy(alpha, x, y, length()); }
+  Vector start() { return workspace_.vector(2); }
+  Vector whole_b() { return workspace_.vector(3); }
+  /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
+  void start_here(T left2) {
+    std::swap_ranges(b(), b() + length(), whole_b());
+    started_ = true;
+    b2_ = left2;
   }
   void add_start(Vector x) {
     if (started_) add(start(), x);
@@ -89,6 +77,7 @@ class SampleSpace : public SampleNumbers<T> {
   /// What the start is; null without one.
   const T* started_from() { return started_ ? start() : nullptr; }
 
+  // ---- what space.h asks for
   Vector vector() {
     TORCH_INTERNAL_ASSERT(used_ < workspace_.count(), "the table of methods promises too few vectors");
     return workspace_.vector(used_++);
@@ -247,8 +236,6 @@ class SampleSpace : public SampleNumbers<T> {
  private:
   const kernels::Layout<T>& layout() const { return system_.a().layout(); }
   int64_t length() const { return system_.a().length(); }
-  Vector start() { return workspace_.vector(2); }
-  Vector whole_b() { return workspace_.vector(3); }
   const T* solution(const T* x) {
     if (!started_) return x;
     copy(x, scratch());

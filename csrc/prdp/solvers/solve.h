@@ -20,7 +20,7 @@ struct SolveRequest {
   std::optional<at::Tensor> caps{};
   bool guarded = true;
   at::Tensor x0{};
-  /// Whether the host may wait for another device to read the report there; solve_unseen.h says what this costs.
+  /// Whether the host may wait for another device to read the report there; the kernels of solve_on_gpu.h never wait.
   bool may_wait = true;
 };
 

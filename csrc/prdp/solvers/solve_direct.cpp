@@ -28,7 +28,7 @@ double least_normal(const at::Tensor& t) {
 std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   if (!is_for(b, request)) return std::nullopt;
   const at::NoGradGuard no_grad;
-  const auto batch = prepare_batch(a, b, request, at::zeros_like(b));
+  const auto batch = prepare_batch(a, b, request);
   const auto x = a.solve_directly(batch.rhs);
   const auto r = a.project(batch.rhs - a.apply(x));
   auto u = a.project_solution(x) / batch.scale;

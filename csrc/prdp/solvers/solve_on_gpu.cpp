@@ -43,13 +43,6 @@ void note_made(const std::string& name) {
   if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
 }
 
-template <class T>
-NullSpaceArguments<T> arguments_of(const at::Tensor& basis, int64_t unknowns, int64_t length) {
-  if (!basis.defined()) return {};
-  const bool constant = basis.numel() == 0;
-  return {constant ? nullptr : basis.const_data_ptr<T>(), constant ? 1 : basis.size(0), unknowns / length, length};
-}
-
 /// Entries of a vector that a null space belongs to: those of a channel.
 int64_t length_of(const at::Tensor& basis, const at::Tensor& b) {
   if (basis.defined() && basis.numel() > 0) return basis.size(1);
@@ -57,9 +50,21 @@ int64_t length_of(const at::Tensor& basis, const at::Tensor& b) {
 }
 
 template <class T>
+NullSpaceArguments<T> arguments_of(const at::Tensor& basis, const at::Tensor& b, int64_t field) {
+  if (!basis.defined()) return {};
+  const bool constant = basis.numel() == 0, one = field >= 0;
+  const int64_t length = length_of(basis, b), unknowns = b.numel() / b.size(0);
+  return {.basis = constant ? nullptr : basis.const_data_ptr<T>(),
+          .count = constant ? 1 : basis.size(0),
+          .first = one ? field : 0,
+          .fields = one ? 1 : unknowns / length,
+          .length = length};
+}
+
+template <class T>
 SolveResult launch(const Kernel& kernel, const SolveKernel& source, const OperatorView& a, const at::Tensor& b,
                    const SolveRequest& request) {
-  const int64_t batch = b.size(0), unknowns = b.numel() / batch;
+  const int64_t batch = b.size(0);
   const auto counts = at::empty({3, batch}, b.options().dtype(at::kLong));
   const auto reals = at::empty({2, batch}, b.options());
   auto u = at::empty(b.sizes(), b.options());
@@ -74,12 +79,13 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
 
   SolveArguments<T> arguments{};
   for (size_t i = 0; i < a.tensors.size(); ++i) {
+    if (!a.tensors[i].defined()) continue;
     arguments.a.tensors[i] = a.tensors[i].const_data_ptr();
     arguments.a.sample_strides[i] = a.tensors[i].size(0) == 1 ? 0 : a.tensors[i].stride(0);
   }
   std::copy(a.numbers.begin(), a.numbers.end(), arguments.a.numbers);
-  arguments.null_space = arguments_of<T>(a.null_space, unknowns, length_of(a.null_space, b));
-  arguments.left_null_space = arguments_of<T>(a.left_null_space, unknowns, length_of(a.left_null_space, b));
+  arguments.null_space = arguments_of<T>(a.null_space, b, a.null_field);
+  arguments.left_null_space = arguments_of<T>(a.left_null_space, b, a.null_field);
   arguments.b = b.const_data_ptr<T>();
   arguments.x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr;
   arguments.u = u.mutable_data_ptr<T>();
@@ -95,6 +101,7 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
   arguments.max_iter = request.solver.max_iter.expect_int();
   arguments.rtol = request.solver.rtol;
   arguments.guarded = request.guarded;
+  arguments.leaks = a.leaks;
   kernel.launch(teams, &arguments);
   return {u, {counts[0], reals[0], counts[1], counts[2], reals[1]}};
 }

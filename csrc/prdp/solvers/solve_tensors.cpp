@@ -7,7 +7,6 @@
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/prepared_batch.h"
-#include "prdp/solvers/solve_unseen.h"
 #include "prdp/solvers/tensor_gmres.h"
 #include "prdp/solvers/tensor_space.h"
 
@@ -117,10 +116,9 @@ void keep_top_of_heap() {
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
-  if (auto unseen = solve_unseen(a, b, request)) return *std::move(unseen);
   if (b.is_cpu()) keep_top_of_heap();
   const auto& solver = request.solver;
-  const auto batch = prepare_batch(a, b, request, at::zeros_like(b));
+  const auto batch = prepare_batch(a, b, request);
   std::vector<SampleState> states(b.size(0));
   const auto caps = request.caps ? request.caps->to(at::kCPU).contiguous() : at::Tensor();
   for (size_t i = 0; i < states.size(); ++i)

@@ -105,7 +105,6 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
     if (vanishes.defined()) note_broken(vanishes);
     return length;
   }
-  if (unseen_) return unseen_->step_length(num, den, a2, b2);
   // As SampleSpace::step_length; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
@@ -119,7 +118,6 @@ TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& de
 
 TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2,
                                              const Scalar& going) const {
-  if (unseen_) return {};  // step_length() tells
   if (in_loops_) return batch_loops::breaks_down(den, a2, b2, going, limits_of(b_).epsilon);
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
   const auto vanishes = den.detach().abs().le(bound).logical_and(bound.isfinite());
@@ -128,7 +126,6 @@ TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2
 
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {
   if (in_loops_) return batch_loops::ratio(num, den, negligible_);
-  if (unseen_) return unseen_->ratio(num, den);
   const auto none = den.detach() < negligible_;
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }
@@ -191,48 +188,8 @@ void TensorSpace::set_active(const std::vector<bool>& active) {
   active_mask_ = all ? at::Tensor() : mask_of(active);
 }
 
-void TensorSpace::look_away(bool track, double rtol, const Scalar& residual2) {
-  if (track && !enough_.defined()) bound_residuals(rtol);
-  unseen_.emplace(limits_of(b_).epsilon, negligible_, residual2);
-  mask_before_ = active_mask_;
-}
-
-void TensorSpace::bound_residuals(double rtol) {
-  const auto batch = static_cast<int64_t>(states_.size());
-  auto bounds = at::empty({2, batch}, at::kDouble);
-  for (int64_t i = 0; i < batch; ++i) {
-    bounds.mutable_data_ptr<double>()[i] = rtol * rtol * states_[i].b2;
-    bounds.mutable_data_ptr<double>()[batch + i] = kDivergenceBound * kDivergenceBound * states_[i].b2;
-  }
-  // Rounded down, so that device and host agree on which residuals lie within.
-  auto rounded = bounds.to(b_.scalar_type());
-  const auto below = at::nextafter(rounded, at::full_like(rounded, -1.0));
-  rounded = at::where(rounded.to(at::kDouble) > bounds, below, rounded).to(b_.device());
-  enough_ = per_sample(rounded[0], b_);
-  too_much_ = per_sample(rounded[1], b_);
-}
-
-void TensorSpace::end_unseen(const Scalar& residual2) {
-  unseen_->end_iteration(residual2);
-  if (!residual2.defined()) return;
-  const auto goes_on = residual2.gt(enough_).logical_and(residual2.le(too_much_));
-  active_mask_ = active_mask_.defined() ? active_mask_.logical_and(goes_on) : goes_on;
-}
-
-UnseenNumbers TensorSpace::take_log() {
-  active_mask_ = std::exchange(mask_before_, {});
-  return *std::exchange(unseen_, {});
-}
-
-UnseenLog TensorSpace::look_back() {
-  const auto log = take_log();
-  const auto host = log.numbers().to(at::kCPU, at::kDouble);
-  return log.read(host.const_data_ptr<double>(), static_cast<int64_t>(states_.size()));
-}
-
 void TensorSpace::count() {
   interruption::Watch::local().look();
-  if (unseen_) return unseen_->count();
   for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += active_.empty() || active_[i];
 }
 

@@ -2,7 +2,6 @@
 #include <ATen/ATen.h>
 
 #include <array>
-#include <optional>
 #include <vector>
 
 #include "prdp/operators/operator.h"
@@ -11,7 +10,6 @@
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
-#include "prdp/solvers/unseen_numbers.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -79,9 +77,7 @@ class TensorSpace {
     x = keep_frozen(at::addcmul(x, alpha, p), x);
     const auto left = at::addcmul(r, alpha, q, -1);
     r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
-    const auto rr = dot(r, r);
-    if (unseen_) unseen_->descend(alpha, rr);
-    return rr;
+    return dot(r, r);
   }
 
   void apply(const Vector& v, Vector& out) {
@@ -97,11 +93,11 @@ class TensorSpace {
   std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
     if (in_loops_) return batch_loops::scale_with_dots(system_.scale_of_a, unscaled_product(v), w, out);
     apply(v, out);
-    return {dot(w, out), unseen_ ? Scalar() : dot(out, out)};
+    return {dot(w, out), dot(out, out)};
   }
   Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) {
     if (in_loops_) return batch_loops::sum_of_squares(rr, beta, pp);
-    return unseen_ ? unseen_->sum_of_squares(rr, beta) : rr + beta * beta * pp;
+    return rr + beta * beta * pp;
   }
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
   Scalar precondition(const Vector& v, Vector& out);
@@ -146,15 +142,12 @@ class TensorSpace {
   Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const;
   Scalar ratio(const Scalar& num, const Scalar& den);
   void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
-    if (unseen_) return unseen_->expect_positive(a, r2);
     note_broken(a.detach().gt(0).logical_or(r2.detach().lt(negligible_)).logical_not());
   }
   Scalar is_rounding(const Scalar& a, const Scalar& b2, const Scalar& c2, double factor) {
-    if (unseen_) return unseen_->expect_above_rounding(a, b2, c2, factor);
     return is_larger(b2.detach().sqrt() * c2.detach().sqrt() * factor, a.detach().abs());
   }
   Scalar unless_zero(const Scalar& value, const Scalar& a, const Scalar& b) {
-    if (unseen_) return value;  // a quotient that vanishes was noticed by step_length(), ratio() or is_rounding()
     return value * (is_not_zero(a) * is_not_zero(b));
   }
 
@@ -186,7 +179,6 @@ class TensorSpace {
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
   Scalar is_larger(const Scalar& a, const Scalar& b) const { return a.gt(b).to(b_.scalar_type()); }
   void restore(const Scalar& where, const at::Tensor& from, at::Tensor& to) {
-    if (unseen_) return;  // nowhere, or is_rounding() tells
     if (in_loops_ && !batch_loops::any(where)) return;
     to = at::where(where.ne(0), from, to);
   }
@@ -212,16 +204,8 @@ class TensorSpace {
   /// Rows of `remade` where a sample was solved again in the last pass, rows of `kept` elsewhere.
   Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
   void reset();
-
-  /// Iterations that the host does not watch (run_unseen.h): between these two, numbers are logged on the device, and
-  /// what would need a closer look is computed as if it did not.
+  /// On another device, where each operation of torch is a launch.
   bool is_far() const { return !b_.is_cpu() && !recording_; }
-  void look_away(bool track, double rtol, const Scalar& residual2);
-  UnseenLog look_back();
-  /// Instead of look_back(), by who does not wait.
-  UnseenNumbers take_log();
-  /// Ends one of these iterations; with the squares of its residuals, freezes the samples that are done.
-  void end_unseen(const Scalar& residual2 = {});
 
  private:
   at::Tensor keep_frozen(const at::Tensor& updated, const at::Tensor& old) const {
@@ -261,7 +245,6 @@ class TensorSpace {
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;
-  void bound_residuals(double rtol);
 
   System& system_;
   at::Tensor b_, b2_, diagonal_;
@@ -272,9 +255,6 @@ class TensorSpace {
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
   bool recording_, in_loops_;
-  std::optional<UnseenNumbers> unseen_;
-  at::Tensor mask_before_;       // active_mask_ at the last look
-  at::Tensor enough_, too_much_;  // bounds of the squares of residuals
 };
 
 }  // namespace prdp

@@ -4,19 +4,21 @@
 /// What a kernel is called with. The host and the kernel read the same text.
 namespace prdp::gpu {
 
-/// Vectors that A, or Aᵀ, maps to zero: orthonormal ones of `length` entries, in each of `fields` parts of a sample.
+/// Vectors that A, or Aᵀ, maps to zero: orthonormal ones of `length` entries, in each of `fields` parts of a sample
+/// from the `first` on.
 template <class T>
 struct NullSpaceArguments {
   const T* basis;  // (count, length); null: the constant vector
   int64_t count;   // 0: there is none
-  int64_t fields, length;
+  int64_t first, fields, length;
 };
 
-/// The tensors and numbers of an operator; views.h says what each of them is made of.
+inline constexpr int kMostTensors = 8, kMostNumbers = 10;
+/// The tensors and numbers of an operator; its view says what each of them is.
 struct OperatorArguments {
-  const void* tensors[3];
-  int64_t sample_strides[3];  // entries between two samples; 0: they share the tensor
-  double numbers[5];
+  const void* tensors[kMostTensors];         // null where there is none
+  int64_t sample_strides[kMostTensors];      // entries between two samples; 0: they share the tensor
+  double numbers[kMostNumbers];
 };
 
 template <class T>
@@ -34,6 +36,7 @@ struct SolveArguments {
   int64_t batch, max_iter;
   double rtol;
   int64_t guarded;
+  int64_t leaks;  // products leave the range of A by their rounding, and are projected
 };
 
 /// Numbers of a team beyond its vectors: for the damped least squares of GMRES.

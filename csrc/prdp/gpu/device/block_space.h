@@ -64,20 +64,29 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   using TeamOfSample = Team<S::kBlocks, S::kThreads>;
 
   /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
-  BlockSpace(TeamOfSample& team, const A& a, T* in_block, T* beyond)
-      : team_(team), a_(a), in_block_(in_block), beyond_(beyond) {}
+  BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, T* in_block, T* beyond)
+      : team_(team),
+        a_(a),
+        in_block_(in_block),
+        beyond_(beyond),
+        null_space_(of.null_space),
+        left_null_space_(of.left_null_space),
+        leaks_(of.leaks != 0) {}
 
-  // ---- a sample
-  /// y = factor · x, where x need not be a vector of the space.
+  // ---- a sample (solve_sample.h)
+  void begin(SampleState& state) {
+    state_ = &state;
+    broken_ = started_ = false;
+  }
+  /// y = factor · x, where one of the two is no vector of the space.
   PRDP_ONCE void load(const T* x, T factor, Vector y) {
     each([&](int i) { return factor * x[i]; }, into(y));
   }
-  void begin(SampleState& state, const NullSpaceArguments<T>* null_space, const NullSpaceArguments<T>* left) {
-    state_ = &state;
-    null_space_ = null_space;
-    left_null_space_ = left;
-    broken_ = started_ = false;
+  T store(const T* x, T factor, T* u) {
+    load(x, factor, u);
+    return largest_magnitude(u);
   }
+  T largest_given(const T* x) { return largest_magnitude(x); }
   void take_b() { b2_ = dot(b(), b()); }
   /// A as it will be used; false where it is not finite.
   PRDP_ONCE bool prepare_operator() {
@@ -106,9 +115,9 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   /// Onto what products with A may contain, and onto the solutions of least norm. Returns the norm of what is taken
   /// off.
-  T project(Vector v) { return project(*left_null_space_, v); }
-  T project_solution(Vector v) { return project(*null_space_, v); }
-  bool is_singular() const { return left_null_space_->count > 0; }
+  T project(Vector v) { return project(left_null_space_, v); }
+  T project_solution(Vector v) { return project(null_space_, v); }
+  bool is_singular() const { return left_null_space_.count > 0; }
   Vector start() { return memory_of(2); }
   Vector whole_b() { return memory_of(3); }
   /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
@@ -173,16 +182,16 @@ class BlockSpace : public SampleNumbers<typename S::T> {
            s += next.second * next.second;
          });
     const T rr = team_.sum(s);
-    if (!is_singular()) return rr;
+    if (!leaks_) return rr;
     project(r);  // no product takes away what rounding leaves there
     return dot(r, r);
   }
   PRDP_ONCE void apply(const T* v, Vector out) {
     product(v, [&](int i, T value) { out[i] = value; });
-    if (is_singular()) project(out);
+    if (leaks_) project(out);
   }
   PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    if (is_singular()) {
+    if (leaks_) {
       apply(v, out);
       return {dot(v, out), dot(out, out)};
     }
@@ -386,7 +395,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     for (int field = 0; field < static_cast<int>(space.fields); ++field)
       for (int k = 0; k < static_cast<int>(space.count); ++k) {
         const auto q = [&](int i) {
-          const int at = i - field * length;
+          const int at = i - (static_cast<int>(space.first) + field) * length;
           if (at < 0 || at >= length) return T(0);
           return space.basis ? space.basis[k * length + at] : entry;
         };
@@ -408,7 +417,8 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   A a_;
   T *in_block_, *beyond_;
   SampleState* state_ = nullptr;
-  const NullSpaceArguments<T>*null_space_ = nullptr, *left_null_space_ = nullptr;
+  const NullSpaceArguments<T>&null_space_, &left_null_space_;
+  bool leaks_;
   int used_ = kOwnVectors;
   T factor_ = 1, b2_ = 0;
   double norm_ = 0;

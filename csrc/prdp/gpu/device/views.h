@@ -9,14 +9,14 @@
 /// What a view computes with is factor·A, where the factor is a power of two that makes the entries of order one.
 namespace prdp::gpu {
 
-/// A grid of nz planes of ny rows of nx points.
+/// A grid of nz planes of ny rows of nx points, and one of these points.
 template <int nz, int ny, int nx>
 struct Grid {
   static constexpr int kPoints = nz * ny * nx;
+  static constexpr int kX = nx, kY = ny, kZ = nz;
   int x, y, z;
   explicit Grid(int point) : x(point % nx), y(point / nx % ny), z(point / (nx * ny)) {}
-
-  static constexpr int kX = nx, kY = ny, kZ = nz;
+  int point() const { return (z * ny + y) * nx + x; }
 };
 
 /// A neighbour, so many cells away along each axis.
@@ -96,15 +96,52 @@ class Laplacian {
   double norm_ = 0, radius_;
 };
 
+/// An operator that says which entries stand in a row: for_each_entry(i, f) calls f(a_ij, j), where several may have
+/// the same j.
+template <class View, class T>
+class Rows {
+ public:
+  static constexpr bool kKnowsRadius = false;
+  static constexpr bool kIsScaled = false;
+
+  T largest_in_row(int i) const {
+    T most = 0;
+    view().for_each_entry(i, [&](T a, int) { most = larger_or_nan(most, std::abs(a)); });
+    return most;
+  }
+  void scale(T factor) { factor_ = factor; }
+  T factor() const { return factor_; }
+  double norm_of_row(int i) const {
+    double sum = 0;
+    view().for_each_entry(i, [&](T a, int) { sum += static_cast<double>(std::abs(factor_ * a)); });
+    return sum;
+  }
+  double radius() const { return 0; }
+  T diagonal(int i) const {
+    T sum = 0;
+    view().for_each_entry(i, [&](T a, int j) { sum += j == i ? factor_ * a : T(0); });
+    return sum;
+  }
+  template <class V>
+  T product(const V& v, int i) const {
+    T sum = 0;
+    view().for_each_entry(i, [&](T a, int j) { sum += (factor_ * a) * v[j]; });
+    return sum;
+  }
+
+ private:
+  const View& view() const { return static_cast<const View&>(*this); }
+
+  T factor_ = 1;
+};
+
 /// Tensors: coefficients, one field for each offset, which all channels share. (A v)[i] = Σ_k c_k[i] v[i + offset_k],
 /// or (Aᵀ v)[i] = Σ_k c_k[i - offset_k] v[i - offset_k].
 template <class T, class G, int kChannels, bool kTransposed, bool periodic_z, bool periodic_y, bool periodic_x,
           class... Offsets>
-class Stencil {
+class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, periodic_y, periodic_x, Offsets...>, T> {
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
-  static constexpr bool kKnowsRadius = false;
-  static constexpr bool kIsScaled = false;
 
   Stencil(const OperatorArguments& a, int64_t sample)
       : coefficients_(static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0]) {}
@@ -112,33 +149,11 @@ class Stencil {
   /// Of all that stands there, also of what leads out of the grid.
   T largest_in_row(int i) const {
     T most = 0;
-    for (int k = 0; k < kOffsets; ++k)
+    for (int k = 0; k < static_cast<int>(sizeof...(Offsets)); ++k)
       most = larger_or_nan(most, std::abs(coefficients_[k * G::kPoints + i % G::kPoints]));
     return most;
   }
-  void scale(T factor) { factor_ = factor; }
-  double norm_of_row(int i) const {
-    double sum = 0;
-    for_each_entry(i, [&](T c, int) { sum += static_cast<double>(std::abs(factor_ * c)); });
-    return sum;
-  }
-  double radius() const { return 0; }
-  T diagonal(int i) const {
-    T sum = 0;
-    for_each_entry(i, [&](T c, int j) { sum += j == i ? factor_ * c : T(0); });
-    return sum;
-  }
-  template <class V>
-  T product(const V& v, int i) const {
-    T sum = 0;
-    for_each_entry(i, [&](T c, int j) { sum += (factor_ * c) * v[j]; });
-    return sum;
-  }
-
- private:
-  static constexpr int kOffsets = sizeof...(Offsets);
-
-  /// f(a_ij, j) for the neighbours j of i that are inside the grid.
+  /// Of the neighbours that are inside the grid.
   template <class F>
   void for_each_entry(int i, const F& f) const {
     const int point = i % G::kPoints;
@@ -146,6 +161,8 @@ class Stencil {
     int k = 0;
     (entry<Offsets>(at, point, i - point, k++, f), ...);
   }
+
+ private:
   template <class O, class F>
   void entry(const G& at, int point, int channel, int k, const F& f) const {
     constexpr int sign = kTransposed ? -1 : 1;
@@ -158,45 +175,45 @@ class Stencil {
   }
 
   const T* coefficients_;
-  T factor_ = 1;
 };
 
 /// Tensors: A, n rows of n entries.
 template <class T, int n, bool kTransposed>
-class Dense {
+class Dense : public Rows<Dense<T, n, kTransposed>, T> {
  public:
   static constexpr int kUnknowns = n;
-  static constexpr bool kKnowsRadius = false;
-  static constexpr bool kIsScaled = false;
 
   Dense(const OperatorArguments& a, int64_t sample)
       : matrix_(static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0]) {}
 
-  T largest_in_row(int i) const {
-    T most = 0;
-    for (int j = 0; j < n; ++j) most = larger_or_nan(most, std::abs(entry(i, j)));
-    return most;
-  }
-  void scale(T factor) { factor_ = factor; }
-  double norm_of_row(int i) const {
-    double sum = 0;
-    for (int j = 0; j < n; ++j) sum += static_cast<double>(std::abs(factor_ * entry(i, j)));
-    return sum;
-  }
-  double radius() const { return 0; }
-  T diagonal(int i) const { return factor_ * entry(i, i); }
-  template <class V>
-  T product(const V& v, int i) const {
-    T sum = 0;
-    for (int j = 0; j < n; ++j) sum += (factor_ * entry(i, j)) * v[j];
-    return sum;
+  template <class F>
+  void for_each_entry(int i, const F& f) const {
+    for (int j = 0; j < n; ++j) f(kTransposed ? matrix_[j * n + i] : matrix_[i * n + j], j);
   }
 
  private:
-  T entry(int i, int j) const { return kTransposed ? matrix_[j * n + i] : matrix_[i * n + j]; }
-
   const T* matrix_;
-  T factor_ = 1;
+};
+
+/// Tensors: the ends of the rows, n + 1 from 0 on; columns; values.
+template <class T, int n>
+class Csr : public Rows<Csr<T, n>, T> {
+ public:
+  static constexpr int kUnknowns = n;
+
+  Csr(const OperatorArguments& a, int64_t sample)
+      : crow_(static_cast<const int64_t*>(a.tensors[0]) + sample * a.sample_strides[0]),
+        col_(static_cast<const int64_t*>(a.tensors[1]) + sample * a.sample_strides[1]),
+        values_(static_cast<const T*>(a.tensors[2]) + sample * a.sample_strides[2]) {}
+
+  template <class F>
+  void for_each_entry(int i, const F& f) const {
+    for (int64_t k = crow_[i]; k < crow_[i + 1]; ++k) f(values_[k], static_cast<int>(col_[k]));
+  }
+
+ private:
+  const int64_t *crow_, *col_;
+  const T* values_;
 };
 
 }  // namespace prdp::gpu

@@ -1,0 +1,91 @@
+#pragma once
+#include "prdp/gpu/device/views.h"
+
+/// shift·u - ∇·(κ ∇u) on the cells of a box, made of κ in each product.
+namespace prdp::gpu {
+
+/// What holds at a side, as prdp::Side counts.
+inline constexpr int kZeroSide = 0, kPeriodicSide = 2, kRobinSide = 3;
+
+/// The same for each channel. The sides are those of z, y and x, the low one first. Numbers: the shift; 1/h along z, y
+/// and x; h of each side where that is a number. Tensors, where they are there: κ, the shift, h of each side.
+template <class T, class G, int kChannels, bool kHarmonic, int... kSides>
+class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, T> {
+  using Base = Rows<Diffusion, T>;
+
+ public:
+  static constexpr int kUnknowns = kChannels * G::kPoints;
+
+  Diffusion(const OperatorArguments& a, int64_t sample) {
+    const auto field = [&](int k) {
+      const T* const first = static_cast<const T*>(a.tensors[k]);
+      return first ? first + sample * a.sample_strides[k] : nullptr;
+    };
+    kappa_ = field(0);
+    shift_ = field(1);
+    shift_number_ = static_cast<T>(a.numbers[0]);
+    for (int axis = 0; axis < 3; ++axis) per_cell_[axis] = static_cast<T>(a.numbers[1 + axis]);
+    for (int side = 0; side < 6; ++side) {
+      robin_[side] = field(2 + side);
+      robin_number_[side] = static_cast<T>(a.numbers[4 + side]);
+    }
+  }
+
+  template <class F>
+  void for_each_entry(int i, const F& f) const {
+    T through = 0;
+    const T held = for_each_face(i, [&](T c, int j) {
+      through += c;
+      f(-c, j);
+    });
+    f(held + through, i);
+  }
+  /// By differences, which no coefficient rounds away.
+  template <class V>
+  T product(const V& v, int i) const {
+    T flux = 0;
+    const T centre = v[i];
+    const T held = for_each_face(i, [&](T c, int j) { flux += c * (centre - v[j]); });
+    return this->factor() * (held * centre + flux);
+  }
+
+ private:
+  /// f(c, j) for each face to a neighbour j; returns the shift and what the sides hold.
+  template <class F>
+  T for_each_face(int i, const F& f) const {
+    const int point = i % G::kPoints;
+    const G at(point);
+    T held = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
+    held += couple<0, 0>(at, i, f) + couple<0, 1>(at, i, f);
+    held += couple<1, 0>(at, i, f) + couple<1, 1>(at, i, f);
+    held += couple<2, 0>(at, i, f) + couple<2, 1>(at, i, f);
+    return held;
+  }
+  template <int axis, int end, class F>
+  T couple(const G& at, int i, const F& f) const {
+    constexpr int sides[] = {kSides...};
+    constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
+    const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
+    const T scale = per_cell_[axis] * per_cell_[axis];
+    const int next = moved < n, end == 0 ? -1 : 1, side == kPeriodicSide && (n > 1) > (here);
+    if (next >= 0) {
+      constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
+      const int there = point + (next - here) * stride;
+      f(scale * mean(kappa_[point], kappa_[there]), i - point + there);
+      return 0;
+    }
+    if constexpr (side != kZeroSide && side != kRobinSide) return 0;
+    const T within = 2 * scale * kappa_[point];
+    if constexpr (side == kZeroSide) return within;
+    constexpr int at_side = 2 * axis + end;
+    const int on_side = axis == 0 ? at.y * G::kX + at.x : axis == 1 ? at.z * G::kX + at.x : at.z * G::kY + at.y;
+    const T beyond = per_cell_[axis] * (robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side]);
+    return within * (beyond / (within + beyond));  // in series
+  }
+  static T mean(T a, T b) { return kHarmonic ? 2 * a * (b / (a + b)) : (a + b) / 2; }
+
+  const T *kappa_, *shift_, *robin_[6];
+  T shift_number_, per_cell_[3], robin_number_[6];
+};
+
+}  // namespace prdp::gpu

@@ -1,0 +1,136 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "prdp/kernels/scales.h"
+#include "prdp/solvers/iterate.h"
+
+/// One sample from its right-hand side to its report: the same text in the CPU loops (solve_samples.cpp) and in a
+/// kernel of a GPU (gpu/device/solve.h).
+namespace prdp {
+
+/// What comes of a sample.
+struct SampleOutcome {
+  SolveStatus status = SolveStatus::kMaxIter;
+  int64_t iterations = 0, applications = 0;
+  double residual = 0.0, floor = 0.0;  // relative to ‖b‖
+  bool is_zero = false;                // u is zero in place of an iterate, and yet to be written
+};
+inline SampleOutcome zero_instead(SolveStatus status, double residual, int64_t applications = 0) {
+  return {status, 0, applications, residual, status == SolveStatus::kStagnated ? residual : 0.0, true};
+}
+
+/// Whether a sample needs no iterations, or gets none, by the largest numbers of b and of its start, which is 0 without
+/// one.
+template <class T, class IsFinite, class HasZero>
+bool is_settled_beforehand(T b, T start, const IsFinite& a_is_finite, const HasZero& divides_by_zero,
+                           SampleOutcome& outcome) {
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  const auto settle = [&](SolveStatus status, double residual) {
+    outcome = zero_instead(status, residual);
+    return true;
+  };
+  if (!std::isfinite(b) || !std::isfinite(start)) return settle(SolveStatus::kNonfiniteInput, infinity);
+  if (!a_is_finite()) return settle(SolveStatus::kNonfiniteOperator, infinity);
+  if (divides_by_zero()) return settle(SolveStatus::kZeroDiagonal, 1.0);
+  if (b == T(0)) return settle(SolveStatus::kConverged, 0.0);
+  return false;
+}
+
+/// Starts a space from α x0, where α = ⟨b, A x0⟩ / ⟨A x0, A x0⟩ makes the residual least, unless that is no better than
+/// zero, or A x0 is rounding. From there on b() is the residual of the start, and what the method looks for is added
+/// to it.
+template <class Space>
+void start_from(Space& space, const typename Space::Scalar* x0) {
+  using T = typename Space::Scalar;
+  const T magnitude = space.largest_given(x0);
+  if (magnitude == T(0)) return;
+  auto x = space.start(), product = space.scratch(), r = space.whole_b();
+  space.load(x0, kernels::power_of_two_scale(magnitude), x);
+  if (space.is_singular()) {
+    const T whole2 = space.dot(x, x);
+    space.project_solution(x);
+    if (leaves_rounding(space.dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
+  }
+  space.apply(x, product);
+  space.project(product);
+  const T largest = space.largest_magnitude(product);
+  if (std::isfinite(largest) && largest > T(0)) {
+    const T scale = kernels::power_of_two_scale(largest);
+    space.scale(scale, product);
+    const T alpha = space.dot(space.b(), product) / space.dot(product, product);
+    space.copy(space.b(), r);
+    space.axpy(-alpha, product, r);
+    space.scale(scale, x);
+    space.scale(alpha, x);
+    const T left2 = space.dot(r, r), b2 = space.b2();
+    bool better = left2 < b2 && std::isfinite(space.largest_magnitude(x));
+    if (better && left2 > b2 / 4)  // less is no rounding's doing
+      better =
+          outdoes_rounding<double>(b2, left2, space.epsilon() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
+    if (better) space.start_here(left2);
+  }
+  space.fill_zero(product);
+}
+
+template <class T>
+struct GivenSample {
+  const T *b, *x0;  // without a start, null
+  T* u;
+  T magnitude;  // of b
+  int64_t cap;
+  double rtol;
+  bool guarded;
+};
+
+/// Stores u = factor/scale x, as A' = factor A and b' = scale b; returns its largest number, which is not finite if one
+/// leaves the range of T.
+template <class Space, class T>
+T store_solution(Space& space, typename Space::Vector x, T scale, T* u) {
+  int exponent = std::ilogb(space.factor()) - std::ilogb(scale);
+  if (std::abs(exponent) > std::numeric_limits<T>::max_exponent - 2) {  // no number of T
+    const int in_place = exponent / 2;
+    space.scale(std::ldexp(T(1), in_place), x);
+    exponent -= in_place;
+  }
+  return space.store(x, std::ldexp(T(1), exponent), u);
+}
+
+/// Solves a sample that is not settled beforehand. b is scaled by a power of two to the order of one, so that no square
+/// over- or underflows and solve(2^k b) = 2^k solve(b) holds to the last bit.
+template <class Space, class Method, class T>
+SampleOutcome solve_sample(Space& space, Method& method, const GivenSample<T>& of) {
+  typename Space::States states{};
+  SampleState& state = states[0];
+  state.cap = of.cap;
+  space.begin(state);
+  const T scale = kernels::power_of_two_scale(of.magnitude);
+  space.load(of.b, scale, space.b());
+  const double rounding = rounding_of_least_numbers<T>(scale, space.unknowns());
+  bool consistent = true;
+  if (space.is_singular()) {
+    const T whole = std::sqrt(space.dot(space.b(), space.b()));
+    const T outside = space.project(space.b());
+    consistent = outside <= std::max(consistency_bound<T>(of.rtol) * whole, static_cast<T>(rounding));
+    if (std::sqrt(space.dot(space.b(), space.b())) <= std::numeric_limits<T>::epsilon() * whole)
+      return zero_instead(consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent, 1.0);
+  }
+  space.take_b();
+  state.b2 = space.b2();
+  state.rounding2 = rounding * rounding;
+  if (of.x0) start_from(space, of.x0);
+  iterate(space, method, states, of.rtol, of.guarded);
+  space.add_start(method.x);
+  space.project_solution(method.x);
+  if (of.guarded) excuse_rounding_of_b(state);
+  if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
+  const T largest = store_solution(space, method.x, scale, of.u);
+  if (of.guarded && !std::isfinite(largest)) return zero_instead(SolveStatus::kOverflow, 1.0, state.applications);
+  if (largest < std::numeric_limits<T>::min() && space.largest_magnitude(method.x) > T(0))
+    note_underflow<T>(state, static_cast<double>(largest));
+  const double floor = is_failure(state.status) ? 0.0 : std::sqrt(state.floor2 / state.b2);
+  return {state.status, state.iterations, state.applications, std::sqrt(state.residual2 / state.b2), floor};
+}
+
+}  // namespace prdp
