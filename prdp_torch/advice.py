@@ -96,7 +96,8 @@ def advise(
     dtypes: Sequence[torch.dtype] | None = None,
     network: torch.nn.Module | None = None,
 ) -> Advice:
-    """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is.
+    """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is. The solvers are
+    timed on the device of the sample; the notes name those that it refuses.
 
     Args:
         step: a `Stepper`, such as `Heat` or `ImplicitStep`. Its own budget is not used.
@@ -179,8 +180,8 @@ def advise_on(
     """Advise on a step that is a part of `update`, an `Update`."""
     rows, sentences = measure(step, sample, candidates(step), seconds)
     best = update.choice(rows, TOLERANCES[-1])
-    threads = f"threads: {torch.get_num_threads()}"
-    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}; {threads}.", *update.notes, *sentences]
+    where = f"; threads: {torch.get_num_threads()}" if sample.is_cpu else f" on {sample.device}"
+    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}{where}.", *update.notes, *sentences]
     others = []
     for other in other_dtypes:
         try:

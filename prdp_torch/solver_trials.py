@@ -147,7 +147,7 @@ def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: f
             if isinstance(solver, Direct):
                 _check_direct(trial, seconds)
             rows += _measure_one(trial, solver, seconds)
-        except ValueError as error:
+        except (ValueError, NotImplementedError) as error:  # the latter: on this device
             why = _C.sentence(str(error)).removeprefix(f"{type(solver).__name__}: ").removeprefix("linear_solve: ")
             refused.append((solver, why))
     counted = (
@@ -267,14 +267,14 @@ def set_solver(step: Stepper, solver: Solver, max_iter: int, rtol: float) -> Non
 
 
 def _check_direct(trial: Trial, seconds: float) -> None:
-    """ValueError where a factorisation would take too much time or memory."""
+    """ValueError where a factorisation would take too much time or memory; a device refuses it itself."""
     step, sample = trial.step, trial.sample
     a = _operator(step, sample)
     if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
         return
     n = sample[0].numel()
     most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
-    if n > most and not _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters):
+    if sample.is_cpu and n > most and not _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters):
         raise ValueError(f"{n} unknowns are too many to factorise within the limit; at most {most}")
     set_solver(step, Direct(1), 1, 0.0)
     # The functions of a step of one's own may hold tensors of the whole batch.
@@ -324,6 +324,7 @@ def _rounding(v: Tensor) -> float:
 
 def now(u: Tensor) -> float:
     """Seconds, when all work on the device of u is done."""
-    if u.is_cuda:
-        torch.cuda.synchronize(u.device)
+    accelerator = torch.accelerator.current_accelerator()
+    if accelerator is not None and accelerator.type == u.device.type:
+        torch.accelerator.synchronize(u.device)
     return time.perf_counter()

@@ -28,8 +28,8 @@ class Solver:
     Args:
         max_iter: K >= 0, the maximum number of iterations.
         rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
-        preconditioner: only for `CG`, `BiCGStab`, `GMRES` and `MINRES`. M ≈ A, whose inverse they apply in every iteration:
-            None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of
+        preconditioner: only for `CG`, `BiCGStab`, `GMRES` and `MINRES`. M ≈ A, whose inverse they apply in every
+            iteration: None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of
             `prdp_torch.operators` whose product is M⁻¹ r, such as `Function(apply, transpose)`. The adjoint solve
             applies its transpose. Derivatives take it for a constant, except the diagonal in unrolled mode.
 

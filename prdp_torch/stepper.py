@@ -64,8 +64,8 @@ class Stepper(torch_private.HearsOfMoves):
     `rhs(u)` if b(u) is not the state itself. `ImplicitStep` takes the two as functions instead.
 
     Args:
-        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `MINRES`, `Multigrid` or `Direct`. Its
-            settings are copied: set those of the stepper later, not those of the solver.
+        solver: `Jacobi`, `Chebyshev`, `SteepestDescent`, `CG`, `BiCGStab`, `GMRES`, `MINRES`, `Multigrid` or `Direct`.
+            Its settings are copied: set those of the stepper later, not those of the solver.
         backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every: as in `linear_solve`.
         start: where the solves start: at "zero", or at "state", the state before the step, which then is the x0 of
             `linear_solve`. This saves iterations if a step changes the state little.

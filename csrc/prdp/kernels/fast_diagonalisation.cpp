@@ -18,7 +18,7 @@ template <class T>
 class Reader {
  public:
   explicit Reader(const StencilRows<T>& a)
-      : a_(a), n_(a.grid().shape), slack_(16.0 * std::numeric_limits<T>::epsilon() * a.norm()) {}
+      : a_(a), n_(a.grid().shape), slack_(slack_of_sum(a.norm(), std::numeric_limits<T>::epsilon())) {}
 
   /// A_d, as it is on the line of points through the first one.
   Eigen::MatrixXd along(int axis) const {
@@ -46,9 +46,9 @@ class Reader {
     }
     return true;
   }
-  /// Whether the rows are of one size. Else what is rounding beside the largest may be all that another one holds.
+  /// Whether the rows are of one size.
   bool has_even_rows() const {
-    constexpr T widest = 1e3;
+    constexpr T widest = kWidestRows;
     T least = std::numeric_limits<T>::infinity(), most = 0;
     for (int64_t r = 0; r < a_.rows(); ++r) {
       const T* diagonal = a_.coefficient(r, 0);
@@ -59,9 +59,7 @@ class Reader {
     }
     return most <= widest * least;
   }
-  bool is_symmetric(const Eigen::MatrixXd& matrix) const {
-    return (matrix - matrix.transpose()).cwiseAbs().maxCoeff() <= slack_;
-  }
+  bool is_symmetric(const Eigen::MatrixXd& matrix) const { return kernels::is_symmetric(matrix, slack_); }
 
  private:
   double at(int axis, int64_t i, int64_t k) const {
@@ -105,13 +103,13 @@ typename AxisProducts<T>::Matrices rounded(const SumOverAxes& matrices) {
 }
 
 /// The eigenvectors of the A_d, as columns, and their eigenvalues.
-struct Diagonalised {
+struct Eigenpairs {
   SumOverAxes eigenvectors;
   std::array<Eigen::VectorXd, 3> eigenvalues;
 };
 
-Diagonalised diagonalise(const SumOverAxes& a) {
-  Diagonalised found;
+Eigenpairs eigenpairs(const SumOverAxes& a) {
+  Eigenpairs found;
   for (int d = 2; d >= 0; --d) {
     if (d < 2 && a[d].rows() == a[d + 1].rows() && a[d] == a[d + 1]) {
       found.eigenvectors[d] = found.eigenvectors[d + 1];
@@ -125,10 +123,9 @@ Diagonalised diagonalise(const SumOverAxes& a) {
   return found;
 }
 
-/// Whether each row of A_d is the one before it, moved on by a point, up to rounding in T.
-template <class T>
-bool is_circulant(const Eigen::MatrixXd& a) {
-  const double slack = 16.0 * std::numeric_limits<T>::epsilon() * a.cwiseAbs().maxCoeff();
+/// Whether each row of A_d is the one before it, moved on by a point, up to rounding.
+bool is_circulant(const Eigen::MatrixXd& a, double epsilon) {
+  const double slack = 16.0 * epsilon * a.cwiseAbs().maxCoeff();
   const auto n = a.rows();
   for (Eigen::Index i = 0; i < n; ++i)
     for (Eigen::Index j = 0; j < n; ++j)
@@ -175,15 +172,25 @@ std::optional<std::vector<double>> inverted(const std::array<Eigen::VectorXd, 3>
 
 }  // namespace
 
+bool has_axes_to_diagonalise(int64_t dim, const int64_t* shape) {
+  constexpr int64_t longest = 2048;
+  return std::all_of(shape + 3 - dim, shape + 3, [](int64_t n) { return n >= 3 && n <= longest; });
+}
+
+bool is_symmetric(const Eigen::MatrixXd& a, double slack) { return (a - a.transpose()).cwiseAbs().maxCoeff() <= slack; }
+
+DiagonalisedSum diagonalise(const SumOverAxes& a, double epsilon, int64_t null_vectors) {
+  if (is_circulant(a[0], epsilon) && is_circulant(a[1], epsilon) && is_circulant(a[2], epsilon))
+    return {std::nullopt, inverted({of_waves(a[0]), of_waves(a[1]), of_waves(a[2])}, null_vectors)};
+  auto found = eigenpairs(a);
+  auto inverse = inverted(found.eigenvalues, null_vectors);
+  return {std::move(found.eigenvectors), std::move(inverse)};
+}
+
 template <class T>
 std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
   const auto& grid = a.grid();
-  constexpr int64_t longest = 2048;  // beyond that the eigenvectors take longer than sparse factors
-  for (int d = 0; d < 3; ++d) {
-    const bool is_there = d >= 3 - grid.dim;
-    if (is_there && (grid.shape[d] < 3 || grid.shape[d] > longest)) return std::nullopt;
-  }
-  if (!a.pattern().nearest) return std::nullopt;
+  if (!has_axes_to_diagonalise(grid.dim, grid.shape) || !a.pattern().nearest) return std::nullopt;
   const Reader<T> reader(a);
   if (!reader.has_even_rows()) return std::nullopt;
   SumOverAxes sum;
@@ -197,14 +204,10 @@ std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
 
 template <class T>
 FastDiagonalisation<T>::FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors) {
-  if (is_circulant<T>(a[0]) && is_circulant<T>(a[1]) && is_circulant<T>(a[2])) {
-    const auto inverse = inverted({of_waves(a[0]), of_waves(a[1]), of_waves(a[2])}, null_vectors);
-    if (inverse) made_ = FourierMultiplier<T>({a[0].rows(), a[1].rows(), a[2].rows()}, *inverse);
-    return;
-  }
-  const auto found = diagonalise(a);
-  const auto inverse = inverted(found.eigenvalues, null_vectors);
-  if (inverse) made_ = Products{AxisProducts<T>(rounded<T>(found.eigenvectors)), {inverse->begin(), inverse->end()}};
+  const auto [eigenvectors, inverse] = diagonalise(a, std::numeric_limits<T>::epsilon(), null_vectors);
+  if (!inverse) return;
+  if (eigenvectors) made_ = Products{AxisProducts<T>(rounded<T>(*eigenvectors)), {inverse->begin(), inverse->end()}};
+  else made_ = FourierMultiplier<T>({a[0].rows(), a[1].rows(), a[2].rows()}, *inverse);
 }
 
 template <class T>

@@ -20,12 +20,31 @@ using SumOverAxes = std::array<Eigen::MatrixXd, 3>;
 template <class T>
 std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a);
 
+/// Whether such a sum is looked for on a grid of these extents (z, y, x): shorter axes have no three points, and the
+/// eigenvectors of longer ones take longer than sparse factors.
+bool has_axes_to_diagonalise(int64_t dim, const int64_t* shape);
+/// How far coefficients may be from those of a sum, beside ‖A‖∞: what rounding hides.
+inline double slack_of_sum(double norm, double epsilon) { return 16.0 * epsilon * norm; }
+bool is_symmetric(const Eigen::MatrixXd& a, double slack);
+/// Rows whose diagonals differ by more are not of one size: what is rounding beside the largest may be all that another
+/// one holds.
+inline constexpr double kWidestRows = 1e3;
+
+struct DiagonalisedSum {
+  /// Of the A_d, as columns; none where these are circulant: then they are waves, and `inverse` is in the order of the
+  /// wavenumbers.
+  std::optional<SumOverAxes> eigenvectors;
+  /// The inverses of all eigenvalues of A, x last, zero for the null vectors; nothing if A has more of these.
+  std::optional<std::vector<double>> inverse;
+};
+/// `epsilon`: the rounding that the A_d carry. `null_vectors`: how many vectors A maps to zero, as somebody named them.
+DiagonalisedSum diagonalise(const SumOverAxes& a, double epsilon, int64_t null_vectors);
+
 /// The exact solver of such a sum, in the eigenvectors of the A_d (Lynch, Rice and Thomas 1964). With constant
 /// coefficients on a periodic grid these are waves.
 template <class T>
 class FastDiagonalisation {
  public:
-  /// `null_vectors`: how many vectors A maps to zero, as somebody named them.
   FastDiagonalisation(const SumOverAxes& a, int64_t null_vectors);
 
   bool is_regular() const { return !std::holds_alternative<std::monostate>(made_); }

@@ -2,6 +2,7 @@
 
 #include "prdp/kernels/burgers.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
 
 namespace prdp {
@@ -31,10 +32,17 @@ std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, 
 }
 
 at::Tensor BurgersOperator::solve_directly(const at::Tensor& b) const {
+  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_directly(b);
   return solve_channels(channel_matrix(*this, winds_.options()), b);
 }
 at::Tensor BurgersOperator::solve_transpose_directly(const at::Tensor& b) const {
+  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_transpose_directly(b);
   return solve_channels(channel_matrix(*this, winds_.options()).mT(), b);
+}
+
+OperatorSpec BurgersOperator::as_stencil(const at::Tensor& b) const {
+  const std::vector<bool> periodic(grid_.dim(), true);
+  return nearest_stencil(block().coefficients().to(b.scalar_type()), grid_.shape(), periodic);
 }
 
 std::shared_ptr<const kernels::Kernels> BurgersOperator::kernels(const at::Tensor& b, bool transposed) const {

@@ -30,6 +30,8 @@ class BurgersOperator final : public FlowOperator {
  private:
   /// The block of one channel, made when first wanted: the CPU loops never ask for it.
   const AdvectionDiffusion& block() const;
+  /// The same operator as a stencil, for vectors like b.
+  OperatorSpec as_stencil(const at::Tensor& b) const;
 
   mutable std::optional<AdvectionDiffusion> made_;
 };

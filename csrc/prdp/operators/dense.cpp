@@ -1,14 +1,46 @@
 #include "prdp/operators/dense.h"
 
+#include "prdp/operators/tensors.h"
+
 namespace prdp {
 
+namespace {
+
+/// With rows and columns brought to one size by powers of two, which change no digit but the choice of pivots: on the
+/// CPU the factorisations of the loops do that.
+at::Tensor solve_equilibrated(const at::Tensor& matrix, const at::Tensor& b) {
+  const auto scale_of = [](const at::Tensor& a, int64_t along) {
+    return power_of_two_scale(a.detach().abs().amax(along, /*keepdim=*/true));
+  };
+  const auto rows = scale_of(matrix, -1), columns = scale_of(rows * matrix, -2);
+  return columns.mT() * std::get<0>(at::linalg_solve_ex(rows * matrix * columns, rows * b));
+}
+
+}  // namespace
+
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b) {
-  if (matrix.dim() < 3 || matrix.size(0) == 1 || !matrix.is_cpu()) return std::get<0>(at::linalg_solve_ex(matrix, b));
+  if (!matrix.is_cpu()) return solve_equilibrated(matrix, b);
+  if (matrix.dim() < 3 || matrix.size(0) == 1) return std::get<0>(at::linalg_solve_ex(matrix, b));
   // One at a time: after torch.set_num_threads, torch factors the matrices of a batch in threads that
   // spoil each other's pivots (pytorch issue 142815).
   std::vector<at::Tensor> solutions;
   for (int64_t i = 0; i < matrix.size(0); ++i) solutions.push_back(std::get<0>(at::linalg_solve_ex(matrix[i], b[i])));
   return solutions.empty() ? at::empty_like(b) : at::stack(solutions);
+}
+
+void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices) {
+  // Beyond that the factors take longer than any iteration of the same system, whose vectors are n times smaller.
+  constexpr int64_t most_unknowns = 4096, most_numbers = int64_t{1} << 26;
+  if (b.is_cpu() || (n <= most_unknowns && matrices * n * n <= most_numbers)) return;
+  TORCH_CHECK_NOT_IMPLEMENTED(
+      false, "linear_solve: Direct on ", b.device(),
+      " solves equations in 1D, stencils with constant coefficients in a box (sums of symmetric operators along the "
+      "axes), and others of at most ",
+      most_unknowns, " unknowns with ", most_numbers, " numbers in all matrices of a batch, got ", matrices,
+      matrices == 1 ? " matrix" : " matrices", " of ", n,
+      " unknowns; take CG (if A is symmetric) or GMRES, with preconditioner=\"multigrid\" where the operator has it, "
+      "or "
+      "solve on the CPU");
 }
 
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options) {

@@ -8,6 +8,10 @@ namespace prdp {
 /// matrix gives values that are not finite, and no exception.
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b);
 
+/// Raises NotImplementedError where b is not on the CPU and so many dense matrices of n rows, made of an operator that
+/// was not given as one, would take too long to factorise or too much memory.
+void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices);
+
 /// The matrix (batch or 1, n, n) of an operator that acts on each channel of a field of n points
 /// alike. Differentiable.
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options);

@@ -310,13 +310,9 @@ at::Tensor DiffusionOperator::coefficients() const {
 }
 
 OperatorSpec DiffusionOperator::as_stencil() const {
-  OperatorSpec spec{"stencil", shape_, {}, {coefficients()}};
-  for (int64_t axis = 0; axis < dim(); ++axis) spec.parameters.push_back(is_closed(axis));
-  spec.parameters.insert(spec.parameters.end(), dim(), 0.0);
-  for (int64_t axis = 0; axis < dim(); ++axis)
-    for (const double cells : {-1.0, 1.0})
-      for (int64_t d = 0; d < dim(); ++d) spec.parameters.push_back(d == axis ? cells : 0.0);
-  return spec;
+  std::vector<bool> periodic;
+  for (int64_t axis = 0; axis < dim(); ++axis) periodic.push_back(is_closed(axis));
+  return nearest_stencil(coefficients(), shape_, periodic);
 }
 
 at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()).norm(); }

@@ -50,6 +50,9 @@ class DiffusionOperator final : public Operator {
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
+  /// The same operator as a stencil.
+  OperatorSpec as_stencil() const;
+
  private:
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
@@ -67,9 +70,8 @@ class DiffusionOperator final : public Operator {
   /// Coefficients of the faces below and above each cell along an axis, times factor/h²; of a side with u = 0 twice
   /// that of its cell, as it is half as far away; of a Robin side that and its h in series.
   std::array<at::Tensor, 2> faces(int64_t axis, double factor = 1.0) const;
-  /// The same operator as a stencil: the diagonal, and for each axis what couples a cell to those below and above.
+  /// Of that stencil: the diagonal, and for each axis what couples a cell to those below and above.
   at::Tensor coefficients() const;
-  OperatorSpec as_stencil() const;
 
   std::vector<int64_t> shape_;
   std::vector<std::array<Side, 2>> sides_;

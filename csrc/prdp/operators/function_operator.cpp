@@ -52,6 +52,7 @@ std::vector<at::Tensor> detached(const std::vector<at::Tensor>& tensors) {
 template <class Product>
 at::Tensor probe(const Product& product, const at::Tensor& like) {
   const auto batch = like.size(0), n = like.numel() / std::max<int64_t>(batch, 1);
+  check_dense_fits(like, n, batch);
   std::vector<at::Tensor> columns;
   for (int64_t j = 0; j < n; ++j) {
     auto unit = at::zeros({batch, n}, like.options());

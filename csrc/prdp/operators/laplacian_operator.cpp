@@ -5,10 +5,13 @@
 #include <cmath>
 
 #include "prdp/gpu/operator_view.h"
+#include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/laplacian.h"
 #include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/sums_in_order.h"
+#include "prdp/operators/tensor_axes.h"
 
 namespace prdp {
 
@@ -16,7 +19,50 @@ at::Tensor LaplacianOperator::diagonal() const {
   return symbol(at::scalar_tensor(laplacian_diagonal(grid_), at::kDouble));
 }
 
+namespace {
+
+/// The sine bases of all axes and the eigenvalues of L, on a device.
+struct SineAxes {
+  std::vector<at::Tensor> bases;
+  at::Tensor eigenvalues;
+
+  SineAxes(const Grid& grid, const at::TensorOptions& real)
+      : eigenvalues(laplacian_eigenvalues(grid, at::kDouble).to(real)) {
+    for (const int64_t n : grid.shape()) bases.push_back(sine_basis(n, at::kDouble).to(real));
+  }
+  int64_t bytes() const {
+    auto sum = static_cast<int64_t>(eigenvalues.nbytes());
+    for (const auto& basis : bases) sum += static_cast<int64_t>(basis.nbytes());
+    return sum;
+  }
+  static std::shared_ptr<const SineAxes> find_or_make(const Grid& grid, const at::TensorOptions& real) {
+    kernels::FactorKeyMaker key;
+    for (int64_t d = 0; d < grid.dim(); ++d) key.add(grid.shape()[d]).add(grid.dx(d));
+    key.add(static_cast<int64_t>(real.device().type())).add(int64_t{real.device().index()});
+    return factor_cache::find_or_make<SineAxes>(key.key(), [&] { return std::make_shared<SineAxes>(grid, real); });
+  }
+};
+
+}  // namespace
+
+at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
+  const auto real = b.options().dtype(widest_real(b.device()));
+  constexpr int64_t longest_alone = 4096;  // a longer basis takes more memory than the vectors of a large batch
+  if (grid_.dim() == 1 && grid_.shape()[0] > longest_alone) {
+    const double per_cell2 = 1.0 / (grid_.dx(0) * grid_.dx(0));
+    const auto of = [&](double x) { return symbol(at::full({1}, x, real)); };
+    const auto beside = (of(per_cell2) - of(0.0)).expand({grid_.shape()[0] - 1});
+    const auto coefficients = at::stack({of(-2.0 * per_cell2).expand({grid_.shape()[0]}),
+                                         at::constant_pad_nd(beside, {1, 0}), at::constant_pad_nd(beside, {0, 1})});
+    return CyclicReduction(coefficients.unsqueeze(0), 0.0).solve(b.to(real)).to(b.scalar_type());
+  }
+  const auto axes = SineAxes::find_or_make(grid_, real);
+  const auto waves = along_axes(b, axes->bases, /*transposed=*/false) / symbol(axes->eigenvalues);
+  return along_axes(waves, axes->bases, /*transposed=*/false).to(b.scalar_type());
+}
+
 at::Tensor LaplacianOperator::solve_directly(const at::Tensor& b) const {
+  if (!b.is_cpu()) return solve_on_device(b);
   const auto eigenvalues = symbol(laplacian_eigenvalues(grid_, b.options()));
   return sine_transform(sine_transform(b, grid_) / eigenvalues.to(b.scalar_type()), grid_);
 }

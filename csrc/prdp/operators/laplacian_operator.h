@@ -39,6 +39,10 @@ class LaplacianOperator : public Operator {
   virtual at::Tensor symbol(const at::Tensor& x) const = 0;
 
   Grid grid_;
+
+ private:
+  /// The exact solve without loops: sine transforms, and cyclic reduction on a long line.
+  at::Tensor solve_on_device(const at::Tensor& b) const;
 };
 
 /// The Laplacian itself, A = L (negative definite).

@@ -189,6 +189,7 @@ at::Tensor CsrOperator::norm() const {
 }
 
 at::Tensor CsrOperator::to_dense() const {
+  check_dense_fits(values_, n(), values_.dim() == 2 ? values_.size(0) : 1);
   auto shape = values_.sizes().vec();
   shape.back() = n() * n();
   const auto flat = at::zeros(shape, values_.options()).scatter_add(-1, rows() * n() + col_, values_);

@@ -92,6 +92,7 @@ std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lam
 
 at::Tensor NavierStokesOperator::regular_matrix() const {
   const int64_t cells = grid_.unknowns(), n = 3 * cells;
+  check_dense_fits(winds_, n, winds_.size(0));
   const auto units = at::eye(n, winds_.options()).view({n, 1, 3, grid_.shape()[kY], grid_.shape()[kX]});
   const auto columns = apply(units.expand({-1, winds_.size(0), -1, -1, -1}));
   const auto a = columns.flatten(2).permute({1, 2, 0});  // (unit, batch, n) → (batch, n, unit)

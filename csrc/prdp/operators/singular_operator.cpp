@@ -6,6 +6,10 @@
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/remembered.h"
+#include "prdp/operators/stencil_direct.h"
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
@@ -146,42 +150,6 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
   }
 }
 
-namespace {
-
-/// An operator by its numbers and tensors, as these were.
-class Remembered {
- public:
-  void take(const OperatorSpec& spec, at::ScalarType dtype) {
-    tensors_.clear();
-    for (const auto& t : spec.tensors) {
-      if (t.is_inference()) return;  // its version is not counted
-      tensors_.emplace_back(t.getIntrusivePtr(), t._version());
-    }
-    kind_ = spec.kind;
-    shape_ = spec.shape;
-    parameters_ = spec.parameters;
-    dtype_ = dtype;
-  }
-  bool is(const OperatorSpec& spec, at::ScalarType dtype) const {
-    if (tensors_.empty() || tensors_.size() != spec.tensors.size()) return false;
-    for (size_t i = 0; i < tensors_.size(); ++i) {
-      const auto& [tensor, version] = tensors_[i];
-      const auto& t = spec.tensors[i];
-      if (tensor.lock().get() != t.unsafeGetTensorImpl() || version != t._version()) return false;
-    }
-    return kind_ == spec.kind && shape_ == spec.shape && parameters_ == spec.parameters && dtype_ == dtype;
-  }
-
- private:
-  std::vector<std::pair<c10::weak_intrusive_ptr<at::TensorImpl, at::UndefinedTensorImpl>, uint32_t>> tensors_;
-  std::string kind_;
-  std::vector<int64_t> shape_;
-  std::vector<double> parameters_;
-  at::ScalarType dtype_{};
-};
-
-}  // namespace
-
 void SingularOperator::check_null_spaces(const at::Tensor& b) const {
   static thread_local Remembered checked;
   if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
@@ -194,11 +162,19 @@ void SingularOperator::check_null_spaces(const at::Tensor& b) const {
 
 namespace {
 
+/// The regular operator of a singular one as a stencil, if it is one.
+std::optional<OperatorSpec> stencil_of(const Operator& a) {
+  if (const auto* stencil = dynamic_cast<const StencilOperator*>(&a)) return stencil->spec();
+  if (const auto* diffusion = dynamic_cast<const DiffusionOperator*>(&a)) return diffusion->as_stencil();
+  return std::nullopt;
+}
+
 /// P_r (A + ‖A‖ Q_l Q_rᵀ)⁻¹ P_l b, where the columns of Q_l and Q_r span the null spaces of Aᵀ and A.
 template <class Product>
 at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const at::Tensor& q_left,
                          const Product& product) {
   const int64_t batch = b.size(0), n = b.numel() / batch, channels = n / q_right.size(-1);
+  check_dense_fits(b, n, batch);
   std::vector<at::Tensor> columns;
   for (int64_t j = 0; j < n; ++j) {
     auto unit = at::zeros({batch, n}, b.options());
@@ -213,12 +189,24 @@ at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const a
 
 }  // namespace
 
+std::optional<at::Tensor> SingularOperator::solve_on_axes(const at::Tensor& b, bool transposed) const {
+  if (b.is_cpu() || right_.spans_channels(b)) return std::nullopt;
+  auto a = stencil_of(*a_);
+  if (!a) return std::nullopt;
+  a->transposed = transposed;
+  const NamedNullSpace named{right_.count().expect_int(), right_.is_constant() && left_.is_constant()};
+  const auto u = solve_stencil_on_axes(*a, transposed ? project_solution(b) : project(b), named);
+  return u ? std::optional(transposed ? project(*u) : project_solution(*u)) : std::nullopt;
+}
+
 at::Tensor SingularOperator::solve_directly(const at::Tensor& b) const {
+  if (auto u = solve_on_axes(b, /*transposed=*/false)) return *std::move(u);
   const auto like = b.detach();
   return project_solution(solve_regular(project(b), orthonormal(right_, like), orthonormal(left_, like),
                                         [this](const at::Tensor& v) { return apply(v); }));
 }
 at::Tensor SingularOperator::solve_transpose_directly(const at::Tensor& b) const {
+  if (auto u = solve_on_axes(b, /*transposed=*/true)) return *std::move(u);
   const auto like = b.detach();
   return project(solve_regular(project_solution(b), orthonormal(left_, like), orthonormal(right_, like),
                                [this](const at::Tensor& v) { return apply_transpose(v); }));

@@ -65,6 +65,9 @@ class SingularOperator final : public Operator {
   /// `size`: how large an entry of a product can be, of each sample or of all.
   void check_is_mapped_to_zero(const Basis& basis, const at::Tensor& b, const at::Tensor& size, bool transposed) const;
 
+  /// On other devices, a solve with a stencil that stencil_direct.h knows a cheap way for.
+  std::optional<at::Tensor> solve_on_axes(const at::Tensor& b, bool transposed) const;
+
   std::unique_ptr<Operator> a_;
   OperatorSpec spec_;
   Basis right_, left_;

@@ -9,7 +9,7 @@
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
-#include "prdp/operators/dense.h"
+#include "prdp/operators/stencil_direct.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/threads/interruption.h"
@@ -72,6 +72,18 @@ OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vect
     spec.parameters.insert(spec.parameters.end(), offset.begin(), offset.end());
   }
   [[maybe_unused]] const StencilOperator checks_the_rest(spec);
+  return spec;
+}
+
+OperatorSpec nearest_stencil(const at::Tensor& coefficients, const std::vector<int64_t>& shape,
+                             const std::vector<bool>& periodic) {
+  OperatorSpec spec{"stencil", shape, {}, {coefficients}};
+  spec.parameters.assign(periodic.begin(), periodic.end());
+  const auto dim = periodic.size();
+  spec.parameters.insert(spec.parameters.end(), dim, 0.0);
+  for (size_t axis = 0; axis < dim; ++axis)
+    for (const double cells : {-1.0, 1.0})
+      for (size_t d = 0; d < dim; ++d) spec.parameters.push_back(d == axis ? cells : 0.0);
   return spec;
 }
 
@@ -187,11 +199,46 @@ at::Tensor StencilOperator::norm() const {
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
 }
 
-at::Tensor StencilOperator::solve_directly(const at::Tensor& b) const {
-  return solve_channels(channel_matrix(*this, coefficients_.options()), b);
-}
+at::Tensor StencilOperator::solve_directly(const at::Tensor& b) const { return solve_stencil_directly(spec(), b); }
 at::Tensor StencilOperator::solve_transpose_directly(const at::Tensor& b) const {
-  return solve_channels(channel_matrix(*this, coefficients_.options()).mT(), b);
+  auto transpose = spec();
+  transpose.transposed = true;
+  return solve_stencil_directly(transpose, b);
+}
+
+OperatorSpec StencilOperator::spec() const {
+  OperatorSpec spec{"stencil", {grid_.shape + 3 - dim(), grid_.shape + 3}, {}, {coefficients_}};
+  for (int64_t axis = 3 - dim(); axis < 3; ++axis) spec.parameters.push_back(grid_.periodic[axis]);
+  for (const auto& offset : offsets_)
+    for (const int64_t cells : entries(offset, dim())) spec.parameters.push_back(static_cast<double>(cells));
+  return spec;
+}
+
+at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
+  auto offsets = offsets_;
+  if (transposed)
+    for (auto& offset : offsets)
+      for (auto& cells : offset.along) cells = -cells;
+  const kernels::StencilPattern pattern(grid_, offsets);
+  if (!pattern.nearest) return {};
+  std::vector<at::Tensor> fields(1 + 2 * dim());
+  for (int64_t k = 0; k < count(); ++k) {
+    const int64_t place = pattern.places[k];
+    if (place < 0) continue;
+    const auto given = coefficients_.select(1, k);
+    const int64_t axis = dim() - 1 - (place - 1) / 2;  // the pattern has x first
+    add_to(fields[place == 0 ? 0 : 1 + 2 * axis + (place - 1) % 2],
+           transposed ? shifted(given, offsets_[k], /*back=*/true) : given);
+  }
+  for (auto& field : fields)
+    if (!field.defined()) field = at::zeros_like(coefficients_.select(1, 0));
+  const auto all = at::stack(fields, 1);
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    if (grid_.periodic[3 - dim() + axis]) continue;
+    all.select(1, 1 + 2 * axis).narrow(1 + axis, 0, 1).zero_();
+    all.select(1, 2 + 2 * axis).narrow(1 + axis, extent(axis) - 1, 1).zero_();
+  }
+  return all;
 }
 
 std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

@@ -14,6 +14,11 @@ namespace prdp {
 OperatorSpec stencil(const at::Tensor& coefficients, const std::vector<std::vector<int64_t>>& offsets,
                      const std::vector<Boundary>& boundary = {Boundary::kDirichlet});
 
+/// The same from coefficients (batch or 1, 1 + 2 dim, *shape) of the point itself and of those before and behind it
+/// along each axis, in this order.
+OperatorSpec nearest_stencil(const at::Tensor& coefficients, const std::vector<int64_t>& shape,
+                             const std::vector<bool>& periodic);
+
 /// The operator of kind "stencil". Parameters: for each axis whether it is periodic, then the offsets one after the
 /// other. Tensors: the coefficients.
 class StencilOperator final : public Operator {
@@ -36,6 +41,11 @@ class StencilOperator final : public Operator {
   std::shared_ptr<const kernels::Kernels> kernels(const at::Tensor& b, bool transposed) const override;
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
+
+  OperatorSpec spec() const;
+  /// Of A, or of Aᵀ, the diagonal and what couples a point to those before and behind it along each axis, (batch or 1,
+  /// 1 + 2 dim, *shape), zero where there is none; undefined if A couples points that are no neighbours.
+  at::Tensor nearest_coefficients(bool transposed) const;
 
  private:
   int64_t dim() const { return grid_.dim; }

@@ -5,6 +5,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve_direct.h"
 #include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/solvers/solve_samples.h"
 #include "prdp/solvers/unnamed_null_space.h"
@@ -104,7 +105,8 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   }
   if (!found) {
     how = "tensors";
-    found = solve_with_tensors(a, b, request);
+    found = solve_direct_at_once(a, b, request);
+    if (!found) found = solve_with_tensors(a, b, request);
   }
   way = how;
   find_inconsistent_constants(a, b, request, *found);

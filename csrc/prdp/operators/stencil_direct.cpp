@@ -1,0 +1,230 @@
+#include "prdp/operators/stencil_direct.h"
+
+#include <ATen/core/grad_mode.h>
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/custom_class.h>
+
+#include <cmath>
+#include <functional>
+#include <map>
+
+#include "prdp/operators/cyclic_reduction.h"
+#include "prdp/operators/dense.h"
+#include "prdp/operators/remembered.h"
+#include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/sum_on_host.h"
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+/// A cheap way for some samples of a batch, or for all.
+struct Way {
+  std::function<at::Tensor(const at::Tensor& b)> solve;  // empty: there is none for any sample
+  at::Tensor rest{};  // of which samples what it says is not to be used, (batch or 1,); undefined: none
+};
+
+Way way_but_for(const std::vector<bool>& rest, const at::Device& device, decltype(Way::solve) solve) {
+  const auto count = std::count(rest.begin(), rest.end(), true);
+  if (count == std::ssize(rest)) return {};
+  if (count == 0) return {std::move(solve)};
+  auto mask = at::empty({std::ssize(rest)}, at::kBool);
+  std::copy(rest.begin(), rest.end(), mask.mutable_data_ptr<bool>());
+  return {std::move(solve), mask.to(device)};
+}
+
+std::vector<bool> periodic_axes(const OperatorSpec& a) {
+  return {a.parameters.begin(), a.parameters.begin() + std::ssize(a.shape)};
+}
+
+OperatorSpec detached(OperatorSpec a) {
+  a.tensors[0] = a.tensors[0].detach();
+  return a;
+}
+
+Way solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space) {
+  if (null_space.vectors > 0 && !null_space.is_constant) return {};
+  const auto real = widest_real(coefficients.device());
+  const CyclicReduction line(coefficients.to(real), 8.0 * epsilon_of(coefficients));
+  const auto dominant = line.is_dominant().to(at::kCPU);
+  std::vector<bool> rest;
+  for (int64_t s = 0; s < dominant.size(0); ++s) rest.push_back(!dominant.const_data_ptr<bool>()[s]);
+  return way_but_for(rest, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
+    const auto rhs = b.to(real);
+    return (null_space.is_constant ? line.solve_with_constant(rhs) : line.solve(rhs)).to(b.scalar_type());
+  });
+}
+
+using Inverse = std::shared_ptr<const TensorAxes>;
+
+/// The keys of what the last few coefficients led to on this thread, which need not be looked at again: those of a flow
+/// are the same tensors in every step.
+class LastSums {
+ public:
+  /// Empty if any of them is not known any more.
+  std::vector<Inverse> find(const OperatorSpec& a, int64_t null_vectors) const {
+    for (const auto& known : known_) {
+      if (known.null_vectors != null_vectors || !known.of.is(a, a.tensors[0].scalar_type())) continue;
+      std::vector<Inverse> inverses;
+      for (const auto& key : known.keys)
+        if (auto kept = factor_cache::find(key, typeid(TensorAxes)))
+          inverses.push_back(std::static_pointer_cast<const TensorAxes>(std::move(kept)));
+      if (inverses.size() == known.keys.size()) return inverses;
+    }
+    return {};
+  }
+  void keep(const OperatorSpec& a, int64_t null_vectors, std::vector<kernels::FactorKey> keys) {
+    auto& oldest = known_[next_++ % known_.size()];
+    oldest.of.take(a, a.tensors[0].scalar_type());
+    oldest.null_vectors = null_vectors;
+    oldest.keys = std::move(keys);
+  }
+  static LastSums& local() {
+    static thread_local LastSums last;
+    return last;
+  }
+
+ private:
+  struct Known {
+    Remembered of;
+    int64_t null_vectors = 0;
+    std::vector<kernels::FactorKey> keys;
+  };
+  std::array<Known, 4> known_;
+  size_t next_ = 0;
+};
+
+/// Null if the sample is no such sum.
+Inverse inverse_of(const SumOnHost& told, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
+                   const at::TensorOptions& options) {
+  const auto sum = told.is_finite(s) ? told.sum(s) : std::nullopt;
+  if (!sum) return nullptr;
+  return factor_cache::find_or_make<TensorAxes>(key, [&] {
+    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, told.epsilon(), null_vectors), told.inner_box(s),
+                                        options);
+  });
+}
+
+/// Samples of the same inverse at once.
+at::Tensor solve_by(const std::vector<Inverse>& inverses, const at::Tensor& b, const at::Tensor& diagonal) {
+  const auto solve = [&](const Inverse& inverse, const at::Tensor& part, const at::Tensor& its_diagonal) {
+    return inverse ? inverse->solve(part, its_diagonal) : at::full_like(part, NAN);
+  };
+  if (std::all_of(inverses.begin(), inverses.end(), [&](const auto& i) { return i == inverses[0]; }))
+    return solve(inverses[0], b, diagonal);
+  std::map<Inverse, std::vector<int64_t>> groups;
+  for (size_t s = 0; s < inverses.size(); ++s) groups[inverses[s]].push_back(static_cast<int64_t>(s));
+  auto u = at::empty_like(b);
+  for (const auto& [inverse, samples] : groups) {
+    const auto index = at::tensor(samples, at::kLong).to(b.device());
+    u.index_copy_(0, index, solve(inverse, b.index_select(0, index), diagonal.index_select(0, index)));
+  }
+  return u;
+}
+
+Way solve_sum(const OperatorSpec& a, int64_t null_vectors) {
+  auto inverses = LastSums::local().find(a, null_vectors);
+  std::vector<bool> rest(inverses.size());
+  if (inverses.empty()) {
+    const auto coefficients =
+        StencilOperator(detached(a)).nearest_coefficients(/*transposed=*/false);  // sums are symmetric
+    if (!coefficients.defined()) return {};
+    const SumOnHost told(coefficients, periodic_axes(a));
+    std::vector<kernels::FactorKey> keys;
+    for (int64_t s = 0; s < told.samples(); ++s) {
+      keys.push_back(told.key(s, null_vectors, coefficients.options()));
+      inverses.push_back(inverse_of(told, s, keys.back(), null_vectors, coefficients.options()));
+      rest.push_back(!inverses.back() && told.is_finite(s));
+    }
+    const auto is_null = [](const Inverse& inverse) { return !inverse; };
+    if (std::none_of(inverses.begin(), inverses.end(), is_null))
+      LastSums::local().keep(a, null_vectors, std::move(keys));
+  }
+  const auto diagonal = StencilOperator(detached(a)).diagonal();
+  return way_but_for(rest, a.tensors[0].device(),
+                     [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
+}
+
+Way find_way(const OperatorSpec& a, const NamedNullSpace& null_space) {
+  const at::NoGradGuard no_grad;
+  const auto dim = static_cast<int64_t>(a.shape.size());
+  if (dim == 1) {
+    const auto coefficients = StencilOperator(detached(a)).nearest_coefficients(a.transposed);
+    return coefficients.defined() ? solve_line(coefficients, null_space) : Way{};
+  }
+  std::array<int64_t, 3> shape{1, 1, 1};
+  std::copy(a.shape.begin(), a.shape.end(), shape.end() - dim);
+  return kernels::has_axes_to_diagonalise(dim, shape.data()) ? solve_sum(a, null_space.vectors) : Way{};
+}
+
+at::Tensor solve_densely(const OperatorSpec& a, const at::Tensor& b) {
+  const StencilOperator stencil(a);
+  check_dense_fits(b, b.numel() / (b.size(0) * b.size(1)), a.tensors[0].size(0));
+  const auto matrix = channel_matrix(stencil, a.tensors[0].options());
+  return solve_channels(a.transposed ? matrix.mT() : matrix, b);
+}
+
+/// What a solve on the axes needs for its derivative, but for tensors.
+struct Plan : public torch::CustomClassHolder {
+  Plan(Way way, OperatorSpec a, const NamedNullSpace& null_space)
+      : way(std::move(way)), a(std::move(a)), null_space(null_space) {
+    this->a.tensors.clear();
+  }
+  Way way;
+  OperatorSpec a;
+  NamedNullSpace null_space;
+};
+
+at::Tensor solve_planned(const Plan& plan, const at::Tensor& coefficients, const at::Tensor& b) {
+  const auto u = plan.way.solve(b);
+  if (!plan.way.rest.defined()) return u;
+  auto a = plan.a;
+  a.tensors = {coefficients};
+  return at::where(per_sample(plan.way.rest, b), solve_densely(a, b), u);
+}
+
+/// The derivative is that of the exact solution, by one more solve and the product rule.
+class SolveStencil : public torch::autograd::Function<SolveStencil> {
+ public:
+  static at::Tensor forward(AutogradContext* ctx, const at::Tensor& coefficients, const at::Tensor& b,
+                            const c10::intrusive_ptr<Plan>& plan) {
+    const auto u = solve_planned(*plan, coefficients, b);
+    ctx->save_for_backward({coefficients, u});
+    ctx->saved_data["plan"] = c10::IValue::make_capsule(plan);
+    return u;
+  }
+  static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
+    const auto plan = c10::static_intrusive_pointer_cast<Plan>(ctx->saved_data["plan"].toCapsule());
+    const auto saved = ctx->get_saved_variables();
+    auto a = plan->a;
+    a.tensors = {saved[0]};
+    const StencilOperator stencil(a);
+    a.transposed = !a.transposed;
+    const auto lambda = solve_stencil_on_axes(a, grads[0], plan->null_space);
+    TORCH_INTERNAL_ASSERT(lambda, "there is a way to solve with A, but not with its transpose");
+    if (!ctx->needs_input_grad(0)) return {{}, *lambda, {}};
+    const auto& u = saved[1];
+    return {-(a.transposed ? stencil.product_rule(*lambda, u) : stencil.product_rule(u, *lambda))[0], *lambda, {}};
+  }
+};
+
+}  // namespace
+
+std::optional<at::Tensor> solve_stencil_on_axes(const OperatorSpec& a, const at::Tensor& b,
+                                                const NamedNullSpace& null_space) {
+  auto way = find_way(a, null_space);
+  if (!way.solve || (way.rest.defined() && null_space.vectors > 0)) return std::nullopt;
+  return SolveStencil::apply(a.tensors[0], b, c10::make_intrusive<Plan>(std::move(way), a, null_space));
+}
+
+at::Tensor solve_stencil_directly(const OperatorSpec& a, const at::Tensor& b) {
+  if (!b.is_cpu())
+    if (auto u = solve_stencil_on_axes(a, b, {})) return *std::move(u);
+  return solve_densely(a, b);
+}
+
+}  // namespace prdp

@@ -1,0 +1,140 @@
+#include "prdp/operators/sum_on_host.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/operators/tensors.h"
+
+namespace prdp {
+
+namespace {
+
+/// t (batch or 1, n) as a field that varies along this axis alone.
+at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
+  std::vector<int64_t> sizes(dim + 1, 1);
+  sizes[0] = t.size(0);
+  sizes[1 + axis] = t.size(1);
+  return t.reshape(sizes);
+}
+
+}  // namespace
+
+SumOnHost::SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic)
+    : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
+  std::vector<at::Tensor> lines, told;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    lines.push_back(middle_line(coefficients, axis));
+    told.push_back(lines.back().flatten(1));
+  }
+  at::Tensor outer;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const auto ends = decoupled_ends(coefficients, axis);
+    told.push_back(ends.to(coefficients.scalar_type()));
+    if (periodic_[axis]) continue;
+    const auto between = ends.new_zeros({ends.size(0), shape_[axis] - 2});
+    const auto of_axis = along(at::cat({ends.narrow(1, 0, 1), between, ends.narrow(1, 1, 1)}, 1), axis, dim());
+    outer = outer.defined() ? outer.logical_or(of_axis) : of_axis;
+  }
+  const auto largest = [](const at::Tensor& t) { return t.flatten(1).amax(1, /*keepdim=*/true); };
+  const auto largest_inside = [&](const at::Tensor& t) {
+    return largest(outer.defined() ? t.masked_fill(outer, 0.0) : t);
+  };
+  const auto size = coefficients.abs(), diagonal = size.select(1, 0);
+  const auto distance = distance_from_sum(coefficients, lines);
+  for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) told.push_back(largest_inside(t));
+  told.push_back(largest(size));
+  host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
+}
+
+at::Tensor SumOnHost::middle_line(const at::Tensor& coefficients, int64_t axis) const {
+  auto line = coefficients;
+  for (int64_t d = dim() - 1; d >= 0; --d)
+    if (d != axis) line = line.select(2 + d, middle(d));
+  return line;
+}
+
+at::Tensor SumOnHost::decoupled_ends(const at::Tensor& coefficients, int64_t axis) const {
+  if (periodic_[axis]) return at::zeros({coefficients.size(0), 2}, coefficients.options().dtype(at::kBool));
+  std::vector<at::Tensor> ends;
+  for (const int64_t end : {0, 1}) {
+    const int64_t place = end == 0 ? 0 : shape_[axis] - 1, beside = end == 0 ? 1 : shape_[axis] - 2;
+    const auto of_plane = coefficients.select(2 + axis, place).narrow(1, 1, 2 * dim()).ne(0).flatten(1);
+    const auto of_beside = coefficients.select(2 + axis, beside).select(1, 1 + 2 * axis + end).ne(0).flatten(1);
+    ends.push_back(at::cat({of_plane, of_beside}, 1).any(1).logical_not());
+  }
+  return at::stack(ends, 1);
+}
+
+at::Tensor SumOnHost::distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const {
+  at::Tensor diagonal;
+  std::vector<at::Tensor> apart;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const auto field = [&](int64_t k) { return along(lines[axis].select(1, k), axis, dim()); };
+    const auto of_middle = lines[axis].select(1, 0).narrow(1, middle(axis), 1);
+    add_to(diagonal, axis == 0 ? field(0) : field(0) - along(of_middle, axis, dim()));
+    for (const int64_t k : {1 + 2 * axis, 2 + 2 * axis}) apart.push_back(coefficients.select(1, k) - field(k));
+  }
+  apart.push_back(coefficients.select(1, 0) - diagonal);
+  return at::stack(apart, 1).abs().amax(1);
+}
+
+SumOnHost::Sizes SumOnHost::sizes(int64_t s) const {
+  const double* of = of_sample(s + 1) - kSizes;
+  return {of[0], of[1], of[2], of[3], of[4]};
+}
+
+bool SumOnHost::is_finite(int64_t s) const { return std::isfinite(sizes(s).largest); }
+
+std::optional<kernels::SumOverAxes> SumOnHost::sum(int64_t s) const {
+  const auto [distance, norm, diagonal, inverse_diagonal, largest] = sizes(s);
+  const double slack = kernels::slack_of_sum(norm, epsilon_);
+  const auto box = inner_box(s);
+  const bool has_axes = std::all_of(box.shape.begin(), box.shape.end(), [](int64_t n) { return n >= 3; });
+  const bool has_even_rows = diagonal * inverse_diagonal <= kernels::kWidestRows;
+  if (!has_axes || !has_even_rows || !(distance <= slack)) return std::nullopt;
+  const auto a = sum_of_lines(s, box);
+  const auto is_symmetric = [slack](const Eigen::MatrixXd& m) { return kernels::is_symmetric(m, slack); };
+  return std::all_of(a.begin(), a.end(), is_symmetric) ? std::optional(a) : std::nullopt;
+}
+
+InnerBox SumOnHost::inner_box(int64_t s) const {
+  InnerBox box{std::vector<int64_t>(dim()), shape_};
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    box.first[axis] = ends(s)[2 * axis] != 0.0;
+    box.shape[axis] -= box.first[axis] + (ends(s)[2 * axis + 1] != 0.0);
+  }
+  return box;
+}
+
+kernels::FactorKey SumOnHost::key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
+  kernels::FactorKeyMaker key;
+  key.add(of_sample(s), host_.size(1) - kSizes).add(shape_.data(), dim()).add(null_vectors);
+  for (const bool closed : periodic_) key.add(int64_t{closed});
+  key.add(static_cast<int64_t>(c10::typeMetaToScalarType(options.dtype())));
+  const auto device = options.device();
+  return key.add(static_cast<int64_t>(device.type())).add(int64_t{device.index()}).key();
+}
+
+kernels::SumOverAxes SumOnHost::sum_of_lines(int64_t s, const InnerBox& box) const {
+  kernels::SumOverAxes sum;
+  const double* line = of_sample(s);
+  for (int64_t axis = dim() - 3; axis < dim(); ++axis) {
+    const int64_t n = axis < 0 ? 1 : box.shape[axis];
+    auto& a = sum[3 - dim() + axis];
+    a.setZero(n, n);
+    if (axis < 0) continue;
+    const int64_t whole = shape_[axis];
+    const double* diagonal = line + box.first[axis];
+    const double *before = diagonal + (1 + 2 * axis) * whole, *behind = before + whole;
+    const double of_others = axis + 1 == dim() ? 0.0 : line[middle(axis)];
+    for (int64_t i = 0; i < n; ++i) {
+      a(i, i) = diagonal[i] - of_others;
+      if (const auto j = kernels::neighbour(i, -1, n, periodic_[axis]); j >= 0) a(i, j) = before[i];
+      if (const auto j = kernels::neighbour(i, 1, n, periodic_[axis]); j >= 0) a(i, j) = behind[i];
+    }
+    line += (1 + 2 * dim()) * whole;
+  }
+  return sum;
+}
+
+}  // namespace prdp

@@ -1,0 +1,53 @@
+#pragma once
+#include <optional>
+#include <vector>
+
+#include "prdp/kernels/factor_cache.h"
+#include "prdp/operators/tensor_axes.h"
+
+namespace prdp {
+
+/// What the host reads of the coefficients of stencils, by one copy, to tell which of them are sums of operators along
+/// the axes: those on the line through the middle point along each axis, on which planes at the ends of the axes A is
+/// diagonal, and how far, at most, A is from the sum that the lines tell on the other points, which are the inner ones.
+class SumOnHost {
+ public:
+  /// `coefficients`: (batch or 1, 1 + 2 dim, *shape) as StencilOperator::nearest_coefficients() orders them, with at
+  /// least 3 points along each axis.
+  SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic);
+
+  int64_t samples() const { return host_.size(0); }
+  bool is_finite(int64_t s) const;
+  /// The sum on the inner points; nothing if A is none, or not symmetric.
+  std::optional<kernels::SumOverAxes> sum(int64_t s) const;
+  InnerBox inner_box(int64_t s) const;
+  kernels::FactorKey key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const;
+  double epsilon() const { return epsilon_; }
+
+ private:
+  int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
+  int64_t middle(int64_t axis) const { return shape_[axis] / 2; }
+  /// (batch or 1, k, n)
+  at::Tensor middle_line(const at::Tensor& coefficients, int64_t axis) const;
+  /// Whether nothing couples the points of the first, and of the last plane to any others: (batch or 1, 2).
+  at::Tensor decoupled_ends(const at::Tensor& coefficients, int64_t axis) const;
+  /// The largest of all coefficients of a point.
+  at::Tensor distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const;
+  kernels::SumOverAxes sum_of_lines(int64_t s, const InnerBox& box) const;
+
+  struct Sizes {
+    double distance, norm, diagonal, inverse_diagonal;  // the largest ones of the inner points
+    double largest;                                     // of all coefficients
+  };
+  static constexpr int64_t kSizes = 5;
+  Sizes sizes(int64_t s) const;
+  const double* of_sample(int64_t s) const { return host_.const_data_ptr<double>() + s * host_.size(1); }
+  const double* ends(int64_t s) const { return of_sample(s + 1) - kSizes - 2 * dim(); }
+
+  std::vector<int64_t> shape_;
+  std::vector<bool> periodic_;
+  double epsilon_;
+  at::Tensor host_;
+};
+
+}  // namespace prdp
