@@ -256,7 +256,7 @@ def worker_of(launcher, rank):
 
 def test_torchrun_ends_with_a_message_when_a_process_dies(tmp_path):
     launcher = torchrun(
-        "-m", "prdp_torch", "train", emulator(tmp_path), "--out", tmp_path / "out", "--intervals", 100000
+        "-m", "prdp_torch", "train", emulator(tmp_path), "--prdp", "--out", tmp_path / "out", "--intervals", 100000
     )
     until((tmp_path / "out/prdp/seed_0.checkpoint").exists, launcher)
     os.kill(worker_of(launcher, 1), signal.SIGKILL)
@@ -287,7 +287,7 @@ def launched(tmp_path, *arguments):
 
 def test_a_process_that_loses_another_one_says_so_and_ends(tmp_path):
     path = emulator(tmp_path)
-    team = launched(tmp_path, "train", path, "--out", str(tmp_path / "out"), "--intervals", "100000")
+    team = launched(tmp_path, "train", path, "--prdp", "--out", str(tmp_path / "out"), "--intervals", "100000")
     end = time.monotonic() + 100
     while not (tmp_path / "out/prdp/seed_0.checkpoint").exists():
         assert time.monotonic() < end and all(process.is_alive() for process in team)
@@ -306,7 +306,7 @@ def test_only_training_is_split_and_only_the_first_process_prints(tmp_path):
         assert process.exitcode == 2
         words = "prdp: compare: runs in a single process; only train is split by torchrun\n"
         assert (tmp_path / f"errors_{rank}").read_text() == words
-    team = launched(tmp_path, "train", "heat_1d", "--out", str(tmp_path / "out"), "--intervals", "3")
+    team = launched(tmp_path, "train", "heat_1d", "--prdp", "--out", str(tmp_path / "out"), "--intervals", "3")
     for process in team:
         process.join(60)
         assert process.exitcode == 0

@@ -21,6 +21,7 @@
 #include "prdp_experiments/networks/mlp.h"
 #include "prdp_experiments/networks/resnet.h"
 #include "prdp_experiments/networks/weights.h"
+#include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/training/failures.h"
 #include "prdp_experiments/training/field.h"
 #include "prdp_experiments/training/fused_adam.h"
@@ -243,7 +244,7 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
     const auto parameters = network.ptr()->parameters();
     for (auto last = parameters.end() - 2; last != parameters.end(); ++last) last->zero_();
   }
-  network.ptr()->to(scene.dtype);
+  network.ptr()->to(scene.device, scene.dtype);  // drawn on the CPU, and so the same on every device
   return network;
 }
 
@@ -320,7 +321,8 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
       std::tie(data.train_start, data.train_between, data.train_end) =
           std::tie(samples.train_start, samples.train_between, samples.train_end);
     }
-    for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
+    const auto order = shuffled(data.train_start.size(0), generator).to(scene.device);
+    for (const auto& batch : order.split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
       optimiser.zero_grad();
       const auto error = objective.loss(batch);
@@ -375,6 +377,8 @@ Curves train_parameters(const Scene& scene, Run& run, const SceneStep& stepper, 
 
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::filesystem::path& weights,
              const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data) {
+  check_device(scene.device);
+  at::globalContext().setDeterministicCuDNN(true);  // a training that goes on gives the same bits
   TORCH_CHECK_VALUE(weights.empty() || scene.trains_network(), "weights: the scene '", scene.name,
                     "' trains no network");
   const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;

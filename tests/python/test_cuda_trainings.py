@@ -1,0 +1,101 @@
+"""Trainings on a GPU, as `make cuda` runs them. Without one the CPU takes its place: then these tests are tried
+themselves, and CUDA is not."""
+
+import json
+
+import pytest
+import torch
+from test_cuda import CUDA, DEVICE
+from test_training_devices import LowPrecision, expect_same, scene_of, stopped
+from trainings import frequent_checkpoints, without_seconds  # noqa: F401  # the fixture
+
+import prdp_torch as prdp
+from prdp_torch.experiments import compare, records, scenes
+from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.training import train
+
+pytestmark = pytest.mark.cuda
+
+
+@pytest.fixture(autouse=True)
+def full_precision():
+    """Convolutions in float32, not TF32: the curves are compared with those of the CPU."""
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
+    yield
+    torch.backends.cudnn.allow_tf32 = before
+
+
+@pytest.mark.parametrize("case", ["emulator", "fresh emulator", "parameters", "corrector", "field", "darcy"])
+def test_a_scene_trains_on_a_gpu_as_on_the_cpu(case, tmp_path):
+    scene = scene_of(case, tmp_path)
+    intervals = []
+    curves = train(scene, Refinement.prdp(scene), device=DEVICE, callbacks=[intervals.append])
+    expect_same(curves, train(scene, Refinement.prdp(scene)), rel=1e-2 if case == "darcy" else 1e-3)
+    assert json.loads(json.dumps(intervals))
+
+
+class Dropout(torch.nn.Module):
+    """It draws random numbers on its device."""
+
+    def __init__(self):
+        super().__init__()
+        self.layers = torch.nn.Sequential(torch.nn.Linear(30, 30), torch.nn.Dropout(0.2))
+
+    def forward(self, u):
+        return self.layers(u)
+
+
+@pytest.mark.parametrize("case", ["emulator", "dropout", "corrector", "field", "darcy"])
+def test_a_training_resumes_bit_for_bit(case, tmp_path):
+    scene = scene_of("emulator" if case == "dropout" else case, tmp_path, intervals=4)
+
+    def curves(**options):
+        torch.manual_seed(0)
+        network = Dropout() if case == "dropout" else None
+        return train(scene, Refinement.auto(), network=network, device=DEVICE, **options)
+
+    kept = Checkpoint(tmp_path / "kept")
+    curves(callbacks=[stopped(2)], checkpoint=kept)
+    assert without_seconds(curves(checkpoint=kept)) == without_seconds(curves())
+
+
+@pytest.mark.parametrize("devices", [(DEVICE, "cpu"), ("cpu", DEVICE)], ids=["to the CPU", "from the CPU"])
+@pytest.mark.parametrize("case", ["emulator", "corrector", "field"])
+def test_a_training_resumes_on_another_device(case, devices, tmp_path):
+    scene = scene_of(case, tmp_path, intervals=4)
+    kept = Checkpoint(tmp_path / "kept")
+    train(scene, Refinement.prdp(scene), device=devices[0], callbacks=[stopped(2)], checkpoint=kept)
+    resumed = train(scene, Refinement.prdp(scene), device=devices[1], checkpoint=kept)
+    expect_same(resumed, train(scene, Refinement.prdp(scene)), rel=1e-3)
+
+
+def test_a_network_trained_there_is_loaded_anywhere(tmp_path):
+    scene = scenes.placed(scene_of("corrector", tmp_path), DEVICE)
+    compare.run_one(scene, "prdp", Refinement.prdp(scene), 0, tmp_path, records.environment(scene.device))
+    machine = json.loads((tmp_path / "prdp/seed_0.json").read_text())["machine"]
+    assert machine["device"] == str(DEVICE) and ("gpu" in machine) == CUDA
+    u = torch.randn(2, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        here, there = prdp.load_trained(tmp_path)(u), prdp.load_trained(tmp_path, device=DEVICE)(u.to(DEVICE))
+    assert there.device.type == DEVICE.type
+    torch.testing.assert_close(there.cpu(), here, rtol=1e-3, atol=1e-4)
+
+
+def test_a_network_in_bfloat16_around_float32_solves(tmp_path):
+    scene = scene_of("emulator", tmp_path)
+    torch.manual_seed(0)
+    network = LowPrecision()
+    curves = train(scene, Refinement.auto(), network=network, device=DEVICE)
+    assert network.conv.weight.device.type == DEVICE.type
+    assert network.conv.weight.dtype == torch.float32 and curves["failed"] == [0, 0]
+
+
+def test_converged_and_refined_trainings_end_within_the_spread_of_the_cpu(tmp_path):
+    """heat_1d as it is: a training of the same seed, whose rounding differs, is no worse than another seed's."""
+    scene = scenes.load("heat_1d")
+    scene.training.intervals = 40
+    of_seeds = torch.tensor([train(scene, Refinement.auto(), seed=seed)["metric"][-1] for seed in range(3)])
+    there = train(scene, Refinement.auto(), device=DEVICE)["metric"][-1]
+    assert abs(there - of_seeds.mean()) <= 3 * of_seeds.std()
