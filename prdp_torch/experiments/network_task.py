@@ -32,7 +32,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torc
             network.to(scene.device)
         datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = data_parallel.shared_loss(network, objective(scene, steppers, train, network))
+    loss_of = data_parallel.shared_loss(network, objective(scene, steppers, train, network), scene.device)
     optimiser = make_optimiser(scene, network.parameters())
     generator = torch.Generator().manual_seed(seed)
 

@@ -134,11 +134,13 @@ def train(
     If torch.distributed is initialised, every process calls this with the same arguments. The processes share each
     batch and the validation samples and return the same curves, which are those of one process to rounding. The first
     one keeps the checkpoint. ValueError for a task without a network, and if a batch has fewer samples than there are
-    processes.
+    processes. With the device "cuda" each process takes the GPU of its LOCAL_RANK; NCCL sums the gradients if no two
+    processes share one.
     """
     if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     scene = placed(scene, device)
+    scene.set_device(str(data_parallel.own_gpu(scene.device)))
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):

@@ -2,9 +2,12 @@
 themselves, and CUDA is not."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 import torch
+from helpers import written
 from test_cuda import CUDA, DEVICE
 from test_training_devices import LowPrecision, expect_same, scene_of, stopped
 from trainings import frequent_checkpoints, without_seconds  # noqa: F401  # the fixture
@@ -99,3 +102,19 @@ def test_converged_and_refined_trainings_end_within_the_spread_of_the_cpu(tmp_pa
     of_seeds = torch.tensor([train(scene, Refinement.auto(), seed=seed)["metric"][-1] for seed in range(3)])
     there = train(scene, Refinement.auto(), device=DEVICE)["metric"][-1]
     assert abs(there - of_seeds.mean()) <= 3 * of_seeds.std()
+
+
+@pytest.mark.skipif(not CUDA, reason="test_processes.py does this on CPUs")
+@pytest.mark.parametrize("device", ["cuda", "cuda:0"])
+def test_two_processes_train_as_one_does(device, tmp_path):
+    """By NCCL where there are two GPUs; with one, or all on one, by gloo, which they are told."""
+    path = written(tmp_path, ('dtype = "float32"', 'dtype = "float64"'))
+    command = ["-m", "prdp_torch", "train", path, "--prdp", "--intervals", "5", "--device", device, "--out"]
+    subprocess.run([sys.executable, *command, tmp_path / "one"], check=True)
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run([*launcher, *command, tmp_path / "two"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    share = device == "cuda:0" or torch.cuda.device_count() == 1
+    assert ("2 processes share 1 GPU: gloo sums their gradients" in done.stderr) == share
+    one, two = (records.read_training(tmp_path / name / "prdp/seed_0.json")["curves"] for name in ("one", "two"))
+    assert two["metric"] == pytest.approx(one["metric"], rel=1e-8) and two["max_iter"] == one["max_iter"]

@@ -184,7 +184,8 @@ def test_compare_and_advise_work_on_a_device(tmp_path):
         done = CliRunner().invoke(cli.app, ["compare", scene, *options])
         advised = CliRunner().invoke(cli.app, ["advise", scene, "--device", "lazy:0", "--seconds", "0.02"])
     assert done.exit_code == 0 and "report:" in done.output, done.output
-    assert json.loads((tmp_path / "summary.json").read_text())["machine"]["device"] == "lazy:0"
+    for record in ("summary.json", "auto/seed_0.json"):
+        assert json.loads((tmp_path / record).read_text())["machine"]["device"] == "lazy:0"
     assert advised.exit_code == 0 and "is the fastest to" in advised.output, advised.output
 
 
