@@ -70,6 +70,7 @@ cuda:
 	$(CUDA_CMAKE) -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(CUDA)/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF \
 	  $(if $(HEADERS),-DCMAKE_INCLUDE_PATH=$(abspath $(HEADERS)) -DCMAKE_PREFIX_PATH=$(abspath $(HEADERS))) > build-cuda/configure.log
 	$(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target python
+	! grep -q '^build prdp_train:' build-cuda/build.ninja || $(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target prdp_train
 	$(CUDA_CMAKE) --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
 	$(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py tests/python/test_cuda_trainings.py
 	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl

@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 
 import torch
-from torch import Tensor
 
 from prdp_torch import data_parallel
 from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
 from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors, load_random, random_states
 from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.reports import any_refused, on_host, spent_on
 from prdp_torch.experiments.scenes import make_stepper, placed
 from prdp_torch.experiments.task import Task
-from prdp_torch.solve import SolveInfo, SolveStatus
 from prdp_torch.stepper import Stepper
 
 
@@ -273,13 +272,15 @@ class _Run:
         iterations = forward = adjoint = 0.0
         failures = _C.Failures()
         for loss, samples in task.updates(len(self.curves["update_loss"])):
-            solves += sum(report.iterations[0].numel() for report in self._reports())
-            loss, refused, *spent = data_parallel.mean([loss, self._refused(), *self._spent()], self._samples())
+            reports = on_host(stepper.info for stepper in self.steppers)
+            adjoints = on_host(stepper.adjoint_info for stepper in self.steppers)
+            solves += sum(report.iterations[0].numel() for report in reports)
+            known = [loss, any_refused(reports), *spent_on(reports, adjoints)]
+            loss, refused, *spent = data_parallel.mean(known, len(reports[0].iterations))
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
             iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
-            adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
-            failures.take([report.status for report in self._reports()], adjoints, samples)
+            failures.take([report.status for report in reports], [report.status for report in adjoints], samples)
         seconds = time.perf_counter() - started
         failed = int(data_parallel.sums([failures.count])[0])
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
@@ -313,33 +314,8 @@ class _Run:
         else:
             self.controller.step(metric, error=error)
 
-    def _reports(self) -> list[SolveInfo]:
-        """Of the solves of the last update."""
-        return [stepper.info for stepper in self.steppers if stepper.info is not None]
-
-    def _samples(self) -> int:
-        return len(self._reports()[0].iterations)
-
-    def _refused(self) -> bool:
-        """Whether the solver was given NaN or Inf by the last update."""
-        return any(bool((report.status <= SolveStatus.NONFINITE_INPUT).any()) for report in self._reports())
-
-    def _spent(self) -> tuple[float, float, float]:
-        """Iterations, operator applications and adjoint applications of the last update."""
-        adjoint = [report for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
-        return (
-            sum((_per_sample(info.iterations) for info in self._reports()), 0.0),
-            sum((_per_sample(info.operator_applications) for info in self._reports()), 0.0),
-            sum((_per_sample(info.operator_applications) for info in adjoint), 0.0),
-        )
-
     def _check(self, loss: float, refused: float, done: int) -> None:
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
         if refused and not self.goes_on:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
-
-
-def _per_sample(counts: Tensor) -> float:
-    """Of counts (batch,), or (batch, steps) of a rollout, summed over the steps."""
-    return float(counts.double().mean(0).sum())

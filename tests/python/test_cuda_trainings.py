@@ -4,6 +4,7 @@ themselves, and CUDA is not."""
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 
 pytestmark = pytest.mark.cuda
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -84,6 +86,22 @@ def test_a_network_trained_there_is_loaded_anywhere(tmp_path):
         here, there = prdp.load_trained(tmp_path)(u), prdp.load_trained(tmp_path, device=DEVICE)(u.to(DEVICE))
     assert there.device.type == DEVICE.type
     torch.testing.assert_close(there.cpu(), here, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("case", ["emulator", "corrector", "field", "darcy", "parameters"])
+def test_both_languages_train_alike(case, tmp_path):
+    """With the trainer that `make cuda` builds where it finds the headers."""
+    trainer = ROOT / ("build-cuda" if CUDA else "build") / "prdp_train"
+    if not trainer.exists():
+        pytest.skip("prdp_train was not built")
+    scene = scene_of(case, tmp_path, intervals=4)
+    options = ["--prdp", "--intervals", "4", "--device", str(DEVICE), "--out", tmp_path / "cpp"]
+    subprocess.run([trainer, scene.path, *options], check=True, capture_output=True)
+    cpp = records.read_training(tmp_path / "cpp/prdp/seed_0.json")["curves"]
+    python = train(scene, Refinement.prdp(scene), device=DEVICE)
+    for name in ("update_loss", "metric"):
+        assert cpp[name] == pytest.approx(python[name], rel=1e-3)
+    assert cpp["max_iter"] == python["max_iter"] and cpp["budget"] == python["budget"]
 
 
 def test_a_network_in_bfloat16_around_float32_solves(tmp_path):

@@ -22,11 +22,23 @@ from prdp_torch.experiments.training import train
 
 ROOT = Path(__file__).parents[2]
 TRAINER = ROOT / "build" / "prdp_train"
+KOLMOGOROV = (
+    ("shape = [64, 64]", "shape = [8, 8]"),
+    ("reference_shape = [256, 256]", "reference_shape = [16, 16]"),
+    ("spin_up = 30", "spin_up = 1"),
+    ("train = 24", "train = 4"),
+    ("valid = 4", "valid = 2"),
+    ("valid_steps = 20", "valid_steps = 2"),
+    ("trained_steps = 4", "trained_steps = 2"),
+    ("batch = 8", "batch = 4"),
+    ("rtol = 1e-5", "rtol = 1e-4"),
+)
 PATHS = {
     "emulator": written,
     "fresh emulator": lambda folder: written(folder, ("valid = 5", "valid = 5\nfresh = true")),
     "parameters": lambda folder: written(folder, scene="poisson_1p"),
     "corrector": tiny,
+    "kolmogorov": lambda folder: written(folder, *KOLMOGOROV, scene="kolmogorov"),
     "field": small_field,
     "darcy": small_darcy,
 }
@@ -54,7 +66,7 @@ def expect_same(curves, others, rel=1e-4):
 @pytest.mark.parametrize("refine", [lambda scene: Refinement.auto(), Refinement.prdp], ids=["auto", "prdp"])
 @pytest.mark.parametrize("case", PATHS)
 def test_a_scene_trains_on_a_device_as_on_the_cpu(case, refine, tmp_path):
-    scene = scene_of(case, tmp_path, intervals=1 if case == "corrector" else 2)
+    scene = scene_of(case, tmp_path, intervals=1 if case in ("corrector", "kolmogorov") else 2)
     intervals = []
     curves, device = on_device(scene, refine(scene), callbacks=[intervals.append])
     assert device.launched() > 1000  # of torch: the work was there
@@ -62,6 +74,18 @@ def test_a_scene_trains_on_a_device_as_on_the_cpu(case, refine, tmp_path):
     expect_same(curves, train(scene, refine(scene)), rel=1e-2 if case == "darcy" else 1e-4)
     assert json.loads(json.dumps(intervals))  # numbers of Python, for callbacks and TensorBoard
     assert scene.device == torch.device("cpu")  # the caller's scene is left as it was
+
+
+def test_the_host_waits_once_for_each_report_and_for_the_loss(tmp_path):
+    """And three times at the end of an interval. The solves do not wait with rtol = 0."""
+    scene = scenes.load(written(tmp_path, ("rtol = 1e-5", "rtol = 0.0")))
+
+    def copies(intervals):
+        scene.training.intervals = intervals
+        return on_device(scene, Refinement.constant(3))[1].copies_to_host
+
+    updates = 200 // 25
+    assert copies(3) - copies(2) == updates * 3 + 3
 
 
 def stopped(number):
