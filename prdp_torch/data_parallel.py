@@ -84,7 +84,7 @@ class _Loss(torch.nn.Module):
 
 def own_gpu(device: torch.device) -> torch.device:
     """This process's GPU, where "cuda" leaves open which one it is; any other device as it is."""
-    if count() == 1 or device != torch.device("cuda"):
+    if count() == 1 or device != torch.device("cuda") or torch.cuda.device_count() == 0:
         return device
     local = int(os.environ.get("LOCAL_RANK", distributed.get_rank()))
     return torch.device("cuda", local % torch.cuda.device_count())

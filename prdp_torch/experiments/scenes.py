@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from prdp_torch import solvers, steppers
+from prdp_torch import data_parallel, solvers, steppers
 from prdp_torch.experiments import _C, field_task
 from prdp_torch.flow import Flow
 from prdp_torch.stepper import Stepper
@@ -38,11 +38,12 @@ def load(scene: str | Path) -> _C.Scene:
 
 
 def placed(scene: _C.Scene, device: "str | torch.device | None" = None) -> _C.Scene:
-    """Return a copy of a scene whose data, network and solves live on `device`; None keeps the scene's own. ValueError
-    if there is no such device here."""
+    """Return a copy of a scene whose data, network and solves live on `device`; None keeps the scene's own. Of
+    several processes each takes its own GPU for "cuda". ValueError if there is no such device here."""
     there = copy.copy(scene)
     if device is not None:
         there.set_device(str(device))
+    there.set_device(str(data_parallel.own_gpu(there.device)))  # before anything is made on another GPU
     _C.find_device(str(there.device))
     return there
 

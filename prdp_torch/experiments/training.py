@@ -139,7 +139,6 @@ def train(
     if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     scene = placed(scene, device)
-    scene.set_device(str(data_parallel.own_gpu(scene.device)))
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):

@@ -300,8 +300,15 @@ def test_each_process_takes_a_gpu_of_its_own_as_far_as_there_are_some(monkeypatc
         assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda", expected)
         assert data_parallel.own_gpu(torch.device("cuda", 1)) == torch.device("cuda", 1)
         assert data_parallel.own_gpu(torch.device("cpu")) == torch.device("cpu")
+    scene = scenes.load("heat_1d")
+    with monkeypatch.context() as patch:  # the GPU that is looked for, and used, is the process's own
+        patch.setenv("LOCAL_RANK", "1")
+        patch.setattr(scenes._C, "find_device", torch.device)
+        assert scenes.placed(scene, "cuda").device == torch.device("cuda", 1)
     monkeypatch.delenv("LOCAL_RANK")
     assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda", 1)  # by the rank
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda")  # which is not there, as others will say
 
 
 def as_launched(rank, port, arguments, errors):
