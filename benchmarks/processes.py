@@ -20,7 +20,7 @@ WAYS = ((1, 1), (1, 2), (2, 1))  # processes, threads of each
 def train(scene, intervals, processes, threads, out):
     """Train in processes of their own. Returns (seconds of the intervals, final metric)."""
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
-    command = [*(launcher if processes > 1 else []), "-m", "prdp_torch", "train", scene]
+    command = [*(launcher if processes > 1 else []), "-m", "prdp_torch", "train", scene, "--prdp"]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     subprocess.run(
         [sys.executable, *command, "--intervals", str(intervals), "--out", str(out)],

@@ -4,8 +4,11 @@ Everything here is about torch.distributed's default group, and does nothing whe
 """
 
 import contextlib
+import functools
 import os
+import socket
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -79,14 +82,49 @@ class _Loss(torch.nn.Module):
         return self.loss(batch)
 
 
+def own_gpu(device: torch.device) -> torch.device:
+    """This process's GPU, where "cuda" leaves open which one it is; any other device as it is."""
+    if count() == 1 or device != torch.device("cuda") or torch.cuda.device_count() == 0:
+        return device
+    local = int(os.environ.get("LOCAL_RANK", distributed.get_rank()))
+    return torch.device("cuda", local % torch.cuda.device_count())
+
+
+def _name_of_gpu(device: torch.device) -> tuple[str, str]:
+    """What no other GPU has."""
+    return socket.gethostname(), str(torch.cuda.get_device_properties(device).uuid)
+
+
+def gradient_group(device: torch.device) -> "distributed.ProcessGroup | None":
+    """The group that sums gradients of tensors on this device: NCCL's where each process has a GPU of its own. None is
+    the default group, which works with GPUs as well if it is gloo's; a warning says so where processes share a GPU."""
+    if device.type != "cuda" or not distributed.is_nccl_available() or distributed.get_backend() != "gloo":
+        return None
+    gpus: list[Any] = [None] * count()
+    distributed.all_gather_object(gpus, _name_of_gpu(device))
+    if len(set(gpus)) < count():
+        if is_first():
+            shared = f"{count()} processes share {len(set(gpus))} GPU{'s' if len(set(gpus)) > 1 else ''}"
+            warnings.warn(f"{shared}: gloo sums their gradients, as NCCL needs a GPU for each process", stacklevel=2)
+        return None
+    group: distributed.ProcessGroup | None = _nccl_group(distributed.group.WORLD)
+    return group
+
+
+@functools.cache
+def _nccl_group(world: object) -> Any:
+    """One for all trainings: each takes memory of the GPU."""
+    return distributed.new_group(backend="nccl")
+
+
 def shared_loss(
-    network: torch.nn.Module, loss: Callable[[Tensor], Tensor]
+    network: torch.nn.Module, loss: Callable[[Tensor], Tensor], device: torch.device
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """From `loss`, of the numbers of a batch's samples, to that of this process's share of them: (its value, its
     part of the whole loss, for the backward pass). The gradients of the parts are then those of the batch's loss."""
     if count() == 1:
         return lambda batch: (whole := loss(batch), whole)
-    parallel = torch.nn.parallel.DistributedDataParallel(_Loss(network, loss))
+    parallel = torch.nn.parallel.DistributedDataParallel(_Loss(network, loss), process_group=gradient_group(device))
 
     def of_share(batch: Tensor) -> tuple[Tensor, Tensor]:
         mine = share(batch)
@@ -153,5 +191,7 @@ def joined() -> Iterator[None]:
 
 
 def _is_of_a_connection(error: RuntimeError) -> bool:
-    """Whether gloo, which has no class of errors of its own, says that it has lost another process."""
-    return any(words in str(error) for words in ("gloo", "Connection closed", "Connection reset", "Broken pipe"))
+    """Whether gloo or NCCL, by words alone, says that it has lost another process."""
+    return any(
+        words in str(error) for words in ("gloo", "NCCL", "Connection closed", "Connection reset", "Broken pipe")
+    )

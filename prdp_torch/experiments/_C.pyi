@@ -4,7 +4,7 @@ import os
 import pathlib
 import torch
 import typing
-__all__: list[str] = ['Checkpoint', 'Compare', 'DARCY_SOURCE', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'without_mean_pressure', 'write_training', 'write_whole']
+__all__: list[str] = ['Checkpoint', 'Compare', 'DARCY_SOURCE', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'find_device', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'without_mean_pressure', 'write_training', 'write_whole']
 class Saved:
     """
     The named tensors of a file, each of which is asked for and checked.
@@ -168,13 +168,20 @@ class Compare:
         ...
 class Scene:
     backward: str
+    def __copy__(self) -> Scene:
+        ...
     def learning_rate(self, update: typing.SupportsInt | typing.SupportsIndex) -> float:
+        ...
+    def set_device(self, name: str) -> None:
         ...
     @property
     def compare(self) -> Compare:
         ...
     @property
     def data(self) -> Data:
+        ...
+    @property
+    def device(self) -> torch.device:
         ...
     @property
     def dtype(self) -> torch.dtype:
@@ -299,6 +306,8 @@ class Failures:
 def all_trajectories(scene: Scene, steps: typing.SupportsInt | typing.SupportsIndex, on_progress: collections.abc.Callable[[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex], None] = None) -> torch.Tensor:
     ...
 def diffusion_stencil(kappa: torch.Tensor, dt: typing.SupportsFloat | typing.SupportsIndex, lengths: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex] = []) -> tuple[torch.Tensor, list[list[int]]]:
+    ...
+def find_device(name: str) -> torch.device:
     ...
 def fingerprint(content: str) -> str:
     ...

@@ -3,7 +3,7 @@
 import json
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -64,6 +64,32 @@ def check_tensors(network: torch.nn.Module) -> None:
                 "train: the state_dict of network must hold tensors only, for its checkpoint, got "
                 f"{type(value).__name__} for '{name}'"
             )
+
+
+RANDOM, RANDOM_CUDA = "random", "random_cuda"
+_CUDA_STATE = torch.zeros(16, dtype=torch.uint8)  # seed and offset
+
+
+def random_states(device: torch.device) -> dict[str, Tensor]:
+    """The states of the generators that a network on this device draws from, which `load_random` takes."""
+    states = {RANDOM: torch.get_rng_state()}
+    if device.type == "cuda":
+        states[RANDOM_CUDA] = torch.cuda.get_rng_state(device)
+    return states
+
+
+def load_random(saved: _C.Saved, device: torch.device) -> None:
+    """Take the states of the generators from a `_C.Saved`. That of a GPU is passed over on another device."""
+    saved.restore(RANDOM, torch.default_generator)
+    if saved.has(RANDOM_CUDA):
+        state = saved.take(RANDOM_CUDA, _CUDA_STATE)
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(state, device)
+
+
+def make_optimiser(scene: _C.Scene, parameters: Iterable[Tensor]) -> torch.optim.Adam:
+    """Adam as the scenes use it; in one kernel where torch has one."""
+    return torch.optim.Adam(parameters, lr=scene.learning_rate(0), fused=scene.device.type in ("cpu", "cuda"))
 
 
 def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

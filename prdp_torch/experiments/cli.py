@@ -2,13 +2,14 @@
 
 import functools
 import importlib
+import json
 import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import IO, Annotated, Any, cast
 
 import torch
 import typer
@@ -59,6 +60,7 @@ Seeds = Annotated[int | None, typer.Option(**COUNT, help="How many seeds, counte
 Resume = Annotated[bool, typer.Option("--resume", help="Keep finished trainings, go on from checkpoints.")]
 Backward = Annotated[str | None, typer.Option(help="implicit, unrolled or (corrector) none, in place of the scene's.")]
 Intervals = Annotated[int | None, typer.Option(**COUNT, help="Epochs (or updates) in place of the scene's.")]
+Device = Annotated[str | None, typer.Option(metavar="NAME", help="cpu, cuda or cuda:N, in place of the scene's.")]
 
 
 def _folder(default: str) -> Any:
@@ -117,8 +119,10 @@ def scenes() -> None:
 @command
 def train(
     scene: SceneName,
-    auto: Annotated[bool, typer.Option("--auto", help="A tolerance tied to the error; nothing to choose.")] = False,
-    prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings; the default.")] = False,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="A tolerance tied to the error; nothing to choose; the default.")
+    ] = False,
+    prdp: Annotated[bool, typer.Option("--prdp", help="PRDP with the scene's settings.")] = False,
     constant: Annotated[int | None, typer.Option(**COUNT, metavar="K", help="Constant K.")] = None,
     schedule: Annotated[str | None, typer.Option(metavar="START:STEP", help="K grows by STEP an interval.")] = None,
     direct: Annotated[bool, typer.Option("--direct", help="The exact solver.")] = False,
@@ -127,10 +131,11 @@ def train(
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
+    device: Device = None,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write the curves for TensorBoard.")] = False,
 ) -> None:
     """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
-    loaded = _load(scene, backward, intervals)
+    loaded = _load(scene, device, backward, intervals)
     chosen = [
         name
         for name, given in (
@@ -144,7 +149,7 @@ def train(
     ]
     if len(chosen) > 1:
         raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
-    refinement = Refinement.auto() if auto else Refinement.prdp(loaded)
+    refinement = Refinement.prdp(loaded) if prdp else Refinement.auto()
     if constant is not None:
         refinement = Refinement.constant(constant)
     elif direct:
@@ -152,7 +157,7 @@ def train(
     elif schedule is not None:
         refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
-    environment = records.environment()
+    environment = records.environment(loaded.device)
     diverged: dict[int, str] = {}
     warnings: dict[int, str] = {}
     with records.alone_in([folder / refinement.label]), _progress() as progress:
@@ -160,7 +165,7 @@ def train(
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
             def show(interval: Interval, task: TaskID = task) -> None:
-                budget = f"rtol {interval.rtol:.1e}" if auto else f"K {interval.max_iter}"
+                budget = f"rtol {interval.rtol:.1e}" if refinement.watches_error else f"K {interval.max_iter}"
                 note = f"metric {interval.metric:.3e}  {budget}"
                 progress.update(task, completed=interval.number, note=note)
 
@@ -200,9 +205,10 @@ def compare(
     resume: Resume = False,
     backward: Backward = None,
     intervals: Intervals = None,
+    device: Device = None,
 ) -> None:
     """Compare converged, exact, auto, PRDP and a sweep of constant K: table, records and an HTML report."""
-    loaded = _load(scene, backward, intervals)
+    loaded = _load(scene, device, backward, intervals)
     folder = records.prepare_folder(out or Path("runs") / loaded.name)
     seeds = seeds or loaded.compare.seeds
     with _progress() as progress:
@@ -218,7 +224,7 @@ def compare(
         table = comparison.summarise(loaded, rows)
         records.write(
             folder / "summary.json",
-            {"settings": records.settings(loaded), **records.environment(), "seeds": seeds, "rows": table},
+            {"settings": records.settings(loaded), **records.environment(loaded.device), "seeds": seeds, "rows": table},
         )
         shown = trajectories.collect(loaded, rows, folder, _bar(progress, "pictures, steps"))
     report.write(loaded, rows, table, shown, folder)
@@ -248,9 +254,10 @@ def export(
 def advise(
     scene: SceneName,
     seconds: Annotated[float, typer.Option(metavar="S", help="The limit for each solver.")] = 5.0,
+    device: Device = None,
 ) -> None:
     """Measure which solver a scene needs and how much refinement can save, without training."""
-    loaded = scene_files.load(scene)
+    loaded = _load(scene, device)
     with console.status("trying the solvers"):
         advised = scene_advice.advise_scene(loaded, seconds)
     console.print(str(advised), soft_wrap=True, highlight=False, markup=False)
@@ -261,9 +268,14 @@ def bench(
     suites: Annotated[list[str] | None, typer.Argument(metavar="[SUITE]...", help=f"{', '.join(SUITES)}; all.")] = None,
     out: Annotated[Path | None, _folder("runs/bench")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
+    device: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Time solves on this device instead, beside a loop in torch.")
+    ] = None,
 ) -> None:
     """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""
     project = _project("bench")
+    if device is not None:
+        return _bench_device(project, device, suites or (), out, quick)
     for suite in suites or ():
         if suite not in SUITES:
             raise ValueError(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}")
@@ -272,6 +284,24 @@ def bench(
     done = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], cwd=project)
     if done.returncode:
         raise typer.Exit(done.returncode)
+
+
+def _bench_device(project: Path, device: str, suites: Sequence[str], out: Path | None, quick: bool) -> None:
+    if suites:
+        raise ValueError(f"bench: the suites time the CPU; with --device give none, got {', '.join(suites)}")
+    environment = records.environment(_C.find_device(device))
+    path = records.prepare_folder(out or Path("runs") / "bench").resolve() / "devices.json"
+    arguments = ["--device", device, *(["--quick"] if quick else [])]
+    found = []
+    command = [sys.executable, "-m", "benchmarks.devices", *arguments]
+    with subprocess.Popen(command, cwd=project, stdout=subprocess.PIPE, text=True) as running:
+        for line in cast(IO[str], running.stdout):
+            print(line, end="", flush=True)
+            found.append(json.loads(line))
+    if running.returncode:
+        raise typer.Exit(running.returncode)
+    records.write(path, {**environment, "quick": quick, "devices": found})
+    console.print(f"record: {path}", soft_wrap=True)
 
 
 @command
@@ -302,8 +332,8 @@ def _project(who: str) -> Path:
     return project
 
 
-def _load(scene: str, backward: str | None, intervals: int | None) -> _C.Scene:
-    loaded = scene_files.load(scene)
+def _load(scene: str, device: str | None, backward: str | None = None, intervals: int | None = None) -> _C.Scene:
+    loaded = scene_files.placed(scene_files.load(scene), device)
     if backward is not None:
         loaded.backward = backward
     if intervals is not None:

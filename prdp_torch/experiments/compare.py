@@ -131,7 +131,7 @@ def run(
     on_data: as in `train`.
     """
     report = progress or (lambda *event: None)
-    environment = records.environment()
+    environment = records.environment(scene.device)
     rows = rows_of(scene)
     with records.alone_in([folder / row.label for row in rows]):
         for row in rows:

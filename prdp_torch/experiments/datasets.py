@@ -32,7 +32,7 @@ class Data(NamedTuple):
 
 
 def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) -> "Data | _C.Dataset":
-    """The data of a training.
+    """The data of a training, on the device of the scene.
 
     Args:
         scene: from `prdp_torch.experiments.scenes.load`.
@@ -57,17 +57,19 @@ def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) ->
     _check_times("training", train, steps)
     _check_times("validation", valid, scene.data.valid_steps)
     starts, *between, end = (train[:, n : train.shape[1] - steps + n].flatten(0, 1) for n in range(steps + 1))
-    return Data(
-        starts, torch.stack(between, 1), end, valid[:, 0].contiguous(), valid[:, scene.data.valid_steps].contiguous()
-    )
+    valid_start, valid_end = (valid[:, n].contiguous() for n in (0, scene.data.valid_steps))
+    parts = starts, torch.stack(between, 1), end, valid_start, valid_end
+    return Data(*(part.to(scene.device) for part in parts))
 
 
 def reference(scene: _C.Scene, steps: int, on_data: OnData | None = None) -> Tensor:
-    """Validation trajectories of `steps` steps, or of as many as the scene's file has: (samples, steps + 1,
-    channels, *shape)."""
+    """Validation trajectories of `steps` steps, or of as many as the scene's file has, on the device of the scene:
+    (samples, steps + 1, channels, *shape)."""
     if not scene.data.file:
-        return _C.validation_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
-    return pdebench.read(path_of(scene), scene)[scene.data.train :, : steps + 1]
+        made = _C.validation_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
+    else:
+        made = pdebench.read(path_of(scene), scene)[scene.data.train :, : steps + 1]
+    return made.to(scene.device)
 
 
 def export(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from prdp_torch import operators
 from prdp_torch.experiments import _C
-from prdp_torch.experiments.checkpoint import load_optimiser, state_of
+from prdp_torch.experiments.checkpoint import load_optimiser, make_optimiser, state_of
 from prdp_torch.experiments.task import Task
 from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solve import detach_failed
@@ -101,7 +101,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int) -> Task:
     (stepper,) = cast(list[ImplicitStep], steppers)
     problem = _C.make_field_problem(scene, seed)
     theta = problem.theta.clone().requires_grad_()
-    optimiser = torch.optim.Adam([theta], lr=scene.learning_rate(0), fused=True)
+    optimiser = make_optimiser(scene, [theta])
     relative = 1.0  # before the first solve nothing is explained yet
 
     def updates(number: int) -> Iterator[tuple[float, Tensor | None]]:
@@ -128,7 +128,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int) -> Task:
     def load(saved: _C.Saved, updates: int) -> None:
         theta.detach().copy_(saved.take("theta", theta))
         if isinstance(equation, Darcy):
-            equation.pressure = saved.take("pressure", problem.start)
+            equation.pressure = saved.take("pressure", problem.start).to(scene.device)
         load_optimiser(saved, optimiser, updates)
 
     return Task(updates, metric, lambda _: relative, state, load)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from prdp_torch import data_parallel, fields
 from prdp_torch.experiments import _C, datasets
-from prdp_torch.experiments.checkpoint import load_optimiser, state_of
+from prdp_torch.experiments.checkpoint import load_optimiser, make_optimiser, state_of
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_stepper
 from prdp_torch.experiments.task import Task
@@ -26,17 +26,19 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torc
     train = _TrainingSamples(scene, data)
     data_parallel.check_batches(train.count, scene.training.batch)
     if network is None:
-        network = make_network(scene, seed)
+        network = make_network(scene, seed).to(scene.device)
     else:
+        if isinstance(network, torch.nn.Module):
+            network.to(scene.device)
         datasets.check_network(scene, network, data.train_start[:1])
     objective = _emulator if scene.task == "emulator" else _corrector
-    loss_of = data_parallel.shared_loss(network, objective(scene, steppers, train, network))
-    optimiser = torch.optim.Adam(network.parameters(), lr=scene.learning_rate(0), fused=True)
+    loss_of = data_parallel.shared_loss(network, objective(scene, steppers, train, network), scene.device)
+    optimiser = make_optimiser(scene, network.parameters())
     generator = torch.Generator().manual_seed(seed)
 
     def updates(first: int) -> Iterator[tuple[float, Tensor | None]]:
         train.begin(first)
-        order = torch.randperm(train.count, generator=generator)
+        order = torch.randperm(train.count, generator=generator).to(scene.device)
         for number, batch in enumerate(order.split(scene.training.batch), first):
             for group in optimiser.param_groups:
                 group["lr"] = scene.learning_rate(number)
@@ -53,11 +55,11 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int, network: torc
     def load(saved: _C.Saved, updates: int) -> None:
         trained = load_optimiser(saved, optimiser, updates)
         parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-        finite = {parameters[i].data_ptr() for i in trained}  # a buffer, such as a mask, may hold Inf
+        finite = {id(parameters[i]) for i in trained}  # a buffer, such as a mask, may hold Inf
         network.load_state_dict(
             {
-                name: saved.take(f"network.{name}", value, finite=value.data_ptr() in finite)
-                for name, value in network.state_dict().items()
+                name: saved.take(f"network.{name}", value, finite=id(value) in finite)
+                for name, value in network.state_dict(keep_vars=True).items()
             }
         )
         saved.restore("shuffling", generator)

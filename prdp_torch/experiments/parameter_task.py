@@ -20,7 +20,7 @@ def make_task(scene: _C.Scene, steppers: list[Stepper], seed: int) -> Task:
 
     def updates(number: int) -> Iterator[tuple[float, Tensor | None]]:
         nonlocal misfit
-        u = stepper((theta @ problem.modes)[None, None])
+        u = stepper((theta[None] @ problem.modes)[None])
         loss = _C.half_mse(u, problem.solution)
         (gradient,) = torch.autograd.grad(loss, theta)
         with torch.no_grad():

@@ -19,8 +19,8 @@ from prdp_torch._C import VERSION
 from prdp_torch.experiments import _C, datasets, own_networks
 
 
-def environment() -> dict[str, Any]:
-    """Versions, machine and commit, as far as they can be found out."""
+def environment(device: torch.device | None = None) -> dict[str, Any]:
+    """Versions, machine and commit, as far as they can be found out; `device` is that of a training."""
     return {
         "versions": {"prdp_torch": VERSION, "torch": torch.__version__, "python": platform.python_version()},
         "machine": {
@@ -28,10 +28,16 @@ def environment() -> dict[str, Any]:
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
             "processes": data_parallel.count(),
+            **({} if device is None else _of_device(device)),
         },
         "commit": _commit(),
         "command": " ".join([_program(), *sys.argv[1:]]),
     }
+
+
+def _of_device(device: torch.device) -> dict[str, str]:
+    card = {"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}
+    return {"device": str(device), **card}
 
 
 def _program() -> str:
@@ -102,15 +108,18 @@ def write(path: Path, content: str | dict[str, Any]) -> None:
 
 
 def write_training(path: Path, record: dict[str, Any], network: torch.nn.Module | None = None) -> None:
-    """Write the record of a training, and the `state_dict` of its network (if it has one) beside it: both, each whole,
-    or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier record is
-    then still there, with its weights. Of several processes the first one writes."""
+    """Write the record of a training, and the `state_dict` of its network (if it has one) beside it, on the CPU: both,
+    each whole, or neither. The record holds the weights' fingerprint. ValueError if they cannot be written; an earlier
+    record is then still there, with its weights. Of several processes the first one writes."""
     if not data_parallel.is_first():
         return
     weights = b""
     if network is not None:
         content = io.BytesIO()
-        torch.save(network.state_dict(), content)
+        state = network.state_dict()
+        for name, value in state.items():
+            state[name] = value.cpu()
+        torch.save(state, content)
         weights = content.getvalue()
         fingerprint = _C.fingerprint(weights)  # type: ignore[arg-type]  # it takes bytes
         record = {**record, "weights": fingerprint}

@@ -182,7 +182,7 @@ def write(scene: _C.Scene, rows: list[Row], table: list[Entry], shown: Trajector
     html = template.render(
         scene=scene,
         seeds=len(rows[0].curves),
-        environment=records.environment(),
+        environment=records.environment(scene.device),
         headline=headline(scene, table),
         failures=failures(scene, table),
         columns=[column.long for column in columns(scene)],

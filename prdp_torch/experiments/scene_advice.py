@@ -18,14 +18,15 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
             f"advise: the equation of '{scene.name}' changes in every update, as its field does; make the step with a "
             "field of yours and call prdp_torch.advise on it"
         )
+    _C.find_device(str(scene.device))
     seconds, step, update = checked_limit(seconds), make_stepper(scene), Update()
     if scene.task == "parameters":
         problem = _C.make_parameter_problem(scene)
         sample = (problem.start @ problem.modes)[None, None]
     else:
         states = datasets.reference(scene, 0)[:, 0]
-        sample = states[torch.arange(scene.training.batch) % len(states)]
-        network = make_network(scene, 0)
+        sample = states[torch.arange(scene.training.batch, device=scene.device) % len(states)]
+        network = make_network(scene, 0).to(scene.device)
         # A corrector's first solve starts from data, which need no gradient.
         adjoints = 0 if scene.backward == "none" else 1
         update = Update(scene.executions * network_seconds(network, sample, seconds), scene.executions, adjoints)

@@ -1,9 +1,12 @@
 """Scenes: training experiments as TOML files, read by the compiled library for both languages."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
-from prdp_torch import solvers, steppers
+import torch
+
+from prdp_torch import data_parallel, solvers, steppers
 from prdp_torch.experiments import _C, field_task
 from prdp_torch.flow import Flow
 from prdp_torch.stepper import Stepper
@@ -34,8 +37,19 @@ def load(scene: str | Path) -> _C.Scene:
     return _C.read_scene(str(known[str(scene)]))
 
 
+def placed(scene: _C.Scene, device: "str | torch.device | None" = None) -> _C.Scene:
+    """Return a copy of a scene whose data, network and solves live on `device`; None keeps the scene's own. Of
+    several processes each takes its own GPU for "cuda". ValueError if there is no such device here."""
+    there = copy.copy(scene)
+    if device is not None:
+        there.set_device(str(device))
+    there.set_device(str(data_parallel.own_gpu(there.device)))  # before anything is made on another GPU
+    _C.find_device(str(there.device))
+    return there
+
+
 def make_stepper(scene: _C.Scene, direct: bool = False, max_iter: int | None = None) -> Stepper:
-    """Make the stepper of a scene.
+    """Make the stepper of a scene, on its device.
 
     Args:
         scene: from `load`.
@@ -61,8 +75,8 @@ def make_stepper(scene: _C.Scene, direct: bool = False, max_iter: int | None = N
     if physics.force is not None:
         # As the C++ trainer has it: central differences would make waves grow at these Courant numbers.
         return Flow(
-            physics.shape, physics.nu, physics.dt, length=physics.length, force=physics.force, advection="upwind",
-            **options,
+            physics.shape, physics.nu, physics.dt, length=physics.length, force=physics.force.to(scene.device),
+            advection="upwind", **options,
         )  # fmt: skip
     kinds = {"heat": steppers.Heat, "burgers": steppers.Burgers, "navier_stokes": steppers.NavierStokes}
     kind = kinds[physics.equation]

@@ -10,6 +10,7 @@ from torch import Tensor
 from prdp_torch import fields
 from prdp_torch.experiments import _C, network_task, own_networks, records
 from prdp_torch.experiments.networks import make_network
+from prdp_torch.experiments.scenes import placed
 from prdp_torch.experiments.training import Curves
 
 
@@ -35,13 +36,14 @@ class Trained(NamedTuple):
         return fields.rollout(self.step, u, steps)
 
 
-def load_trained(run_folder: str | Path, seed: int = 0) -> Trained:
+def load_trained(run_folder: str | Path, seed: int = 0, device: str | torch.device = "cpu") -> Trained:
     """Load a trained network from the folder of its training.
 
     Args:
         run_folder: the folder with the records, such as "runs/heat_1d-train/prdp". The folder above it
             will do if it holds a single way of choosing K.
         seed: which of the trainings.
+        device: where the network shall be, such as "cuda"; it may have been trained on any other.
 
     Returns:
         A `Trained`. Call it for one time step, or use its `rollout(u, steps)`. Wrap the call in
@@ -49,7 +51,7 @@ def load_trained(run_folder: str | Path, seed: int = 0) -> Trained:
 
     Raises:
         ValueError: no record or no weights are there, they are damaged or do not belong together, or the
-            training diverged.
+            training diverged. Or there is no such device here.
 
     If the scene has a network of your own, `network = "module:Class"`, the module is imported from where it was for the
     training. Then load only records that you trust; other records run no code.
@@ -61,7 +63,7 @@ def load_trained(run_folder: str | Path, seed: int = 0) -> Trained:
     path = _record_in(Path(run_folder), f"seed_{seed}.json")
     record = records.read_training(path)
     assert record is not None
-    scene = records.scene_of(path, record)
+    scene = placed(records.scene_of(path, record), device)
     if not scene.trains_network:
         raise ValueError(f"load_trained: the scene '{scene.name}' trains no network; read its record, '{path}'")
     if "diverged" in record["curves"]:
@@ -73,6 +75,7 @@ def load_trained(run_folder: str | Path, seed: int = 0) -> Trained:
         raise ValueError(
             f"load_trained: '{records.weights_of(path)}', the weights that belong to the record, is missing"
         )
+    network.to(scene.device)
     return Trained(network, network_task.propagator(scene, network), scene, record["curves"])
 
 

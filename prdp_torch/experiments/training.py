@@ -1,24 +1,24 @@
 """The Python trainer. Data, losses and metrics come from the library, the network may be any
-`nn.Module`; `csrc/train` holds the same loops in C++."""
+`nn.Module`; `csrc/prdp_experiments/training` holds the same loops in C++."""
 
+import contextlib
 import functools
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 
 import torch
-from torch import Tensor
 
 from prdp_torch import data_parallel
 from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
-from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors
+from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors, load_random, random_states
 from prdp_torch.experiments.refinement import Refinement
-from prdp_torch.experiments.scenes import make_stepper
+from prdp_torch.experiments.reports import any_refused, on_host, spent_on
+from prdp_torch.experiments.scenes import make_stepper, placed
 from prdp_torch.experiments.task import Task
-from prdp_torch.solve import SolveInfo, SolveStatus
 from prdp_torch.stepper import Stepper
 
 
@@ -84,6 +84,7 @@ def train(
     on_data: datasets.OnData | None = None,
     checkpoint: Checkpoint | None = None,
     data: datasets.Own = None,
+    device: str | torch.device | None = None,
 ) -> Curves:
     """Train a scene once.
 
@@ -104,6 +105,9 @@ def train(
             dt, as a tensor, an array or a dataset of trajectories. The first `data.train` of them train, the next
             `data.valid` validate; or give a pair (training, validation). Every state of a training trajectory
             that two more states follow is a sample.
+        device: where data, network, optimiser and solves live, such as "cuda" or "cuda:1"; by default the scene's. The
+            same seed gives the same data and initial weights on every device. A network of yours is moved there, and
+            stays there. A training may continue on another device than its checkpoint is from.
 
     Returns:
         The curves, a dict of lists with one entry per interval: an epoch, or an update if there is no network.
@@ -123,16 +127,18 @@ def train(
           there, and the curves end with that interval, with a metric of NaN and no costs.
 
     Raises:
-        ValueError, TypeError: network, data or checkpoint do not fit the scene. Network and data are checked before
-            any work.
+        ValueError, TypeError: network, data or checkpoint do not fit the scene, or there is no such device here.
+            Device, network and data are checked before any work.
 
     If torch.distributed is initialised, every process calls this with the same arguments. The processes share each
     batch and the validation samples and return the same curves, which are those of one process to rounding. The first
     one keeps the checkpoint. ValueError for a task without a network, and if a batch has fewer samples than there are
-    processes.
+    processes. With the device "cuda" each process takes the GPU of its LOCAL_RANK; NCCL sums the gradients if no two
+    processes share one.
     """
     if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
+    scene = placed(scene, device)
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):
@@ -150,10 +156,23 @@ def train(
     else:
         task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
     try:
-        run.go(task, found)
+        with _repeatable():
+            run.go(task, found)
     except _Diverged as divergence:
         run.give_up(str(divergence))
     return cast(Curves, run.curves)
+
+
+@contextlib.contextmanager
+def _repeatable() -> Iterator[None]:
+    """Convolutions of GPUs that give the same bits each time: a training that continues then ends where it would
+    have."""
+    before = torch.backends.cudnn.deterministic
+    torch.backends.cudnn.deterministic = True
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.deterministic = before
 
 
 class _Diverged(Exception):
@@ -179,6 +198,7 @@ class _Run:
         self.who = f"{scene.name}, {refinement.label}, seed {seed}"
         self.goes_on = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
         self.intervals = scene.training.intervals
+        self.device = scene.device
         self.steppers = steppers
         self.controller = refinement.attach(steppers)
         self.watches_error = refinement.watches_error
@@ -227,7 +247,7 @@ class _Run:
         return len(self.curves["seconds"])
 
     def _keep(self, task: Task, checkpoint: Checkpoint) -> None:
-        tensors = {**task.state(), "random": torch.get_rng_state()}
+        tensors = {**task.state(), **random_states(self.device)}
         checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
     def _restores(self, task: Task, found: Found) -> bool:
@@ -242,7 +262,7 @@ class _Run:
         curves, controller = saved.progress(task.updates_per_interval)
         task.load(saved, len(curves["update_loss"]))
         self.controller.load_state_dict({**self.controller.state_dict(), **controller})
-        saved.restore("random", torch.default_generator)
+        load_random(saved, self.device)
         self.curves = curves
 
     def _run_interval(self, task: Task, number: int) -> None:
@@ -251,13 +271,15 @@ class _Run:
         iterations = forward = adjoint = 0.0
         failures = _C.Failures()
         for loss, samples in task.updates(len(self.curves["update_loss"])):
-            solves += sum(report.iterations[0].numel() for report in self._reports())
-            loss, refused, *spent = data_parallel.mean([loss, self._refused(), *self._spent()], self._samples())
+            reports = on_host(stepper.info for stepper in self.steppers)
+            adjoints = on_host(stepper.adjoint_info for stepper in self.steppers)
+            solves += sum(report.iterations[0].numel() for report in reports)
+            known = [loss, any_refused(reports), *spent_on(reports, adjoints)]
+            loss, refused, *spent = data_parallel.mean(known, len(reports[0].iterations))
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
             iterations, forward, adjoint = (a + b for a, b in zip((iterations, forward, adjoint), spent, strict=True))
-            adjoints = [report.status for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
-            failures.take([report.status for report in self._reports()], adjoints, samples)
+            failures.take([report.status for report in reports], [report.status for report in adjoints], samples)
         seconds = time.perf_counter() - started
         failed = int(data_parallel.sums([failures.count])[0])
         self._append(k, k * solves, iterations, forward + adjoint, adjoint, rtol, failed, seconds)
@@ -291,33 +313,8 @@ class _Run:
         else:
             self.controller.step(metric, error=error)
 
-    def _reports(self) -> list[SolveInfo]:
-        """Of the solves of the last update."""
-        return [stepper.info for stepper in self.steppers if stepper.info is not None]
-
-    def _samples(self) -> int:
-        return len(self._reports()[0].iterations)
-
-    def _refused(self) -> bool:
-        """Whether the solver was given NaN or Inf by the last update."""
-        return any(bool((report.status <= SolveStatus.NONFINITE_INPUT).any()) for report in self._reports())
-
-    def _spent(self) -> tuple[float, float, float]:
-        """Iterations, operator applications and adjoint applications of the last update."""
-        adjoint = [report for stepper in self.steppers if (report := stepper.adjoint_info) is not None]
-        return (
-            sum((_per_sample(info.iterations) for info in self._reports()), 0.0),
-            sum((_per_sample(info.operator_applications) for info in self._reports()), 0.0),
-            sum((_per_sample(info.operator_applications) for info in adjoint), 0.0),
-        )
-
     def _check(self, loss: float, refused: float, done: int) -> None:
         if not math.isfinite(loss):
             raise _Diverged(f"interval {done}: the loss is {loss}")
         if refused and not self.goes_on:
             raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
-
-
-def _per_sample(counts: Tensor) -> float:
-    """Of counts (batch,), or (batch, steps) of a rollout, summed over the steps."""
-    return float(counts.double().mean(0).sum())

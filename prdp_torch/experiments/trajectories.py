@@ -59,7 +59,7 @@ def collect(scene: _C.Scene, rows: list[Row], folder: Path, on_data: OnData | No
     ]
     if scene.task == "corrector":
         courses.insert(0, _follow(scene, "coarse solver alone", "coarse", [torch.zeros_like], reference))
-    return Trajectories(reference, courses, [row.title for row in rows if not networks[row.label]])
+    return Trajectories(reference.cpu(), courses, [row.title for row in rows if not networks[row.label]])
 
 
 def field(scene: _C.Scene, states: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ def _networks(scene: _C.Scene, row: Row, folder: Path) -> list[torch.nn.Module]:
         for seed in range(len(row.curves))
         if "diverged" not in row.curves[seed]
     ]
-    return [network for network in networks if network is not None]
+    return [network.to(scene.device) for network in networks if network is not None]
 
 
 def _follow(
@@ -87,4 +87,4 @@ def _follow(
     with torch.no_grad():
         runs = [fields.rollout(propagator(scene, network), reference[:, 0], steps) for network in networks]
     errors = [[error(scene, run[:, n], reference[:, n]) for n in range(1, steps + 1)] for run in runs]
-    return Course(title, kind, runs[0], np.array(errors))
+    return Course(title, kind, runs[0].cpu(), np.array(errors))

@@ -63,7 +63,7 @@ class CppForgery(Forgery):
         self.scene = written(self.folder, SMALL, ("train = 200", "train = 50"))
 
     def run(self, out, *more):
-        command = [TRAINER, self.scene, "--out", out, "--intervals", str(self.intervals), *more]
+        command = [TRAINER, self.scene, "--out", out, "--intervals", str(self.intervals), "--prdp", *more]
         environment = {**os.environ, **SETTINGS}
         return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
 

@@ -65,12 +65,12 @@ class Attempt:
     def __init__(self, trainer, arguments, cache):
         environment = {"PRDP_CACHE": str(cache), "OMP_NUM_THREADS": "1", "PRDP_CHECKPOINT_SECONDS": "0"}
         if trainer == "cpp":
-            command = [ROOT / "build" / "prdp_train", *arguments]
+            command = [ROOT / "build" / "prdp_train", "--prdp", *arguments]
             nowhere = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
             self.process = subprocess.Popen(command, env={**os.environ, **environment}, **nowhere)
             self.wait = self.process.wait
         else:
-            self.process = FORK.Process(target=_prdp, args=(["train", *arguments], environment))
+            self.process = FORK.Process(target=_prdp, args=(["train", "--prdp", *arguments], environment))
             self.process.start()
             self.wait = self.process.join
 

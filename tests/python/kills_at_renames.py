@@ -25,7 +25,7 @@ for line in sys.stdin:
     if child == 0:
         os.environ.update(environment)
         sys.stdout = sys.stderr = open(os.devnull, "w")
-        sys.argv = ["prdp", "train", *arguments]
+        sys.argv = ["prdp", "train", "--prdp", *arguments]
         torch.set_num_threads(1)
         try:
             cli.main()
@@ -59,7 +59,7 @@ class Runner:
     def __call__(self, arguments, **changes):
         arguments, environment = list(map(str, arguments)), {**self.environment, **changes}
         if self.forks is None:
-            command = [kills.ROOT / "build" / "prdp_train", *arguments]
+            command = [kills.ROOT / "build" / "prdp_train", "--prdp", *arguments]
             done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, timeout=300)
             return done.returncode
         print(json.dumps([arguments, environment]), file=self.forks.stdin, flush=True)

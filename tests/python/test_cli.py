@@ -65,17 +65,17 @@ def test_resume_keeps_what_is_finished_and_redoes_what_is_not(comparison):
     missing.unlink()
     done = prdp("compare", "heat_1d", "--seeds", 2, "--intervals", 4, "--resume", cwd=folder)
     assert done.returncode == 0 and missing.exists() and kept.stat().st_mtime_ns == before
-    longer = prdp("train", "heat_1d", "--intervals", 5, "--resume", "--out", records, cwd=folder)
+    longer = prdp("train", "heat_1d", "--prdp", "--intervals", 5, "--resume", "--out", records, cwd=folder)
     assert longer.returncode == 2 and "of a finished training of 4 intervals, not 5; it cannot go on" in longer.stderr
     assert kept.stat().st_mtime_ns == before
     other = ("--backward", "unrolled", "--intervals", 5, "--resume")  # not the same training
-    assert prdp("train", "heat_1d", *other, "--out", records, cwd=folder).returncode == 0
+    assert prdp("train", "heat_1d", "--prdp", *other, "--out", records, cwd=folder).returncode == 0
     assert kept.stat().st_mtime_ns > before
 
 
 @pytest.mark.parametrize(
-    "options, label", [([], "prdp"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
-                       (["--direct"], "direct"), (["--auto"], "auto")]
+    "options, label", [([], "auto"), (["--constant", "3"], "constant_3"), (["--schedule", "2:1"], "schedule_2_1"),
+                       (["--direct"], "direct"), (["--auto"], "auto"), (["--prdp"], "prdp")]
 )  # fmt: skip
 def test_train_writes_one_record_and_the_weights_of_each_seed(tmp_path, options, label):
     done = prdp("train", "heat_1d", *options, "--seeds", 2, "--intervals", 2, "--out", "here", cwd=tmp_path)
@@ -124,7 +124,7 @@ def test_mistakes_are_one_line_and_exit_2(tmp_path, arguments, message):
 )
 def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    first = tmp_path / "prdp/seed_0.json"
+    first = tmp_path / "auto/seed_0.json"
     for _ in range(600):
         if first.exists():
             break

@@ -129,7 +129,7 @@ def test_a_cache_that_cannot_be_written_is_said_before_any_work(tmp_path, monkey
         _C.make_dataset(scenes.load(tiny(tmp_path)), no_solve)
 
 
-@pytest.mark.parametrize("arguments, refine", [([], Refinement.prdp), (["--constant", "3"], None)])
+@pytest.mark.parametrize("arguments, refine", [(["--prdp"], Refinement.prdp), (["--constant", "3"], None)])
 @pytest.mark.parametrize("backward", ["implicit", "none"])
 def test_both_languages_train_alike(tmp_path, arguments, refine, backward):
     path = tiny(tmp_path)

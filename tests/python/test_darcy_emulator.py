@@ -46,7 +46,7 @@ def test_the_gradient_of_log_kappa(tmp_path, backward):
 
 
 @pytest.mark.parametrize("fresh", [False, True])
-@pytest.mark.parametrize("arguments, refine", [([], Refinement.prdp), (["--auto"], lambda _: Refinement.auto())])
+@pytest.mark.parametrize("arguments, refine", [(["--prdp"], Refinement.prdp), ([], lambda _: Refinement.auto())])
 def test_both_languages_train_alike(tmp_path, arguments, refine, fresh):
     path = small(tmp_path, *([("seed = 0", "seed = 0\nfresh = true")] if fresh else []))
     scene = scenes.load(path)

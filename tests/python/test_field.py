@@ -134,7 +134,7 @@ def in_cpp(tmp_path, path, *arguments):
         (["--auto"], lambda scene: Refinement.auto()),
         (["--constant", "4"], lambda scene: Refinement.constant(4)),
         (["--direct"], lambda scene: Refinement.exact()),
-        ([], Refinement.prdp),
+        (["--prdp"], Refinement.prdp),
     ],
     ids=["auto", "constant", "direct", "prdp"],
 )

@@ -120,7 +120,7 @@ def test_damaged_checkpoints_are_refused(tmp_path):
 @pytest.mark.parametrize("trainer", TRAINERS)
 @pytest.mark.parametrize("content", ["{}", "null", "", None])
 def test_what_is_no_record_is_one_line(tmp_path, trainer, content):
-    record = tmp_path / "prdp/seed_0.json"
+    record = tmp_path / "auto/seed_0.json"
     record.parent.mkdir()
     record.mkdir() if content is None else record.write_text(content)
     status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1, "--resume")
@@ -130,7 +130,7 @@ def test_what_is_no_record_is_one_line(tmp_path, trainer, content):
 
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_a_checkpoint_that_is_a_folder_is_one_line(tmp_path, trainer):
-    checkpoint = tmp_path / "prdp/seed_0.checkpoint"
+    checkpoint = tmp_path / "auto/seed_0.checkpoint"
     checkpoint.mkdir(parents=True)
     for resume in ([], ["--resume"]):
         status, errors = run(trainer, HEAT, "--out", tmp_path, "--intervals", 1, *resume)
@@ -166,7 +166,7 @@ class Bomb:
 @pytest.mark.filterwarnings("ignore:`torch.jit", "ignore:'torch.load' received a zip file")
 def test_no_checkpoint_runs_code(tmp_path):
     process = subprocess.Popen([TRAINER, HEAT, "--out", tmp_path / "cpp"], stdout=subprocess.PIPE, text=True)
-    path = tmp_path / "cpp/prdp/seed_0.checkpoint"
+    path = tmp_path / "cpp/auto/seed_0.checkpoint"
     while not path.exists():
         assert process.poll() is None
     process.kill()
@@ -243,7 +243,7 @@ def test_a_finished_training_is_not_overwritten_by_a_longer_one(tmp_path, traine
 
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_a_folder_is_trained_into_by_one_process_at_a_time(tmp_path, trainer):
-    folder = tmp_path / "prdp"
+    folder = tmp_path / "auto"
     folder.mkdir()
     (folder / "seed_0.json.1-0.part").touch()  # of a killed process
     lock = _C.FolderLock(folder)
@@ -263,8 +263,8 @@ def test_many_processes_with_one_folder_finish_or_say_why(tmp_path):
     assert any(status == 0 for _, status in ends)
     for errors, status in ends:
         assert status == 0 or (status == 2 and "another process is training into" in errors and errors.count("\n") == 1)
-    assert records.read(tmp_path / "prdp/seed_0.json")["curves"]["metric"]
-    assert sorted(path.name for path in (tmp_path / "prdp").iterdir()) == ["seed_0.json", "seed_0.pt"]
+    assert records.read(tmp_path / "auto/seed_0.json")["curves"]["metric"]
+    assert sorted(path.name for path in (tmp_path / "auto").iterdir()) == ["seed_0.json", "seed_0.pt"]
 
 
 @pytest.mark.parametrize("trainer, most", [("python", 8000), ("cpp", 1000)])  # weights, a record
@@ -275,11 +275,11 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_record(tmp_path, trainer, mo
 
     arguments = (trainer, HEAT, "--out", tmp_path, "--intervals")
     assert run(*arguments, 1)[0] == 0
-    before = {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()}
+    before = {path.name: path.read_bytes() for path in (tmp_path / "auto").iterdir()}
     calm = {**os.environ, "PRDP_CHECKPOINT_SECONDS": "1000"}
     status, errors = in_process_of_its_own(*arguments, 2, preexec_fn=no_room, env=calm)
     assert status == 2 and "cannot write '" in errors and "File too large" in errors and errors.count("\n") == 1
-    assert {path.name: path.read_bytes() for path in (tmp_path / "prdp").iterdir()} == before
+    assert {path.name: path.read_bytes() for path in (tmp_path / "auto").iterdir()} == before
 
 
 # ---- errors in one line

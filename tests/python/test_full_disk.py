@@ -113,7 +113,7 @@ def test_a_training_on_a_disk_that_fills_is_one_line_and_goes_on_bit_for_bit(tmp
     scene = written(tmp_path)
 
     def run(out, *more, **options):
-        command = [*TRAINERS[trainer], scene, "--out", out, "--intervals", "30", *more]
+        command = [*TRAINERS[trainer], scene, "--out", out, "--intervals", "30", "--prdp", *more]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
         return done.returncode, done.stderr
 

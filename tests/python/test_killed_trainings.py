@@ -23,7 +23,7 @@ TRAINERS = {
 
 
 def start(trainer, scene, out, *arguments):
-    command = [*TRAINERS[trainer], scene, "--out", out, *map(str, arguments)]
+    command = [*TRAINERS[trainer], scene, "--prdp", "--out", out, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
@@ -213,7 +213,7 @@ def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, trainer):
     (out / "prdp").mkdir(parents=True)
     for folder in (out / "prdp", out):
         folder.chmod(0o555)
-        command = [*TRAINERS[trainer], scene, "--out", out, "--intervals", "2"]
+        command = [*TRAINERS[trainer], scene, "--out", out, "--intervals", "2", "--prdp"]
         done = subprocess.run(command, capture_output=True, text=True, preexec_fn=with_the_rights_of_a_user)
         assert done.returncode == 2 and "Permission denied" in done.stderr and done.stderr.count("\n") == 1
         assert f"cannot write to '{out}" in done.stderr or f"cannot write '{out}" in done.stderr

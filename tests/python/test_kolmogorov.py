@@ -99,7 +99,7 @@ def test_the_loss_is_that_of_all_trained_steps(tmp_path):
 @pytest.mark.parametrize(
     "arguments, refine, changes",
     [
-        ([], Refinement.prdp, []),
+        (["--prdp"], Refinement.prdp, []),
         (["--auto"], lambda _: Refinement.auto(), []),
         (["--constant", "3"], lambda _: Refinement.constant(3), [ZERO_GRAD]),
     ],

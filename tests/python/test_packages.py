@@ -13,6 +13,9 @@ import torch
 
 ROOT = Path(__file__).parents[2]
 BUILD = ROOT / "build"
+sys.path.append(str(ROOT / "packaging"))
+import make_wheel  # noqa: E402
+
 CMAKE = Path(sys.executable).with_name("cmake")
 
 
@@ -110,29 +113,39 @@ def test_the_source_archive_can_be_built(tmp_path):
     run(CMAKE, "-S", source, "-B", tmp_path / "build", "-G", "Ninja", f"-DPython_EXECUTABLE={sys.executable}")
 
 
-def test_the_wheel_works_in_an_environment_of_its_own(tmp_path):
-    setup(tmp_path, "build", "--build-base", tmp_path / "base", "bdist_wheel", "--dist-dir", tmp_path)
-    (wheel,) = tmp_path.glob("*.whl")
+def needed(library):
+    """The libraries that it asks for."""
+    return set(re.findall(r"\(NEEDED\)\s+Shared library: \[(.*?)\]", run("readelf", "--dynamic", library).stdout))
+
+
+def test_the_wheel_works_in_an_environment_of_its_own(tmp_path, monkeypatch):
+    """As it is made for the CPU and for CUDA. The first program of the README runs with it."""
+    monkeypatch.setenv("PRDP_BUILD_DIR", str(BUILD))
+    monkeypatch.setenv("PATH", f"{CMAKE.parent}:{os.environ['PATH']}")
+    release = torch.__version__.partition("+")[0]
+    wheel = make_wheel.build(tmp_path)
+    assert re.fullmatch(rf"prdp_torch-[\d.]+\+torch{re.escape(release)}-cp3\d+-cp3\d+-linux_\w+\.whl", wheel.name)
     with zipfile.ZipFile(wheel) as archive:
         (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        assert f"Requires-Dist: torch=={torch.__version__.partition('+')[0]}\n" in archive.read(metadata).decode()
+        assert f"Requires-Dist: torch=={release}\n" in archive.read(metadata).decode()
     run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "fresh")
     python = tmp_path / "fresh" / "bin" / "python"
     run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)
     (packages,) = (tmp_path / "fresh" / "lib").glob("python*/site-packages")
+    libraries = [*(packages / "prdp_torch").rglob("*.so")]
+    asked = set.union(*map(needed, libraries)) - {library.name for library in libraries}
+    of_the_system = {"libstdc++.so.6", "libm.so.6", "libgcc_s.so.1", "libc.so.6", "ld-linux-x86-64.so.2"}
+    assert len(libraries) == 3 and asked - of_the_system == set(make_wheel.TORCH)  # none of CUDA's
     # Torch and the others come from here: no network. An editable installation among them is not followed.
     (packages / "others.pth").write_text(str(Path(torch.__file__).parents[1]))
-    smoke = """
-import torch, prdp_torch as prdp
+    program = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    where = """
+assert heat.converged and u0.grad.abs().min() > 0
 from prdp_torch.experiments import scenes
-u = torch.randn(2, 1, 30, requires_grad=True)
-heat = prdp.Heat((30,), 1e-3, 1.0, prdp.CG(100))
-heat(u).sum().backward()
-assert heat.converged and u.grad.abs().min() > 0
 print(prdp.__file__, *map(str, scenes.available().values()))
 """
-    found = run(python, "-c", smoke, folder=tmp_path).stdout.split()
-    assert len(found) > 5 and all(path.startswith(str(packages)) for path in found)
+    *_, found = run(python, "-c", program + where, folder=tmp_path).stdout.splitlines()
+    assert len(found.split()) > 5 and all(path.startswith(str(packages)) for path in found.split())
     listed = run(tmp_path / "fresh" / "bin" / "prdp", "scenes", folder=tmp_path).stdout
     assert "heat_1d" in listed and "navier_stokes" in listed
 

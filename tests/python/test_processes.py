@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -256,13 +257,58 @@ def worker_of(launcher, rank):
 
 def test_torchrun_ends_with_a_message_when_a_process_dies(tmp_path):
     launcher = torchrun(
-        "-m", "prdp_torch", "train", emulator(tmp_path), "--out", tmp_path / "out", "--intervals", 100000
+        "-m", "prdp_torch", "train", emulator(tmp_path), "--prdp", "--out", tmp_path / "out", "--intervals", 100000
     )
     until((tmp_path / "out/prdp/seed_0.checkpoint").exists, launcher)
     os.kill(worker_of(launcher, 1), signal.SIGKILL)
     _, errors = launcher.communicate(timeout=60)
     assert launcher.returncode == 1 and "Signal 9 (SIGKILL) received" in errors
     assert not (tmp_path / "out/prdp/seed_0.json").exists()
+
+
+def find_group(folder, gpus):
+    """Which group sums the gradients of processes with these GPUs, as a computer with NCCL chooses it."""
+    device, made = torch.device("cuda", 0), []
+    data_parallel._name_of_gpu = lambda device: ("host", gpus[distributed.get_rank()])
+    distributed.is_nccl_available = lambda: True
+    distributed.new_group = lambda backend: made.append(backend) or "group"
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        groups = [data_parallel.gradient_group(device) for _ in range(2)]
+    on_cpu = data_parallel.gradient_group(torch.device("cpu"))
+    found = {"groups": groups, "made": made, "said": [str(one.message) for one in said[:1]], "cpu": on_cpu}
+    (folder / f"rank_{distributed.get_rank()}").write_text(json.dumps(found))
+
+
+@pytest.mark.parametrize("gpus, words", [("ab", None), ("aa", "2 processes share 1 GPU: gloo sums their gradients")])
+def test_nccl_sums_gradients_where_no_two_processes_share_a_gpu(tmp_path, gpus, words):
+    together(2, tmp_path, find_group, tmp_path, gpus)
+    for rank in range(2):
+        found = json.loads((tmp_path / f"rank_{rank}").read_text())
+        assert found["groups"] == [None if words else "group"] * 2 and found["cpu"] is None
+        assert found["made"] == ([] if words else ["nccl"])  # once for all trainings
+        assert [said.startswith(words) for said in found["said"]] == ([True] if words and rank == 0 else [])
+
+
+def test_each_process_takes_a_gpu_of_its_own_as_far_as_there_are_some(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda")  # alone
+    monkeypatch.setattr(data_parallel, "count", lambda: 4)
+    monkeypatch.setattr(distributed, "get_rank", lambda: 3)
+    for local, expected in enumerate((0, 1, 0, 1)):
+        monkeypatch.setenv("LOCAL_RANK", str(local))
+        assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda", expected)
+        assert data_parallel.own_gpu(torch.device("cuda", 1)) == torch.device("cuda", 1)
+        assert data_parallel.own_gpu(torch.device("cpu")) == torch.device("cpu")
+    scene = scenes.load("heat_1d")
+    with monkeypatch.context() as patch:  # the GPU that is looked for, and used, is the process's own
+        patch.setenv("LOCAL_RANK", "1")
+        patch.setattr(scenes._C, "find_device", torch.device)
+        assert scenes.placed(scene, "cuda").device == torch.device("cuda", 1)
+    monkeypatch.delenv("LOCAL_RANK")
+    assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda", 1)  # by the rank
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    assert data_parallel.own_gpu(torch.device("cuda")) == torch.device("cuda")  # which is not there, as others will say
 
 
 def as_launched(rank, port, arguments, errors):
@@ -287,7 +333,7 @@ def launched(tmp_path, *arguments):
 
 def test_a_process_that_loses_another_one_says_so_and_ends(tmp_path):
     path = emulator(tmp_path)
-    team = launched(tmp_path, "train", path, "--out", str(tmp_path / "out"), "--intervals", "100000")
+    team = launched(tmp_path, "train", path, "--prdp", "--out", str(tmp_path / "out"), "--intervals", "100000")
     end = time.monotonic() + 100
     while not (tmp_path / "out/prdp/seed_0.checkpoint").exists():
         assert time.monotonic() < end and all(process.is_alive() for process in team)
@@ -306,7 +352,7 @@ def test_only_training_is_split_and_only_the_first_process_prints(tmp_path):
         assert process.exitcode == 2
         words = "prdp: compare: runs in a single process; only train is split by torchrun\n"
         assert (tmp_path / f"errors_{rank}").read_text() == words
-    team = launched(tmp_path, "train", "heat_1d", "--out", str(tmp_path / "out"), "--intervals", "3")
+    team = launched(tmp_path, "train", "heat_1d", "--prdp", "--out", str(tmp_path / "out"), "--intervals", "3")
     for process in team:
         process.join(60)
         assert process.exitcode == 0

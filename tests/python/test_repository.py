@@ -97,6 +97,19 @@ def test_the_workflow_runs_the_commands_of_the_readme():
     assert oldest == f">={job['strategy']['matrix']['python'][0]}"
 
 
+def test_the_wheels_are_for_every_supported_python_and_torch():
+    jobs = yaml.safe_load((ROOT / ".github/workflows/wheels.yml").read_text())["jobs"]
+    ci = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["linux"]["strategy"]["matrix"]
+    matrix, steps = jobs["wheel"]["strategy"]["matrix"], jobs["wheel"]["steps"]
+    assert [matrix["python"][0], matrix["python"][-1]] == ci["python"]
+    oldest = re.search(r"VERSION_LESS ([\d.]+)\)", (ROOT / "cmake/prdpTorch.cmake").read_text())[1]
+    tested = re.search(r"^torch==(.*)$", (ROOT / "requirements.txt").read_text(), re.MULTILINE)[1]
+    assert matrix["torch"][0] == f"{oldest}.0" and tested in matrix["torch"]
+    (made,) = (step["run"] for step in steps if step.get("name") == "wheel")
+    assert "python packaging/make_wheel.py dist" in made and jobs["release"]["needs"] == "wheel"
+    assert "$(BIN)/python packaging/make_wheel.py dist" in (ROOT / "Makefile").read_text()
+
+
 def test_the_citation_names_the_paper():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     paper = citation["preferred-citation"]

@@ -118,6 +118,7 @@ def test_the_defaults_are_those_of_a_scene_without_the_keys():
     content = tomllib.loads(scenes.available()["heat_1d"].read_text())
     scene = load(content)
     read = {
+        ("", "device"): f"`{scene.device}`",
         ("physics", "length"): f"{scene.physics.length[0]:g}",
         ("solver", "on_failure"): f"`{scene.on_failure}`",
         ("solver", "start"): f"`{scene.start}`",

@@ -67,7 +67,7 @@ def test_both_trainers_agree(tmp_path, monkeypatch, make, shape, length):
     scene.training.intervals = 3
     assert scene.physics.length == length
     python = train(scene, Refinement.prdp(scene))
-    command = [TRAINER, path, "--out", tmp_path / "cpp", "--intervals", "3"]
+    command = [TRAINER, path, "--out", tmp_path / "cpp", "--intervals", "3", "--prdp"]
     assert subprocess.run(command, capture_output=True).returncode == 0
     cpp = json.loads((tmp_path / "cpp/prdp/seed_0.json").read_text())["curves"]
     np.testing.assert_allclose(cpp["metric"], python["metric"], rtol=1e-4)

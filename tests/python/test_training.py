@@ -38,12 +38,12 @@ def short(name, intervals=3, backward=None):
 @pytest.mark.parametrize(
     "name, arguments, refinement",
     [
-        ("heat_1d", [], Refinement.prdp),
+        ("heat_1d", ["--prdp"], Refinement.prdp),
         ("heat_1d", ["--constant", "7"], lambda scene: Refinement.constant(7)),
         ("heat_1d", ["--direct"], lambda scene: Refinement.exact()),
         ("poisson_1p", ["--schedule", "25:6"], lambda scene: Refinement.schedule(25, 6, 600)),
-        ("poisson_3p", [], Refinement.prdp),
-        ("heat_1d", ["--auto"], lambda scene: Refinement.auto()),
+        ("poisson_3p", ["--prdp"], Refinement.prdp),
+        ("heat_1d", [], lambda scene: Refinement.auto()),
         ("poisson_3p", ["--auto"], lambda scene: Refinement.auto()),
     ],
 )
@@ -102,7 +102,7 @@ def test_the_metric_applies_the_network_as_often_as_the_scene_says(tmp_path):
     data = _C.make_dataset(scene)
     expected = float(_C.normalised_mse(data.valid_start / 16, data.valid_end))
     assert train(scene, Refinement.constant(25), network=network)["metric"][0] == pytest.approx(expected, rel=1e-5)
-    cpp, python = in_cpp(tmp_path, str(path), "--intervals", "1"), train(scene, Refinement.prdp(scene))
+    cpp, python = in_cpp(tmp_path, str(path), "--intervals", "1", "--prdp"), train(scene, Refinement.prdp(scene))
     np.testing.assert_allclose(cpp["metric"], python["metric"], rtol=1e-5)
 
 

@@ -222,7 +222,7 @@ def test_the_report_holds_the_pictures_also_after_resume(tmp_path):
 
 
 def test_making_data_is_shown_as_a_bar_and_reading_them_is_not(tmp_path):
-    command = [*PRDP, "train", tiny(tmp_path), "--intervals", "1"]
+    command = [*PRDP, "train", tiny(tmp_path), "--prdp", "--intervals", "1"]
     made, read = (subprocess.run(command, cwd=tmp_path, capture_output=True, text=True) for _ in range(2))
     assert made.returncode == 0 == read.returncode
     assert made.stdout.count("data, steps") == 1 and "26/26" in made.stdout

@@ -28,7 +28,7 @@ def environment(tmp_path, monkeypatch):
 
 
 def prdp_train(*arguments):
-    command = [ROOT / "build" / "prdp_train", *map(str, arguments)]
+    command = [ROOT / "build" / "prdp_train", "--prdp", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     return done.returncode, done.stderr
 

@@ -3,6 +3,7 @@
 #include "bindings/convert.h"
 #include "prdp_experiments/bindings/bindings.h"
 #include "prdp_experiments/data/kolmogorov.h"
+#include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/scenes/scene.h"
 
 namespace py = pybind11;
@@ -72,6 +73,9 @@ void bind_scenes(py::module_& m) {
       .def_property_readonly("trains_network", &Scene::trains_network)
       .def_property_readonly("unit", [](const Scene& s) { return s.trains_network() ? "epoch" : "update"; })
       .def_readonly("dtype", &Scene::dtype)
+      .def_property_readonly("device", [](const Scene& s) { return s.device; })
+      .def("set_device", &Scene::set_device, py::arg("name"))
+      .def("__copy__", [](const Scene& s) { return s; })
       .def_readonly("physics", &Scene::physics)
       .def_readonly("data", &Scene::data)
       .def_readonly("network", &Scene::network)
@@ -99,6 +103,14 @@ void bind_scenes(py::module_& m) {
                            py::arg("means") = key.means));
     return keys;
   });
+  m.def(
+      "find_device",
+      [](const std::string& name) {
+        const auto device = named_device(name);
+        check_device(device);
+        return device;
+      },
+      py::arg("name"), py::call_guard<py::gil_scoped_release>());
   m.def("parse_scene", &parse_scene, py::arg("text"), py::arg("path"));
   m.attr("MOST_COUNTED") = kMostCounted;
 }

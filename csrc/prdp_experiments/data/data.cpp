@@ -155,9 +155,16 @@ Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress) {
   return data;
 }
 
+Dataset moved(Dataset data, const at::Device& device) {
+  for (auto* part : {&data.train_start, &data.train_end, &data.valid_start, &data.valid_end, &data.train_between})
+    if (part->defined()) *part = part->to(device);
+  return data;
+}
+
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress) {
   const auto make = [&] { return compute_dataset(scene, on_progress); };
-  return scene.physics.direct_is_cheap() || !scene.data.file.empty() ? make() : cached_dataset(scene, make);
+  const bool cheap = scene.physics.direct_is_cheap() || !scene.data.file.empty();
+  return moved(cheap ? make() : cached_dataset(scene, make), scene.device);
 }
 
 namespace {
@@ -193,8 +200,8 @@ ParameterProblem make_parameter_problem(const Scene& scene) {
   const auto modes = at::stack(sines);
   const auto reference = at::tensor(scene.parameters.reference, real);
   const auto solution = scene.stepper(Direct{})(at::matmul(reference, modes).view({1, 1, n}));
-  return {modes.to(scene.dtype), at::tensor(scene.parameters.start, real).to(scene.dtype), reference.to(scene.dtype),
-          solution.to(scene.dtype)};
+  const auto there = [&](const at::Tensor& t) { return t.to(scene.dtype).to(scene.device); };
+  return {there(modes), there(at::tensor(scene.parameters.start, real)), there(reference), there(solution)};
 }
 
 }  // namespace prdp

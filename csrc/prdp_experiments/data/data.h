@@ -33,10 +33,13 @@ struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
   at::Tensor train_between;  // (samples, trained_steps - 1, channels, *shape); only for the task "corrector"
 };
-/// Makes the samples of a scene. Flows in two dimensions take seconds to minutes, because their reference solves are
-/// iterative. Their data are kept on disk (data_cache.h).
+/// Makes the samples of a scene, on the CPU, and moves them to its device: they are the same on every device. Flows in
+/// two dimensions take seconds to minutes, because their reference solves are iterative. Their data are kept on disk
+/// (data_cache.h).
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
-/// The same without the cache on disk.
+/// The same on a device.
+Dataset moved(Dataset data, const at::Device& device);
+/// Those of make_dataset(), without the cache on disk and on the CPU.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
 /// The training samples alone, in the train_ fields.

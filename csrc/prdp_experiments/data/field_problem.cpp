@@ -82,7 +82,8 @@ FieldProblem make_field_problem(const Scene& scene, int64_t seed) {
   auto generator = make_generator(seed);
   const auto noise = at::randn(states.sizes(), generator, states.options());
   const auto snapshots = states + f.noise * states.square().mean().sqrt() * noise;
-  return {start.to(scene.dtype), snapshots.to(scene.dtype), theta.to(scene.dtype), reference.to(scene.dtype)};
+  const auto there = [&](const at::Tensor& t) { return t.to(scene.dtype).to(scene.device); };
+  return {there(start), there(snapshots), there(theta), there(reference)};
 }
 
 at::Tensor observed(const at::Tensor& states, const Scene& scene) {

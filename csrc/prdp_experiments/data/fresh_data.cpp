@@ -36,7 +36,7 @@ Dataset FreshData::epoch(int64_t number) {
   auto samples = std::exchange(coming_, -1) == number ? made_.get() : make(number);
   coming_ = number + 1;
   made_ = std::async(std::launch::async, [this, next = coming_] { return make(next); });
-  return samples;
+  return moved(std::move(samples), scene_.device);
 }
 
 }  // namespace prdp

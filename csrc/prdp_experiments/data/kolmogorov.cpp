@@ -8,13 +8,13 @@ namespace prdp {
 
 namespace {
 
-Flow make_flow(const Scene::Physics& physics, FlowAdvection advection, SolveOptions options) {
+Flow make_flow(const Scene::Physics& physics, const at::Device& device, FlowAdvection advection, SolveOptions options) {
   const auto lengths = physics.lengths.empty() ? std::vector<double>{1.0} : physics.lengths;
   auto box = std::make_shared<FlowBox>(physics.shape, std::vector{FlowBoundary::kPeriodic}, lengths, at::Tensor());
   return {FlowEquation{.box = std::move(box),
                        .dt = physics.dt,
                        .nu = at::scalar_tensor(physics.nu, at::kDouble),
-                       .force = kolmogorov_force(physics),
+                       .force = kolmogorov_force(physics).to(device),
                        .advection = advection},
           std::move(options)};
 }
@@ -36,14 +36,15 @@ at::Tensor kolmogorov_force(const Scene::Physics& physics) {
   return at::stack({on_faces, at::zeros_like(on_faces)}).unsqueeze(0);
 }
 
-Flow kolmogorov_step(const Scene::Physics& physics, SolveOptions options) {
-  return make_flow(physics, FlowAdvection::kUpwind, std::move(options));
+Flow kolmogorov_step(const Scene& scene, SolveOptions options) {
+  return make_flow(scene.physics, scene.device, FlowAdvection::kUpwind, std::move(options));
 }
 
 KolmogorovReference::KolmogorovReference(const Scene& scene)
     : shape_(scene.physics.shape),
       factor_(scene.data.reference_shape[0] / shape_[0]),
-      flow_(make_flow(finer(scene, factor_), FlowAdvection::kCentral, SolveOptions{scene.reference_solver()})) {}
+      flow_(make_flow(finer(scene, factor_), at::kCPU, FlowAdvection::kCentral,
+                      SolveOptions{scene.reference_solver()})) {}
 
 at::Tensor KolmogorovReference::step(at::Tensor u) {
   for (int64_t i = 0; i < factor_; ++i) u = converged_step(flow_, u);

@@ -10,7 +10,7 @@ at::Tensor kolmogorov_force(const Scene::Physics& physics);
 
 /// A step of the coarse flow that a network corrects. Its advection is upwind: central differences would make waves
 /// grow, at the Courant numbers at which a coarse flow is worth its place.
-Flow kolmogorov_step(const Scene::Physics& physics, SolveOptions options);
+Flow kolmogorov_step(const Scene& scene, SolveOptions options);
 
 /// The flow that data are made from, on the grid data.reference_shape and with central advection. One step of the scene
 /// is so many of its steps that the Courant number stays the same.

@@ -8,7 +8,7 @@ std::string pack(const TensorMap& tensors) {
   std::vector<c10::IValue> entries;
   for (const auto& [name, tensor] : tensors) {
     entries.emplace_back(name);
-    entries.emplace_back(tensor.detach());
+    entries.emplace_back(tensor.detach().cpu());
   }
   const auto bytes = torch::jit::pickle_save(c10::ivalue::Tuple::create(std::move(entries)));
   return {bytes.data(), bytes.size()};

@@ -23,7 +23,7 @@ TensorMap read(std::string_view bytes) {
 
 std::string pack_weights(const torch::nn::Module& network) {
   c10::Dict<std::string, at::Tensor> state;
-  for (const auto& weight : network.named_parameters()) state.insert(weight.key(), weight.value().detach());
+  for (const auto& weight : network.named_parameters()) state.insert(weight.key(), weight.value().detach().cpu());
   // torch::jit::pickle_save does the same but for one thing: it marks the types of what is in the dict, by a function
   // that torch.load(weights_only=True) refuses to call.
   std::string pickled, file;

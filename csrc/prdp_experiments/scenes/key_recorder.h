@@ -35,6 +35,7 @@ class KeyRecorder {
     for (const auto& [name, when] : choices)
       if (from_name(name) == target) return add(key, names(choices), quoted(name), false);
   }
+  void device(const at::Device& target, const Key& key) { add(key, "`cpu`, `cuda`", quoted(target.str()), false); }
   void flag(bool target, const Key& key) { add(key, "`true`, `false`", target ? "`true`" : "`false`", false); }
   template <class T>
   void at_least(const T& target, double least, const Key& key) {

@@ -5,6 +5,7 @@
 #include <numbers>
 
 #include "prdp/steppers/equation_kinds.h"
+#include "prdp_experiments/scenes/device.h"
 
 namespace prdp {
 
@@ -33,6 +34,8 @@ Stepper Scene::stepper(Solver with) const {
 }
 
 SolveOptions Scene::options(Solver with) const { return {std::move(with), backward, {}, {}, on_failure, 0, 0, start}; }
+
+void Scene::set_device(const std::string& name) { device = named_device(name); }
 
 double Scene::learning_rate(int64_t update) const {
   if (training.cosine_updates) {

@@ -94,6 +94,7 @@ struct Scene {
   std::string title;
   Task task = Task::kEmulator;
   at::ScalarType dtype = at::kFloat;
+  at::Device device = at::kCPU;  // where data, network and solves live
   Physics physics;
   Solver solver{Method::kJacobi, 1};  // converged: max_iter is K_ε
   Backward backward = Backward::kImplicit;
@@ -120,6 +121,8 @@ struct Scene {
   /// Sets `backward` by its name. Raises ValueError for an unknown name, and for one that would leave the task without
   /// a gradient.
   void set_backward(const std::string& name);
+  /// Sets `device` by its name. Raises ValueError for what names none.
+  void set_device(const std::string& name);
   /// The learning rate of an update, counted from 0.
   double learning_rate(int64_t update) const;
 };

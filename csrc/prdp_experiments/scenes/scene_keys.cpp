@@ -266,6 +266,9 @@ void read_all(Section& s, Scene& scene) {
             "what is trained: a network that replaces a time step, a network that corrects a coarse solver, "
             "amplitudes of the right-hand side, or a diffusivity field"});
   s.choice(scene.dtype, dtype_from_name, {"float32", "float64"}, {"dtype", "type of all tensors"});
+  s.device(
+      scene.device,
+      {.name = "device", .means = "where data, network and solves live; `cuda:1` is the second GPU", .optional = true});
   s.section(scene, read_physics<Section>, {"physics", "the equation"});
   s.section(scene, read_solver<Section>, {"solver", "the solver in the training"});
   s.section(scene, read_data<Section>, {"data", "training and validation samples", "", network(scene)});

@@ -31,6 +31,7 @@ struct BrokenToml {};
 #include <toml++/toml.h>
 #pragma pop_macro("NDEBUG")
 
+#include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/scenes/scene.h"
 #include "prdp_experiments/scenes/scene_key.h"
 
@@ -81,6 +82,13 @@ class TomlSection {
       allowed << (allowed.tellp() > 0 ? ", " : "") << name;
     }
     fail(key.name, "unknown name '" + chosen + "'; allowed: " + allowed.str());
+  }
+  void device(at::Device& target, const Key& key) {
+    if (!given(key)) return;
+    const auto name = value<std::string>(key.name, "a string");
+    const auto found = device_from_name(name);
+    if (!found) fail(key.name, "unknown name '" + name + "'; allowed: " + kDeviceNames);
+    target = *found;
   }
   void flag(bool& target, const Key& key) {
     if (!given(key)) return;

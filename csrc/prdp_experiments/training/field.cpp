@@ -37,7 +37,7 @@ Task FieldTraining::task() {
       [this](Saved& saved, int64_t updates) {
         theta_.detach().copy_(saved.take("theta", theta_.scalar_type(), theta_.sizes()));
         auto& p = model_.pressure;
-        if (p.defined()) p = saved.take("pressure", p.scalar_type(), p.sizes());
+        if (p.defined()) p = saved.take("pressure", p.scalar_type(), p.sizes()).to(p.device());
         optimiser_.load(saved, updates);
       },
   };

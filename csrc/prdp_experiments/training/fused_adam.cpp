@@ -28,7 +28,7 @@ torch::Tensor FusedAdam::step(LossClosure closure) {
       gradients.push_back(parameter.grad());
       means.push_back(state.exp_avg());
       squares.push_back(state.exp_avg_sq());
-      steps.push_back(at::scalar_tensor(static_cast<double>(state.step()), at::kFloat));
+      steps.push_back(at::full({}, static_cast<double>(state.step()), parameter.options().dtype(at::kFloat)));
     }
     const auto& options = static_cast<const torch::optim::AdamOptions&>(group.options());
     const auto [beta1, beta2] = options.betas();
@@ -63,12 +63,13 @@ void FusedAdam::load(Saved& saved, int64_t updates) {
   const auto& parameters = param_groups()[0].params();
   for (size_t i = 0; i < parameters.size(); ++i) {
     const auto dtype = parameters[i].scalar_type();
+    const auto device = parameters[i].device();
     const auto sizes = parameters[i].sizes();
     auto state = std::make_unique<torch::optim::AdamParamState>();
     const Range steps{.least = static_cast<double>(updates), .most = static_cast<double>(updates)};
     state->step(saved.list<int64_t>(name_of(i, "step"), 1, steps)[0]);
-    state->exp_avg(saved.take(name_of(i, "mean"), dtype, sizes).contiguous());
-    state->exp_avg_sq(saved.take(name_of(i, "square"), dtype, sizes, {.least = 0.0}).contiguous());
+    state->exp_avg(saved.take(name_of(i, "mean"), dtype, sizes).contiguous().to(device));
+    state->exp_avg_sq(saved.take(name_of(i, "square"), dtype, sizes, {.least = 0.0}).contiguous().to(device));
     state_[parameters[i].unsafeGetTensorImpl()] = std::move(state);
   }
 }

@@ -15,6 +15,7 @@
 #include "prdp_experiments/files/record.h"
 #include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/files/whole_files.h"
+#include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/training/training.h"
 
 namespace {
@@ -26,9 +27,9 @@ volatile std::sig_atomic_t interrupted = 0;
 struct Interrupted {};
 
 struct Options {
-  std::string scene, out, schedule, backward, weights;
+  std::string scene, out, schedule, backward, weights, device;
   int64_t seeds = 1, constant = -1, intervals = 0;
-  bool direct = false, automatic = false, resume = false;
+  bool direct = false, prdp = false, resume = false;
 };
 
 /// What a record or a checkpoint must agree on to be of the same training, which may go on for more intervals.
@@ -50,6 +51,12 @@ std::string text_of(const Json& json, int indent = -1) {
 
 Json versions() { return {{"prdp_torch", PRDP_VERSION}, {"torch", TORCH_VERSION}}; }
 
+Json machine(const prdp::Scene& scene) {
+  return {{"cores", std::thread::hardware_concurrency()},
+          {"threads", at::get_num_threads()},
+          {"device", scene.device.str()}};
+}
+
 Json record(const Identity& identity, const std::string& label, int64_t seed, const std::string& command,
             const prdp::train::Curves& c) {
   auto all = identity.settings();
@@ -62,7 +69,7 @@ Json record(const Identity& identity, const std::string& label, int64_t seed, co
               {"seed", seed},
               {"settings", all},
               {"versions", versions()},
-              {"machine", {{"cores", std::thread::hardware_concurrency()}, {"threads", at::get_num_threads()}}},
+              {"machine", machine(identity.scene)},
               {"command", command},
               {"curves", curves}};
   if (!c.weights.empty()) record["weights"] = prdp::fingerprint(c.weights);
@@ -115,8 +122,8 @@ std::pair<int64_t, int64_t> parse_schedule(const std::string& text) {
 prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene& scene) {
   if (options.constant >= 0) return prdp::train::constant(options.constant);
   if (options.direct) return prdp::train::direct();
-  if (options.automatic) return prdp::train::automatic();
-  if (options.schedule.empty()) return prdp::train::prdp(scene);
+  if (options.prdp) return prdp::train::prdp(scene);
+  if (options.schedule.empty()) return prdp::train::automatic();
   const auto [start, step] = parse_schedule(options.schedule);
   return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
 }
@@ -126,6 +133,8 @@ int run(const Options& options, const std::string& command) {
   auto scene = prdp::read_scene(options.scene);
   if (!options.backward.empty()) scene.set_backward(options.backward);
   if (options.intervals > 0) scene.training.intervals = options.intervals;
+  if (!options.device.empty()) scene.set_device(options.device);
+  prdp::check_device(scene.device);
   const auto refinement = refinement_of(options, scene);
   const Identity identity{scene, options.weights.empty() ? "" : prdp::read_whole("weights", options.weights)};
   const auto folder = fs::path(options.out.empty() ? "runs/" + scene.name + "-cpp" : options.out) / refinement.label;
@@ -174,19 +183,22 @@ int main(int argc, char** argv) {
   const auto positive = CLI::Range(int64_t{1}, prdp::kMostCounted);
   app.add_option("scene", options.scene, "scene file (.toml)")->required();
   app.add_option("--seeds", options.seeds, "how many seeds, from 0")->check(positive);
-  auto* k = app.add_option("--constant", options.constant, "constant K in place of PRDP")->check(positive);
+  auto* k = app.add_option("--constant", options.constant, "constant K")->check(positive);
   auto* s = app.add_option("--schedule", options.schedule, "START:STEP, K grows by STEP an interval up to the scene's");
   auto* d = app.add_flag("--direct", options.direct, "the exact solver in place of the scene's");
-  auto* a = app.add_flag("--auto", options.automatic, "a tolerance tied to the error, with nothing to choose");
+  auto* a = app.add_flag("--auto")->description("a tolerance tied to the error, with nothing to choose; the default");
+  auto* p = app.add_flag("--prdp", options.prdp, "PRDP with the scene's settings");
   app.add_option("--backward", options.backward, "implicit, unrolled or (corrector) none, in place of the scene's");
+  app.add_option("--device", options.device, "cpu, cuda or cuda:N, in place of the scene's");
   app.add_option("--intervals", options.intervals, "epochs (or updates) in place of the scene's")->check(positive);
   app.add_option("--out", options.out, "folder for the records; default runs/SCENE-cpp");
   app.add_option("--weights", options.weights, "file of weights that the network begins with, in place of the seed's");
   app.add_flag("--resume", options.resume, "keep finished trainings, go on from checkpoints");
   app.set_version_flag("--version", "prdp_torch " PRDP_VERSION ", torch " TORCH_VERSION);
-  k->excludes(s)->excludes(d)->excludes(a);
-  s->excludes(d)->excludes(a);
-  d->excludes(a);
+  k->excludes(s)->excludes(d)->excludes(a)->excludes(p);
+  s->excludes(d)->excludes(a)->excludes(p);
+  d->excludes(a)->excludes(p);
+  a->excludes(p);
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {

@@ -24,8 +24,7 @@ SceneStep scene_step(Step step) {
 }
 inline SceneStep scene_step(const Scene& scene, Solver solver) {
   if (scene.physics.is_darcy()) return scene_step(darcy_step(scene.physics, scene.options(std::move(solver))));
-  if (scene.physics.is_kolmogorov())
-    return scene_step(kolmogorov_step(scene.physics, scene.options(std::move(solver))));
+  if (scene.physics.is_kolmogorov()) return scene_step(kolmogorov_step(scene, scene.options(std::move(solver))));
   return scene_step(scene.stepper(std::move(solver)));
 }
 

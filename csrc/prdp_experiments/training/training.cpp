@@ -21,6 +21,7 @@
 #include "prdp_experiments/networks/mlp.h"
 #include "prdp_experiments/networks/resnet.h"
 #include "prdp_experiments/networks/weights.h"
+#include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/training/failures.h"
 #include "prdp_experiments/training/field.h"
 #include "prdp_experiments/training/fused_adam.h"
@@ -64,6 +65,21 @@ namespace {
 
 /// Of counts (batch), or (batch, steps) of a rollout, summed over the steps.
 double per_sample(const at::Tensor& counts) { return counts.to(at::kDouble).mean(0).sum().item<double>(); }
+
+/// What the trainer reads of a report, on the CPU: one copy from a device, for which the host waits.
+struct Report {
+  at::Tensor iterations, operator_applications, status;
+
+  explicit Report(const SolveInfo& info)
+      : iterations(info.iterations), operator_applications(info.operator_applications), status(info.status) {
+    if (status.is_cpu()) return;
+    const auto all = at::stack({iterations, operator_applications, status}).cpu();
+    iterations = all[0];
+    operator_applications = all[1];
+    status = all[2];
+  }
+  bool refused() const { return status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)).any().item<bool>(); }
+};
 
 struct Diverged {
   std::string why;
@@ -148,20 +164,23 @@ class Run {
     const auto started = std::chrono::steady_clock::now();
     Failures failures;
     task.updates(static_cast<int64_t>(curves_.update_loss.size()), [&](double loss, const auto& samples) {
-      check(loss, done);
-      curves_.update_loss.push_back(loss);
       std::vector<at::Tensor> forward, backward;
+      bool refused = false;
       for (const auto* stepper : steppers_) {
-        const auto& info = *stepper->info();
-        forward.push_back(info.status);
-        costs.solves += info.iterations.numel() / info.iterations.size(0);
-        costs.iterations += per_sample(info.iterations);
-        costs.forward += per_sample(info.operator_applications);
-        if (const auto adjoint = stepper->adjoint_info()) {
-          backward.push_back(adjoint->status);
-          costs.adjoint += per_sample(adjoint->operator_applications);
+        const Report report(*stepper->info());
+        refused = refused || report.refused();
+        forward.push_back(report.status);
+        costs.solves += report.iterations.numel() / report.iterations.size(0);
+        costs.iterations += per_sample(report.iterations);
+        costs.forward += per_sample(report.operator_applications);
+        if (const auto info = stepper->adjoint_info()) {
+          const Report adjoint(*info);
+          backward.push_back(adjoint.status);
+          costs.adjoint += per_sample(adjoint.operator_applications);
         }
       }
+      check(loss, refused, done);
+      curves_.update_loss.push_back(loss);
       failures.take(forward, backward, samples);
     });
     costs.failed = failures.count();
@@ -197,14 +216,10 @@ class Run {
     take_budget();
   }
 
-  void check(double loss, int64_t done) const {
+  void check(double loss, bool refused, int64_t done) const {
     const auto interval = "interval " + std::to_string(done);
     if (!std::isfinite(loss)) throw Diverged{interval + ": the loss is " + std::to_string(loss)};
-    if (goes_on_) return;
-    const auto nonfinite = static_cast<int64_t>(SolveStatus::kNonfiniteInput);
-    for (const auto* stepper : steppers_)
-      if (stepper->info()->status.le(nonfinite).any().item<bool>())
-        throw Diverged{interval + ": the solver was given NaN or Inf"};
+    if (refused && !goes_on_) throw Diverged{interval + ": the solver was given NaN or Inf"};
   }
 
   /// The curves end with the interval that was lost.
@@ -243,7 +258,7 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
     const auto parameters = network.ptr()->parameters();
     for (auto last = parameters.end() - 2; last != parameters.end(); ++last) last->zero_();
   }
-  network.ptr()->to(scene.dtype);
+  network.ptr()->to(scene.device, scene.dtype);  // drawn on the CPU, and so the same on every device
   return network;
 }
 
@@ -320,7 +335,8 @@ Curves train_network(const Scene& scene, Run& run, Steppers& steppers, int64_t s
       std::tie(data.train_start, data.train_between, data.train_end) =
           std::tie(samples.train_start, samples.train_between, samples.train_end);
     }
-    for (const auto& batch : shuffled(data.train_start.size(0), generator).split(scene.training.batch)) {
+    const auto order = shuffled(data.train_start.size(0), generator).to(scene.device);
+    for (const auto& batch : order.split(scene.training.batch)) {
       for (auto& group : optimiser.param_groups()) group.options().set_lr(scene.learning_rate(update));
       optimiser.zero_grad();
       const auto error = objective.loss(batch);
@@ -375,6 +391,8 @@ Curves train_parameters(const Scene& scene, Run& run, const SceneStep& stepper, 
 
 Curves train(const Scene& scene, const Refinement& refinement, int64_t seed, const std::filesystem::path& weights,
              const OnInterval& on_interval, Checkpoint& checkpoint, const OnProgress& on_data) {
+  check_device(scene.device);
+  at::globalContext().setDeterministicCuDNN(true);  // a training that goes on gives the same bits
   TORCH_CHECK_VALUE(weights.empty() || scene.trains_network(), "weights: the scene '", scene.name,
                     "' trains no network");
   const Solver solver = refinement.direct ? Solver(Direct{}) : scene.solver;
