@@ -222,7 +222,8 @@ void bind_solvers(py::module_& m) {
       "Whether `Direct` solves with A, axis by axis, without a factorisation of the whole.",
       py::call_guard<py::gil_scoped_release>(), py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
       py::arg("parameters"));
-  m.def("way_of_last_solve", &way_of_last_solve, "How this thread's last solve was computed: kernel, loops or tensors.");
+  m.def("way_of_last_solve", &way_of_last_solve,
+        "How this thread's last solve was computed: kernel, loops or tensors.");
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
   m.def("bytes_of_factorisations", &factor_cache::bytes_kept, "The memory of those that are kept for later solves.");

@@ -314,7 +314,7 @@ def test_steps_and_their_controller_take_it():
 
 def test_arguments_are_checked():
     with pytest.raises(
-        ValueError, match="Jacobi: the method Jacobi takes no preconditioner; CG, BiCGStab and GMRES take one"
+        ValueError, match="Jacobi: the method Jacobi takes no preconditioner; CG, BiCGStab, GMRES and MINRES take one"
     ):
         prdp.Jacobi(3, preconditioner="diagonal")
     for kind in (prdp.Chebyshev, prdp.SteepestDescent, prdp.Direct):

@@ -24,33 +24,37 @@ class MinresMethod {
       : x(space.vector()),
         space_(space),
         r_(space.vector()),
+        z_(space.vector()),
+        az_(space.vector()),
         p_(space.vector()),
         q_(space.vector()),
         last_p_(space.vector()),
         last_q_(space.vector()),
         next_(space.vector()),
-        az_(space.vector()),
-        z_(space.is_preconditioned() ? space.vector() : q_),
         parts_(space.template array<Vector>(kTerms)),
         weights_(space.template array<Scalar>(kTerms)) {}
 
   void start() {
-    for (auto* vector : {&x, &last_p_, &last_q_}) space_.fill_zero(*vector);
+    for (auto* vector : {&x, &p_, &q_, &last_p_, &last_q_}) space_.fill_zero(*vector);
     space_.copy(space_.b(), r_);
     begin_along(space_.b2());
   }
   void step() {
     using std::sqrt;
-    const Scalar qz = space_.is_preconditioned() ? space_.precondition(q_, z_) : space_.dot(q_, q_);
-    space_.break_down_unless_positive(qz, rr_);
-    const Vector& z = space_.is_preconditioned() ? z_ : q_;
-    rr_ = space_.descend(space_.ratio(space_.dot(r_, z), qz), p_, q_, x, r_);
-    space_.apply(z, az_);
-    const Scalar scale = space_.ratio(sqrt(qz), qz), along = scale * space_.ratio(space_.dot(az_, z), qz);
-    const Scalar along_last = sqrt(space_.ratio(qz, last_qz_));
-    combine(z, scale, p_, along, last_p_, along_last);
+    space_.apply(z_, az_);
+    // Of the first direction 1, 0 and 0; the root of zero has no derivative.
+    const Scalar first = space_.is_zero(qz_);
+    const Scalar scale = space_.ratio(sqrt(qz_ + first), qz_) + first;
+    const Scalar along = scale * space_.ratio(space_.dot(az_, z_), qz_);
+    const Scalar grown = space_.ratio(qz_, last_qz_), second = space_.is_zero(grown);
+    const Scalar along_last = sqrt(grown + second) - second;
+    combine(z_, scale, p_, along, last_p_, along_last);
     combine(az_, scale, q_, along, last_q_, along_last);
-    space_.assign(qz, last_qz_);
+    space_.assign(qz_, last_qz_);
+    set_z(q_);
+    space_.assign(space_.dot(q_, z_), qz_);
+    space_.break_down_unless_positive(qz_, rr_);
+    rr_ = space_.descend(space_.ratio(space_.dot(r_, z_), qz_), p_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
@@ -59,7 +63,7 @@ class MinresMethod {
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, p_, q_, last_p_, last_q_, rr_, last_qz_); }
+  auto carried() { return std::tie(r_, z_, p_, q_, last_p_, last_q_, rr_, qz_, last_qz_); }
   void resume(int64_t) {}
 
   Vector x;
@@ -70,11 +74,13 @@ class MinresMethod {
   /// Starts anew along the residual, which is in r and whose square is given.
   void begin_along(const Scalar& rr) {
     space_.assign(rr, rr_);
+    space_.assign(rr * 0, qz_);
     space_.assign(rr * 0, last_qz_);
-    if (space_.is_preconditioned()) space_.precondition(r_, p_);
-    else space_.copy(r_, p_);
-    space_.apply(p_, az_);
-    space_.copy(az_, q_);
+    set_z(r_);
+  }
+  void set_z(const Vector& from) {
+    if (space_.is_preconditioned()) space_.precondition(from, z_);
+    else space_.copy(from, z_);
   }
   /// v, and `last` with it, go one direction further: a fresh - b v - c last.
   void combine(const Vector& fresh, const Scalar& a, Vector& v, const Scalar& b, Vector& last, const Scalar& c) {
@@ -91,8 +97,8 @@ class MinresMethod {
   }
 
   Space& space_;
-  Vector r_, p_, q_, last_p_, last_q_, next_, az_, z_;  // q = A p; A z; z = M⁻¹ q, or q itself
-  Scalar rr_{}, last_qz_{};  // r·r; q·z of the last direction, 0 before
+  Vector r_, z_, az_, p_, q_, last_p_, last_q_, next_;  // z = M⁻¹ q, of the first direction M⁻¹ r; A z; q = A p
+  Scalar rr_{}, qz_{}, last_qz_{};  // r·r; q·z of this direction and of the last, 0 before the first
   ArrayOf<Space, Vector> parts_;
   ArrayOf<Space, Scalar> weights_;
 };
