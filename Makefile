@@ -1,4 +1,4 @@
-# make demo   set everything up, then compare PRDP with constant K on the 1D heat equation
+# make demo   set everything up, then compare ways of solving while a field is found
 # make test   set everything up, then run all C++ and Python tests
 # make docs   build the documentation as a site, site/index.html
 # make sanitize  the C++ tests under AddressSanitizer, UBSan and ThreadSanitizer (two builds of their own, 20 minutes)
@@ -24,7 +24,8 @@ demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
-	$(BIN)/prdp compare heat_1d
+	@echo "prdp: finding a field from snapshots, through a differentiable solver: one to two minutes"
+	OMP_NUM_THREADS=1 $(BIN)/prdp compare diffusion_inverse
 
 test: $(STAMPS)/configure
 	@echo "prdp: building library, trainer and tests (from scratch some 6 minutes on two cores)"

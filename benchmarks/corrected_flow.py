@@ -2,7 +2,7 @@
 `python -m benchmarks.refinement kolmogorov`.
 
 Prints the error of each row beside that of the coarse flow alone, over more steps than any training knows, and draws it
-and the vorticity to docs/results."""
+to docs/results."""
 
 import argparse
 from pathlib import Path
@@ -14,7 +14,7 @@ from prdp_torch.experiments import datasets, records, scenes, trajectories, traj
 from prdp_torch.experiments.charts import write_png
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
-SHOWN = ("converged", "auto")  # in the pictures
+SHOWN = ("converged", "auto")  # in the picture
 
 
 def main():
@@ -38,8 +38,7 @@ def main():
         spread = errors.std(0, ddof=1) if len(errors) > 1 else 0 * errors[0]  # the coarse flow is one run
         print(course.title, *(f"{m:.2e} ± {s:.0e}" for m, s in zip(errors.mean(0), spread, strict=True)))
     shown = trajectories.Trajectories(reference, [courses[label] for label in ("coarse", *SHOWN)], [])
-    for name, draw in (("error", trajectory_charts.error_over_time), ("vorticity", trajectory_charts.snapshots)):
-        write_png(draw(scene, shown), RESULTS / f"kolmogorov_{name}.png", dpi=70)
+    write_png(trajectory_charts.error_over_time(scene, shown), RESULTS / "kolmogorov_error.png", dpi=70)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def sections(results):
     if "memory" in results:
         yield {
             "name": "memory", "title": "Memory of a gradient", "table": memory_table(results["memory"]),
-            "figure": charts.memory(results["memory"], memory.CASES),
+            "figure": charts.memory(results["memory"], memory.CHARTED),
             "text": "Growth of the peak resident set by one solve with its gradients for the state and nu, batch "
             f"of {memory.BATCH}, float32, each case in a process of its own.",
         }  # fmt: skip

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks import page, refinement_charts
+from benchmarks import overview_charts, page, refinement_charts
 from benchmarks.atlas import MAPS
 from benchmarks.mosaic import charts as mosaic_charts
 from prdp_torch.experiments import charts, scenes
@@ -29,6 +29,8 @@ def read(path):
 def all_of_them():
     """(path, dpi, function that draws it) of each picture."""
     results, stability = DOCS / "results", DOCS / "stability"
+    yield results / "heat_1d_errors.png", 110, lambda: overview_charts.errors(read(results / "heat_1d.json"))
+    yield results / "refinement.png", 110, lambda: overview_charts.products(refinement_charts.summaries())
     for path in sorted(results.glob("*_accuracy.png")):
         yield path, 120, partial(accuracy, path.with_name(path.name.replace("_accuracy.png", ".json")))
     for name, figure in refinement_charts.figures():

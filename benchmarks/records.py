@@ -123,7 +123,7 @@ def main():
         make(entry, commit)
     for entry in chosen:  # only now: a changed file in docs would mark the records after it as made on a dirty tree
         keep(entry, commit)
-    for script in ("benchmarks.pictures", *(f"docs.{kind}_tables" for kind in TABLES)):
+    for script in ("benchmarks.pictures", *(f"docs.{kind}_tables" for kind in TABLES), "docs.figures"):
         subprocess.run([sys.executable, "-m", script], cwd=ROOT, check=True)
 
 

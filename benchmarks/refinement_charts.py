@@ -1,5 +1,5 @@
-"""`python -m benchmarks.refinement_charts`: the pictures of docs/refinement_records.md and docs/study_time.md,
-from the records in docs/results."""
+"""`python -m benchmarks.refinement_charts`: the pictures of trainings on the pages of docs, from the records in
+docs/results."""
 
 import json
 import math
@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from benchmarks import readme_picture
 from docs.record_rows import NOISE_OF_TIME, by_label, claims, share_of_products, share_of_seconds
 from prdp_torch.experiments.charts import write_png
 
@@ -215,43 +216,11 @@ def over_the_training(found):
     return figure
 
 
-FIVE = {  # label: title, colour
-    "converged": ("converged", "#222222"),
-    "multigrid": ("converged, with multigrid", "#9467bd"),
-    "rtol_0.01": ("rtol = 1e-2 throughout", "#2ca02c"),
-    "prdp": ("PRDP, tuned", "#d62728"),
-    "auto": ("auto", "#1f77b4"),
-}
-
-
-def error_over_cost(summary):
-    """The validation error of one scene against the seconds and the products spent so far."""
-    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    costs = (
-        ("seconds", 1, "seconds of training"),
-        ("operator_applications", 1000, "thousands of products with A (without multigrid's own)"),
-    )
-    for axes, (cost, unit, title) in zip(panels, costs, strict=True):
-        for label, (name, colour) in FIVE.items():
-            curves = summary["curves"][label]
-            spent = np.cumsum(curves[cost]) / unit
-            axes.plot(spent, curves["metric"][1:], color=colour, lw=1.6, label=name)
-            axes.plot(spent[-1], curves["metric"][-1], "o", color=colour, ms=5)
-        axes.set(yscale="log", xlabel=title)
-        axes.grid(alpha=0.3, lw=0.4)
-    panels[0].set_ylabel("validation error")
-    panels[1].legend(frameon=False, fontsize=9)
-    figure.suptitle(f"{summary['settings']['scene']}: what an error costs (one seed; the dots are the ends)")
-    return figure
-
-
 def figures():
-    """(file name, figure) of each picture. The costs need curves that older records do not have."""
+    """(file name, figure) of each picture."""
     found = summaries()
-    if all("seconds" in found["burgers_2d"]["curves"].get(label, ()) for label in FIVE):
-        yield "burgers_2d_cost.png", error_over_cost(found["burgers_2d"])
-    yield "refinement.png", error_against_products(found)
+    yield "readme.png", readme_picture.draw(found)
+    yield "refinement_panels.png", error_against_products(found)
     yield "time_saved.png", time_against_products(found)
     yield "refinement_training.png", over_the_training(found)
 

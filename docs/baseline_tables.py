@@ -13,6 +13,7 @@ from docs.record_rows import (
     record,
     rows,
     saved,
+    shown,
     time_saved,
     title,
 )
@@ -23,6 +24,11 @@ SCENES = (*SCENES, "navier_stokes", "diffusion_inverse")
 TOO_SHORT = 0.5  # seconds of a training; what is shorter is all noise
 # The scene's solver, and what takes the time of an update, as `prdp bench training` measured it. diffusion_inverse has
 # no network.
+GROUPS = {
+    "solves": "the solves take the time",
+    "both": "solves and network take it",
+    "network": "the network takes it",
+}
 TRAININGS = {
     "burgers_2d": ("GMRES(6)", "solves"),
     "burgers_2d_192": ("GMRES(6)", "solves"),
@@ -38,38 +44,40 @@ TRAININGS = {
 
 def seconds():
     """The seconds of a training with each way of solving; of a row that fails or warns, only that it does."""
-    body = []
+    body, group = [], None
     for name, (solver, what) in TRAININGS.items():
+        if what != group:
+            body.append([f"**{GROUPS[what]}**", *[""] * 7])
+            group = what
         found = rows(f"refinement_{name}")
         base, prdp = found["converged"], found.get("prdp")
         others = _of_as_many_seeds(found.values(), base)
         strongest = _fastest(row for row in others if row["label"] in ("converged", "direct", "multigrid"))
         auto = _fastest(row for row in others if row["label"] in ("auto", "auto_multigrid"))
         constant = _fastest(filter(None, (_loosest(others), _loosest(others, "multigrid_"))))
+        seeds = "" if base["seeds"] > 1 else ", one seed"
         cells = [
             seconds_of(base),
-            _with_notes(strongest, _other_solver(strongest)),
+            _with_notes(strongest, _other_solver(strongest), _range(strongest)),
             _with_notes(constant, _power_of(constant), _other_solver(constant)),
             _seconds_claimed(prdp if prdp in others else None),
-            _with_notes(auto, _other_solver(auto)),
+            _with_notes(auto, _other_solver(auto), _range(auto)),
         ]
-        seeds = "" if base["seeds"] > 1 else ", one seed"
-        body.append(
-            [
-                f"{name}, {solver}{seeds}",
-                what,
-                *cells,
-                time_saved(auto, strongest),
-                f"{auto['metric'] / base['metric']:.2f}",
-            ]
-        )
-    head = ["scene", "its time is in the", "converged", "strongest", "one rtol", "PRDP", "auto", "auto saves", "error"]
-    return page_tables.markdown(head, body)
+        ends = f"{auto['metric'] / base['metric']:.2f}"
+        body.append([f"{name}, {solver}{seeds}", *cells, time_saved(auto, strongest), ends])
+    return page_tables.markdown(["", "converged", "strongest", "one rtol", "PRDP", "auto", "auto saves", "error"], body)
+
+
+def _range(row):
+    """The least and the greatest seconds of the seeds."""
+    each = row.get("each", {}).get("seconds")
+    return "–".join(shown(value) for value in (min(each), max(each))) if each and len(each) > 1 else None
 
 
 SOLVERS = {  # of Burgers 2D
     "converged": "converged, GMRES(6)",
     "multigrid": "converged, multigrid",
+    "rtol_0.1": "rtol = 1e-1 throughout, GMRES(6)",
     "rtol_0.01": "rtol = 1e-2 throughout, GMRES(6)",
     "multigrid_rtol_0.01": "rtol = 1e-2 throughout, multigrid",
     "prdp": "PRDP, tuned, GMRES(6)",

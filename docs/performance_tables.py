@@ -1,4 +1,4 @@
-"""Write the tables of docs/performance.md from the records in docs/performance.
+"""Write the tables of docs/performance.md and docs/appendix/performance.md from the records in docs/performance.
 
 Run it after new records: python -m docs.performance_tables
 """
@@ -10,7 +10,7 @@ from statistics import median
 from docs import page_tables
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "performance.md"
+PAGES = [DOCS / "performance.md", DOCS / "appendix" / "performance.md"]
 TABLE = page_tables.places("performance_tables.py")
 
 
@@ -97,7 +97,6 @@ def _on(grid, k, label, found):
 CASES = {
     "heat_3d": "heat 3D 20³, Jacobi",
     "heat_3d_chebyshev": "heat 3D 20³, Chebyshev",
-    "navier_stokes": "Navier–Stokes 48², GMRES(8)",
 }
 MODES = {
     "unrolled, checkpoint_every='sqrt'": '`checkpoint_every="sqrt"`',
@@ -110,7 +109,7 @@ def memory():
     found = record("memory")
     budgets = sorted({point["k"] for point in found})
     body = []
-    for case in dict.fromkeys(point["case"] for point in found):
+    for case in CASES:
         for mode in dict.fromkeys(point["mode"] for point in found):
             title = f"**{CASES[case]}**: {mode}" if mode == "implicit" else MODES.get(mode, mode)
             of_k = {p["k"]: p["bytes"] for p in found if (p["case"], p["mode"]) == (case, mode)}
@@ -198,4 +197,5 @@ def with_tables(page):
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_tables(PAGE.read_text()))
+    for path in PAGES:
+        path.write_text(with_tables(path.read_text()))

@@ -105,7 +105,18 @@ def median_seconds(row):
 
 
 def seconds(row):
-    value = median_seconds(row)
+    return shown(median_seconds(row))
+
+
+def seconds_beside(row, found):
+    """Nothing where the row was trained on another processor than the converged one, or on several."""
+    base = found["rows"][0]
+    mine, its = (r.get("machine", found["machine"])["processor"] for r in (row, base))
+    return seconds(row) if mine == its else "–"
+
+
+def shown(value):
+    """Two digits, or all before the point."""
     return f"{value:.2g}" if value < 10 else f"{value:,.0f}"
 
 

@@ -1,4 +1,4 @@
-"""Write the table of docs/records.md: which command made which record, on which commit and processor.
+"""Write the table of docs/appendix/records.md: which command made which record, on which commit and processor.
 
 Run it after new records: python -m docs.record_tables
 """
@@ -11,7 +11,7 @@ from benchmarks import records
 from docs import page_tables
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "records.md"
+PAGE = DOCS / "appendix" / "records.md"
 SCRIPT = "record_tables.py"
 TABLE = page_tables.places(SCRIPT)
 ATLAS = "stability/*.json"

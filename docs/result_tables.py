@@ -1,4 +1,4 @@
-"""Write the tables of results in README.md and on the pages of docs from the records in docs/results.
+"""Write the tables of results on the pages of docs from the records in docs/results.
 
 A row that ends worse than the converged one, or whose controller warns, claims no saving in any of them.
 Run it after new records: python -m docs.result_tables
@@ -20,12 +20,13 @@ from docs.record_rows import (
     rows,
     saved,
     seconds,
+    seconds_beside,
     time_saved,
     title,
 )
 
 TABLE = page_tables.places("result_tables.py")
-PAGES = [path for path in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))) if TABLE.search(path.read_text())]
+PAGES = [path for path in sorted(DOCS.rglob("*.md")) if TABLE.search(path.read_text())]
 
 BOLD = ("auto", "prdp")
 
@@ -76,25 +77,29 @@ def comparison(name, with_seconds=True):
     """The rows of `prdp compare`, or of a record of `python -m benchmarks.refinement`."""
     body, found = [], record(name)
     for row in found["rows"]:
-        shown = f"**{row['title']}**" if row["label"] in BOLD else row["title"]
-        shown += fewer_seeds(row, found["seeds"])
         last = "–" if row["kind"] == "direct" else f"{row['last_k']:.3g}"
-        body.append([shown, error(row), last, *products(row), saved(row), *([seconds(row)] if with_seconds else [])])
+        time = [seconds_beside(row, found)] if with_seconds else []
+        body.append([_name(row, found["seeds"]), error(row), last, *products(row), saved(row), *time])
     head = ["", "error", "last K", "forward", "adjoint", "in all", "products saved", *(["s"] if with_seconds else [])]
     return page_tables.markdown(head, body)
 
 
-def readme():
-    """Converged, auto and PRDP of the scenes that train a network, or a field."""
-    body = []
-    for name in ("heat_1d", "burgers_1d", "burgers_2d", "heat_2d", "navier_stokes", "diffusion_inverse"):
-        found = rows(f"refinement_{name}")
-        base = found["converged"]
-        body.append([f"{name}, {base['seeds']} seeds", "converged", error(base), "–", "–"])
-        for label, shown in (("auto", "**auto**"), ("prdp", "PRDP, tuned")):
-            row = found[label]
-            body.append(["", shown, error(row), products_saved(row, base), time_saved(row, base)])
-    return page_tables.markdown(["scene", "", "error", "products saved", "time saved"], body)
+def _name(row, seeds):
+    name = "auto" if row["label"] == "auto" else row["title"]
+    return (f"**{name}**" if row["label"] in BOLD else name) + fewer_seeds(row, seeds)
+
+
+PARTS = ("prdp_defaults", "prdp_growth", "tolerance", "tolerance_adjoint", "rtol_0.0001")
+
+
+def main_rows(name, with_seconds=True):
+    """A comparison without the parts of a rule, and without the products of each kind."""
+    body, found = [], record(name)
+    for row in found["rows"]:
+        if row["label"] not in PARTS:
+            time = [seconds_beside(row, found)] if with_seconds else []
+            body.append([_name(row, found["seeds"]), error(row), products(row)[2], saved(row), *time])
+    return page_tables.markdown(["", "error", "products", "saved", *(["s"] if with_seconds else [])], body)
 
 
 # scene: its name and section in reproduction.md; the paper's share of iterations saved, and errors of the converged
@@ -105,7 +110,7 @@ PAPER = {
     "heat_3d": ("[Heat 3D](#heat-2d-and-3d-emulators)", "81 %", "4e-03 ± 9e-04", "5e-03 ± 1.0e-03"),
     "burgers_1d": ("[Burgers 1D](#burgers-1d-an-emulator)", "59 %", "5.5e-02 ± 1.4e-02", "6.2e-02 ± 2.1e-02"),
     "refinement_navier_stokes": (
-        "[Navier–Stokes](#navier-stokes-a-corrector)",
+        "[Navier–Stokes](#navierstokes-a-corrector)",
         "81 %",
         "6e-03 ± 5e-04",
         "7e-03 ± 4e-04",
@@ -143,7 +148,8 @@ def parts_of_the_saving():
         row = rows(name)["prdp"]
         incomplete, whole = row["saved_by_incomplete_convergence"], row["saved"]
         ours = [claim(row, share, 1) for share in (incomplete, whole - incomplete)]
-        body.append([scene, *ours, PARTS_OF_THE_PAPER.get(name, "")])
+        link = scene.replace("](#", "](../reproduction.md#")  # the table is in the appendix
+        body.append([link, *ours, PARTS_OF_THE_PAPER.get(name, "")])
     head = ["scene", "incomplete convergence", "progressive refinement", "paper"]
     return page_tables.markdown(head, body)
 
@@ -193,7 +199,6 @@ TABLES = {
     "what a warning predicts": what_a_warning_predicts,
     "the parts of auto": parts_of_auto,
     "the shares of auto": shares_of_auto,
-    "the README's table": readme,
     "the scenes beside the paper": beside_the_paper,
     "the parts of the saving": parts_of_the_saving,
     "three parameters": three_parameters,
@@ -217,6 +222,10 @@ def table(name):
         return comparison(what)
     if kind == "the comparison, without seconds,":
         return comparison(what, with_seconds=False)
+    if kind == "the main rows":
+        return main_rows(what)
+    if kind == "the main rows, without seconds,":
+        return main_rows(what, with_seconds=False)
     if kind == "the study":
         return study(what)
     return TABLES[name]()

@@ -1,4 +1,4 @@
-"""Write the tables of scene keys in docs/command_line.md, from what the reader of scenes declares.
+"""Write the tables of scene keys in docs/scene_keys.md, from what the reader of scenes declares.
 
 Run it after a change of csrc/prdp_experiments/scenes/scene_keys.cpp and a build: python -m docs.scene_keys
 """
@@ -9,18 +9,20 @@ from pathlib import Path
 from docs import page_tables
 from prdp_torch.experiments import _C
 
-PAGE = Path(__file__).with_name("command_line.md")
+PAGE = Path(__file__).with_name("scene_keys.md")
 TABLE = page_tables.places("scene_keys.py")
 
 
 def table(name):
     """Return the Markdown table of the keys in one table of a scene file; "the top level" has a name too."""
-    rows = ["| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
+    rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
     for key in _C.scene_keys():
         if (key["table"] or "the top level") == name:
-            meaning = key["means"] + (f" ({key['when']})" if key["when"] else "")
-            value = re.sub("(>=?) ", r"\1&nbsp;", key["value"])
-            cells = f"`{key['name']}`", value, key["unit"], key["default"] or "", meaning
+            meaning = key["means"].replace("](#", "](command_line.md#")
+            meaning += f" ({key['when']})" if key["when"] else ""
+            value = re.sub("(>=?) ", r"\1&nbsp;", key["value"].replace("whole number", "integer"))
+            value += f" ({key['unit']})" if key["unit"] else ""
+            cells = f"`{key['name']}`", value, key["default"] or "", meaning
             rows.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
 

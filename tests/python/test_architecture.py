@@ -1,4 +1,4 @@
-"""docs/architecture.md says what is true of the source."""
+"""docs/architecture.md and CONTRIBUTING.md say what is true of the source."""
 
 import re
 from pathlib import Path
@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/architecture.md").read_text()
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text()
 
 
 @pytest.mark.parametrize("home", ["prdp", "prdp_experiments"])
@@ -37,7 +38,7 @@ def test_the_folders_have_as_many_lines_as_the_page_says():
 
 
 def test_the_files_of_the_page_exist():
-    named = re.findall(r"`([\w/]+\.(?:h|cpp|py|toml|txt))`", PAGE)
+    named = re.findall(r"`([\w/]+\.(?:h|cpp|py|toml|txt))`", PAGE + GUIDE.split("\n## How to add a method")[1])
     assert len(named) > 30
     homes = [ROOT, ROOT / "csrc/prdp", ROOT / "prdp_torch", ROOT / "prdp_torch/experiments"]
     missing = {
@@ -49,7 +50,7 @@ def test_the_files_of_the_page_exist():
 
 
 def named_in(section):
-    text = PAGE.split(f"\n## {section}\n")[1].split("\n## ")[0]
+    text = GUIDE.split(f"\n## {section}\n")[1].split("\n## ")[0]
     return {file for row in re.findall(r"^\| (`.*?) \|", text, re.MULTILINE) for file in re.findall(r"`(.*?)`", row)}
 
 

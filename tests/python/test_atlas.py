@@ -125,8 +125,8 @@ def test_the_command_writes_a_picture_and_a_record_for_each_map(tmp_path):
 def test_the_docs_show_every_map_with_its_measured_answer(name, tmp_path):
     record = json.loads((DOCS / f"{name}.json").read_text())
     assert not record["quick"] and record["commit"] and record["command"].startswith("prdp stability")
-    text = (ROOT / "docs" / "atlas.md").read_text()
-    assert f"![{record['question']}](stability/{name}.png)" in text and f"*{record['answer']}*" in text
+    text = (ROOT / "docs" / "appendix" / "atlas.md").read_text()
+    assert f"![{record['question']}](../stability/{name}.png)" in text and f"*{record['answer']}*" in text
     atlas.MAPS[name].draw(record["data"]).savefig(tmp_path / "again.png", dpi=20)
 
 

@@ -36,6 +36,8 @@ TOLERANT = {
     "jacobi, rtol": prdp.Jacobi(900, 1e-9),
     "chebyshev, rtol": prdp.Chebyshev(400, 1e-9),
     "bicgstab, rtol": prdp.BiCGStab(60, 1e-4),
+    "minres, rtol": prdp.MINRES(60, 1e-9),
+    "minres, diagonal": prdp.MINRES(60, 1e-9, preconditioner="diagonal"),
     "gmres, rtol": prdp.GMRES(60, 1e-9, restart=8),
     "cg, multigrid": prdp.CG(20, 1e-9, preconditioner="multigrid"),
     "multigrid": prdp.Multigrid(40, 1e-9),

@@ -14,23 +14,21 @@ import typer.main
 from helpers import as_toml
 
 import prdp_torch as prdp
+from docs import notebooks
 from prdp_torch.experiments import cli, scenes
 
 ROOT = Path(__file__).parents[2]
-PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"))}
+PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))}
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SHOWN = re.compile(r'^--8<-- "(.*)"$', re.MULTILINE)
+SHOWN = [("docs/cpp.md", "examples/cpp/CMakeLists.txt"), ("docs/cpp.md", "examples/cpp/heat_gradient.cpp"),
+         ("docs/flows.md", "examples/flow_around_cylinder.py")]  # fmt: skip
 COMMAND = typer.main.get_command(cli.app)
 
 
-def shown(file):
-    return (ROOT / file[1]).read_text()
-
-
 def blocks(language):
-    """(page, first line, code) of every block in this language, with the files that it shows."""
+    """(page, first line, code) of every block in this language."""
     return [
-        SimpleNamespace(page=page, line=text.count("\n", 0, found.start(2)), code=SHOWN.sub(shown, found[2]))
+        SimpleNamespace(page=page, line=text.count("\n", 0, found.start(2)), code=found[2])
         for page, text in PAGES.items()
         for found in BLOCK.finditer(text)
         if found[1] == language
@@ -54,11 +52,20 @@ def alone():
     torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize("page, file", SHOWN)
+def test_a_page_shows_a_file_as_it_is(page, file):
+    assert f"\n{(ROOT / file).read_text().rstrip()}\n```" in PAGES[page]
+
+
 # What a page has its reader run before, cut short.
 BEFORE = {"docs/command_line.md": ["train", "heat_1d", "--auto", "--intervals", "3"]}
 
 
-@pytest.mark.parametrize("page", sorted({block.page for block in blocks("python")}))
+# The tutorials run as notebooks, which are the same to the letter: test_notebooks.py.
+RUN_THERE = {f"docs/{name}.md" for name in notebooks.TUTORIALS}
+
+
+@pytest.mark.parametrize("page", sorted({block.page for block in blocks("python")} - RUN_THERE))
 def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, alone):
     monkeypatch.chdir(tmp_path)
     if page in BEFORE:
@@ -147,7 +154,7 @@ def test_the_cpp_blocks_use_public_names(block):
 
 
 def test_every_guarantee_names_tests_that_exist():
-    page = PAGES["docs/stability.md"].split("## What is guaranteed")[1]
+    page = PAGES["docs/appendix/guarantees.md"].split("## What is guaranteed")[1]
     python = "".join(path.read_text() for path in (ROOT / "tests" / "python").glob("test_*.py"))
     cpp = "".join(path.read_text() for path in (ROOT / "tests" / "cpp").glob("test_*.cpp"))
     tests = set(re.findall(r"^def (test_\w+)\(", python, re.MULTILINE))
@@ -164,12 +171,13 @@ def test_the_links_to_files_lead_somewhere(page):
     """mkdocs checks the pages of the site; this also covers the README."""
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[\w-]*)?\)", BLOCK.sub("", PAGES[page])):
         if "://" not in target:
-            assert (ROOT / page).parent.joinpath(target).is_file(), target
+            assert (ROOT / page).parent.joinpath(target).exists(), target
 
 
 def test_every_page_is_in_the_navigation():
     named = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
-    assert named == {Path(page).name for page in PAGES if page.startswith("docs/")}
+    pages = {Path(page) for page in PAGES if page.startswith("docs/")}
+    assert named == {page.name for page in pages if page.parent.name != "appendix"}
 
 
 def documented():

@@ -5,11 +5,9 @@ import subprocess
 
 import pytest
 
-from benchmarks import charts, pictures, refinement_charts
+from benchmarks import charts, overview_charts, pictures, refinement_charts
 
-OF_TRAININGS = {  # their records are not in the repository
-    "burgers_1d_metric", "kolmogorov_error", "kolmogorov_vorticity", "snapshots",
-}  # fmt: skip
+OF_TRAININGS = {"kolmogorov_error", "snapshots"}  # their records are not in the repository
 OF_EXAMPLES = {"first_emulator", "coarse_corrector", "inverse_permeability", "pdebench_data",
                "flow_around_cylinder", "lid_driven_cavity", "passive_scalar", "force_network"}  # fmt: skip
 
@@ -59,6 +57,27 @@ def test_an_error_far_above_the_others_does_not_flatten_a_panel():
     (axes,) = refinement_charts.error_against_products({"heat_1d": summary}).axes
     assert axes.get_ylim()[1] < 2
     assert any("e+04" in text.get_text() or "e+05" in text.get_text() for text in axes.texts)
+
+
+def test_the_marks_of_a_scene_are_its_shares_of_the_converged_products():
+    found = {"heat_2d": refinement_charts.summaries()["heat_2d"]}
+    rows = {row["label"]: row for row in found["heat_2d"]["rows"]}
+    (axes,) = overview_charts.products(found).axes
+    marks = {float(x): dots.get_facecolor()[0] for dots in axes.collections for x, _ in dots.get_offsets()}
+    shares = [rows[label]["operator_applications"] / rows["converged"]["operator_applications"]
+              for label in ("auto", "prdp", "rtol_0.01")]  # fmt: skip
+    assert list(marks) == pytest.approx(shares)
+    hollow = [tuple(colour[:3]) == (1.0, 1.0, 1.0) for colour in marks.values()]
+    assert hollow == [False, True, False]  # tuned PRDP fails there
+
+
+def test_a_bar_ends_at_its_error_or_names_it():
+    found = pictures.read(pictures.DOCS / "results" / "heat_1d.json")
+    (axes,) = overview_charts.errors(found, highest=2.0).axes
+    rows, limit = found["rows"], 2.0 * found["rows"][0]["metric"]
+    assert [bar.get_width() for bar in axes.patches] == pytest.approx([min(row["metric"], limit) for row in rows])
+    beside = {text.get_text().strip() for text in axes.texts}
+    assert {f"{row['metric']:.2g}" for row in rows if row["metric"] >= limit} <= beside
 
 
 def test_the_bars_of_an_update_have_one_length():

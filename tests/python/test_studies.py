@@ -1,4 +1,4 @@
-"""The studies of docs/study_*.md train what they say."""
+"""The studies of docs/appendix/study_*.md train what they say."""
 
 import tomllib
 
