@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -136,7 +136,6 @@ def is_sum_over_axes(b: torch.Tensor, tensors: collections.abc.Sequence[torch.Te
     """
 def join_adjoint_logs(logs: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex]) -> tuple | None:
     ...
-def way_of_last_solve() -> str: ...
 def kernels_made() -> list[str]:
     """
     The kernels of GPUs that this process has made, by name.
@@ -159,6 +158,10 @@ def solve_with_tensors(b: torch.Tensor, tensors: collections.abc.Sequence[torch.
     """
 def step(u: typing.Any, tensors: collections.abc.Sequence[typing.Any], equation: Equation, options: SolveOptions, max_iter: typing.SupportsInt | typing.SupportsIndex, adjoint_log: typing.SupportsInt | typing.SupportsIndex) -> typing.Any:
     ...
+def way_of_last_solve() -> str:
+    """
+    How this thread's last solve was computed: kernel, loops or tensors.
+    """
 CHECKPOINT_SQRT: int = -1
 DEFAULT_RESTART: int = 10
 DEFAULT_RTOL: float = 1e-05

@@ -140,7 +140,7 @@ class MINRES(Solver):
     Where A is definite, `CG` takes less work per iteration. A preconditioner must be positive definite, also where A is
     not; where it is not, a sample ends with BREAKDOWN.
 
-    Source: Paige and Saunders 1975; in the form of Ashby, Manteuffel and Saylor 1990.
+    Source: Paige and Saunders 1975.
     """
 
     method: ClassVar[str] = "minres"

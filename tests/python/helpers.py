@@ -10,7 +10,7 @@ import prdp_torch as prdp
 from prdp_torch.experiments import _C, scenes
 
 DATA = Path(__file__).parents[1] / "data"
-ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.GMRES]
+ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.MINRES, prdp.GMRES]
 SOLVERS = [*ITERATIVE, prdp.Direct]
 NO_PRECONDITIONER = ("", [], [], [], False)  # as the ops take it
 modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])

@@ -38,9 +38,9 @@ def case(name):
 def test_converged_solves_pass_gradcheck_and_gradgradcheck(name, solver, backward):
     make, inputs = case(name)
 
-    # CG all but ends on so small a system: iterations beyond would work, and be differentiated, on a
+    # CG and MINRES all but end on so small a system: iterations beyond would work, and be differentiated, on a
     # residual of rounding errors.
-    rtol = 1e-6 if solver is prdp.CG and backward == "unrolled" else 1e-14
+    rtol = 1e-6 if solver in (prdp.CG, prdp.MINRES) and backward == "unrolled" else 1e-14
 
     def solve(b, *tensors):
         return prdp.linear_solve(make(*tensors), b, solver(400, rtol=rtol), backward=backward)[0]

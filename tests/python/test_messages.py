@@ -34,7 +34,7 @@ ZERO = operators.Stencil(torch.tensor([[[0.0], [1.0], [-1.0]]]).expand(1, 3, 8).
 BUDGET = {"max_iter": 2000}
 BY_DIAGONAL = {"max_iter": 9, "preconditioner": "diagonal"}
 NOT_SYMMETRIC = r"A is not symmetric \(‖A v - Aᵀ v‖ is [\d.]+ ‖A v‖ for a v of no structure\); take GMRES"
-INDEFINITE = "A is symmetric but not definite; take GMRES"
+INDEFINITE = "A is symmetric but not definite; take MINRES"
 RADIUS = r"as an eigenvalue of I - D⁻¹A is larger than 1 in magnitude; take GMRES"
 
 TABLE = [

@@ -80,16 +80,16 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
   const double share = asymmetry(a, b, sample);
   if (share > 100.0 * epsilon_of(b))
     return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
-  return "A is symmetric but not definite; take GMRES";
+  return "A is symmetric but not definite; take MINRES";
 }
 
 /// Why MINRES finds no direction.
 std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (solver.preconditioner)
-    return "q·M⁻¹ q is not positive for a q = A p: its preconditioner is not positive definite, or A p vanishes";
+    return "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is singular";
   const double share = asymmetry(a, b, sample);
   if (share > 100.0 * epsilon_of(b)) return not_definite(a, b, sample);
-  return "A p vanishes for a direction p: A is singular, and b lies outside its range; take a b without that part";
+  return "A is singular, and b lies outside its range; take a b without that part";
 }
 
 std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {

@@ -140,6 +140,7 @@ inline constexpr std::tuple kMethods{
         .vectors = 8,
         .takes_preconditioner = true,
         .nanoseconds = 0.6,
+        .ends_at_unknowns = true,
         .has_tape = false,
         .kernel = "MinresMethod",
         .kernel_header = "minres.h",

@@ -8,11 +8,12 @@
 
 namespace prdp {
 
-/// The minimal residual of symmetric operators, definite or not (MINRES, Paige and Saunders 1975), by directions p
-/// whose products q = A p are orthogonal (Ashby, Manteuffel and Saylor 1990): with z = M⁻¹ q, α = r·z / q·z, x += α p,
-/// r -= α q, and the next p is z / √(q·z) less its parts along the last two. It takes one product, and no quotient
-/// vanishes before A p does: A may have eigenvalues of both signs. M must be positive definite; then ‖r‖ in the norm of
-/// M⁻¹ never grows.
+/// The minimal residual of symmetric operators, definite or not (MINRES, Paige and Saunders 1975): Lanczos vectors v of
+/// M⁻¹A, of length γ in the norm of M⁻¹, whose tridiagonal matrix is rotated into a triangle as it grows; x moves along
+/// directions w = (z/γ - α₂ w₋ - α₃ w₋₋)/α₁ with z = M⁻¹ v. Memory does not grow. M must be positive definite; then
+/// the norm of r in M⁻¹, |η|, never grows. (The notation is that of Elman, Silvester and Wathen 2014, algorithm 4.1.)
+///
+/// It breaks down where α₁ is rounding: A is singular there, and b lies outside its range.
 template <KrylovSpace Space>
 class MinresMethod {
  public:
@@ -24,37 +25,48 @@ class MinresMethod {
       : x(space.vector()),
         space_(space),
         r_(space.vector()),
-        z_(space.vector()),
+        v_(space.vector()),
+        last_v_(space.vector()),
+        w_(space.vector()),
+        last_w_(space.vector()),
         az_(space.vector()),
-        p_(space.vector()),
-        q_(space.vector()),
-        last_p_(space.vector()),
-        last_q_(space.vector()),
         next_(space.vector()),
+        z_(space.is_preconditioned() ? space.vector() : v_),
+        next_z_(space.is_preconditioned() ? space.vector() : v_),
         parts_(space.template array<Vector>(kTerms)),
         weights_(space.template array<Scalar>(kTerms)) {}
 
   void start() {
-    for (auto* vector : {&x, &p_, &q_, &last_p_, &last_q_}) space_.fill_zero(*vector);
+    for (auto* vector : {&x, &last_v_, &w_, &last_w_, &az_}) space_.fill_zero(*vector);
     space_.copy(space_.b(), r_);
     begin_along(space_.b2());
   }
   void step() {
-    using std::sqrt;
-    space_.apply(z_, az_);
-    // Of the first direction 1, 0 and 0; the root of zero has no derivative.
-    const Scalar first = space_.is_zero(qz_);
-    const Scalar scale = space_.ratio(sqrt(qz_ + first), qz_) + first;
-    const Scalar along = scale * space_.ratio(space_.dot(az_, z_), qz_);
-    const Scalar grown = space_.ratio(qz_, last_qz_), second = space_.is_zero(grown);
-    const Scalar along_last = sqrt(grown + second) - second;
-    combine(z_, scale, p_, along, last_p_, along_last);
-    combine(az_, scale, q_, along, last_q_, along_last);
-    space_.assign(qz_, last_qz_);
-    set_z(q_);
-    space_.assign(space_.dot(q_, z_), qz_);
-    space_.break_down_unless_positive(qz_, rr_);
-    rr_ = space_.descend(space_.ratio(space_.dot(r_, z_), qz_), p_, q_, x, r_);
+    const Scalar inverse = space_.ratio(one_, gamma_);
+    const Scalar delta = space_.apply_with_dots(space_.is_preconditioned() ? z_ : v_, az_)[0] * inverse * inverse;
+    combine(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
+    turn(v_, last_v_);
+    const Vector& z = space_.is_preconditioned() ? z_ : last_v_;
+    const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, next_z_) : space_.dot(v_, v_);
+    space_.break_down_unless_positive(square + space_.is_zero(square), rr_);
+    const Scalar gamma = root(square);
+    const Scalar a0 = c_ * delta - last_c_ * s_ * coupling_, a2 = s_ * delta + last_c_ * c_ * coupling_;
+    const Scalar a3 = last_s_ * coupling_, a1 = root(a0 * a0 + square);
+    const Scalar row2 = delta * delta + coupling_ * coupling_ + square;
+    space_.break_down_unless_positive(one_ - space_.breaks_down(a1, 100 * row2, one_, rr_), rr_);
+    last_c_ = c_;
+    last_s_ = s_;
+    c_ = space_.ratio(a0, a1);
+    s_ = space_.ratio(gamma, a1);
+    combine(z, inverse * space_.ratio(one_, a1), w_, -space_.ratio(a2, a1), last_w_, -space_.ratio(a3, a1));
+    turn(w_, last_w_);
+    parts_[0] = w_;
+    weights_[0] = c_ * eta_;
+    space_.add_combination(weights_.data(), parts_, 1, x);
+    eta_ = -s_ * eta_;
+    last_gamma_ = gamma_;
+    gamma_ = coupling_ = gamma;
+    take_residual();
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
@@ -63,7 +75,10 @@ class MinresMethod {
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, z_, p_, q_, last_p_, last_q_, rr_, qz_, last_qz_); }
+  auto carried() {
+    return std::tie(r_, z_, v_, last_v_, w_, last_w_, rr_, eta_, gamma_, last_gamma_, coupling_, c_, last_c_, s_,
+                    last_s_);
+  }
   void resume(int64_t) {}
 
   Vector x;
@@ -73,32 +88,56 @@ class MinresMethod {
 
   /// Starts anew along the residual, which is in r and whose square is given.
   void begin_along(const Scalar& rr) {
+    const Scalar zero = rr * 0;
+    one_ = zero + 1;
     space_.assign(rr, rr_);
-    space_.assign(rr * 0, qz_);
-    space_.assign(rr * 0, last_qz_);
-    set_z(r_);
+    space_.copy(r_, v_);
+    const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, z_) : rr;
+    space_.break_down_unless_positive(square, rr_);
+    space_.assign(root(square), gamma_);
+    space_.assign(gamma_, eta_);
+    for (auto* number : {&last_gamma_, &c_, &last_c_}) space_.assign(one_, *number);
+    for (auto* number : {&coupling_, &s_, &last_s_}) space_.assign(zero, *number);
   }
-  void set_z(const Vector& from) {
-    if (space_.is_preconditioned()) space_.precondition(from, z_);
-    else space_.copy(from, z_);
+  /// The square of ‖r‖; with a preconditioner r = s² r + c η v/γ, whose norm η alone does not tell.
+  void take_residual() {
+    if (!space_.is_preconditioned()) {
+      rr_ = eta_ * eta_;
+      return;
+    }
+    std::swap(z_, next_z_);
+    combine(r_, s_ * s_, v_, space_.ratio(c_ * eta_, gamma_), v_, eta_ * 0);
+    std::swap(r_, next_);
+    rr_ = space_.dot(r_, r_);
   }
-  /// v, and `last` with it, go one direction further: a fresh - b v - c last.
-  void combine(const Vector& fresh, const Scalar& a, Vector& v, const Scalar& b, Vector& last, const Scalar& c) {
-    parts_[0] = fresh;
+  /// √value, without an infinite derivative at zero.
+  Scalar root(const Scalar& value) {
+    using std::sqrt;
+    const Scalar nothing = space_.is_zero(value);
+    return sqrt(value + nothing) - nothing;
+  }
+  /// next = a u + b v + c w
+  void combine(const Vector& u, const Scalar& a, const Vector& v, const Scalar& b, const Vector& w, const Scalar& c) {
+    parts_[0] = u;
     parts_[1] = v;
-    parts_[2] = last;
+    parts_[2] = w;
     weights_[0] = a;
-    weights_[1] = -b;
-    weights_[2] = -c;
+    weights_[1] = b;
+    weights_[2] = c;
     space_.fill_zero(next_);
     space_.add_combination(weights_.data(), parts_, kTerms, next_);
-    std::swap(last, v);
-    std::swap(v, next_);
+  }
+  /// `last` takes the value of `now`, and `now` that of next.
+  void turn(Vector& now, Vector& last) {
+    std::swap(last, now);
+    std::swap(now, next_);
   }
 
   Space& space_;
-  Vector r_, z_, az_, p_, q_, last_p_, last_q_, next_;  // z = M⁻¹ q, of the first direction M⁻¹ r; A z; q = A p
-  Scalar rr_{}, qz_{}, last_qz_{};  // r·r; q·z of this direction and of the last, 0 before the first
+  Vector r_, v_, last_v_, w_, last_w_, az_, next_, z_, next_z_;
+  Scalar rr_{}, eta_{}, one_{};
+  Scalar gamma_{}, last_gamma_{}, coupling_{};  // of v and of the one before; γ again, but 0 of the first v
+  Scalar c_{}, last_c_{}, s_{}, last_s_{};      // of the last two rotations
   ArrayOf<Space, Vector> parts_;
   ArrayOf<Space, Scalar> weights_;
 };
