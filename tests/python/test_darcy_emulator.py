@@ -79,7 +79,12 @@ def test_there_are_no_trajectories_to_show(tmp_path):
         ("modes = 1", "modes = 1\nvalid_steps = 2", "valid_steps", "data.valid_steps: not for `darcy`"),
         ("modes = 1", 'modes = 1\nfile = "x.npz"', "file =", "data.file: not for `darcy`"),
         ('"multigrid"', '"ilu"', "preconditioner", "unknown name 'ilu'; allowed: none, diagonal, multigrid"),
-        ('"cg"', '"jacobi"', "preconditioner", "solver.preconditioner: only for `cg`, `bicgstab`, `gmres` and `minres`"),
+        (
+            '"cg"',
+            '"jacobi"',
+            "preconditioner",
+            "solver.preconditioner: only for `cg`, `bicgstab`, `gmres` and `minres`",
+        ),
         ('"cg"', '"chebyshev"', "method", "solver.method: 'chebyshev' is only for `heat` and `poisson`"),
     ],
 )

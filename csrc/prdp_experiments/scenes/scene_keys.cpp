@@ -82,7 +82,8 @@ void read_solver(Section& s, Scene& scene) {
                                              : method.method == Method::kMultigrid      ? coarse_grids
                                                                                         : When{});
   s.choice(scene.solver.method, method_from_name, methods, {"method", "the solver"});
-  const When takes_one{traits(scene.solver.method).takes_preconditioner, "only for `cg`, `bicgstab`, `gmres` and `minres`"};
+  const When takes_one{traits(scene.solver.method).takes_preconditioner,
+                       "only for `cg`, `bicgstab`, `gmres` and `minres`"};
   std::string preconditioner = scene.solver.method == Method::kMultigrid ? "multigrid" : "none";
   s.choice(preconditioner, {"none", "diagonal", "multigrid"},
            {.name = "preconditioner", .means = "the preconditioner", .when = takes_one, .optional = true});
