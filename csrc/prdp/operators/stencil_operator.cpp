@@ -32,6 +32,13 @@ at::ArrayRef<int64_t> entries(const kernels::Offset& offset, int64_t dim) {
   return {offset.along + 3 - dim, static_cast<size_t>(dim)};
 }
 
+/// The neighbours on the other side, which are those of the transpose.
+std::vector<kernels::Offset> turned(std::vector<kernels::Offset> offsets) {
+  for (auto& offset : offsets)
+    for (auto& cells : offset.along) cells = -cells;
+  return offsets;
+}
+
 /// The product rule by loops: products (batch or 1, k, *shape) from λ and u (batch, channel, *shape).
 template <class T>
 void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& lambda, const at::Tensor& u,
@@ -215,10 +222,7 @@ OperatorSpec StencilOperator::spec() const {
 }
 
 at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
-  auto offsets = offsets_;
-  if (transposed)
-    for (auto& offset : offsets)
-      for (auto& cells : offset.along) cells = -cells;
+  const auto offsets = transposed ? turned(offsets_) : offsets_;
   const kernels::StencilPattern pattern(grid_, offsets);
   if (!pattern.nearest) return {};
   std::vector<at::Tensor> fields(1 + 2 * dim());
@@ -280,10 +284,7 @@ bool StencilOperator::has_coarse_grids() const {
 }
 
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tensor& b, bool transposed) const {
-  auto offsets = offsets_;
-  if (transposed)
-    for (auto& offset : offsets)
-      for (auto& cells : offset.along) cells = -cells;
+  const auto offsets = transposed ? turned(offsets_) : offsets_;
   const auto of_samples =
       [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
        pattern = std::make_shared<kernels::StencilPattern>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {

@@ -11,8 +11,6 @@ inline constexpr int kZeroSide = 0, kPeriodicSide = 2, kRobinSide = 3;
 /// and x; h of each side where that is a number. Tensors, where they are there: κ, the shift, h of each side.
 template <class T, class G, int kChannels, bool kHarmonic, int... kSides>
 class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, T> {
-  using Base = Rows<Diffusion, T>;
-
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
 
@@ -67,7 +65,9 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
     const T scale = per_cell_[axis] * per_cell_[axis];
-    const int next = moved < n, end == 0 ? -1 : 1, side == kPeriodicSide && (n > 1) > (here);
+    constexpr int cells = end == 0 ? -1 : 1;
+    constexpr bool closed = side == kPeriodicSide && n > 1;
+    const int next = moved<n, cells, closed>(here);
     if (next >= 0) {
       constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
       const int there = point + (next - here) * stride;
