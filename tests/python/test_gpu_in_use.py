@@ -43,6 +43,19 @@ def test_in_a_compiled_program(start):
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.parametrize("start", ["zero", "state"])
+@pytest.mark.parametrize("method", [prdp.Jacobi, prdp.Chebyshev])
+def test_unrolled_sweeps_go_back_in_a_kernel(method, start):
+    """Their derivative for b is as many iterations with A transposed; where no kernel took them, this would raise."""
+    step = prdp.Heat(SHAPE, nu=1e-2, dt=1.0, solver=method(max_iter=7), backward="unrolled", start=start)
+    u = noise(3, 1, *SHAPE).requires_grad_()
+    expected = torch.autograd.grad(step.rollout(u, 2).square().sum(), u)[0]
+    with Fibers():
+        found = torch.autograd.grad(step.rollout(u, 2).square().sum(), u)[0]
+        assert step.info.way == "kernel"
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
+
+
 @pytest.mark.filterwarnings("ignore:`torch.jit.script")
 def test_in_transforms():
     """A batch of batches is one launch; a derivative along a direction is a solve of its own."""
