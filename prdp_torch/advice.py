@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
+from prdp_torch.flow import Flow
 from prdp_torch.operators.base import full_precision
 from prdp_torch.solver_trials import (
     RUNS,
@@ -96,11 +97,12 @@ def advise(
     dtypes: Sequence[torch.dtype] | None = None,
     network: torch.nn.Module | None = None,
 ) -> Advice:
-    """Try the solvers on one step and recommend one. Nothing is trained, and `step` stays as it is. The solvers are
-    timed on the device of the sample; the notes name those that it refuses.
+    """Try the solvers on one step and recommend one. A step of `Flow` counts as a whole, with all its solves. Nothing
+    is trained, and `step` stays as it is. The solvers are timed on the device of the sample; the notes name those that
+    it refuses.
 
     Args:
-        step: a `Stepper`, such as `Heat` or `ImplicitStep`. Its own budget is not used.
+        step: a `Stepper`, such as `Heat`, `Flow` or `ImplicitStep`. Its own budget is not used.
         sample: states (batch, channel, *shape) to step from, as many as a batch of the training has.
         seconds: the limit for each solver. A solver that does not reach a tolerance in time is marked
             MAX_ITER.
@@ -125,7 +127,7 @@ def advise(
     """
     if not isinstance(step, Stepper):
         raise TypeError(f"advise: step must be a Stepper such as Heat or ImplicitStep, got {type(step).__name__}")
-    if type(step).operator is Stepper.operator:
+    if type(step).operator is Stepper.operator and not isinstance(step, Flow):
         raise TypeError(
             f"advise: a step of {type(step).__name__} is not one equation A(u) u_next = b(u), as it has no "
             "operator(u); time its steps with each solver instead"
@@ -141,6 +143,11 @@ def advise(
     others, seconds = _other_dtypes(step, sample, dtypes), checked_limit(seconds)
     update = Update() if network is None else Update(network=network_seconds(network, sample.detach(), seconds))
     return advise_on(step, sample.detach(), seconds, update, others)
+
+
+def is_built_in(step: Stepper) -> bool:
+    """Whether `step.to(dtype)` reaches all of it."""
+    return isinstance(step, EquationStepper | Flow)
 
 
 def network_seconds(network: torch.nn.Module, sample: Tensor, most: float) -> float:
@@ -168,7 +175,7 @@ def _other_dtypes(step: Stepper, sample: Tensor, dtypes: Sequence[torch.dtype] |
     """The dtypes to try beside that of the sample, checked."""
     both = torch.float32, torch.float64
     if dtypes is None:
-        dtypes = both if isinstance(step, EquationStepper) else ()
+        dtypes = both if is_built_in(step) else ()
     if not isinstance(dtypes, (tuple, list)) or not set(dtypes) <= set(both):
         raise ValueError(f"advise: dtypes must hold torch.float32 and torch.float64 only, got {dtypes!r}")
     return [dtype for dtype in both if dtype in dtypes and dtype != sample.dtype]
@@ -201,9 +208,9 @@ def advise_on(
             f"At {_power(TOLERANCES[-1])} the residual of {best.name} is the rounding of {_name(best.dtype)}. "
             "The error of u may be far smaller; a smaller residual needs float64."
         )
-    if (best is None or at_rounding) and not other_dtypes and not isinstance(step, EquationStepper):
+    if (best is None or at_rounding) and not other_dtypes and not is_built_in(step):
         notes.append("Only the dtype of the sample was tried, as the step is your own; dtypes=... tries others.")
-    if best is not None and not isinstance(best.solver, Direct):
+    if best is not None and not isinstance(best.solver, Direct) and not isinstance(step, Flow):
         notes.append(_start_gain(best, measure_with_start(step, sample, best)))
     words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
     return Advice(rows + others, notes, words)

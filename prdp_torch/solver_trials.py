@@ -1,6 +1,7 @@
 """Trials of solvers on one step: products and seconds to a tolerance, forward and adjoint."""
 
 import copy
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, operators
+from prdp_torch.flow import Flow
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, SolveInfo, SolveStatus
 from prdp_torch.solvers import (
@@ -116,7 +118,10 @@ def preconditioner_of(solver: Solver) -> Preconditioner:
 
 
 def candidates(step: Stepper) -> list[Solver]:
-    """The solvers to try on a step."""
+    """The solvers to try on a step. The systems of a `Flow` are symmetric, and do not depend on the state."""
+    if isinstance(step, Flow):
+        by_diagonal, by_cycles = CG(1, preconditioner="diagonal"), CG(1, preconditioner="multigrid")
+        return [CG(1), by_diagonal, Multigrid(1), by_cycles, Direct(1)]
     own = [step.restart] if step.method.startswith("gmres") else []
     restarts = sorted({*RESTARTS, *own})
     every = [Jacobi(1), Chebyshev(1), SteepestDescent(1), CG(1), BiCGStab(1), MINRES(1)]
@@ -191,6 +196,8 @@ def trial_of(step: Stepper, sample: Tensor) -> Trial:
 
 def is_renewed(step: Stepper, sample: Tensor, v: Tensor) -> bool:
     """Whether A depends on the state or is trained: whether its tensors have a gradient, or A v changes with u."""
+    if isinstance(step, Flow):
+        return False
     with torch.enable_grad():
         a = _operator(step, sample)
     if any(t.requires_grad for t in a.tensors):
@@ -269,12 +276,17 @@ def set_solver(step: Stepper, solver: Solver, max_iter: int, rtol: float) -> Non
 def _check_direct(trial: Trial, seconds: float) -> None:
     """ValueError where a factorisation would take too much time or memory; a device refuses it itself."""
     step, sample = trial.step, trial.sample
-    a = _operator(step, sample)
-    if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
-        return
     n = sample[0].numel()
-    most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
-    if sample.is_cpu and n > most and not _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters):
+    if isinstance(step, Flow):
+        n = math.prod(step.shape)
+        most, cheap = MOST_UNKNOWNS["sparse"], step.obstacle is None  # transforms along the axes
+    else:
+        a = _operator(step, sample)
+        if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
+            return
+        most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
+        cheap = _C.is_sum_over_axes(sample, a.tensors, a.kind, a.shape, a.parameters)
+    if sample.is_cpu and n > most and not cheap:
         raise ValueError(f"{n} unknowns are too many to factorise within the limit; at most {most}")
     set_solver(step, Direct(1), 1, 0.0)
     # The functions of a step of one's own may hold tensors of the whole batch.
@@ -296,6 +308,8 @@ def _operator(step: Stepper, sample: Tensor) -> operators.Operator:
 
 def _symmetric(trial: Trial) -> bool:
     """Whether A v and Aᵀ v agree to rounding, entry by entry."""
+    if isinstance(trial.step, Flow):
+        return True
     v = trial.cotangent
     with torch.no_grad():
         a = _operator(trial.step, trial.sample)
@@ -306,6 +320,8 @@ def _symmetric(trial: Trial) -> bool:
 def random_cotangent(step: Stepper, sample: Tensor) -> Tensor:
     """Random, without the mean of a channel whose constants A maps to zero, such as a pressure."""
     c = torch.randn(sample.shape, generator=torch.Generator().manual_seed(0), dtype=sample.dtype).to(sample.device)
+    if isinstance(step, Flow):
+        return c
     with torch.no_grad():
         a = _operator(step, sample)
         rounding = _rounding(a.apply(c))

@@ -397,3 +397,27 @@ def test_direct_is_tried_on_a_large_grid_whose_operator_is_a_sum_over_the_axes()
         assert any(row.name == "Direct" for row in advice.rows) == tried
         refused = "Direct was not tried: 34200 unknowns are too many to factorise within the limit; at most 32768."
         assert (refused in advice.notes) == (not tried)
+
+
+@pytest.mark.parametrize("options", [{}, {"boundary": ("wall", "open"), "inflow": (1.0, 0.0)}])
+def test_a_flow_is_timed_by_whole_steps(options):
+    """Its solves together: beside those of a step that is called by hand."""
+    flow = prdp.Flow((12, 16), nu=1e-2, dt=1e-2, **options)
+    with torch.no_grad():
+        u = flow.project(0.1 * torch.randn(3, 2, 12, 16, generator=torch.Generator().manual_seed(0)))
+    advice = advise(flow, u, 0.3, network=torch.nn.Conv2d(2, 2, 3, padding=1))
+    assert {row.name for row in advice.rows} == {"CG", "CG(diagonal)", "CG(multigrid)", "Multigrid", "Direct"}
+    same = prdp.Flow((12, 16), nu=1e-2, dt=1e-2, **options, solver=prdp.CG(1000, rtol=1e-5))
+    same(u)
+    assert rows(advice, "CG", torch.float32)[1e-5].forward.products == int(same.info.operator_applications.max())
+    assert "of an update" in advice.recommendation and "start" not in str(advice)
+    assert {row.dtype for row in advice.rows} == {torch.float32, torch.float64}
+
+
+def test_a_flow_with_an_obstacle_of_many_cells_has_no_factorisation():
+    obstacle = torch.zeros(256, 256, dtype=torch.bool)
+    obstacle[100:120, 100:120] = True
+    flow = prdp.Flow((256, 256), nu=1e-3, dt=1e-3, obstacle=obstacle)
+    trial = solver_trials.Trial(flow, torch.zeros(1, 2, 256, 256), torch.zeros(1, 2, 256, 256), renewed=False)
+    with pytest.raises(ValueError, match="65536 unknowns are too many to factorise within the limit; at most 32768"):
+        solver_trials._check_direct(trial, 1.0)
