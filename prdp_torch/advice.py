@@ -29,6 +29,7 @@ from prdp_torch.steppers import EquationStepper
 WORTH_REFINING = 0.1  # of an update
 WORTH_A_START = 0.1  # of the products of a solve
 NOISE = 0.1  # of the seconds of a solve
+MOST_ERROR = 0.1  # of u at the loosest tolerance: what a network is off by when a controller asks for that one
 
 
 @dataclass
@@ -40,15 +41,18 @@ class Advice:
     recommendation: str
 
     def table(self) -> str:
-        """The rows as lines of aligned text."""
-        lines: list[tuple[str, ...]] = [("solver", "rtol", "dtype", "products", "ms", "adjoint", "ms", "status")]
-        for row in self.rows:
+        """The rows as lines of aligned text; the error is that of u."""
+        lines: list[tuple[str, ...]] = [("solver", "rtol", "products", "ms", "adjoint", "ms", "error", "status")]
+        for before, row in zip([None, *self.rows], self.rows, strict=False):
+            if before is not None and before.dtype != row.dtype:
+                lines.append((f"in {_name(row.dtype)}:", *[""] * (len(lines[0]) - 1)))
             costs = ["", ""] * 2
             for i, solve in enumerate(row.solves):
                 costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
-            lines.append((row.name, _power(row.rtol), _name(row.dtype), *costs, row.status))
+            error = "" if row.error is None else _power(row.error) if row.error else "0"
+            lines.append((row.name, _power(row.rtol), *costs, error, row.status))
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        align = (str.ljust,) * 3 + (str.rjust,) * 4 + (str.ljust,)
+        align = (str.ljust,) * 2 + (str.rjust,) * 5 + (str.ljust,)
         lines.insert(1, tuple("─" * width for width in widths))
         cells = ([put(cell, width) for put, cell, width in zip(align, line, widths, strict=True)] for line in lines)
         return "\n".join("  ".join(line).rstrip() for line in cells)
@@ -114,7 +118,7 @@ def advise(
 
     Returns:
         An `Advice`. Its `rows` hold iterations, products with A, seconds and statuses to 1e-2 and 1e-5,
-        forward and adjoint. Its `notes` name the solvers that the operator does not allow. Its
+        forward and adjoint, and the error of u. Its `notes` name the solvers that the operator does not allow. Its
         `recommendation` is one choice with the reason for it.
 
     Raises:
@@ -151,7 +155,7 @@ def is_built_in(step: Stepper) -> bool:
 
 
 def network_seconds(network: torch.nn.Module, sample: Tensor, most: float) -> float:
-    """One forward and one backward pass; a first one that takes more than `most` is also the last."""
+    """One forward and one backward pass: the median, without the first; for about `most` seconds, at least twice."""
     if not isinstance(network, torch.nn.Module):
         raise TypeError(f"advise: network must be a torch.nn.Module, got {type(network).__name__}")
     network = copy.deepcopy(network)  # a forward pass may change its buffers
@@ -161,14 +165,15 @@ def network_seconds(network: torch.nn.Module, sample: Tensor, most: float) -> fl
     times: list[float] = []
     deadline = now(sample) + most
     with torch.enable_grad():
-        while len(times) <= RUNS and (not times or now(sample) < deadline):
+        # The first call makes what the others find, which may take more than `most`.
+        while len(times) < 2 or (len(times) <= RUNS and now(sample) < deadline):
             started = now(sample)
             out = network(sample)
             if not isinstance(out, Tensor) or not out.requires_grad:
                 raise TypeError("advise: network(sample) must be a tensor that depends on the parameters")
             torch.autograd.grad(out, trained, torch.ones_like(out), allow_unused=True)
             times.append(now(sample) - started)
-    return median(times[1:] or times)
+    return median(times[1:])
 
 
 def _other_dtypes(step: Stepper, sample: Tensor, dtypes: Sequence[torch.dtype] | None) -> list[torch.dtype]:
@@ -189,6 +194,7 @@ def advise_on(
     best = update.choice(rows, TOLERANCES[-1])
     where = f"; threads: {torch.get_num_threads()}" if sample.is_cpu else f" on {sample.device}"
     notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}{where}.", *update.notes, *sentences]
+    notes += _misleading(rows)
     others = []
     for other in other_dtypes:
         try:
@@ -265,7 +271,7 @@ def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, upd
     best if that is faster to the loosest tolerance by more than the noise."""
     loosest, finest = TOLERANCES
     solved = {(row.name, row.rtol): row for row in rows if row.solved}
-    rough = update.fastest([row for row in rows if not isinstance(row.solver, Direct)], loosest)
+    rough = update.fastest([row for row in rows if not isinstance(row.solver, Direct) and is_useful(row)], loosest)
     if rough is not None and rough.name != best.name:
         own = best if isinstance(best.solver, Direct) else solved.get((best.name, loosest), best)
         if update.physics(rough) < (1 - NOISE) * update.physics(own):
@@ -274,6 +280,29 @@ def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, upd
     if isinstance(best.solver, Direct) or _most(best) == 1:
         return best, update.physics(best), ""
     return best, update.physics(measure_one_iteration(step, sample, best.solver)), "a single iteration"
+
+
+def is_useful(row: Row) -> bool:
+    return row.error is None or row.error <= MOST_ERROR
+
+
+def _misleading(rows: Sequence[Row]) -> list[str]:
+    """A sentence on the solvers whose residual says too much."""
+    loosest = TOLERANCES[0]
+    wrong = [row for row in rows if row.solved and row.rtol == loosest and not is_useful(row)]
+    if not wrong:
+        return []
+    worst = max(row.error or 0.0 for row in wrong)
+    return [
+        f"At {_power(loosest)}, {_listed([row.name for row in wrong])} leave u off by up to {_percent(worst)}: b is "
+        "mostly what does not change u, such as values on the sides, or A is ill-conditioned. Solve for the change of "
+        "u, or take a finer rtol; a controller cannot tell."
+    ]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """ "A", "A and B", "A, B and C"."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _most(row: Row) -> int:

@@ -35,6 +35,7 @@ TOLERANCES = (1e-2, 1e-5)  # what a controller asks for at an error of 10 %, and
 RESTARTS = (2, 8, 30)
 MOST_UNKNOWNS = {"sparse": 2**15, "dense": 2**12}  # of a factorisation, which the time limit cannot interrupt
 RUNS = 5  # of which the median counts
+FINER = 1e-3  # than the finest tolerance: what a solution is compared with, where none is exact
 
 
 @dataclass
@@ -64,6 +65,8 @@ class Row:
     forward: Solve
     adjoint: Solve | None
     """With a random cotangent; None where nothing in the step needs a gradient."""
+    error: float | None = None
+    """‖u - u*‖ / ‖u*‖ of the worst sample, where u* is the most accurate solution that was found; of solved rows."""
 
     @property
     def name(self) -> str:
@@ -155,12 +158,35 @@ def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: f
         except (ValueError, NotImplementedError) as error:  # the latter: on this device
             why = _C.sentence(str(error)).removeprefix(f"{type(solver).__name__}: ").removeprefix("linear_solve: ")
             refused.append((solver, why))
+    measure_errors(trial, rows)
     counted = (
         "A depends on the state or is trained, so each forward solve makes its factors or grids anew."
         if trial.renewed
         else "A is the same in every update, so its factors and grids are made once and not counted."
     )
     return rows, [counted, *_refusals(refused, {type(row.solver) for row in rows})]
+
+
+def measure_errors(trial: Trial, rows: Sequence[Row]) -> None:
+    """The error of each solved row. Residuals do not tell: of A with a large condition number, or with a b that is
+    mostly values on the sides, a small one may leave a large error."""
+    fine = [row for row in rows if row.solved and row.rtol == TOLERANCES[-1]]
+    exact = [row for row in fine if isinstance(row.solver, Direct)]
+    if not fine:
+        return
+    best = exact[0] if exact else min(fine, key=lambda row: row.forward.seconds)
+    reference = _states(trial, best.solver, 4 * best.forward.iterations, FINER * TOLERANCES[-1]).double().flatten(1)
+    for row in rows:
+        if row.solved:
+            u = _states(trial, row.solver, max(1, row.forward.iterations), row.rtol).double().flatten(1)
+            errors = (u - reference).norm(dim=1) / reference.norm(dim=1)
+            row.error = float(errors.nan_to_num(0.0).max())  # of a solution that is zero
+
+
+def _states(trial: Trial, solver: Solver, max_iter: int, rtol: float) -> Tensor:
+    set_solver(trial.step, solver, max_iter, rtol)
+    with torch.no_grad():
+        return trial.step(trial.sample)
 
 
 def _refusals(refused: Sequence[tuple[Solver, str]], tried: set[type[Solver]]) -> list[str]:

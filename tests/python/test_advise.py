@@ -421,3 +421,18 @@ def test_a_flow_with_an_obstacle_of_many_cells_has_no_factorisation():
     trial = solver_trials.Trial(flow, torch.zeros(1, 2, 256, 256), torch.zeros(1, 2, 256, 256), renewed=False)
     with pytest.raises(ValueError, match="65536 unknowns are too many to factorise within the limit; at most 32768"):
         solver_trials._check_direct(trial, 1.0)
+
+
+def test_a_small_residual_with_a_large_error_is_told():
+    """A field between high values at the sides: most of b does not change u. The errors are those of LAPACK."""
+    generator = torch.Generator().manual_seed(0)
+    kappa = torch.exp(2.5 * torch.randn(1, 24, 24, generator=generator, dtype=torch.float64))
+    A = operators.Diffusion(kappa, boundary=["flux", "zero"])
+    b = A.boundary_rhs(values=[(0.0, 0.0), (100.0, 101.0)])
+    advice = advise(own_step(A, lambda u: b), torch.zeros(1, 1, 24, 24, dtype=torch.float64), 0.5)
+    exact = torch.linalg.solve(A.dense(), b.flatten())
+    row = rows(advice, "CG(diagonal)", torch.float64)[1e-2]
+    u = prdp.linear_solve(A, b, prdp.CG(row.forward.iterations, rtol=1e-2, preconditioner="diagonal"))[0].flatten()
+    assert row.error == pytest.approx(float((u - exact).norm() / exact.norm()), rel=1e-6) and row.error > 0.1
+    assert "CG(diagonal)" in next(note for note in advice.notes if "leave u off by up to" in note)
+    assert "multigrid" in advice.recommendation or "Direct" in advice.recommendation
