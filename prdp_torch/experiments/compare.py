@@ -1,5 +1,6 @@
 """`prdp compare`: the converged solver, the exact one, auto, PRDP and a sweep of constant K, over seeds."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -134,6 +135,8 @@ def run(
     environment = records.environment(scene.device)
     rows = rows_of(scene)
     with records.alone_in([folder / row.label for row in rows]):
+        if not resume:
+            refuse_to_lose(scene, [row.label for row in rows], seeds, folder, environment)
         for row in rows:
             for seed in range(seeds):
 
@@ -161,14 +164,10 @@ def run_one(
     """One training with its record, and beside it the final weights of a network, `seed_N.pt`; if `resume`,
     the curves of a finished record of the same settings, or the training goes on from its checkpoint. ValueError for
     a record of the same settings and another number of intervals, which would be lost."""
-    path = folder / label / f"seed_{seed}.json"
+    path, checkpoint = _files_of(scene, label, seed, folder, environment)
     path.parent.mkdir(parents=True, exist_ok=True)
     if data_parallel.is_first():
         _C.settle_weights(path)
-    versions = environment["versions"]
-    checkpoint = Checkpoint(
-        path.with_suffix(".checkpoint"), label=label, seed=seed, settings=records.identity(scene), versions=versions
-    )
     if not resume:
         checkpoint.remove()
     curves = data_parallel.from_first(lambda: _finished(path, scene, checkpoint)) if resume else None
@@ -182,6 +181,25 @@ def run_one(
     records.write_training(path, record, network)
     checkpoint.remove()
     return curves
+
+
+def refuse_to_lose(
+    scene: _C.Scene, labels: Iterable[str], seeds: int, folder: Path, environment: dict[str, Any]
+) -> None:
+    """ValueError where one of these trainings has a checkpoint to go on from, which beginning anew would delete."""
+    for label in labels:
+        for seed in range(seeds):
+            path, checkpoint = _files_of(scene, label, seed, folder, environment)
+            data_parallel.from_first(functools.partial(checkpoint.refuse_to_lose, path))
+
+
+def _files_of(
+    scene: _C.Scene, label: str, seed: int, folder: Path, environment: dict[str, Any]
+) -> tuple[Path, Checkpoint]:
+    """The record of a training, and its checkpoint."""
+    record = folder / label / f"seed_{seed}.json"
+    path, settings, versions = record.with_suffix(".checkpoint"), records.identity(scene), environment["versions"]
+    return record, Checkpoint(path, label=label, seed=seed, settings=settings, versions=versions)
 
 
 def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | None:

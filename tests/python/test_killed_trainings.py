@@ -181,6 +181,18 @@ def test_where_both_checkpoints_were_tampered_with_it_is_one_line(tmp_path, trai
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_killed_training_is_not_begun_anew_unasked(tmp_path, trainer):
+    scene, out = scene_of("parameters", tmp_path), tmp_path / "killed"
+    checkpoint = out / "prdp/seed_0.checkpoint"
+    stop(start(trainer, scene, out, "--intervals", 300), checkpoint, SIGKILL)
+    left = checkpoint.read_bytes()
+    status, errors = run(trainer, scene, out, "--intervals", 300, "--seeds", 2)
+    assert status == 2 and errors.count("\n") == 1
+    assert f"checkpoint: '{checkpoint}' is of a training that has not ended: pass --resume to go on with it" in errors
+    assert checkpoint.read_bytes() == left
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
 def test_a_checkpoint_that_a_kill_has_left_beside_its_record_goes(tmp_path, trainer):
     scene, out = scene_of("parameters", tmp_path), tmp_path / "out"
     arguments = (trainer, scene, out, "--intervals", 3)

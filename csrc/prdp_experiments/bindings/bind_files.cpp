@@ -97,6 +97,7 @@ void bind_files(py::module_& m) {
       .def("restore", &restore, py::arg("found"), py::arg("load"))
       .def_property_readonly("notice", &Checkpoint::notice)
       .def("remove_before", &Checkpoint::remove_before, py::arg("record"))
+      .def("refuse_to_lose", &Checkpoint::refuse_to_lose, py::arg("record"))
       .def("check_length", &Checkpoint::check_length, py::arg("done"), py::arg("intervals"))
       .def("remove", &Checkpoint::remove);
 

@@ -56,6 +56,16 @@ std::vector<Checkpoint::Found> Checkpoint::find() {
   return found;
 }
 
+void Checkpoint::refuse_to_lose(const fs::path& record) {
+  remove_before(record);
+  std::vector<Found> found;
+  for (const auto& path : {path_, before_}) find_in(path, found);
+  for (const auto& one : found)
+    TORCH_CHECK_VALUE(!one.wrong.empty(), "checkpoint: '", one.path.string(),
+                      "' is of a training that has not ended: pass --resume to go on with it, or delete the file to "
+                      "train afresh");
+}
+
 void Checkpoint::find_in(const fs::path& path, std::vector<Found>& found) {
   auto opened = open_sealed(path, kKind);
   if (!opened) return;

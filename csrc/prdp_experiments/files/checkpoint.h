@@ -47,6 +47,9 @@ class Checkpoint {
   void remove() const;
   /// Removes them if they are older than the record of their training: a kill came between the two.
   void remove_before(const std::filesystem::path& record) const;
+  /// Raises ValueError if there is a state to go on from that is not older than the record: a training from the start
+  /// would lose it.
+  void refuse_to_lose(const std::filesystem::path& record);
 
  private:
   using Clock = std::chrono::steady_clock;

@@ -76,17 +76,15 @@ Json record(const Identity& identity, const std::string& label, int64_t seed, co
   return record;
 }
 
-/// Beside the record to come; without --resume what an earlier run has left there is gone.
-prdp::Checkpoint checkpoint_of(const fs::path& record, const Options& options, const Identity& identity,
-                               const std::string& label, int64_t seed) {
+/// Beside the record to come.
+prdp::Checkpoint checkpoint_of(const fs::path& record, const Identity& identity, const std::string& label,
+                               int64_t seed) {
   const Json all{{"trainer", "C++"},
                  {"label", label},
                  {"seed", seed},
                  {"settings", identity.settings()},
                  {"versions", versions()}};
-  prdp::Checkpoint checkpoint(fs::path(record).replace_extension(".checkpoint"), text_of(all));
-  if (!options.resume) checkpoint.remove();
-  return checkpoint;
+  return {fs::path(record).replace_extension(".checkpoint"), text_of(all)};
 }
 
 /// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on
@@ -144,12 +142,16 @@ int run(const Options& options, const std::string& command) {
   const prdp::FolderLock lock(folder);
 
   std::printf("%s: %s, %s\n", scene.name.c_str(), refinement.label.c_str(), scene.title.c_str());
+  const auto file_of = [&](int64_t seed) { return folder / ("seed_" + std::to_string(seed) + ".json"); };
+  for (int64_t seed = 0; !options.resume && seed < options.seeds; ++seed)
+    checkpoint_of(file_of(seed), identity, refinement.label, seed).refuse_to_lose(file_of(seed));
   int diverged = 0;
   for (int64_t seed = 0; seed < options.seeds; ++seed) {
-    const auto file = folder / ("seed_" + std::to_string(seed) + ".json");
+    const auto file = file_of(seed);
     prdp::settle_weights(file);
-    auto checkpoint = checkpoint_of(file, options, identity, refinement.label, seed);
+    auto checkpoint = checkpoint_of(file, identity, refinement.label, seed);
     if (options.resume && is_done(file, identity, checkpoint)) continue;
+    if (!options.resume) checkpoint.remove();
     const auto on_interval = [&, first = true](int64_t done, double metric, int64_t k) mutable {
       if (interrupted) throw Interrupted{};
       if (std::exchange(first, false) || done % 10 == 0)
