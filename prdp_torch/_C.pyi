@@ -63,7 +63,7 @@ class FlowEquation:
 class Controller:
     def _load(self, max_iter: typing.SupportsInt | typing.SupportsIndex, checkpoint: typing.SupportsFloat | typing.SupportsIndex, history: collections.abc.Sequence[tuple[typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex, bool, typing.SupportsFloat | typing.SupportsIndex | None, typing.SupportsFloat | typing.SupportsIndex | None]]) -> None:
         ...
-    def _step(self, metric: typing.SupportsFloat | typing.SupportsIndex, converged: bool, residual: typing.SupportsFloat | typing.SupportsIndex | None, error: typing.SupportsFloat | typing.SupportsIndex | None) -> bool:
+    def _step(self, metric: typing.SupportsFloat | typing.SupportsIndex, converged: bool, residual: typing.SupportsFloat | typing.SupportsIndex | None, error: typing.SupportsFloat | typing.SupportsIndex | None, idle: typing.SupportsFloat | typing.SupportsIndex) -> bool:
         ...
     @property
     def _budget(self) -> dict:
@@ -165,6 +165,7 @@ def way_of_last_solve() -> str:
 CHECKPOINT_SQRT: int = -1
 DEFAULT_RESTART: int = 10
 DEFAULT_RTOL: float = 1e-05
+SMALL_RESIDUAL: float = 0.0001
 PRDP_DEFAULTS: dict = {'tau_step': 0.95, 'tau_stop': 0.9, 'delta': 3, 'window': 6, 'initial': 1, 'increment': 1, 'maximum': None, 'growth': 1.0, 'adjoint_ratio': None}
 SOLVE_STATUSES: dict = {'CONVERGED_BREAKDOWN': 2, 'CONVERGED': 1, 'MAX_ITER': -1, 'STAGNATED': -2, 'DIVERGED': -3, 'OVERFLOW': -4, 'BREAKDOWN': -5, 'ZERO_DIAGONAL': -6, 'INCONSISTENT': -7, 'NONFINITE_INPUT': -8, 'NONFINITE_OPERATOR': -9}
 TOLERANCE_DEFAULTS: dict = {'ratio': 0.1, 'adjoint_ratio': 0.1, 'floor': 1e-05, 'adjoint_floor': 0.01, 'maximum': 10000}

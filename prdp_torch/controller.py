@@ -119,24 +119,27 @@ class _Attached(_Compiled):
 
     def _of_all_processes(
         self, metric: float, converged: bool, error: float | None
-    ) -> tuple[float, bool, float | None, float | None]:
-        """(metric, converged, residual, error), the same in every process: means, and whether all have converged. The
-        residual is that where the last solves ended: the mean over the samples, of several steppers the largest."""
+    ) -> tuple[float, bool, float | None, float | None, float]:
+        """(metric, converged, residual, error, idle), the same in every process: means, and whether all have converged.
+        The residual is that where the last solves ended: the mean over the samples, of several steppers the largest;
+        `idle` is the share of solves that took no iteration."""
         ended = [getattr(stepper, "info", None) for stepper in self.steppers]
         residuals = [torch.zeros(0) if info is None else _beyond_rounding(info) for info in ended]
+        idle = max((_idle(info) for info in ended if info is not None and info.status.numel()), default=0.0)
         many = data_parallel.count(self.process_group)
         if many > 1:
             # One that is refused must be refused in every process.
             numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
-            numbers += [converged, error is not None]
-            metric, error_sum, agree, known, *of_steppers = data_parallel.sums(
+            numbers += [converged, error is not None, idle]
+            metric, error_sum, agree, known, idle, *of_steppers = data_parallel.sums(
                 [*numbers, *(n for r in residuals for n in (float(r.sum()), r.numel()))], self.process_group
             )
             metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None
+            idle /= many
             means = [total / n for total, n in zip(of_steppers[::2], of_steppers[1::2], strict=True) if n]
         else:
             means = [float(r.mean()) for r in residuals if r.numel()]
-        return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error
+        return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error, idle
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
@@ -172,6 +175,11 @@ def _kind(controller: type) -> str:
 def _beyond_rounding(info: SolveInfo) -> Tensor:
     """The residuals of a report, with 0 where it is rounding alone."""
     return info.residual.double().masked_fill(info.floor > 0, 0.0)
+
+
+def _idle(info: SolveInfo) -> float:
+    """The share of samples whose solve took no iteration, though its residual is not small."""
+    return float(((info.iterations == 0) & (_beyond_rounding(info) > _C.SMALL_RESIDUAL)).double().mean())
 
 
 def _remade(
@@ -229,6 +237,7 @@ class PRDPController(_C.PRDPController, _Attached):
     Every controller has a `warning`. It is None, or a sentence about one of these:
 
     - The solves stop so far from the solution that their error dominates what is trained.
+    - Most of the last solves took no iteration, so that steps pass their start on.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
 

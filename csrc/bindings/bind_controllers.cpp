@@ -33,10 +33,12 @@ void bind_interface(py::module_& m) {
   py::class_<Controller>(m, "Controller")
       .def(
           "_step",
-          [](Controller& c, double metric, bool converged, Known residual, Known error) {
-            return c.step(metric, {converged, residual, error});
+          [](Controller& c, double metric, bool converged, Known residual, Known error, double idle) {
+            Solves solves{converged, residual, error};
+            solves.idle = idle;
+            return c.step(metric, solves);
           },
-          "metric"_a, "converged"_a, "residual"_a, "error"_a)
+          "metric"_a, "converged"_a, "residual"_a, "error"_a, "idle"_a)
       .def("_load", &load, "max_iter"_a, "checkpoint"_a, "history"_a)
       .def_property_readonly("max_iter", &Controller::max_iter)
       .def_property_readonly("warning", &Controller::warning)
@@ -58,6 +60,7 @@ py::dict as_dict(const ToleranceSettings& s) {
 }  // namespace
 
 void bind_controllers(py::module_& m) {
+  m.attr("SMALL_RESIDUAL") = kSmallResidual;
   m.attr("PRDP_DEFAULTS") = as_dict(PRDPSettings{});
   m.attr("TOLERANCE_DEFAULTS") = as_dict(ToleranceSettings{});
 

@@ -363,6 +363,18 @@ def test_a_tolerance_that_was_asked_for_is_no_warning():
     assert "the solves stop at a residual of" in controller.warning
 
 
+def test_solves_that_take_no_iteration_are_told():
+    heat = prdp.Heat((30,), nu=1e-4, dt=1.0, solver=prdp.CG(100))
+    u = torch.randn(4, 1, 30, generator=torch.Generator().manual_seed(0)).cumsum(-1)
+    controller = prdp.ToleranceController([heat])
+    for start, told in (("state", True), ("zero", False)):
+        heat.start = start
+        heat(u)
+        controller.step(0.9)
+        assert (int(heat.info.iterations.max()) == 0) == told
+        assert ("took no iteration" in (controller.warning or "")) == told
+
+
 def test_without_an_error_prdp_warns_of_a_stalled_metric():
     heat = heat_step()
     controller = prdp.PRDPController([heat], delta=2, window=1)

@@ -11,8 +11,6 @@ namespace prdp {
 
 namespace {
 
-/// Below it, solves are as good as converged.
-constexpr double kSmallResidual = 1e-4;
 /// The residual may make up the error from this share on. Measured: up to .28 trainings end as well as with
 /// converged solves, from .38 on most do not (docs/refinement.md).
 constexpr double kShareOfError = 0.3;
@@ -41,9 +39,10 @@ void Controller::check_metric(double metric, const char* what) {
   TORCH_CHECK_VALUE(good, name(), ": ", what, " must be finite and >= 0, got ", metric);
 }
 
-void Controller::check_solves(const Solves& solves) const {
+void Controller::check_solves(const Solves& solves) {
   for (const auto& [what, value] : {std::pair("error", solves.error), std::pair("residual", solves.residual)})
     TORCH_CHECK_VALUE(!value || is_size(*value), name(), ": ", what, " must be finite and >= 0, got ", *value);
+  idle_ = solves.idle;
 }
 
 void Controller::check_state(const State& state, bool is_ignored) const {
@@ -83,6 +82,10 @@ std::string Controller::about_metric() const {
 
 std::string Controller::about_residual() const {
   const auto& history = state().history;
+  if (idle_ > 0.5)
+    return std::string(name()) +
+           ": most of the last solves took no iteration, as their start met rtol, so that the step hardly changes the "
+           "state; start from zero, solve for the change of the state, or take a finer rtol";
   if (history.empty() || !history.back().residual) return {};
   const auto& last = history.back();
   const double residual = *last.residual;

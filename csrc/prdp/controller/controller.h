@@ -7,6 +7,9 @@
 
 namespace prdp {
 
+/// Below it, solves are as good as converged.
+inline constexpr double kSmallResidual = 1e-4;
+
 /// The outcome of the solves of an interval, and the error of what is trained.
 struct Solves {
   bool converged = false;            // whether all of them met their tolerance
@@ -14,6 +17,8 @@ struct Solves {
   /// The relative error of what is trained. For a network, ‖u - u_ref‖ / ‖u_ref‖ after one step: the square root of a
   /// normalised squared metric, divided by the number of steps. In an inverse problem, the relative misfit.
   std::optional<double> error{};
+  /// The share of samples whose solve took no iteration, as its start met the tolerance, and is above rounding.
+  double idle = 0.0;
 
   Solves(bool converged = false, std::optional<double> residual = {}, std::optional<double> error = {})
       : converged(converged), residual(residual), error(error) {}
@@ -64,13 +69,15 @@ class Controller {
   ///     network gives v, and training makes the solve P_K v meet u₂ = P v_ref. If the loss is small, v - v_ref is the
   ///     residual of that solve. So a residual as large as the error is the error. If the error is not known, a large
   ///     residual counts once the metric has stalled.
+  ///   - Most of the last solves took no iteration, so that steps pass their start on.
   std::optional<std::string> warning() const;
 
  protected:
   /// Raises ValueError unless the metric, called `what` in the message, is finite and >= 0. warning() then reports it.
   void check_metric(double metric, const char* what);
-  /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0.
-  void check_solves(const Solves& solves) const;
+  /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0. warning() then
+  /// reports solves that did nothing.
+  void check_solves(const Solves& solves);
   /// Raises ValueError for a state that no controller can have reached; a metric that `is_ignored` may be anything.
   void check_state(const State& state, bool is_ignored = false) const;
   virtual const char* name() const = 0;
@@ -86,6 +93,7 @@ class Controller {
   std::string about_residual() const;
 
   std::optional<double> refused_;  // the metric of the last step(), if it raised an error
+  double idle_ = 0.0;              // of its solves
 };
 
 /// ⌈ratio · K⌉, the iterations of an adjoint solve: at least one where K is. Raises ValueError in the name of `who`
