@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <atomic>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -27,9 +28,14 @@ struct KernelSource {
   int64_t threads, block_memory, blocks_of_team;
 };
 
+/// What is known of a kernel by its first result, which is compared with tensor operations.
+enum class Trust { kUnknown, kGood, kNone };
+
 /// A kernel on a device.
 class Kernel {
  public:
+  mutable std::atomic<Trust> trust = Trust::kUnknown;
+
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
   virtual int64_t teams() const = 0;

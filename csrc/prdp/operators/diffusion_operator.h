@@ -34,7 +34,7 @@ class DiffusionOperator final : public Operator {
 
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless kappa > 0 and h >= 0.
-  void check_parameters() const override;
+  void check_parameters(bool kernel_checks) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
   at::Tensor diagonal() const override { return coefficients().narrow(1, 0, 1); }

@@ -34,8 +34,8 @@ class CsrOperator final : public Operator {
   explicit CsrOperator(const OperatorSpec& spec);
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless each crow rises from 0 to nnz and each column lies in [0, n). Torch does not
-  /// check this when a sparse tensor is made, and the CPU loops read and write where the indices say.
-  void check_parameters() const override;
+  /// check this when a sparse tensor is made, and loops and kernels read and write where the indices say.
+  void check_parameters(bool kernel_checks) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;

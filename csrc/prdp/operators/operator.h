@@ -33,8 +33,10 @@ class Operator {
 
   /// Raises ValueError or TypeError unless b is a right-hand side of this operator.
   virtual void check_vector(const at::Tensor& b) const = 0;
-  /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu.
-  virtual void check_parameters() const {}
+  /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu. With `kernel_checks`, numbers
+  /// on a GPU are left to the kernel of the solve, so that the host need not wait for them: there, what is not allowed
+  /// counts as not finite.
+  virtual void check_parameters(bool /*kernel_checks*/ = false) const {}
 
   /// Raises ValueError if what somebody named as a null space is none, for vectors like b.
   virtual void check_null_spaces(const at::Tensor& /*b*/) const {}

@@ -23,7 +23,7 @@ class SingularOperator final : public Operator {
   SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title);
 
   void check_vector(const at::Tensor& b) const override;
-  void check_parameters() const override { a_->check_parameters(); }
+  void check_parameters(bool kernel_checks) const override { a_->check_parameters(kernel_checks); }
   /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero. Of the operator that this thread
   /// checked last, it is known.
   void check_null_spaces(const at::Tensor& b) const override;

@@ -62,6 +62,8 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   for (int64_t i = 0; i < batch; ++i)
     if (is_failure(static_cast<SolveStatus>(status[i]))) failed.push_back(i);
   if (failed.empty()) return;
+  for (const int64_t i : failed)
+    if (static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator) a.check_parameters();
 
   constexpr size_t named = 4;
   std::ostringstream text;

@@ -6,12 +6,16 @@
 #include <mutex>
 #include <set>
 
+#include "prdp/solvers/first_result.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_kernel.h"
 
 namespace prdp::gpu {
 
 namespace {
+
+constexpr const char* kDisagrees =
+    "the first result of a kernel does not have the residual that it reports; please report this, with your device";
 
 /// Why a solve has no kernel, which is no fault.
 std::string not_made(const Solver& solver) {
@@ -150,8 +154,15 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   const auto prepared = prepare(a, rhs, request.solver);
   if (!prepared) return std::nullopt;
   const auto run = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
+  auto& trust = prepared->kernel->trust;
   try {
-    return run(*prepared->kernel, prepared->source, prepared->a, rhs, request);
+    if (trust == Trust::kNone) throw Unavailable(kDisagrees);
+    auto found = run(*prepared->kernel, prepared->source, prepared->a, rhs, request);
+    if (trust == Trust::kUnknown && request.guarded) {
+      trust = residuals_agree(a, rhs, found) ? Trust::kGood : Trust::kNone;
+      if (trust == Trust::kNone) throw Unavailable(kDisagrees);
+    }
+    return found;
   } catch (const Unavailable& reason) {
     fall_back(reason.what());
     return std::nullopt;

@@ -29,6 +29,11 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     }
   }
 
+  /// NaN where κ is not allowed.
+  T largest_in_row(int i) const {
+    const bool allowed = !(kappa_[i % G::kPoints] <= T(0));
+    return allowed ? Rows<Diffusion, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
+  }
   template <class F>
   void for_each_entry(int i, const F& f) const {
     T through = 0;
@@ -79,7 +84,9 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     if constexpr (side == kZeroSide) return within;
     constexpr int at_side = 2 * axis + end;
     const int on_side = axis == 0 ? at.y * G::kX + at.x : axis == 1 ? at.z * G::kX + at.x : at.z * G::kY + at.y;
-    const T beyond = per_cell_[axis] * (robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side]);
+    const T h = robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side];
+    if (h < T(0)) return std::numeric_limits<T>::quiet_NaN();  // not allowed
+    const T beyond = per_cell_[axis] * h;
     return within * (beyond / (within + beyond));  // in series
   }
   static T mean(T a, T b) { return kHarmonic ? 2 * a * (b / (a + b)) : (a + b) / 2; }

@@ -27,7 +27,8 @@ class Upwind {
         beta_(static_cast<T>(a.numbers[1])),
         inverse_h_{static_cast<T>(a.numbers[4]), static_cast<T>(a.numbers[3])} {
     const T* const by = static_cast<const T*>(a.tensors[1]);
-    const double nu = by ? a.numbers[2] * static_cast<double>(*by) : a.numbers[2];
+    constexpr double not_allowed = std::numeric_limits<double>::quiet_NaN();
+    const double nu = !by ? a.numbers[2] : *by >= T(0) ? a.numbers[2] * static_cast<double>(*by) : not_allowed;
     for (int axis = 0; axis < 2; ++axis)
       diffusion_[axis] = static_cast<T>(a.numbers[1] * nu * a.numbers[4 - axis] * a.numbers[4 - axis]);
   }

@@ -1,6 +1,7 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "prdp/gpu/device/arguments.h"
 #include "prdp/kernels/scales.h"
@@ -73,6 +74,7 @@ class Laplacian {
     y_ = static_cast<T>(off[1] * factor);
     x_ = static_cast<T>(off[2] * factor);
     norm_ = (norm_ + std::abs(centre)) * factor;
+    if (by && !(*by >= T(0))) norm_ = std::numeric_limits<double>::quiet_NaN();  // ν is not allowed
     radius_ = around / std::abs(centre);
   }
 
