@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+SUITES = ("accuracy", "diffusion", "size", "large", "roofline", "change_of_k", "training", "memory")
 PEERS = ("torch", "jax", "lineax", "scipy", "pyamg", "phiflow", "jax-cfd", "exponax", "torch-fem")
 
 
@@ -28,15 +29,19 @@ def peer_versions():
 
 def main():
     parser = argparse.ArgumentParser(prog="prdp bench")
-    parser.add_argument("suites", nargs="*", metavar="SUITE")
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help=f"{', '.join(SUITES)}; all.")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
+    for suite in options.suites:
+        if suite not in SUITES:
+            print(f"bench: unknown suite '{suite}'; allowed: {', '.join(SUITES)}", file=sys.stderr)
+            sys.exit(2)
     use_one_thread()
     import torch  # only now: it reads the environment, and counts the cores for its pool
 
     from benchmarks import measure, page
-    from prdp_torch.experiments import cli, records
+    from prdp_torch.experiments import records
 
     torch.set_num_threads(1)
     measure.keep_to_one_core()
@@ -44,7 +49,7 @@ def main():
     environment = records.environment() | {"peers": peer_versions()}
     environment["command"] = " ".join(["prdp", "bench", *options.suites, *(["--quick"] if options.quick else [])])
     results = {}
-    for suite in options.suites or cli.SUITES:
+    for suite in options.suites or SUITES:
         module = importlib.import_module(f"benchmarks.{suite}")
         results[suite] = module.run(lambda text: print(text, file=sys.stderr, flush=True), options.quick)
         records.write(folder / f"{suite}.json", {**environment, "quick": options.quick, suite: results[suite]})

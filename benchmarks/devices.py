@@ -27,7 +27,7 @@ def on(device, problem):
     else:
         make = operators.Burgers if problem.name.startswith("burgers") else operators.NavierStokes
         a = make(winds, problem.nu, problem.dt)
-    return a, stencils.make(problem, torch_eager.Backend, lambda array: torch.from_numpy(array).to(device))
+    return a, stencils.make(problem, stencils.TorchBackend, lambda array: torch.from_numpy(array).to(device))
 
 
 def problem_offsets(problem):

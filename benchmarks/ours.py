@@ -1,22 +1,10 @@
 """This library on a problem: every solver that fits, in every derivative mode."""
 
-from typing import NamedTuple
-
 import prdp_torch as prdp
+from benchmarks.entries import Entry
+from benchmarks.peers import stencils
 from benchmarks.problems import gradient_of
 from prdp_torch import _C
-
-
-class Entry(NamedTuple):
-    """A way to solve a problem. `prepare(k)` gives two callables: the solution, and (solution, gradient),
-    finished when they return."""
-
-    label: str
-    mode: str  # "implicit" or "unrolled"
-    ks: list  # budgets to run; [None] where there is none to choose
-    prepare: callable
-    applications: callable = None  # (forward, both) products with A of a run with K
-    same_as: str | None = None  # the method of ours that runs the same iteration with the same K
 
 
 def budgets(k):
@@ -74,14 +62,13 @@ def entries(problem, modes=("implicit", "unrolled")):
 def through_function(problem):
     """CG on `operators.Function`, products of torch operations: what a user writes without a Stencil. As in the eager
     loop, the coefficients are made of the field once, not in every product."""
-    from benchmarks.peers import stencils, torch_eager
 
     def product(v, diagonal, *sides):
         lower, upper = ({axis: sides[2 * axis + first] for axis in (-1, -2)} for first in (0, 1))
-        return stencils.Upwind(diagonal, lower, upper, torch_eager.Backend).apply(v)
+        return stencils.Upwind(diagonal, lower, upper, stencils.TorchBackend).apply(v)
 
     def operator_of(b, kappa):
-        a = stencils.diffusion(kappa, problem.dt, torch_eager.Backend)
+        a = stencils.diffusion(kappa, problem.dt, stencils.TorchBackend)
         sides = [side[axis] for axis in (-2, -1) for side in (a.lower, a.upper)]
         return prdp.operators.Function(product, tensors=(a.diagonal, *sides), symmetric=True)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import gmres as library_gmres
 
-from benchmarks import ours
+from benchmarks.entries import Entry
 from benchmarks.peers import stencils
 
 
@@ -172,7 +172,7 @@ def run_jitted(solution, b, g, kappa):
 def entries(problem):
     if problem.kappa is not None:
         prepare = lambda k: diffusion_calls(problem, lambda stencil, b: cg(stencil, b, k))  # noqa: E731
-        yield ours.Entry("JAX jit, CG", "implicit", [problem.k], prepare, same_as="CG")
+        yield Entry("JAX jit, CG", "implicit", [problem.k], prepare, same_as="CG")
         return
     stencil = stencils.make(problem, Backend, jnp.asarray)
     b, g = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g))
@@ -182,12 +182,12 @@ def entries(problem):
         return lambda: forward(b).block_until_ready(), lambda: jax.block_until_ready(both(b, g))
 
     if problem.name.startswith("heat"):
-        yield ours.Entry(
+        yield Entry(
             "JAX jit, Jacobi", "implicit", [problem.k], partial(prepare, loop=jacobi, extra=()), same_as="Jacobi"
         )
         return
     m = problem.solver(1).restart
-    yield ours.Entry(
+    yield Entry(
         f"JAX jit, GMRES({m})", "implicit", [problem.k], partial(prepare, loop=gmres, extra=(m,)), same_as=f"GMRES({m})"
     )
 
@@ -207,4 +207,4 @@ def entry_for_any(problem):
         bound = jnp.asarray(k)
         return lambda: forward(b, bound).block_until_ready(), lambda: jax.block_until_ready(both(b, g, bound))
 
-    return ours.Entry(f"JAX jit with K traced, {method}", "implicit", [problem.k], prepare, same_as=method)
+    return Entry(f"JAX jit with K traced, {method}", "implicit", [problem.k], prepare, same_as=method)

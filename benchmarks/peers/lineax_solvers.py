@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import lineax
 import numpy as np
 
-from benchmarks import ours
+from benchmarks.entries import Entry
 from benchmarks.peers import stencils
 from benchmarks.peers.jax_loops import Backend, run_jitted
 
@@ -31,7 +31,7 @@ def entries(problem):
     if problem.kappa is not None:
         b, g, kappa = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g, problem.kappa))
         prepare = lambda _: run_jitted(partial(solve_diffusion, problem), b, g, kappa)  # noqa: E731
-        yield ours.Entry("lineax, CG", "implicit", [None], prepare)
+        yield Entry("lineax, CG", "implicit", [None], prepare)
         return
     stencil = stencils.make(problem, Backend, jnp.asarray)
     b, g = (jnp.asarray(np.asarray(v)) for v in (problem.b, problem.g))
@@ -65,4 +65,4 @@ def entries(problem):
         jitted, jitted_both = jax.jit(solve), jax.jit(both)
         return lambda: jitted(b).block_until_ready(), lambda: jax.block_until_ready(jitted_both(b, g))
 
-    yield ours.Entry(f"lineax, {label}", "implicit", [None], prepare)
+    yield Entry(f"lineax, {label}", "implicit", [None], prepare)

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from benchmarks import ours
+from benchmarks.entries import Entry
 from benchmarks.peers import stencils
 
 
@@ -73,7 +73,7 @@ def of_field(problem, u, found):
 
 def entries(problem):
     if problem.kappa is not None:
-        return [ours.Entry("SciPy, sparse LU", "implicit", [None], lambda _: diffusion_calls(problem))]
+        return [Entry("SciPy, sparse LU", "implicit", [None], lambda _: diffusion_calls(problem))]
     return entries_of_gradients_for_b(problem)
 
 
@@ -112,4 +112,4 @@ def entries_of_gradients_for_b(problem):
             return u
         return u, np.stack([solve(lu, v, "T") for lu, v in zip(factors, g, strict=True)])
 
-    yield ours.Entry("SciPy, sparse LU", "implicit", [None], lambda _: (lambda: run(False), lambda: run(True)))
+    yield Entry("SciPy, sparse LU", "implicit", [None], lambda _: (lambda: run(False), lambda: run(True)))

@@ -5,6 +5,19 @@ A backend is an object with `roll(v, shift, axis)`, `pad(v, axis)` (one zero on 
 """
 
 import numpy as np
+import torch
+
+
+class TorchBackend:
+    stack = staticmethod(torch.stack)
+
+    @staticmethod
+    def roll(v, shift, axis):
+        return torch.roll(v, shift, axis)
+
+    @staticmethod
+    def pad(v, axis):
+        return torch.nn.functional.pad(v, [0, 0] * (-axis - 1) + [1, 1])
 
 
 class Heat:

@@ -6,21 +6,9 @@ from functools import partial
 
 import torch
 
-from benchmarks import ours
+from benchmarks.entries import Entry
 from benchmarks.peers import stencils
 from benchmarks.problems import gradient_of
-
-
-class Backend:
-    stack = staticmethod(torch.stack)
-
-    @staticmethod
-    def roll(v, shift, axis):
-        return torch.roll(v, shift, axis)
-
-    @staticmethod
-    def pad(v, axis):
-        return torch.nn.functional.pad(v, [0, 0] * (-axis - 1) + [1, 1])
 
 
 def jacobi(stencil, transposed, b, k):
@@ -116,7 +104,7 @@ class ImplicitDiffusion(torch.autograd.Function):
         found = ctx.solve(ctx.stencil, g)
         with torch.enable_grad():
             leaf = kappa.detach().requires_grad_()
-            (bar,) = torch.autograd.grad(stencils.diffusion(leaf, ctx.dt, Backend).apply(u), leaf, -found)
+            (bar,) = torch.autograd.grad(stencils.diffusion(leaf, ctx.dt, stencils.TorchBackend).apply(u), leaf, -found)
         return found, bar, None, None, None
 
 
@@ -140,14 +128,14 @@ def diffusion_calls(problem, make, solve):
 
 
 def diffusion_entries(problem):
-    def prepare(k, make=lambda kappa: stencils.diffusion(kappa, problem.dt, Backend)):
+    def prepare(k, make=lambda kappa: stencils.diffusion(kappa, problem.dt, stencils.TorchBackend)):
         return diffusion_calls(problem, make, lambda stencil, b: cg(stencil, False, b, k))
 
-    yield ours.Entry("torch eager, CG", "implicit", [problem.k], prepare, same_as="CG")
+    yield Entry("torch eager, CG", "implicit", [problem.k], prepare, same_as="CG")
     if importlib.util.find_spec("scipy"):
         matrix = Sparse(problem)
         prepare_sparse = partial(prepare, make=lambda kappa: matrix)
-        yield ours.Entry("torch eager CSR, CG", "implicit", [problem.k], prepare_sparse, same_as="CG")
+        yield Entry("torch eager CSR, CG", "implicit", [problem.k], prepare_sparse, same_as="CG")
 
 
 def calls(problem, solve):
@@ -170,7 +158,7 @@ def entries(problem):
     if problem.kappa is not None:
         yield from diffusion_entries(problem)
         return
-    stencil = stencils.make(problem, Backend, torch.from_numpy)
+    stencil = stencils.make(problem, stencils.TorchBackend, torch.from_numpy)
     if problem.name.startswith("heat"):
         loop, label, extra = jacobi, "Jacobi", ()
     else:
@@ -180,4 +168,4 @@ def entries(problem):
     def prepare(k):
         return calls(problem, lambda b, transposed: loop(stencil, transposed, b, k, *extra))
 
-    yield ours.Entry(f"torch eager, {label}", "implicit", [problem.k], prepare, same_as=label)
+    yield Entry(f"torch eager, {label}", "implicit", [problem.k], prepare, same_as=label)

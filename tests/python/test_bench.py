@@ -64,7 +64,7 @@ def test_the_exact_answers_solve_the_dense_systems(name):
 @small
 def test_the_stencils_of_the_peers_are_the_operators(name):
     problem = SMALL[name]()
-    stencil = stencils.make(problem, torch_eager.Backend, torch.from_numpy)
+    stencil = stencils.make(problem, stencils.TorchBackend, torch.from_numpy)
     v = torch.randn_like(problem.b)
     for applied, matrix in ((stencil.apply(v), dense), (stencil.transpose(v), lambda *of: dense(*of).T)):
         for i in range(2):

@@ -11,10 +11,6 @@ using Rows = std::vector<bool>;  // which samples
 
 inline bool any(const Rows& rows) { return std::find(rows.begin(), rows.end(), true) != rows.end(); }
 inline bool all(const Rows& rows) { return std::find(rows.begin(), rows.end(), false) == rows.end(); }
-inline Rows both(Rows a, const Rows& b) {
-  for (size_t i = 0; i < a.size(); ++i) a[i] = a[i] && b[i];
-  return a;
-}
 
 /// t with zeros in all samples except these, even if they were not finite; differentiable.
 at::Tensor only(const at::Tensor& t, const Rows& rows);

@@ -3,8 +3,6 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
-#include <limits>
-
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/unrolled_vjp.h"
@@ -37,9 +35,7 @@ namespace {
 /// Samples whose share of ḡ may leave the range of the dtype, told by the largest numbers of λ and u.
 at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
   const auto largest = [](const at::Tensor& v) { return v.detach().abs().flatten(1).amax(1).to(at::kDouble); };
-  const double most =
-      lambda.scalar_type() == at::kFloat ? std::numeric_limits<float>::max() : std::numeric_limits<double>::max();
-  return largest(lambda) * largest(u) > 1e-3 * most / static_cast<double>(lambda.numel());
+  return largest(lambda) * largest(u) > 1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
 }
 
 /// The report where ḡ of the samples that are not in `rows` left the range of the dtype.

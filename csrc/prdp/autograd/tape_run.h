@@ -157,15 +157,10 @@ class TapeRun {
     if (!carries_x_) body(method_.x, i++);
     std::apply([&](auto&... part) { (body(part, i++), ...); }, carried);
   }
-  /// As iterate() takes it: a method whose own residual claimed convergence before, in vain, goes on from the true one.
   void iterate_once() {
-    if constexpr (detail::kHasRecursiveResidual<Method>) {
-      const double own2 = method_.residual2().value;
-      if (stop_.rtol > 0.0 && done_ > 0 && detail::is_within(own2, stop_.rtol, stop_.b2)) method_.recompute_residual();
-    }
-    if constexpr (detail::kTakesStrides<Method>) method_.step(1);
-    else method_.step();
-    if constexpr (detail::kLeastResidual<Method>) method_.residual2();
+    detail::repeat_iteration(method_, stop_.rtol, done_, [&] {
+      if (is_within(method_.residual2().value, stop_.rtol, stop_.b2)) method_.recompute_residual();
+    });
   }
 
   Tape<T>& tape_;

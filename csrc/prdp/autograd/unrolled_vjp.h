@@ -9,7 +9,7 @@
 namespace prdp {
 
 /// The product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran. It is the
-/// torch op prdp::unrolled_vjp, which runs the iterations again. There are three kinds of samples:
+/// torch op prdp::unrolled_vjp, which runs the iterations again. There are four kinds of samples:
 ///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
 ///   solved to rounding                              gets the implicit derivative, because its last iterations, or
 ///                                                   those that it no longer needed, say nothing about that of u

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <limits>
 #include <tuple>
+#include <vector>
 
 /// What batches of tensors need everywhere.
 namespace prdp {
@@ -17,9 +18,24 @@ inline at::Tensor per_sample(at::Tensor t, const at::Tensor& like) {
 /// The unknowns of one channel of v, as its last axis: (…, n).
 inline at::Tensor by_channel(const at::Tensor& v) { return v.dim() < 3 ? v : v.flatten(2); }
 
-/// The distance from 1 to the next number of a float32 or float64 tensor.
-inline double epsilon_of(const at::Tensor& t) {
-  return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::epsilon() : std::numeric_limits<double>::epsilon();
+/// The dtype of a float32 or float64 tensor: the distance from 1 to its next number, its least numbers, its largest.
+struct Limits {
+  double epsilon, least_normal, least, largest;
+};
+inline Limits limits_of(const at::Tensor& t) {
+  const auto of = [](auto limits) -> Limits {
+    return {limits.epsilon(), limits.min(), limits.denorm_min(), limits.max()};
+  };
+  return t.scalar_type() == at::kFloat ? of(std::numeric_limits<float>()) : of(std::numeric_limits<double>());
+}
+inline double epsilon_of(const at::Tensor& t) { return limits_of(t).epsilon; }
+
+/// One number per sample, on the host; `t` may hold a single one for all.
+template <class T>
+std::vector<T> to_host(const at::Tensor& t, int64_t batch) {
+  const auto flat =
+      t.detach().to(at::kCPU, c10::CppTypeToScalarType<T>::value).reshape({-1}).expand({batch}).contiguous();
+  return {flat.template const_data_ptr<T>(), flat.template const_data_ptr<T>() + batch};
 }
 
 /// The powers of two that bring these magnitudes to the order of one.

@@ -6,7 +6,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/stopping.h"
+#include "prdp/solvers/sample_state.h"
 
 namespace prdp {
 
@@ -68,9 +68,8 @@ at::Tensor largest_magnitude(const at::Tensor& b) {
 }
 
 at::Tensor rounding_of_least_numbers(const at::Tensor& scale, const at::Tensor& b) {
-  const double least = b.scalar_type() == at::kFloat ? std::numeric_limits<float>::denorm_min()
-                                                     : std::numeric_limits<double>::denorm_min();
-  return scale.flatten() * least * std::sqrt(static_cast<double>(b.numel() / std::max<int64_t>(b.size(0), 1)));
+  return scale.flatten() * limits_of(b).least *
+         std::sqrt(static_cast<double>(b.numel() / std::max<int64_t>(b.size(0), 1)));
 }
 
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }

@@ -84,6 +84,22 @@ std::optional<SolveResult> solve_on_loops(const Operator& a, const at::Tensor& b
 
 const char* way_of_last_solve() { return way; }
 
+SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real) {
+  const auto batch = static_cast<int64_t>(outcomes.size());
+  SolveInfo info{at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble), at::empty({batch}, at::kLong),
+                 at::empty({batch}, at::kLong), at::empty({batch}, at::kDouble)};
+  for (int64_t i = 0; i < batch; ++i) {
+    const auto& o = outcomes[i];
+    info.iterations.mutable_data_ptr<int64_t>()[i] = o.iterations;
+    info.residual.mutable_data_ptr<double>()[i] = o.residual;
+    info.status.mutable_data_ptr<int64_t>()[i] = static_cast<int64_t>(o.status);
+    info.operator_applications.mutable_data_ptr<int64_t>()[i] = o.applications;
+    info.floor.mutable_data_ptr<double>()[i] = o.floor;
+  }
+  for (auto* part : {&info.residual, &info.floor}) *part = part->to(real);
+  return info;
+}
+
 int64_t grain_size(Method method, int64_t samples, int64_t unknowns, int64_t iterations, int64_t restart) {
   constexpr double worthwhile = 1e5;
   const double steps = steps_of(method, iterations, std::min(restart, unknowns));

@@ -2,8 +2,8 @@
 #include <functional>
 
 #include "prdp/operators/operator.h"
+#include "prdp/solvers/sample_state.h"
 #include "prdp/solvers/solver.h"
-#include "prdp/solvers/status.h"
 
 namespace prdp {
 
@@ -27,6 +27,9 @@ struct SolveRequest {
 /// Solves A u = b by the CPU loops, or by plain tensor operations if the operator or the device has no such loops.
 /// Samples do not influence each other; in the CPU loops not even in the last bit.
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
+
+/// The report of what came of these samples, with numbers of this dtype.
+SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real);
 
 /// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors".
 const char* way_of_last_solve();

@@ -2,8 +2,6 @@
 
 #include <ATen/core/grad_mode.h>
 
-#include <limits>
-
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
@@ -17,10 +15,6 @@ bool is_for(const at::Tensor& b, const SolveRequest& request) {
   const auto& solver = request.solver;
   return !b.is_cpu() && b.numel() > 0 && traits(solver.method).is_direct && solver.rtol > 0.0 &&
          solver.max_iter.maybe_as_int().value_or(0) >= 1 && request.guarded && !request.caps;
-}
-
-double least_normal(const at::Tensor& t) {
-  return t.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
 }
 
 }  // namespace
@@ -43,7 +37,7 @@ std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Ten
                           .logical_and(inconsistent.eq(0))
                           .logical_and(r2 <= b2 * (request.solver.rtol * request.solver.rtol))
                           .logical_and(largest.isfinite())
-                          .logical_and(largest >= least_normal(b));
+                          .logical_and(largest >= limits_of(b).least_normal);
   const auto zero = status.eq(static_cast<int64_t>(SolveStatus::kConverged));
   if (!solved.logical_or(zero).all().item<bool>()) return std::nullopt;
   if (zero.any().item<bool>()) u = at::where(per_sample(batch.takes_part, b), u, at::zeros_like(u));

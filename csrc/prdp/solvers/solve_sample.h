@@ -10,31 +10,19 @@
 /// kernel of a GPU (gpu/device/solve.h).
 namespace prdp {
 
-/// What comes of a sample.
-struct SampleOutcome {
-  SolveStatus status = SolveStatus::kMaxIter;
-  int64_t iterations = 0, applications = 0;
-  double residual = 0.0, floor = 0.0;  // relative to ‖b‖
-  bool is_zero = false;                // u is zero in place of an iterate, and yet to be written
-};
-inline SampleOutcome zero_instead(SolveStatus status, double residual, int64_t applications = 0) {
-  return {status, 0, applications, residual, status == SolveStatus::kStagnated ? residual : 0.0, true};
-}
-
 /// Whether a sample needs no iterations, or gets none, by the largest numbers of b and of its start, which is 0 without
 /// one.
 template <class T, class IsFinite, class HasZero>
 bool is_settled_beforehand(T b, T start, const IsFinite& a_is_finite, const HasZero& divides_by_zero,
                            SampleOutcome& outcome) {
-  constexpr double infinity = std::numeric_limits<double>::infinity();
-  const auto settle = [&](SolveStatus status, double residual) {
-    outcome = zero_instead(status, residual);
+  const auto settle = [&](SolveStatus status) {
+    outcome = zero_instead(status);
     return true;
   };
-  if (!std::isfinite(b) || !std::isfinite(start)) return settle(SolveStatus::kNonfiniteInput, infinity);
-  if (!a_is_finite()) return settle(SolveStatus::kNonfiniteOperator, infinity);
-  if (divides_by_zero()) return settle(SolveStatus::kZeroDiagonal, 1.0);
-  if (b == T(0)) return settle(SolveStatus::kConverged, 0.0);
+  if (!std::isfinite(b) || !std::isfinite(start)) return settle(SolveStatus::kNonfiniteInput);
+  if (!a_is_finite()) return settle(SolveStatus::kNonfiniteOperator);
+  if (divides_by_zero()) return settle(SolveStatus::kZeroDiagonal);
+  if (b == T(0)) return settle(SolveStatus::kConverged);
   return false;
 }
 
@@ -114,7 +102,7 @@ SampleOutcome solve_sample(Space& space, Method& method, const GivenSample<T>& o
     const T outside = space.project(space.b());
     consistent = outside <= std::max(consistency_bound<T>(of.rtol) * whole, static_cast<T>(rounding));
     if (std::sqrt(space.dot(space.b(), space.b())) <= std::numeric_limits<T>::epsilon() * whole)
-      return zero_instead(consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent, 1.0);
+      return zero_instead(consistent ? SolveStatus::kStagnated : SolveStatus::kInconsistent);
   }
   space.take_b();
   state.b2 = space.b2();
@@ -123,14 +111,9 @@ SampleOutcome solve_sample(Space& space, Method& method, const GivenSample<T>& o
   iterate(space, method, states, of.rtol, of.guarded);
   space.add_start(method.x);
   space.project_solution(method.x);
-  if (of.guarded) excuse_rounding_of_b(state);
-  if (!consistent && !is_failure(state.status)) state.status = SolveStatus::kInconsistent;
   const T largest = store_solution(space, method.x, scale, of.u);
-  if (of.guarded && !std::isfinite(largest)) return zero_instead(SolveStatus::kOverflow, 1.0, state.applications);
-  if (largest < std::numeric_limits<T>::min() && space.largest_magnitude(method.x) > T(0))
-    note_underflow<T>(state, static_cast<double>(largest));
-  const double floor = is_failure(state.status) ? 0.0 : std::sqrt(state.floor2 / state.b2);
-  return {state.status, state.iterations, state.applications, std::sqrt(state.residual2 / state.b2), floor};
+  return outcome_of<T>(state, of.guarded, consistent, static_cast<double>(largest),
+                       [&] { return space.largest_magnitude(method.x) > T(0); });
 }
 
 }  // namespace prdp

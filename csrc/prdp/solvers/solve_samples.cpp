@@ -91,7 +91,7 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
         set = a;
         return true;
       }
-      report(batch, s, zero_instead(SolveStatus::kZeroDiagonal, 1.0));
+      report(batch, s, zero_instead(SolveStatus::kZeroDiagonal));
     }
     return false;
   };

@@ -1,6 +1,5 @@
 #include "prdp/solvers/tensor_space.h"
 
-#include <limits>
 #include <utility>
 
 #include "prdp/operators/tensors.h"
@@ -8,30 +7,11 @@
 
 namespace prdp {
 
-namespace {
-
-struct Limits {
-  double epsilon, smallest_normal;
-};
-
-Limits limits_of(const at::Tensor& t) {
-  if (t.scalar_type() == at::kFloat) return {std::numeric_limits<float>::epsilon(), std::numeric_limits<float>::min()};
-  return {std::numeric_limits<double>::epsilon(), std::numeric_limits<double>::min()};
-}
-
-/// One value per sample, on the host.
-std::vector<double> to_host(const at::Tensor& t, int64_t batch) {
-  const auto flat = t.detach().to(at::kCPU, at::kDouble).reshape(-1).expand(batch).contiguous();
-  return {flat.const_data_ptr<double>(), flat.const_data_ptr<double>() + batch};
-}
-
-}  // namespace
-
 TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool recording)
     : system_(system), b_(std::move(b)), states_(states), recording_(recording) {
   in_loops_ = !recording_ && batch_loops::take(b_);
   b2_ = dot(b_, b_);
-  negligible_ = limits_of(b_).smallest_normal / limits_of(b_).epsilon;
+  negligible_ = limits_of(b_).least_normal / limits_of(b_).epsilon;
 }
 
 void TensorSpace::start_from(at::Tensor x, at::Tensor r) {
@@ -155,19 +135,19 @@ void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t
 }
 
 std::vector<double> TensorSpace::lanes(const Scalar& value) const {
-  return to_host(value, static_cast<int64_t>(states_.size()));
+  return to_host<double>(value, static_cast<int64_t>(states_.size()));
 }
 
 std::vector<bool> TensorSpace::broken() const {
   std::vector<bool> rows(states_.size());
   if (!broken_.defined()) return rows;
-  const auto host = to_host(broken_, static_cast<int64_t>(states_.size()));
+  const auto host = to_host<double>(broken_, static_cast<int64_t>(states_.size()));
   for (size_t i = 0; i < rows.size(); ++i) rows[i] = host[i] != 0.0;
   return rows;
 }
 
 std::vector<double> TensorSpace::operator_norm() const {
-  return to_host(system_.a.norm(), static_cast<int64_t>(states_.size()));
+  return to_host<double>(system_.a.norm(), static_cast<int64_t>(states_.size()));
 }
 
 TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, const Vector& kept,

@@ -1,0 +1,209 @@
+#include "prdp/autograd/unrolled_samples.h"
+
+#include <algorithm>
+#include <limits>
+
+#include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/finite_rows.h"
+#include "prdp/autograd/solved_to_rounding.h"
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
+#include "prdp/solvers/solve.h"
+
+namespace prdp {
+
+namespace {
+
+/// How a sample gets its derivative.
+enum class Way {
+  kIterations,  // that of its iterations
+  kImplicit,    // that of the solution
+  kNone,        // none: its solve failed
+  kRefused,     // none: its cotangent is not finite
+};
+
+/// ‖ū - Aᵀ b̄‖ / ‖ū‖ of each sample, within the range of Aᵀ, where A is singular; 0 where ū is.
+std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotangent, const at::Tensor& b_bar) {
+  const at::NoGradGuard no_grad;
+  const auto norm = [](const at::Tensor& v) {
+    return to_host<double>(v.flatten(1).to(at::kDouble).norm(2, 1), v.size(0));
+  };
+  const auto product = apply_on_loops(a, b_bar.detach().contiguous(), /*transposed=*/true);
+  const auto left = norm(a.project_solution(cotangent.detach() - product)), whole = norm(cotangent.detach());
+  std::vector<double> residuals(whole.size());
+  for (size_t i = 0; i < whole.size(); ++i) residuals[i] = whole[i] > 0.0 ? left[i] / whole[i] : 0.0;
+  return residuals;
+}
+
+class SampleVjps {
+ public:
+  SampleVjps(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec, const SolveOptions& options,
+             at::IntArrayRef needed, OfIterations of_iterations, decltype(linear_solve)& any_solve)
+      : cotangent_(cotangent),
+        solved_(solved),
+        spec_(spec),
+        options_(options),
+        needed_(needed),
+        of_iterations_(of_iterations),
+        any_solve_(any_solve),
+        batch_(solved.b.size(0)),
+        a_(make_operator(spec)),
+        counts_(to_host<int64_t>(solved.iterations, batch_)),
+        outcomes_(batch_) {
+    for (const auto status : to_host<int64_t>(solved.status, batch_))
+      status_.push_back(static_cast<SolveStatus>(status));
+    for_a_ = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
+    zero_grad_ = options.on_failure == OnFailure::kZeroGrad;
+    asked_ = options.adjoint_rtol.value_or(options.solver.rtol);
+  }
+
+  SolveVjp find() {
+    classify();
+    differentiate(rows_);
+    retry_implicitly();
+    if (zero_grad_) leave_out_failed_adjoints();
+    for (size_t i = 0; i < needed_.size(); ++i)
+      if (needed_[i] && !gradients_[i].defined())
+        gradients_[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
+    return {std::move(gradients_), report()};
+  }
+
+ private:
+  void classify() {
+    const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
+    rows_ = finite_rows(cotangent_);
+    bar_ = only(cotangent_, rows_);
+    for (int64_t i = 0; i < batch_; ++i)
+      ways_.push_back(!rows_[i]                              ? Way::kRefused
+                      : exact[i]                             ? Way::kImplicit
+                      : zero_grad_ && is_failure(status_[i]) ? Way::kNone
+                                                             : Way::kIterations);
+  }
+
+  /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`.
+  void differentiate(Rows& rows) {
+    gradients_ = finite_sum(rows, [this](const Rows& some) {
+      auto sum = take_iterations_back(some);
+      auto implicit = some;
+      for (int64_t i = 0; i < batch_; ++i) implicit[i] = some[i] && ways_[i] == Way::kImplicit;
+      if (any(implicit)) add_adjoint_solves(implicit, sum);
+      return sum;
+    });
+  }
+
+  std::vector<at::Tensor> take_iterations_back(const Rows& rows) {
+    auto caps = at::zeros({batch_}, at::kLong);
+    const bool of_none = !any(rows);  // what the iterations make of no cotangent, finite or not
+    for (int64_t i = 0; i < batch_; ++i) {
+      outcomes_[i] = {status_[i], counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
+      if ((rows[i] || of_none) && ways_[i] == Way::kIterations) caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
+    }
+    if (!caps.any().item<bool>()) return std::vector<at::Tensor>(needed_.size());
+    auto found = of_iterations_(
+        only(bar_, rows), solved_.b,
+        {spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()), options_.checkpoint_every}, needed_);
+    const auto applications = to_host<int64_t>(found.operator_applications, batch_);
+    for (int64_t i = 0; i < batch_; ++i) outcomes_[i].applications = applications[i];
+    return std::move(found.gradients);
+  }
+
+  void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum) {
+    auto implicit = options_;
+    implicit.backward = Backward::kImplicit;
+    implicit.checkpoint_every = implicit.adjoint_log = 0;
+    implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
+    implicit.adjoint_rtol = std::min(asked_, kRoundings / 2 * epsilon_of(solved_.b));
+    const auto u = for_a_ ? solution() : at::Tensor();
+    const auto found = implicit_vjp(only(bar_, rows), u, spec_, implicit, needed_, any_solve_);
+    for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
+    const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
+    const auto residual = to_host<double>(found.info.residual, batch_);
+    const auto status = to_host<int64_t>(found.info.status, batch_);
+    const auto products = to_host<int64_t>(found.info.operator_applications, batch_);
+    for (int64_t i = 0; i < batch_; ++i) {
+      if (!rows[i]) continue;
+      const auto said = static_cast<SolveStatus>(status[i]);
+      const bool good = status[i] < 0 && !is_refused(said) && residual[i] <= asked_;
+      outcomes_[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
+    }
+  }
+
+  /// The samples whose iterations say little about the derivative of the solution: it is one in few directions.
+  void retry_implicitly() {
+    if (!gradients_[0].defined() || traits(options_.solver.method).is_polynomial) return;
+    const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
+    bool any_far = false;
+    for (int64_t i = 0; i < batch_; ++i) {
+      const bool ended = status_[i] == SolveStatus::kConverged || status_[i] == SolveStatus::kStagnated;
+      if (!ended || ways_[i] != Way::kIterations || !rows_[i] || !(residual[i] > 1.0)) continue;
+      ways_[i] = Way::kImplicit;
+      any_far = true;
+    }
+    if (any_far) differentiate(rows_);
+  }
+
+  void leave_out_failed_adjoints() {
+    auto good = rows_;
+    for (int64_t i = 0; i < batch_; ++i) good[i] = rows_[i] && !adjoint_failed(i);
+    if (good == rows_) return;
+    const auto said = outcomes_;
+    differentiate(good);
+    outcomes_ = said;
+  }
+  bool adjoint_failed(int64_t i) const { return ways_[i] == Way::kImplicit && is_failure(outcomes_[i].status); }
+
+  SolveInfo report() {
+    for (int64_t i = 0; i < batch_; ++i)
+      if (!rows_[i])
+        outcomes_[i] = zero_instead(ways_[i] == Way::kRefused ? SolveStatus::kNonfiniteInput : SolveStatus::kOverflow);
+    auto failures = outcomes_;
+    for (int64_t i = 0; i < batch_; ++i)
+      if (rows_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
+    auto info = info_of(outcomes_, solved_.b.scalar_type());
+    if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
+    report_failures({spec_, options_.solver, /*adjoint=*/true}, *a_, cotangent_,
+                    info_of(failures, solved_.b.scalar_type()), options_.on_failure);
+    for (auto* part : info.parts()) *part = part->to(solved_.b.device());
+    return info;
+  }
+
+  /// u, solved for again, as it is not kept.
+  const at::Tensor& solution() {
+    auto silent = options_;
+    silent.on_failure = OnFailure::kReturn;
+    silent.adjoint_log = 0;
+    if (!u_.defined()) u_ = any_solve_(spec_, solved_.b, silent, solved_.x0).u;
+    return u_;
+  }
+
+  const at::Tensor& cotangent_;
+  const Solved& solved_;
+  const OperatorSpec& spec_;
+  const SolveOptions& options_;
+  at::IntArrayRef needed_;
+  OfIterations of_iterations_;
+  decltype(linear_solve)& any_solve_;
+  int64_t batch_;
+  std::unique_ptr<Operator> a_;
+  std::vector<int64_t> counts_;      // of iterations, and the status, in the solve
+  std::vector<SolveStatus> status_;
+  bool for_a_, zero_grad_;
+  double asked_;  // tolerance of adjoint solves
+  std::vector<Way> ways_;
+  Rows rows_;       // whose gradients are finite
+  at::Tensor bar_;  // the cotangent of samples that are not refused
+  std::vector<SampleOutcome> outcomes_;
+  std::vector<at::Tensor> gradients_;
+  at::Tensor u_;
+};
+
+}  // namespace
+
+SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
+                        const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
+                        decltype(linear_solve)& any_solve) {
+  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).find();
+}
+
+}  // namespace prdp

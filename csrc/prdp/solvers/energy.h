@@ -1,0 +1,59 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/solvers/sample_state.h"
+
+/// Whether an iterate whose residual is above ‖b‖ is what a method for definite operators is made for.
+namespace prdp::detail {
+
+/// What energy_falls() is told by: products of x; b; r, its residual; and A r.
+struct Energies {
+  double xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2;
+};
+
+/// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
+/// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
+/// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in the null
+/// space of A, and says nothing.
+inline bool energy_falls(const Energies& e, double epsilon) {
+  const auto positive = [](double v) { return std::max(v, 0.0); };
+  const double scale =
+      std::sqrt(e.rr) * std::sqrt(positive(e.bb - 2 * e.rb + e.rr)) + std::sqrt(e.xx) * std::sqrt(e.ar2);
+  const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - 2e3 * epsilon * scale);
+  const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
+  const bool nearer = e.xb * e.xb > e.xr * e.xr;
+  const bool not_rounding = std::abs(energy) > 2e3 * epsilon * std::abs(e.xb);
+  const bool definite = e.r_ar * energy > across * across;
+  return symmetric && definite && nearer && not_rounding;
+}
+
+/// Of the samples that ended above ‖b‖: where the energy falls, the iterate stands; else the sample is DIVERGED. For a
+/// method whose residual is the true one. One product of the whole batch, which counts for these samples alone.
+template <class Space, class Method>
+void excuse_by_energy(Space& space, Method& method, typename Space::States& states) {
+  const auto is_above = [](const SampleState& s) { return s.verdict != Verdict::kStands; };
+  if (std::none_of(states.begin(), states.end(), is_above)) return;
+  const auto before = states;
+  space.freeze_unless(states, [](const SampleState&) { return true; });
+  const auto& x = method.x;
+  const auto &r = method.residual(), &b = space.b();
+  auto ar = space.scratch();
+  space.apply(r, ar);
+  const auto lanes = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
+  const auto xb = lanes(x, b), xr = lanes(x, r), rb = lanes(r, b), rr = lanes(r, r), bb = lanes(b, b);
+  const auto x_ar = lanes(x, ar), r_ar = lanes(r, ar), xx = lanes(x, x), ar2 = lanes(ar, ar);
+  space.fill_zero(ar);
+  for (size_t i = 0; i < states.size(); ++i) {
+    auto& s = states[i];
+    if (!is_above(s)) {
+      s.applications = before[i].applications;
+      continue;
+    }
+    s.verdict = Verdict::kStands;
+    const Energies e{xb[i], xr[i], rb[i], rr[i], bb[i], x_ar[i], r_ar[i], xx[i], ar2[i]};
+    if (!energy_falls(e, space.epsilon())) s.status = SolveStatus::kDiverged;
+  }
+}
+
+}  // namespace prdp::detail
