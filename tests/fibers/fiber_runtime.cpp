@@ -84,7 +84,7 @@ class FiberKernel final : public prdp::gpu::Kernel {
         "left_out) {\n"
         "  fibers::left_out = left_out;\n"
         "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
-        "    prdp_kernel(*static_cast<const SolveArguments<S::T>*>(arguments)); });\n}\n";
+        "    prdp_kernel(*static_cast<const Arguments*>(arguments)); });\n}\n";
     void* const library = dlopen(compiled(text).c_str(), RTLD_NOW);
     if (!library) throw Unavailable(dlerror());
     run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));
@@ -155,7 +155,7 @@ extern "C" const char* prdp_why_no_cuda() {
 extern "C" const char* prdp_why_too_large(int64_t unknowns) {
   static std::string said;
   try {
-    prdp::gpu::solve_kernel({"A"}, prdp::CG{}, at::kFloat, unknowns, {96 << 10, 16384, 1024});
+    prdp::gpu::solve_kernel({"A"}, false, prdp::CG{}, at::empty({1}).expand({1, unknowns}), {96 << 10, 16384, 1024});
   } catch (const Unavailable& e) {
     said = e.what();
   }

@@ -22,6 +22,11 @@ struct OperatorView {
   bool leaks = false;       // Operator::leaks()
 };
 
+/// Its tensors and numbers as a kernel takes them.
+OperatorArguments arguments_of(const OperatorView& a);
+/// Whether all samples have the same A.
+bool is_shared(const OperatorView& a);
+
 /// "float" or "double".
 std::string type_of(at::ScalarType dtype);
 /// "Grid<1, 64, 64>" of up to three extents.

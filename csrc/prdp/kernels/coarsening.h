@@ -1,10 +1,11 @@
 #pragma once
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <limits>
-#include <vector>
 
-/// The rules of multigrid that its loops (multigrid.h) and its tensors (solvers/tensor_cycles.h) share.
+/// The rules of multigrid that its loops (multigrid.h), its kernels (gpu/device/hierarchy.h) and its tensors
+/// (solvers/tensor_cycles.h) share.
 namespace prdp::kernels {
 
 /// The number of coarse points of an axis.
@@ -12,10 +13,21 @@ inline int64_t coarse_points(int64_t n, bool periodic) { return periodic ? (n + 
 
 /// How a stencil couples the points, summed over all or some of them.
 struct Couplings {
-  std::vector<double> along;  // for each axis, the magnitudes of the coefficients that reach along it
+  double along[3] = {0, 0, 0};  // for each axis, the magnitudes of the coefficients that reach along it
   /// The same of the sums of those that reach as far along the axis: what the other axes brought in cancels.
-  std::vector<double> net;
-  double rows;  // the magnitudes of the sums of rows, within the grid
+  double net[3] = {0, 0, 0};
+  double rows = 0;  // the magnitudes of the sums of rows, within the grid
+};
+
+/// Axes of a grid, in their order.
+struct Axes {
+  int count = 0, axis[3] = {0, 0, 0};
+
+  void add(int d) { axis[count++] = d; }
+  bool empty() const { return count == 0; }
+  int front() const { return axis[0]; }
+  const int* begin() const { return axis; }
+  const int* end() const { return axis + count; }
 };
 
 constexpr int64_t kCoarsest = 4;  // points of an axis
@@ -36,28 +48,29 @@ bool may_need_one_point(const Shape& shape, int dim) {
 /// holds their constant, such as a value on the boundary, what is constant along the short axis is neither smoothed nor
 /// coarsened: that axis is coarsened as well, down to one point. `net` and `rows` are needed if may_need_one_point().
 template <class Shape>
-std::vector<int> axes_to_coarsen(const Shape& shape, const Couplings& couplings) {
+Axes axes_to_coarsen(const Shape& shape, int dim, const Couplings& couplings) {
   constexpr double weak = 0.25, held = 3.0 / 16.0;
-  const int dim = static_cast<int>(couplings.along.size());
-  std::vector<int> candidates;
-  for (int d = 0; d < dim; ++d)
-    if (shape[d] > kCoarsest) candidates.push_back(d);
-  const auto* coupling = &couplings.along;
+  bool is_candidate[3] = {false, false, false};
+  for (int d = 0; d < dim; ++d) is_candidate[d] = shape[d] > kCoarsest;
+  const double* coupling = couplings.along;
   if (may_need_one_point(shape, dim)) {
     double weakest = std::numeric_limits<double>::infinity();
-    for (const int d : candidates) weakest = std::min(weakest, couplings.net[d]);
+    for (int d = 0; d < dim; ++d)
+      if (is_candidate[d]) weakest = std::min(weakest, couplings.net[d]);
     for (int d = 0; d < dim; ++d) {
       const double own = couplings.net[d];
       if (shape[d] == 1 || shape[d] > kCoarsest || weakest >= weak * own || couplings.rows >= held * own) continue;
-      candidates.push_back(d);
-      coupling = &couplings.net;
+      is_candidate[d] = true;
+      coupling = couplings.net;
     }
-    std::sort(candidates.begin(), candidates.end());
   }
   double strongest = 0;
-  for (const int d : candidates) strongest = std::max(strongest, (*coupling)[d]);
-  std::erase_if(candidates, [&](int d) { return (*coupling)[d] < weak * strongest; });
-  return candidates;
+  for (int d = 0; d < dim; ++d)
+    if (is_candidate[d]) strongest = std::max(strongest, coupling[d]);
+  Axes axes;
+  for (int d = 0; d < dim; ++d)
+    if (is_candidate[d] && !(coupling[d] < weak * strongest)) axes.add(d);
+  return axes;
 }
 
 /// A coarse diagonal below this many roundings of the fine one is what was left of a pocket that the coarse grid does
@@ -69,17 +82,44 @@ inline constexpr double kVanishing = 8.0, kVanishingAlone = 256.0;
 struct SmoothingStep {
   double p, q;
 };
-inline std::vector<SmoothingStep> smoothing_steps(double radius, int64_t count) {
-  constexpr double ratio = 4.0;
-  const double middle = (radius + radius / ratio) / 2, half = (radius - radius / ratio) / 2, sigma = middle / half;
-  std::vector<SmoothingStep> steps{{0.0, 1.0 / middle}};
-  double rho = 1.0 / sigma;
-  for (int64_t s = 1; s < count; ++s) {
-    const double next = 1.0 / (2.0 * sigma - rho);
-    steps.push_back({next * rho, 2.0 * next / half});
-    rho = next;
+/// These steps, one after the other.
+class SmoothingSteps {
+  static constexpr double kRatio = 4.0;
+
+ public:
+  explicit SmoothingSteps(double radius)
+      : middle_((radius + radius / kRatio) / 2), half_((radius - radius / kRatio) / 2), sigma_(middle_ / half_) {}
+
+  SmoothingStep next() {
+    if (is_first_) {
+      is_first_ = false;
+      rho_ = 1.0 / sigma_;
+      return {0.0, 1.0 / middle_};
+    }
+    const double before = rho_;
+    rho_ = 1.0 / (2.0 * sigma_ - before);
+    return {rho_ * before, 2.0 * rho_ / half_};
   }
-  return steps;
-}
+
+ private:
+  double middle_, half_, sigma_, rho_ = 0;
+  bool is_first_ = true;
+};
+
+/// What a point between two coarse ones takes of them, by the sums of its coefficients with offset -1, 0 and 1 along
+/// the axis. Where the neighbours outweigh the point, as in the columns of A where winds meet, the weights are made to
+/// add up to one.
+template <class T>
+struct WeightsOfPoint {
+  T left, right;
+
+  WeightsOfPoint(T diagonal, T sum_before, T sum, T sum_after) {
+    const T sign = diagonal < T(0) ? T(-1) : T(1);
+    const T before = std::max(-sign * sum_before, T(0)), after = std::max(-sign * sum_after, T(0));
+    const T whole = std::max(sign * sum, before + after);
+    left = whole > T(0) ? before / whole : T(0);
+    right = whole > T(0) ? after / whole : T(0);
+  }
+};
 
 }  // namespace prdp::kernels

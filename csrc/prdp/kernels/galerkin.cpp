@@ -74,8 +74,7 @@ Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
   return sums;
 }
 
-/// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros. Where
-/// the neighbours outweigh the point, as in the columns of A where winds meet, they are made to add up to one.
+/// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros.
 template <class T>
 Weights<T> weights_of(const RawStencil<T>& a, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
   const StencilGrid& grid = a.grid;
@@ -89,11 +88,9 @@ Weights<T> weights_of(const RawStencil<T>& a, const Sums<T>& sums, const Sums<T>
       T s[3] = {sums[0][at + i], sums[1][at + i], sums[2][at + i]};
       if (averaged_with)
         for (int d = 0; d < 3; ++d) s[d] += (*averaged_with)[d][at + i];
-      const T sign = diagonal[at + i] < T(0) ? T(-1) : T(1);
-      const T before = std::max(-sign * s[0], T(0)), after = std::max(-sign * s[2], T(0));
-      const T whole = std::max(sign * s[1], before + after);
-      left[i] = whole > T(0) ? before / whole : T(0);
-      right[i] = whole > T(0) ? after / whole : T(0);
+      const WeightsOfPoint<T> of_point(diagonal[at + i], s[0], s[1], s[2]);
+      left[i] = of_point.left;
+      right[i] = of_point.right;
     }
   });
   for (auto* field : {&w.left, &w.right}) {

@@ -28,9 +28,9 @@ double radius_of(const RawStencil<T>& a) {
 
 /// By a sample of the points.
 template <class T>
-std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
+Axes axes_to_coarsen(const RawStencil<T>& a) {
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
-  Couplings couplings{std::vector<double>(3), std::vector<double>(3), 0.0};
+  Couplings couplings;
   for (int k = 0; k < 27; ++k) {
     if (!a.coefficients[k]) continue;
     double sum = 0;
@@ -39,7 +39,7 @@ std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
       if (RawStencil<T>::offset(k).along[d] != 0) couplings.along[d] += sum;
   }
   const auto& [nz, ny, nx] = a.grid.shape;
-  if (!may_need_one_point(a.grid.shape, 3)) return kernels::axes_to_coarsen(a.grid.shape, couplings);
+  if (!may_need_one_point(a.grid.shape, 3)) return kernels::axes_to_coarsen(a.grid.shape, 3, couplings);
   for (int64_t i = 0; i < n; i += step) {
     const int64_t at[3] = {i / (ny * nx), i / nx % ny, i % nx};
     double net[3][2] = {}, row = 0;
@@ -57,7 +57,7 @@ std::vector<int> axes_to_coarsen(const RawStencil<T>& a) {
     for (int d = 0; d < 3; ++d) couplings.net[d] += std::abs(net[d][0]) + std::abs(net[d][1]);
     couplings.rows += std::abs(row);
   }
-  return kernels::axes_to_coarsen(a.grid.shape, couplings);
+  return kernels::axes_to_coarsen(a.grid.shape, 3, couplings);
 }
 
 template <class T>

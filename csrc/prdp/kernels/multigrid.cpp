@@ -64,7 +64,9 @@ void Multigrid<T>::add_level(size_t l, const Kernel<T>& a, const Kernel<T>* tran
   levels_.emplace_back();
   levels_.back().a = &a;
   levels_.back().transpose = transpose;
-  for (const auto& [p, q] : smoothing_steps(hierarchy_->levels()[l].radius, smoothing)) {
+  SmoothingSteps steps(hierarchy_->levels()[l].radius);
+  for (int64_t s = 0; s < smoothing; ++s) {
+    const auto [p, q] = steps.next();
     levels_.back().p.push_back(static_cast<T>(p));
     levels_.back().q.push_back(static_cast<T>(q));
   }

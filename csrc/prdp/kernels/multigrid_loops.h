@@ -1,4 +1,5 @@
 #pragma once
+#include "prdp/kernels/collapsed_point.h"
 #include "prdp/kernels/vector_loops.h"
 
 /// The part of loops.cpp for transfers between grids and for coarse operators; included there only, and for the same
@@ -42,22 +43,20 @@ template <int Step, bool Sides, class T>
 void collapse_points(const Collapse<T>& c, int64_t n) {
   for (int64_t i = 0; i < n; ++i) {
     const int64_t f = Step * i;
-    const T restrict_before = c.restrict_before[f], restrict_after = c.restrict_after[f];
-    const T before_left = c.before_left[f], before_right = c.before_right[f];
-    const T after_left = c.after_left[f], after_right = c.after_right[f];
-    T left = restrict_before * c.centre_before[f] * before_left;
-    T centre = restrict_before * c.centre_before[f] * before_right + c.centre_here[f] +
-               restrict_after * c.centre_after[f] * after_left;
-    T right = restrict_after * c.centre_after[f] * after_right;
-    if constexpr (Sides) {
-      left += restrict_before * c.lower_before[f] + c.lower_here[f] * before_left;
-      centre += restrict_before * c.upper_before[f] + c.lower_here[f] * before_right + c.upper_here[f] * after_left +
-                restrict_after * c.lower_after[f];
-      right += c.upper_here[f] * after_right + restrict_after * c.upper_after[f];
-    }
-    c.left[i] = left;
-    c.centre[i] = centre;
-    c.right[i] = right;
+    CollapsedPoint<T> point;
+    point.restrict_before = c.restrict_before[f];
+    point.restrict_after = c.restrict_after[f];
+    point.before_left = c.before_left[f];
+    point.before_right = c.before_right[f];
+    point.after_left = c.after_left[f];
+    point.after_right = c.after_right[f];
+    point.take_centres(c.centre_before[f], c.centre_here[f], c.centre_after[f]);
+    if constexpr (Sides)
+      point.take_sides({c.lower_before[f], c.lower_here[f], c.lower_after[f]},
+                       {c.upper_before[f], c.upper_here[f], c.upper_after[f]});
+    c.left[i] = point.left;
+    c.centre[i] = point.centre;
+    c.right[i] = point.right;
   }
 }
 

@@ -152,6 +152,8 @@ inline constexpr std::tuple kMethods{
         .vectors = 3,
         .nanoseconds = 4.0,
         .is_polynomial = true,
+        .kernel = "MultigridMethod",
+        .kernel_header = "correction.h",
     }},
     MethodRow<DirectMethod>{{
         .method = Method::kDirect,

@@ -6,6 +6,7 @@
 #include <limits>
 #include <sstream>
 
+#include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp::gpu {
@@ -31,37 +32,43 @@ int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
 
 bool has_kernel(const Solver& solver) {
   const auto& row = traits(solver.method);
-  const bool preconditioned = solver.preconditioner && !solver.preconditioner.is_diagonal();
-  return !row.kernel.empty() && !preconditioned && (row.counts != Counts::kCycles || solver.restart <= kLongestBasis);
+  return !row.kernel.empty() && !solver.preconditioner.is_operator() && (row.counts != Counts::kCycles || solver.restart <= kLongestBasis);
 }
 
-SolveKernel solve_kernel(const OperatorView& a, const Solver& solver, at::ScalarType dtype, int64_t unknowns,
+SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solver& solver, const at::Tensor& b,
                          const Limits& limits) {
+  const int64_t unknowns = b.numel() / b.size(0);
   if (unknowns > std::numeric_limits<int32_t>::max() / 2)
     throw Unavailable("a sample of " + std::to_string(unknowns) + " unknowns is too large for a kernel");
   const auto& row = traits(solver.method);
-  const int64_t number = dtype == at::kFloat ? 4 : 8;
-  const bool has_cycles = row.counts == Counts::kCycles;
-  const int64_t restart = has_cycles ? std::min(solver.restart, unknowns) : 0;
-  const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart);
+  const bool has_arrays = row.counts == Counts::kCycles, has_cycles = solver.preconditioner.is_multigrid();
+  const int64_t number = b.element_size(), restart = has_arrays ? std::min(solver.restart, unknowns) : 0;
+  const int64_t of_cycles = !has_cycles ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
+  const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart) + of_cycles;
   const int64_t blocks = at::divup(unknowns, limits.cells_of_block);
   const int64_t threads = std::min(limits.threads, at::divup(at::divup(unknowns, blocks), kWarp) * kWarp);
-  const int64_t in_block = blocks > 1 ? 0 : std::min(vectors, limits.block_memory / (unknowns * number));
-  const bool by_diagonal = solver.preconditioner.is_diagonal();
+  // Coarse grids come first into the memory of the block, then the vectors of the finest one.
+  const CycleMemory cycle = has_cycles ? memory_of_cycle(b) : CycleMemory{};
+  const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;
+  const int64_t cycle_in_block = cycle.usual <= of_block ? cycle.usual : 0;
+  const int64_t in_block = std::min(vectors, (of_block - cycle_in_block) / unknowns);
 
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
        << "using namespace prdp::gpu;\n"
-       << "using S = Setting<" << type_of(dtype) << ", " << a.type << ", " << blocks << ", " << threads << ", "
-       << vectors << ", " << in_block << ", " << by_diagonal << ", " << divides_by_diagonal(solver) << ", "
-       << bytes_of_arrays(solver.method, restart, number) << ", " << restart << ">;\n"
-       << "using Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
-       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const SolveArguments<S::T> "
-          "arguments) "
-          "{\n  PRDP_BLOCK_MEMORY(memory);\n"
+       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << blocks << ", " << threads << ", "
+       << vectors << ", " << in_block << ", " << solver.preconditioner.is_diagonal() << ", "
+       << divides_by_diagonal(solver) << ", " << bytes_of_arrays(solver.method, restart, number) << ", " << restart
+       << ", ";
+  if (has_cycles) text << "Cycles<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
+  else text << "NoCycles";
+  text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
+       << "using Arguments = SolveArguments<S::T>;\n"
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
+          "  PRDP_BLOCK_MEMORY(memory);\n"
           "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
-  return {{text.str(), threads, in_block * unknowns * number, blocks},
-          (vectors - in_block) * unknowns + numbers_beyond(restart)};
+  return {{text.str(), threads, (in_block * unknowns + cycle_in_block) * number, blocks},
+          (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.most};
 }
 
 }  // namespace prdp::gpu

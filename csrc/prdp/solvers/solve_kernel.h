@@ -15,8 +15,9 @@ struct SolveKernel {
 bool has_kernel(const Solver& solver);
 
 /// The choice of a team depends on the sample and the device, never on the batch: neighbours must not change a bit.
-/// Raises Unavailable for a sample that is too large.
-SolveKernel solve_kernel(const OperatorView& a, const Solver& solver, at::ScalarType dtype, int64_t unknowns,
+/// For vectors like b. The preconditioner is that of the saddle point, or that of a field. Raises Unavailable for a
+/// sample that is too large.
+SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solver& solver, const at::Tensor& b,
                          const Limits& limits);
 
 }  // namespace prdp::gpu

@@ -6,7 +6,9 @@
 #include <mutex>
 #include <set>
 
+#include "prdp/gpu/team_memory.h"
 #include "prdp/solvers/first_result.h"
+#include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_kernel.h"
 
@@ -65,9 +67,17 @@ NullSpaceArguments<T> arguments_of(const at::Tensor& basis, const at::Tensor& b,
           .length = length};
 }
 
+/// A kernel, with all that its launch needs.
+struct Prepared {
+  std::shared_ptr<const Kernel> kernel;
+  SolveKernel source;
+  OperatorView a;
+  std::optional<HierarchyKernel> hierarchy;
+};
+
 template <class T>
-SolveResult launch(const Kernel& kernel, const SolveKernel& source, const OperatorView& a, const at::Tensor& b,
-                   const SolveRequest& request) {
+SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& request) {
+  const auto& [kernel, source, a, hierarchy] = of;
   const int64_t batch = b.size(0);
   const auto counts = b.options().dtype(at::kLong);
   // Memory of their own: a compiled graph takes no results that share theirs.
@@ -75,21 +85,14 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
                      {at::empty({batch}, counts), at::empty({batch}, b.options()), at::empty({batch}, counts),
                       at::empty({batch}, counts), at::empty({batch}, b.options())}};
   const int64_t blocks = source.source.blocks_of_team;
-  const int64_t teams = std::min(batch, blocks > 1 ? kernel.teams() : 4 * kernel.teams());
+  const int64_t teams = std::min(batch, blocks > 1 ? kernel->teams() : 4 * kernel->teams());
   const auto memory = at::empty({std::max<int64_t>(teams * source.memory_of_team, 1)}, b.options());
-  const auto arrived = blocks > 1 ? at::zeros({32 * teams}, b.options().dtype(at::kInt)) : at::Tensor();
-  const auto parts =
-      blocks > 1 ? at::empty({2 * kMostAtOnce * blocks * teams}, b.options().dtype(at::kDouble)) : at::Tensor();
+  const TeamMemory of_teams(blocks, teams, b.options());
   const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
 
   SolveArguments<T> arguments{};
-  for (size_t i = 0; i < a.tensors.size(); ++i) {
-    if (!a.tensors[i].defined()) continue;
-    arguments.a.tensors[i] = a.tensors[i].const_data_ptr();
-    arguments.a.sample_strides[i] = a.tensors[i].size(0) == 1 ? 0 : a.tensors[i].stride(0);
-  }
-  std::copy(a.numbers.begin(), a.numbers.end(), arguments.a.numbers);
+  arguments.a = arguments_of(a);
   arguments.null_space = arguments_of<T>(a.null_space, b, a.null_field);
   arguments.left_null_space = arguments_of<T>(a.left_null_space, b, a.null_field);
   arguments.b = b.const_data_ptr<T>();
@@ -102,25 +105,25 @@ SolveResult launch(const Kernel& kernel, const SolveKernel& source, const Operat
   arguments.residual = result.info.residual.mutable_data_ptr<T>();
   arguments.floor = result.info.floor.mutable_data_ptr<T>();
   arguments.memory = memory.mutable_data_ptr<T>();
-  if (blocks > 1) {
-    arguments.arrived = static_cast<unsigned*>(arrived.mutable_data_ptr());
-    arguments.parts = parts.mutable_data_ptr<double>();
-  }
+  of_teams.put_into(arguments);
   arguments.batch = batch;
   arguments.max_iter = request.solver.max_iter.expect_int();
   arguments.rtol = request.solver.rtol;
   arguments.guarded = request.guarded;
   arguments.leaks = a.leaks;
-  kernel.launch(teams, &arguments);
+  MadeHierarchy made;
+  if (hierarchy) {
+    made = make_hierarchy(*hierarchy, b);
+    const auto& preconditioner = request.solver.preconditioner;
+    arguments.hierarchy = {.grids = static_cast<const Grids*>(made.grids.const_data_ptr()),
+                           .numbers = made.numbers.const_data_ptr<T>(),
+                           .numbers_of_sample = made.numbers_of_sample,
+                           .smoothing = preconditioner.smoothing(),
+                           .transposed = preconditioner.spec().transposed};
+  }
+  kernel->launch(teams, &arguments);
   return result;
 }
-
-/// A kernel, with all that its launch needs.
-struct Prepared {
-  std::shared_ptr<const Kernel> kernel;
-  SolveKernel source;
-  OperatorView a;
-};
 
 /// Nothing where there is none.
 std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const Solver& solver) {
@@ -133,12 +136,15 @@ std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const So
   if (!has_kernel(solver)) return by_design(not_made(solver));
   auto view = a.gpu_view(b, /*transposed=*/false);
   if (!view) return by_design("this operator has no kernel");
+  const bool has_cycles = solver.preconditioner.is_multigrid();
   try {
-    const auto source =
-        solve_kernel(*view, solver, b.scalar_type(), b.numel() / b.size(0), runtime->limits(b.device()));
+    std::optional<HierarchyKernel> hierarchy;
+    if (has_cycles)  // of A, where this is its transpose
+      hierarchy = hierarchy_kernel(*runtime, *a.gpu_view(b, solver.preconditioner.spec().transposed), b);
+    const auto source = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
     auto kernel = runtime->kernel(b.device(), source.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
-    return Prepared{std::move(kernel), source, *std::move(view)};
+    return Prepared{std::move(kernel), source, *std::move(view), std::move(hierarchy)};
   } catch (const Unavailable& reason) {
     fall_back(reason.what());
     return std::nullopt;
@@ -157,7 +163,7 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   auto& trust = prepared->kernel->trust;
   try {
     if (trust == Trust::kNone) throw Unavailable(kDisagrees);
-    auto found = run(*prepared->kernel, prepared->source, prepared->a, rhs, request);
+    auto found = run(*prepared, rhs, request);
     if (trust == Trust::kUnknown && request.guarded) {
       trust = residuals_agree(a, rhs, found) ? Trust::kGood : Trust::kNone;
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);

@@ -11,7 +11,7 @@ namespace prdp {
 namespace {
 
 /// One look at the device.
-std::vector<int> axes_to_coarsen(const TensorStencil& a, const at::Tensor& magnitudes) {
+kernels::Axes axes_to_coarsen(const TensorStencil& a, const at::Tensor& magnitudes) {
   const int dim = static_cast<int>(a.dim());
   const auto entries = static_cast<int64_t>(a.entries.size());
   auto sums = magnitudes;
@@ -29,7 +29,7 @@ std::vector<int> axes_to_coarsen(const TensorStencil& a, const at::Tensor& magni
   }
   const auto host = sums.flatten(1).sum(1).to(at::kCPU, at::kDouble);
   const double* number = host.const_data_ptr<double>();
-  kernels::Couplings couplings{std::vector<double>(dim), std::vector<double>(dim), 0.0};
+  kernels::Couplings couplings;
   for (int64_t e = 0; e < entries; ++e)
     for (int d = 0; d < dim; ++d)
       if (a.entries[e].offset[d] != 0) couplings.along[d] += number[e];
@@ -37,7 +37,7 @@ std::vector<int> axes_to_coarsen(const TensorStencil& a, const at::Tensor& magni
     couplings.rows = number[entries];
     for (int d = 0; d < dim; ++d) couplings.net[d] = number[entries + 1 + 2 * d] + number[entries + 2 + 2 * d];
   }
-  return kernels::axes_to_coarsen(a.shape, couplings);
+  return kernels::axes_to_coarsen(a.shape, dim, couplings);
 }
 
 /// See kernels::kVanishing.
@@ -113,8 +113,11 @@ TensorCycles::TensorCycles(const Operator& a, bool of_transpose, int64_t smoothi
     const auto ratios = magnitudes.sum(0) / magnitudes.select(0, 0);
     const auto radius = per_sample(ratios.flatten(1).amax(1), ratios),
                per_radius = (radius * stencil.diagonal()).reciprocal();
-    for (const auto& [p, q] : kernels::smoothing_steps(1.0, smoothing))
+    kernels::SmoothingSteps steps(1.0);
+    for (int64_t s = 0; s < smoothing; ++s) {
+      const auto [p, q] = steps.next();
       level.steps.push_back({p, (q * per_radius).unsqueeze(1)});
+    }
     const auto axes = axes_to_coarsen(stencil, magnitudes);
     if (axes.empty()) break;
     auto fine = stencil.diagonal();

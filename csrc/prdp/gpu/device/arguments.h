@@ -21,6 +21,49 @@ struct OperatorArguments {
   double numbers[kMostNumbers];
 };
 
+/// A grid of a hierarchy, with the places of what belongs to it in the numbers of the sample.
+struct CoarseGrid {
+  int shape[3];          // z, y, x
+  int axes;              // bits of those along which it is coarsened; 0: it is the last
+  int64_t coefficients;  // of A there
+  int64_t weights[3];    // of each such axis: interpolation from before and from after, restriction likewise
+  double radius;         // of D⁻¹A, by the rows' sums
+};
+/// Each has at most two thirds of the points of the one before.
+inline constexpr int kMostGrids = 56;
+/// The coarsest one has at most four points an axis.
+inline constexpr int kMostOfCoarsest = 64;
+/// The grids of one sample.
+struct Grids {
+  int64_t count;         // 0: A is not finite, or a diagonal is zero on one of them
+  int64_t is_symmetric;  // then restriction has the weights of interpolation
+  int64_t inverse;       // of A on the last grid: its place in the numbers
+  CoarseGrid grid[kMostGrids];
+};
+
+template <class T>
+struct HierarchyArguments {
+  OperatorArguments a;
+  Grids* grids;               // (samples,)
+  T* numbers;                 // (samples, numbers_of_sample)
+  int64_t numbers_of_sample;
+  double* work;               // of each team
+  unsigned* arrived;          // as those of SolveArguments
+  double* parts;
+  int64_t samples;
+  int64_t nullity;            // how many vectors A is said to map to zero
+};
+
+/// A hierarchy as a solve uses it.
+template <class T>
+struct HierarchyView {
+  const Grids* grids;         // null: none
+  const T* numbers;
+  int64_t numbers_of_sample;  // 0: the samples share both
+  int64_t smoothing;          // steps
+  int64_t transposed;         // A is the transpose of what it was made of
+};
+
 template <class T>
 struct SolveArguments {
   OperatorArguments a;
@@ -38,13 +81,20 @@ struct SolveArguments {
   double rtol;
   int64_t guarded;
   int64_t leaks;  // products leave the range of A by their rounding, and are projected
+  HierarchyView<T> hierarchy;
 };
+
+/// Numbers of the memory that pseudo_inverse() works in (pseudo_inverse.h), the matrix first.
+constexpr int64_t numbers_of_inverse(int64_t n) { return 2 * n * n + 9 * n; }
 
 /// Numbers of a team beyond its vectors: for the damped least squares of GMRES.
 constexpr int64_t numbers_beyond(int64_t restart) { return restart * (restart + 3); }
 
 /// Vectors of a sample that the space itself keeps: b, scratch; and with a start, the start and b - A start.
 inline constexpr int kOwnVectors = 4;
+
+/// And that a V-cycle keeps of the finest grid.
+inline constexpr int kVectorsOfCycle = 3;
 
 /// Blocks of a team keep their parts of so many sums at once.
 inline constexpr int kMostAtOnce = 4;

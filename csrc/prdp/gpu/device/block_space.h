@@ -5,6 +5,8 @@
 #include <limits>
 #include <utility>
 
+#include "prdp/gpu/device/cycle.h"
+#include "prdp/gpu/device/saddle_point.h"
 #include "prdp/gpu/device/team.h"
 #include "prdp/gpu/device/views.h"
 #include "prdp/kernels/scales.h"
@@ -19,7 +21,7 @@ namespace prdp::gpu {
 
 /// Constants of a kernel.
 template <class Number, class Operator, int blocks, int threads, int vectors, int vectors_in_block, bool by_diagonal,
-          bool divides_by_diagonal, int numbers, int restart>
+          bool divides_by_diagonal, int numbers, int restart, class WithCycles>
 struct Setting {
   using T = Number;                                 // float or double
   using A = Operator;                               // of views.h
@@ -31,6 +33,7 @@ struct Setting {
   static constexpr bool kDividesByDiagonal = divides_by_diagonal;  // by it, or by the method
   static constexpr int kNumbers = numbers;          // bytes of small arrays that the method keeps
   static constexpr int kRestart = restart;          // of GMRES
+  using Cycles = WithCycles;                        // the preconditioner is a V-cycle (cycle.h)
   static_assert(blocks == 1 || vectors_in_block == 0);
 };
 
@@ -64,11 +67,12 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   using TeamOfSample = Team<S::kBlocks, S::kThreads>;
 
   /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
-  BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, T* in_block, T* beyond)
+  BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, int64_t sample, T* in_block, T* beyond)
       : team_(team),
         a_(a),
-        in_block_(in_block),
+        in_block_(in_block + S::Cycles::kInBlock),
         beyond_(beyond),
+        cycle_{of.hierarchy, sample, in_block, beyond + beyond_of(S::kRestart)},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
         leaks_(of.leaks != 0) {}
@@ -90,15 +94,8 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   void take_b() { b2_ = dot(b(), b()); }
   /// A as it will be used; false where it is not finite.
   PRDP_ONCE bool prepare_operator() {
-    if constexpr (!A::kIsScaled) {
-      const T most = largest_over_rows([&](int i) { return a_.largest_in_row(i); });
-      if (!std::isfinite(most)) return false;
-      factor_ = kernels::scale_of_operator(most);
-      a_.scale(factor_);
-    } else {
-      factor_ = a_.factor();
-      if (!std::isfinite(a_.norm_of_row(0))) return false;
-    }
+    if (!scale_operator<T>(team_, a_)) return false;
+    factor_ = a_.factor();
     norm_ = largest_over_rows([&](int i) { return a_.norm_of_row(i); });
     return true;
   }
@@ -237,9 +234,17 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     return team_.sum(s);
   }
 
-  static constexpr bool is_preconditioned() { return S::kByDiagonal; }
+  static constexpr bool is_preconditioned() { return S::kByDiagonal || S::Cycles::kAny; }
   PRDP_ONCE Scalar precondition(const T* v, Vector out) {
     T s = 0;
+    if constexpr (S::Cycles::kAny) {
+      if constexpr (std::is_same<A, typename A::Cycled>::value)
+        cycle_.apply(team_, a_, v, out, place(0), place(1), place(2));
+      else
+        SaddlePoint<S>{team_, a_, cycle_, {place(0), place(1), place(2), place(3), place(4), place(5)}}.apply(v, out);
+      if (null_space_.count > 0) project_solution(out);  // cycles leave rounding there, which they would amplify
+      return dot(v, out);
+    }
     each([&](int i) { return v[i] / a_.diagonal(i); },
          [&](int i, T value) {
            out[i] = value;
@@ -248,6 +253,8 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     return team_.sum(s);
   }
   void correct(const T* v, Vector out) { precondition(v, out); }
+  /// Whether there is a preconditioner of the kind that is asked for.
+  bool has_preconditioner() const { return cycle_.exists(); }
 
   PRDP_ONCE void divide_by_diagonal(const T* x, Vector y) {
     each([&](int i) { return x[i] / a_.diagonal(i); }, into(y));
@@ -301,11 +308,11 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
                       Scalar* y) const {
     if (keep != 0) return;
-    T* const work = beyond_ + static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns;
+    T* const work = beyond_ + beyond_of(0);
     T* const found = work + numbers_of_solve_damped(n);
     if (team_.leads()) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
     team_.meet();
-    for (int64_t j = 0; j < n; ++j) y[j] = shared_entry(found, j);
+    for (int64_t j = 0; j < n; ++j) y[j] = shared_entry<S::kBlocks>(found, j);
   }
   using Numbers::restore;
   void restore(Scalar where, const T* from, Vector to) {
@@ -339,19 +346,15 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   static auto into(Vector v) {
     return [v](int i, T value) { v[i] = value; };
   }
-  /// An entry that another thread wrote. Those of other blocks are not in this block's cache.
-  static T shared_entry(const T* v, int64_t i) {
-    if constexpr (S::kBlocks > 1) return __ldcg(v + i);
-    else return v[i];
-  }
-  struct Shared {
-    const T* v;
-    T operator[](int i) const { return shared_entry(v, i); }
-  };
-
-  Vector memory_of(int i) {
+  Vector place(int i) {
     if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
     return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
+  }
+  /// The first vectors are those of cycles.
+  Vector memory_of(int i) { return place(i + S::Cycles::kVectors); }
+  /// Numbers beyond the block: vectors, and what damping needs.
+  static constexpr int64_t beyond_of(int restart) {
+    return static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns + numbers_beyond(restart);
   }
   template <class F>
   T square_of(const F& f, Vector out) {
@@ -364,9 +367,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   template <class F>
   auto largest_over_rows(const F& f) {
-    decltype(f(0)) most = 0;
-    each(f, [&](int, auto value) { most = larger_or_nan(most, value); });
-    return team_.largest(most);
+    return largest_of(team_, A::kUnknowns, f);
   }
   /// store(i, (A v)_i) for this thread's cells. Before v is changed, a sum or another product must come: slower threads
   /// still read it. The methods are like that; one that is not gives other bits in tests/python/test_gpu_kernels.py.
@@ -374,7 +375,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
-    const Shared of_all{v};
+    const Shared<S::kBlocks, T> of_all{v};
     each([&](int i) { return a_.product(of_all, i); }, store);
   }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
@@ -416,6 +417,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   TeamOfSample& team_;
   A a_;
   T *in_block_, *beyond_;
+  typename S::Cycles::template Of<S> cycle_;
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>&null_space_, &left_null_space_;
   bool leaks_;

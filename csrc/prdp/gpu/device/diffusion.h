@@ -29,6 +29,12 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     }
   }
 
+  using Cycled = Diffusion;
+  using Points = G;
+  static constexpr bool periodic(int axis) {
+    constexpr int sides[] = {kSides...};
+    return (axis == 0 ? sides[0] : axis == 1 ? sides[2] : sides[4]) == kPeriodicSide;
+  }
   /// NaN where κ is not allowed.
   T largest_in_row(int i) const {
     const bool allowed = !(kappa_[i % G::kPoints] <= T(0));
@@ -37,35 +43,52 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   template <class F>
   void for_each_entry(int i, const F& f) const {
     T through = 0;
-    const T held = for_each_face(i, [&](T c, int j) {
+    const T held = for_each_face(i, [&](T c, int j, int, int) {
       through += c;
       f(-c, j);
     });
     f(held + through, i);
+  }
+  template <class F>
+  void for_each_offset(int point, const F& f) const {
+    T through = 0;
+    const auto couple = [&](T c, int axis, int cells) {
+      f(-c, axis == 0 ? cells : 0, axis == 1 ? cells : 0, axis == 2 ? cells : 0);
+    };
+    const auto inside = [&](T c, int, int axis, int cells) {
+      through += c;
+      couple(c, axis, cells);
+    };
+    const T held = for_each_face(point, inside, couple);
+    f(held + through, 0, 0, 0);
   }
   /// By differences, which no coefficient rounds away.
   template <class V>
   T product(const V& v, int i) const {
     T flux = 0;
     const T centre = v[i];
-    const T held = for_each_face(i, [&](T c, int j) { flux += c * (centre - v[j]); });
+    const T held = for_each_face(i, [&](T c, int j, int, int) { flux += c * (centre - v[j]); });
     return this->factor() * (held * centre + flux);
   }
 
  private:
-  /// f(c, j) for each face to a neighbour j; returns the shift and what the sides hold.
-  template <class F>
-  T for_each_face(int i, const F& f) const {
+  struct Nothing {
+    void operator()(T, int, int) const {}
+  };
+  /// f(c, j, axis, cells) for each face to a neighbour j, so many cells along the axis, and beyond(c, axis, cells) for
+  /// each on a side that holds u; returns the shift and what the sides hold.
+  template <class F, class Beyond = Nothing>
+  T for_each_face(int i, const F& f, const Beyond& beyond = {}) const {
     const int point = i % G::kPoints;
     const G at(point);
     T held = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
-    held += couple<0, 0>(at, i, f) + couple<0, 1>(at, i, f);
-    held += couple<1, 0>(at, i, f) + couple<1, 1>(at, i, f);
-    held += couple<2, 0>(at, i, f) + couple<2, 1>(at, i, f);
+    held += couple<0, 0>(at, i, f, beyond) + couple<0, 1>(at, i, f, beyond);
+    held += couple<1, 0>(at, i, f, beyond) + couple<1, 1>(at, i, f, beyond);
+    held += couple<2, 0>(at, i, f, beyond) + couple<2, 1>(at, i, f, beyond);
     return held;
   }
-  template <int axis, int end, class F>
-  T couple(const G& at, int i, const F& f) const {
+  template <int axis, int end, class F, class Beyond>
+  T couple(const G& at, int i, const F& f, const Beyond& beyond) const {
     constexpr int sides[] = {kSides...};
     constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
@@ -76,18 +99,25 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     if (next >= 0) {
       constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
       const int there = point + (next - here) * stride;
-      f(scale * mean(kappa_[point], kappa_[there]), i - point + there);
+      f(scale * mean(kappa_[point], kappa_[there]), i - point + there, axis, cells);
       return 0;
     }
     if constexpr (side != kZeroSide && side != kRobinSide) return 0;
-    const T within = 2 * scale * kappa_[point];
-    if constexpr (side == kZeroSide) return within;
+    const T held = held_by<axis, end>(at, 2 * scale * kappa_[point]);
+    beyond(held, axis, cells);
+    return held;
+  }
+  /// By the side, half a cell away.
+  template <int axis, int end>
+  T held_by(const G& at, T within) const {
+    constexpr int sides[] = {kSides...};
+    if constexpr (sides[2 * axis + end] == kZeroSide) return within;
     constexpr int at_side = 2 * axis + end;
     const int on_side = axis == 0 ? at.y * G::kX + at.x : axis == 1 ? at.z * G::kX + at.x : at.z * G::kY + at.y;
     const T h = robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side];
     if (h < T(0)) return std::numeric_limits<T>::quiet_NaN();  // not allowed
-    const T beyond = per_cell_[axis] * h;
-    return within * (beyond / (within + beyond));  // in series
+    const T outside = per_cell_[axis] * h;
+    return within * (outside / (within + outside));  // in series
   }
   static T mean(T a, T b) { return kHarmonic ? 2 * a * (b / (a + b)) : (a + b) / 2; }
 

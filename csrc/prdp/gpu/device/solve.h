@@ -32,6 +32,7 @@ SampleOutcome solve_sample_of(const SolveArguments<typename S::T>& of, int64_t s
   SampleOutcome outcome;
   if (is_settled_beforehand(given.magnitude, start, [&] { return space.prepare_operator(); }, divides_by_zero, outcome))
     return outcome;
+  if (!space.has_preconditioner()) return zero_instead(SolveStatus::kZeroDiagonal, 1.0);
   auto method = make_method<Method, S>(space);
   return solve_sample(space, method, given);
 }
@@ -42,11 +43,11 @@ void solve_batch(const SolveArguments<typename S::T>& of, typename S::T* in_bloc
   using T = typename S::T;
   using Space = BlockSpace<S>;
   const int team = static_cast<int>(blockIdx.x) / S::kBlocks, rank = static_cast<int>(blockIdx.x) % S::kBlocks;
-  const int64_t beyond_of_team =
-      static_cast<int64_t>(S::kVectors - S::kInBlock) * Space::unknowns() + numbers_beyond(S::kRestart);
+  const int64_t beyond_of_team = static_cast<int64_t>(S::kVectors - S::kInBlock) * Space::unknowns() +
+                                 numbers_beyond(S::kRestart) + S::Cycles::kBeyond;
   typename Space::TeamOfSample threads(rank, of.arrived + 32 * team, of.parts + 2 * kMostAtOnce * S::kBlocks * team);
   for (int64_t sample = team; sample < of.batch; sample += static_cast<int>(gridDim.x) / S::kBlocks) {
-    Space space(threads, typename S::A(of.a, sample), of, in_block, of.memory + beyond_of_team * team);
+    Space space(threads, typename S::A(of.a, sample), of, sample, in_block, of.memory + beyond_of_team * team);
     const SampleOutcome outcome = solve_sample_of<Method, S>(of, sample, space);
     if (outcome.is_zero) space.fill_zero(of.u + sample * Space::unknowns());
     if (!threads.leads()) continue;

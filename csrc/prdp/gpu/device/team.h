@@ -13,6 +13,19 @@ inline constexpr int kWarp = 32;
 /// Several loads are under way before the first of their values is needed.
 inline constexpr int kCellsAtOnce = 4;
 
+/// An entry that another thread of the team wrote. Those of other blocks are not in this block's cache.
+template <int blocks, class T>
+T shared_entry(const T* v, int64_t i) {
+  if constexpr (blocks > 1) return __ldcg(v + i);
+  else return v[i];
+}
+/// A vector of such entries.
+template <int blocks, class T>
+struct Shared {
+  const T* v;
+  T operator[](int i) const { return shared_entry<blocks>(v, i); }
+};
+
 /// The threads of a block, or of several blocks that meet in memory. Each thread owns the same cells throughout, so
 /// what it alone writes and reads needs no barrier.
 template <int kBlocks, int kThreads>
@@ -23,6 +36,7 @@ class Team {
  public:
   Team(int rank, unsigned* arrived, double* parts) : rank_(rank), arrived_(arrived), parts_(parts) {}
 
+  bool is_first_block() const { return rank_ == 0; }
   bool leads() const { return rank_ == 0 && threadIdx.x == 0; }
 
   /// f(i), and then store(i, f(i)), for each of this thread's share of 0 … n - 1. f only reads.
@@ -37,6 +51,14 @@ class Team {
       PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < end)
           store(first + k * kThreads, value[k]);
     }
+  }
+
+  /// f(i) likewise, one after the other.
+  template <class F>
+  void for_each(int n, const F& f) const {
+    const int share = kBlocks == 1 ? n : (n + kBlocks - 1) / kBlocks;
+    const int begin = share * rank_, end = kBlocks == 1 ? n : begin + share < n ? begin + share : n;
+    for (int i = begin + static_cast<int>(threadIdx.x); i < end; i += kThreads) f(i);
   }
 
   /// Waits for all threads of the team, and sees what they wrote. Tests leave out the one of a line, and must notice.

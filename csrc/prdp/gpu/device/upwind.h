@@ -28,22 +28,23 @@ class Upwind {
         inverse_h_{static_cast<T>(a.numbers[4]), static_cast<T>(a.numbers[3])} {
     const T* const by = static_cast<const T*>(a.tensors[1]);
     constexpr double not_allowed = std::numeric_limits<double>::quiet_NaN();
-    const double nu = !by ? a.numbers[2] : *by >= T(0) ? a.numbers[2] * static_cast<double>(*by) : not_allowed;
+    nu_ = !by ? a.numbers[2] : *by >= T(0) ? a.numbers[2] * static_cast<double>(*by) : not_allowed;
     for (int axis = 0; axis < 2; ++axis)
-      diffusion_[axis] = static_cast<T>(a.numbers[1] * nu * a.numbers[4 - axis] * a.numbers[4 - axis]);
+      diffusion_[axis] = static_cast<T>(a.numbers[1] * nu_ * a.numbers[4 - axis] * a.numbers[4 - axis]);
   }
 
   T inverse_h(int axis) const { return inverse_h_[axis]; }
+  double nu() const { return nu_; }
   T wind(int channel, const G& at) const { return winds_[channel * G::kPoints + at.point()]; }
 
-  /// f(c_ij, j) at a point of the channel whose first unknown is `first`. The winds at the lower and the upper face of
+  /// f(c_ij, j, dy, dx) at a point of the channel whose first unknown is `first`. The winds at the lower and the upper face of
   /// a cell: lower(axis, point), upper(axis, point), with an Along.
   template <class Lower, class Upper, class F>
   void for_each_entry(const G& at, int first, const Lower& lower, const Upper& upper, const F& f) const {
     T centre = alpha_;
     centre += couple<0>(at, first, lower, upper, f);
     if constexpr (G::kY > 1) centre += couple<1>(at, first, lower, upper, f);
-    f(centre, first + at.point());
+    f(centre, first + at.point(), 0, 0);
   }
 
  private:
@@ -60,12 +61,13 @@ class Upwind {
     // What couples a point to its neighbour belongs to the neighbour in the transpose.
     const T to_before = kTransposed ? negative(upper(along, before)) : -below;
     const T to_after = kTransposed ? -positive(lower(along, after)) : above;
-    f(speed * to_before - spread, first + before.point());
-    f(speed * to_after - spread, first + after.point());
+    f(speed * to_before - spread, first + before.point(), axis == 1 ? -1 : 0, axis == 0 ? -1 : 0);
+    f(speed * to_after - spread, first + after.point(), axis == 1 ? 1 : 0, axis == 0 ? 1 : 0);
     return speed * (below - above) + 2 * spread;
   }
 
   const T* winds_;
+  double nu_;
   T alpha_, beta_;
   T inverse_h_[2], diffusion_[2];
 };
@@ -78,21 +80,76 @@ class Burgers : public Rows<Burgers<T, G, kChannels, kTransposed>, T> {
 
   Burgers(const OperatorArguments& a, int64_t sample) : block_(a, sample) {}
 
+  using Cycled = Burgers;
+  using Points = G;
+  static constexpr bool periodic(int axis) { return axis == 2 || (axis == 1 && G::kY > 1); }
   template <class F>
   void for_each_entry(int i, const F& f) const {
     const int point = i % G::kPoints;
+    for_each_coefficient(point, i - point, [&](T a, int j, int, int) { f(a, j); });
+  }
+  template <class F>
+  void for_each_offset(int point, const F& f) const {
+    for_each_coefficient(point, 0, [&](T a, int, int dy, int dx) { f(a, 0, dy, dx); });
+  }
+
+ private:
+  template <class F>
+  void for_each_coefficient(int point, int first, const F& f) const {
     const auto lower = [&]<int axis>(Along<axis>, const G& at) {
       return T(0.5) * (block_.wind(axis, next_along<axis, -1>(at)) + block_.wind(axis, at));
     };
     const auto upper = [&]<int axis>(Along<axis>, const G& at) {
       return T(0.5) * (block_.wind(axis, at) + block_.wind(axis, next_along<axis, 1>(at)));
     };
-    block_.for_each_entry(G(point), i - point, lower, upper, f);
+    block_.for_each_entry(G(point), first, lower, upper, f);
+  }
+
+  using Block = Upwind<T, G, kTransposed>;
+  Block block_;
+};
+
+/// -L on a periodic grid, times the square of the smaller spacing. Numbers: as those of Upwind.
+template <class T, class G>
+class PressureLaplacian {
+ public:
+  static constexpr int kUnknowns = G::kPoints;
+  static constexpr bool kIsScaled = true;
+  using Cycled = PressureLaplacian;
+  using Points = G;
+  static constexpr bool periodic(int) { return true; }
+
+  PressureLaplacian(const OperatorArguments& a, int64_t) {
+    const double y = G::kY > 1 ? a.numbers[3] * a.numbers[3] : 0.0, x = G::kX > 1 ? a.numbers[4] * a.numbers[4] : 0.0;
+    largest_ = std::max(x, y);
+    y_ = static_cast<T>(-y / largest_);
+    x_ = static_cast<T>(-x / largest_);
+    centre_ = static_cast<T>(2 * (x + y) / largest_);
+  }
+
+  T factor() const { return 1; }
+  /// What -L was divided by.
+  double largest() const { return largest_; }
+  double norm_of_row(int) const { return 2 * static_cast<double>(centre_); }
+  template <class F>
+  void for_each_offset(int, const F& f) const {
+    f(centre_, 0, 0, 0);
+    for (int side = -1; side <= 1; side += 2) {
+      f(x_, 0, 0, side);
+      f(y_, 0, side, 0);
+    }
+  }
+  template <class V>
+  T product(const V& v, int i) const {
+    const G at(i);
+    const T along_x = v[next_along<0, -1>(at).point()] + v[next_along<0, 1>(at).point()];
+    const T along_y = v[next_along<1, -1>(at).point()] + v[next_along<1, 1>(at).point()];
+    return centre_ * v[i] + x_ * along_x + y_ * along_y;
   }
 
  private:
-  using Block = Upwind<T, G, kTransposed>;
-  Block block_;
+  double largest_;
+  T centre_, y_, x_;
 };
 
 /// [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]] on a staggered grid: u₁ on the left faces, u₂ on the bottom faces, p in the
@@ -102,7 +159,18 @@ class NavierStokes : public Rows<NavierStokes<T, G, kTransposed>, T> {
  public:
   static constexpr int kUnknowns = 3 * G::kPoints;
 
-  NavierStokes(const OperatorArguments& a, int64_t sample) : block_(a, sample) {}
+  using Cycled = PressureLaplacian<T, G>;
+  static constexpr int kVelocity = 2 * G::kPoints;  // the pressure comes behind
+
+  NavierStokes(const OperatorArguments& a, int64_t sample)
+      : block_(a, sample), laplacian_(a, sample), per_dt_(a.numbers[0]) {}
+
+  const Cycled& laplacian() const { return laplacian_; }
+  /// The Schur complement without winds has the inverse `of_laplacian` times that of laplacian(), and `of_identity`.
+  T of_laplacian() const {
+    return static_cast<T>(per_dt_ / (laplacian_.largest() * static_cast<double>(this->factor())));
+  }
+  T of_identity() const { return static_cast<T>(block_.nu() / static_cast<double>(this->factor())); }
 
   template <class F>
   void for_each_entry(int i, const F& f) const {
@@ -119,7 +187,7 @@ class NavierStokes : public Rows<NavierStokes<T, G, kTransposed>, T> {
       if constexpr (axis == 0) return mean<0, 1, 1, -1>(here);
       else return mean<1, 1, 0, -1>(here);
     };
-    block_.for_each_entry(at, channel * G::kPoints, wind, wind, f);
+    block_.for_each_entry(at, channel * G::kPoints, wind, wind, [&](T a, int j, int, int) { f(a, j); });
     if (channel == 0) gradient<0>(at, f);
     else gradient<1>(at, f);
   }
@@ -147,6 +215,8 @@ class NavierStokes : public Rows<NavierStokes<T, G, kTransposed>, T> {
   }
 
   Block block_;
+  Cycled laplacian_;
+  double per_dt_;
 };
 
 }  // namespace prdp::gpu

@@ -7,6 +7,7 @@
 #include "prdp/kernels/scales.h"
 
 /// Operators as a kernel knows them: what stands in a row of A. The sizes are constants. `v` is anything with v[i].
+/// `Cycled` is what coarse grids are made of, where multigrid serves the operator.
 /// What a view computes with is factor·A, where the factor is a power of two that makes the entries of order one.
 namespace prdp::gpu {
 
@@ -46,6 +47,27 @@ T larger_or_nan(T a, T b) {
   return b > a || b != b ? b : a;
 }
 
+/// The largest f(i), with the same bits in every thread of the team; infinite if one is not finite.
+template <class Team, class F>
+auto largest_of(Team& team, int n, const F& f) {
+  decltype(f(0)) most = 0;
+  team.each(n, f, [&](int, auto value) { most = larger_or_nan(most, value); });
+  return team.largest(most);
+}
+
+/// Brings A to the order of one; false where it is not finite.
+template <class T, class Team, class A>
+bool scale_operator(Team& team, A& a) {
+  if constexpr (A::kIsScaled) {
+    return std::isfinite(a.norm_of_row(0));
+  } else {
+    const T most = largest_of(team, A::kUnknowns, [&](int i) { return a.largest_in_row(i); });
+    if (!std::isfinite(most)) return false;
+    a.scale(kernels::scale_of_operator(most));
+    return true;
+  }
+}
+
 /// α I + β L with the Laplacian L of a box, zero outside the grid. Numbers: α, β, and 1/h² along z, y and x. Tensor,
 /// where it is there: a number that β is multiplied by.
 template <class T, class G>
@@ -78,6 +100,20 @@ class Laplacian {
     radius_ = around / std::abs(centre);
   }
 
+  using Cycled = Laplacian;
+  using Points = G;
+  static constexpr bool periodic(int) { return false; }
+  /// f(a, dz, dy, dx) for what couples a point to its neighbours, in the grid or out of it: what multigrid is made of.
+  /// Scaled only where the view always is.
+  template <class F>
+  void for_each_offset(int, const F& f) const {
+    f(centre_, 0, 0, 0);
+    for (int side = -1; side <= 1; side += 2) {
+      f(x_, 0, 0, side);
+      f(y_, 0, side, 0);
+      f(z_, side, 0, 0);
+    }
+  }
   T factor() const { return factor_; }
   double norm_of_row(int) const { return norm_; }
   double radius() const { return radius_; }
@@ -148,6 +184,24 @@ class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, pe
   Stencil(const OperatorArguments& a, int64_t sample)
       : coefficients_(static_cast<const T*>(a.tensors[0]) + sample * a.sample_strides[0]) {}
 
+  using Cycled = Stencil;
+  using Points = G;
+  static constexpr bool periodic(int axis) { return axis == 0 ? periodic_z : axis == 1 ? periodic_y : periodic_x; }
+  /// What leads out of the grid is known of A, not of Aᵀ.
+  template <class F>
+  void for_each_offset(int point, const F& f) const {
+    const auto one = [&]<class O>(O, T a) {
+      constexpr int sign = kTransposed ? -1 : 1;
+      f(a, sign * O::kZ, sign * O::kY, sign * O::kX);
+    };
+    int k = 0;
+    if constexpr (kTransposed) {
+      const G at(point);
+      (entry<Offsets>(at, point, 0, k++, [&](T a, int) { one(Offsets(), a); }), ...);
+    } else {
+      (one(Offsets(), coefficients_[k++ * G::kPoints + point]), ...);
+    }
+  }
   /// Of all that stands there, also of what leads out of the grid.
   T largest_in_row(int i) const {
     T most = 0;

@@ -1,0 +1,289 @@
+#pragma once
+#include "prdp/gpu/device/diffusion.h"
+#include "prdp/gpu/device/pseudo_inverse.h"
+#include "prdp/gpu/device/team.h"
+#include "prdp/gpu/device/upwind.h"
+#include "prdp/kernels/collapsed_point.h"
+
+/// The coarse grids of multigrid with their operators, as kernels/hierarchy.cpp and kernels/galerkin.cpp make them on
+/// the CPU: one launch for all samples, each by a team that sees nothing of the others.
+namespace prdp::gpu {
+
+/// Constants of a kernel.
+template <class Number, class Operator, int dimensions, int blocks, int threads>
+struct HierarchySetting {
+  using T = Number;
+  using A = typename Operator::Cycled;     // of the views of operators
+  static constexpr int kDim = dimensions;  // of the grid
+  static constexpr int kBlocks = blocks;   // that work on one sample
+  static constexpr int kThreads = threads;
+};
+
+template <class S>
+class HierarchyMaker {
+  using T = typename S::T;
+  using A = typename S::A;
+  using Stencil = GridStencil<T, A, S::kDim>;
+  using TeamOfSample = Team<S::kBlocks, S::kThreads>;
+  static constexpr int kOffsets = Stencil::kOffsets, kCentre = Stencil::kCentre, kFirstAxis = 3 - S::kDim;
+
+ public:
+  HierarchyMaker(TeamOfSample& team, const HierarchyArguments<T>& of, int64_t sample, double* work)
+      : team_(team),
+        grids_(of.grids[sample]),
+        numbers_(of.numbers + sample * of.numbers_of_sample),
+        nullity_(static_cast<int>(of.nullity)),
+        work_(work) {}
+
+  void make(A a) {
+    const int64_t count = make_grids(a);
+    if (team_.leads()) grids_.count = count;
+  }
+
+ private:
+  int64_t make_grids(A& a) {
+    if (!scale_operator<T>(team_, a)) return 0;
+    Stencil stencil = finest(a);
+    symmetric_ = is_symmetric(stencil);
+    if (team_.leads()) grids_.is_symmetric = symmetric_;
+    for (int level = 0; level < kMostGrids; ++level) {
+      const double radius = radius_of(stencil);
+      if (!std::isfinite(radius)) return 0;
+      const kernels::Axes axes = axes_to_coarsen(stencil);
+      CoarseGrid grid{{stencil.shape[0], stencil.shape[1], stencil.shape[2]}, 0, stencil.coefficients - numbers_, {},
+                      radius};
+      Stencil next = stencil;
+      for (const int axis : axes) {
+        grid.axes |= 1 << axis;
+        grid.weights[axis] = used_;
+        next = collapse(next, axis);
+      }
+      if (team_.leads()) grids_.grid[level] = grid;
+      if (axes.empty()) return invert_coarsest(stencil) ? level + 1 : 0;
+      stencil = next;
+    }
+    return 0;
+  }
+
+  T* take(int64_t n) {
+    T* const taken = numbers_ + used_;
+    used_ += n;
+    return taken;
+  }
+  static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
+
+  PRDP_ONCE Stencil finest(const A& a) {
+    Stencil made{nullptr, {A::Points::kZ, A::Points::kY, A::Points::kX}};
+    constexpr int n = A::Points::kPoints;
+    T* const to = take(int64_t{kOffsets} * n);
+    const T factor = A::kIsScaled ? T(1) : a.factor();  // a view that always is gives its entries so
+    team_.for_each(n, [&](int i) {
+      for (int k = 0; k < kOffsets; ++k) to[k * n + i] = 0;
+      a.for_each_offset(i, [&](T value, int dz, int dy, int dx) {
+        if ((S::kDim < 3 && dz != 0) || (S::kDim < 2 && dy != 0)) return;
+        to[Stencil::place(dz, dy, dx) * n + i] += factor * value;
+      });
+    });
+    team_.meet();
+    made.coefficients = to;
+    return made;
+  }
+
+  /// To the last bit.
+  PRDP_ONCE bool is_symmetric(const Stencil& a) {
+    const int n = a.points();
+    const auto entry = shared(a.coefficients);
+    T differs = 0;
+    team_.for_each(n, [&](int i) {
+      a.for_each_neighbour(i, [&](int k, int there) {
+        if (there >= 0 && entry[k * n + i] != entry[(kOffsets - 1 - k) * n + there]) differs = 1;
+      });
+    });
+    return team_.largest(differs) == T(0);
+  }
+
+  /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero, or a number is not finite.
+  PRDP_ONCE double radius_of(const Stencil& a) {
+    const int n = a.points();
+    const auto entry = shared(a.coefficients);
+    return static_cast<double>(largest_of(team_, n, [&](int i) {
+      T sum = 0;
+      for (int k = 0; k < kOffsets; ++k) sum += std::abs(entry[k * n + i]);
+      return sum / std::abs(entry[kCentre * n + i]);
+    }));
+  }
+
+  /// By a sample of the points.
+  PRDP_ONCE kernels::Axes axes_to_coarsen(const Stencil& a) {
+    const int n = a.points(), step = (n / 4096 > 1 ? n / 4096 : 1) | 1;
+    const auto entry = shared(a.coefficients);
+    double along[4] = {}, net[4] = {};  // of each axis; and of the rows
+    team_.for_each((n + step - 1) / step, [&](int place) {
+      const int i = place * step;
+      double sides[3][2] = {}, row = 0;
+      a.for_each_neighbour(i, [&](int k, int there) {
+        const double value = static_cast<double>(entry[k * n + i]);
+        for (int axis = kFirstAxis; axis < 3; ++axis) {
+          const int cells = k / Stencil::step(axis) % 3 - 1;
+          if (cells == 0) continue;
+          along[axis] += std::abs(value);
+          sides[axis][cells > 0] += value;
+        }
+        if (there >= 0) row += value;
+      });
+      for (int axis = kFirstAxis; axis < 3; ++axis) net[axis] += std::abs(sides[axis][0]) + std::abs(sides[axis][1]);
+      net[3] += std::abs(row);
+    });
+    team_.sum(along);
+    team_.sum(net);
+    const kernels::Couplings couplings{{along[0], along[1], along[2]}, {net[0], net[1], net[2]}, net[3]};
+    return kernels::axes_to_coarsen(a.shape, 3, couplings);
+  }
+
+  /// The weights of the axis, which are kept, and the operator on the coarse points.
+  PRDP_ONCE Stencil collapse(const Stencil& a, int axis) {
+    const CoarsenedAxis line(a.shape, axis, A::periodic(axis));
+    T* const weights = take(int64_t{symmetric_ ? 2 : 4} * line.weights());
+    make_weights(a, line, axis, weights);
+    Stencil coarse = a;
+    coarse.shape[axis] = line.coarse;
+    T* const to = take(int64_t{kOffsets} * coarse.points());
+    coarse.coefficients = to;
+    team_.meet();
+    team_.for_each(coarse.points(), [&](int i) { collapse_point(a, line, axis, weights, i, coarse.points(), to); });
+    team_.meet();
+    return coarse;
+  }
+
+  /// Of a symmetric operator, interpolation and restriction are the same; else interpolation comes from the symmetric
+  /// part and restriction from the transpose (Dendy 1983).
+  PRDP_ONCE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
+    const int n = a.points(), weights = line.weights();
+    const auto entry = shared(a.coefficients);
+    team_.for_each(weights, [&](int w) {
+      const int row = w / line.inner;
+      const int at = line.of_between(row % line.between());
+      const int i = (row / line.between() * line.n + at) * line.inner + w % line.inner;
+      T own[3] = {}, of_transpose[3] = {};
+      a.for_each_neighbour(i, [&](int k, int there) {
+        const int d = k / Stencil::step(axis) % 3;
+        const T value = entry[k * n + i];
+        own[d] += value;
+        // Aᵀ couples i to its neighbour as A couples that to i. Beyond the grid, A's own coefficient stands for it.
+        if (!symmetric_) of_transpose[d] += there < 0 ? value : entry[(kOffsets - 1 - k) * n + there];
+      });
+      const T diagonal = entry[kCentre * n + i];
+      if (!symmetric_)
+        for (int d = 0; d < 3; ++d) own[d] += of_transpose[d];
+      const kernels::WeightsOfPoint<T> interpolation(diagonal, own[0], own[1], own[2]);
+      to[w] = interpolation.left;
+      to[weights + w] = interpolation.right;
+      if (symmetric_) return;
+      const kernels::WeightsOfPoint<T> restriction(diagonal, of_transpose[0], of_transpose[1], of_transpose[2]);
+      to[2 * weights + w] = restriction.left;
+      to[3 * weights + w] = restriction.right;
+    });
+  }
+
+  /// All coefficients of a coarse point.
+  void collapse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
+                      T* to) const {
+    const int n = a.points(), inner = line.inner, step = Stencil::step(axis), extent = line.n;
+    const int row = i / inner, j = row % line.coarse, o = row / line.coarse;
+    const int here = line.of_coarse(j), before = line.before(j), after = line.after(j);
+    const auto fine = [&](int at) { return (o * extent + (at + extent) % extent) * inner + i % inner; };
+    const int at[3] = {fine(here - 1), fine(here), fine(here + 1)};
+    const auto entry = shared(a.coefficients);
+    const auto weight = shared(weights);
+    const int of_field = line.weights(), restriction = symmetric_ ? 0 : 2 * of_field;
+    // Of the column at an offset in the other axes: nothing is taken from beyond the grid.
+    const auto of_column = [&](int field, int between, int dz, int dy, int dx) {
+      const int fine_point = at[1];
+      int place[3] = {fine_point / (a.shape[1] * a.shape[2]), fine_point / a.shape[2] % a.shape[1],
+                      fine_point % a.shape[2]};
+      const int offset[3] = {dz, dy, dx};
+      int shape[3];
+      for (int d = 0; d < 3; ++d) {
+        shape[d] = d == axis ? line.between() : a.shape[d];
+        place[d] = d == axis ? between : moved(place[d], offset[d], a.shape[d], A::periodic(d));
+        if (place[d] < 0) return T(0);
+      }
+      return weight[field * of_field + (place[0] * shape[1] + place[1]) * shape[2] + place[2]];
+    };
+    for (int dz = axis != 0 && S::kDim > 2 ? -1 : 0; dz <= (axis != 0 && S::kDim > 2 ? 1 : 0); ++dz)
+      for (int dy = axis != 1 && S::kDim > 1 ? -1 : 0; dy <= (axis != 1 && S::kDim > 1 ? 1 : 0); ++dy)
+        for (int dx = axis != 2 ? -1 : 0; dx <= (axis != 2 ? 1 : 0); ++dx) {
+          const int centre = Stencil::place(dz, dy, dx);
+          const auto coefficient = [&](int d, int p) { return entry[(centre + d * step) * n + at[p]]; };
+          kernels::CollapsedPoint<T> made;
+          made.before_left = before >= 0 ? of_column(0, before, dz, dy, dx) : T(1);
+          made.before_right = before >= 0 ? of_column(1, before, dz, dy, dx) : T(0);
+          made.after_left = after >= 0 ? of_column(0, after, dz, dy, dx) : T(0);
+          made.after_right = after >= 0 ? of_column(1, after, dz, dy, dx) : T(1);
+          const int first = o * line.between() * inner + i % inner;
+          made.restrict_before = before >= 0 ? weight[restriction + of_field + first + before * inner] : T(0);
+          made.restrict_after = after >= 0 ? weight[restriction + first + after * inner] : T(0);
+          made.take_centres(coefficient(0, 0), coefficient(0, 1), coefficient(0, 2));
+          made.take_sides({coefficient(-1, 0), coefficient(-1, 1), coefficient(-1, 2)},
+                          {coefficient(1, 0), coefficient(1, 1), coefficient(1, 2)});
+          const bool is_alone = line.periodic && line.coarse == 1;  // and its own neighbour
+          to[(centre - step) * points + i] = is_alone ? T(0) : made.left;
+          to[centre * points + i] = is_alone ? made.centre + made.left + made.right : made.centre;
+          to[(centre + step) * points + i] = is_alone ? T(0) : made.right;
+        }
+    keep_vanishing_diagonal(entry[kCentre * n + at[1]], i, points, to);
+  }
+  /// See kernels::kVanishing.
+  static void keep_vanishing_diagonal(T fine, int i, int points, T* to) {
+    constexpr T rounding = std::numeric_limits<T>::epsilon();
+    T& diagonal = to[kCentre * points + i];
+    const T size = std::abs(diagonal);
+    if (size > static_cast<T>(kernels::kVanishingAlone) * rounding * std::abs(fine)) return;
+    bool is_alone = true;
+    for (int k = 0; k < kOffsets; ++k) is_alone = is_alone && (k == kCentre || to[k * points + i] == T(0));
+    if (is_alone || size <= static_cast<T>(kernels::kVanishing) * rounding * std::abs(fine)) diagonal = fine;
+  }
+
+  PRDP_ONCE bool invert_coarsest(const Stencil& a) {
+    const int n = a.points();
+    if (n > kMostOfCoarsest) return false;
+    T* const inverse = take(int64_t{n} * n);
+    if (team_.leads()) grids_.inverse = inverse - numbers_;
+    if (team_.is_first_block()) {
+      const auto entry = shared(a.coefficients);
+      for (int i = static_cast<int>(threadIdx.x); i < n; i += S::kThreads) {
+        for (int j = 0; j < n; ++j) work_[i * n + j] = 0;
+        a.for_each_neighbour(i, [&](int k, int there) {
+          if (there >= 0) work_[i * n + there] += static_cast<double>(entry[k * n + i]);
+        });
+      }
+      __syncthreads();
+      const double tiny = 10.0 * n * static_cast<double>(std::numeric_limits<T>::epsilon());
+      pseudo_inverse<S::kThreads>(n, work_, nullity_, tiny, inverse);
+    }
+    team_.meet();
+    const auto found = shared(inverse);
+    return std::isfinite(largest_of(team_, n * n, [&](int i) { return std::abs(found[i]); }));
+  }
+
+  TeamOfSample& team_;
+  Grids& grids_;
+  T* numbers_;
+  int nullity_;
+  double* work_;
+  int64_t used_ = 0;
+  bool symmetric_ = true;
+};
+
+/// The body of a kernel: each team takes one sample after the other.
+template <class S>
+void make_hierarchies(const HierarchyArguments<typename S::T>& of) {
+  const int team = static_cast<int>(blockIdx.x) / S::kBlocks, rank = static_cast<int>(blockIdx.x) % S::kBlocks;
+  Team<S::kBlocks, S::kThreads> threads(rank, of.arrived + 32 * team, of.parts + 2 * kMostAtOnce * S::kBlocks * team);
+  for (int64_t sample = team; sample < of.samples; sample += static_cast<int>(gridDim.x) / S::kBlocks) {
+    HierarchyMaker<S> maker(threads, of, sample, of.work + numbers_of_inverse(kMostOfCoarsest) * team);
+    maker.make(typename S::A(of.a, sample));
+  }
+}
+
+}  // namespace prdp::gpu

@@ -1,0 +1,76 @@
+#pragma once
+#include <utility>
+
+#include "prdp/gpu/device/team.h"
+
+/// The preconditioner of kernels/saddle_point.h by a team of threads: for the Navier-Stokes equations [[C, G], [D, 0]],
+/// Jacobi sweeps in the place of C⁻¹, and a V-cycle for the pressure.
+namespace prdp::gpu {
+
+template <class S>
+struct SaddlePoint {
+  using T = typename S::T;
+  using A = typename S::A;
+  static constexpr int kVelocity = A::kVelocity, kPressure = A::kUnknowns - kVelocity;
+
+  Team<S::kBlocks, S::kThreads>& team;
+  const A& a;
+  const typename S::Cycles::template Of<S>& cycle;
+  T* memory[6];
+
+  /// z = M⁻¹ r, or M⁻ᵀ r where A is a transpose.
+  PRDP_ONCE void apply(const T* r, T* z) const {
+    T *const c = memory[3], *const p = memory[4] + kVelocity;
+    const T* u;
+    team.meet();
+    const Shared<S::kBlocks, T> given{r};
+    if (cycle.hierarchy.transposed == 0) {
+      team.for_each(kPressure, [&](int i) { c[kVelocity + i] = given[kVelocity + i]; });
+      solve_schur(c + kVelocity, p);
+      product(memory[4], true, 0, kVelocity, [&](int i, T value) { c[i] = given[i] - value; });
+      u = solve_velocity(c);
+    } else {
+      team.for_each(kVelocity, [&](int i) { c[i] = given[i]; });
+      u = solve_velocity(c);
+      product(u, false, kVelocity, kPressure, [&](int i, T value) { c[i] = given[i] - value; });
+      solve_schur(c + kVelocity, p);
+    }
+    team.meet();  // each thread has other cells of the whole vector than of its parts
+    const Shared<S::kBlocks, T> velocity{u}, pressure{memory[4]};
+    team.for_each(A::kUnknowns, [&](int i) { z[i] = i < kVelocity ? velocity[i] : pressure[i]; });
+  }
+
+ private:
+  /// A vector of which one part is zero.
+  struct Part {
+    Shared<S::kBlocks, T> v;
+    bool is_pressure;
+    T operator[](int i) const { return (i >= kVelocity) == is_pressure ? v[i] : T(0); }
+  };
+  /// store(i, (A v)_i) for the rows from `first` on, where v is one part of a vector.
+  template <class Store>
+  void product(const T* v, bool is_pressure, int first, int rows, const Store& store) const {
+    team.meet();
+    const Part part{{v}, is_pressure};
+    team.for_each(rows, [&](int i) { store(first + i, product(part, first + i)); });
+  }
+  PRDP_ONCE T product(const Part& v, int row) const { return a.product(v, row); }
+
+  void solve_schur(const T* r, T* p) const {
+    cycle.apply(team, a.laplacian(), r, p, memory[0], memory[1], memory[2]);
+    const T of_laplacian = a.of_laplacian(), of_identity = a.of_identity();
+    team.for_each(kPressure, [&](int i) { p[i] = of_laplacian * p[i] + of_identity * r[i]; });
+  }
+  /// Sweeps from zero; returns the vector that holds the result.
+  PRDP_ONCE const T* solve_velocity(const T* c) const {
+    T *x = memory[4], *next = memory[5];
+    team.for_each(kVelocity, [&](int i) { x[i] = c[i] / a.diagonal(i); });
+    constexpr int64_t sweeps_per_smoothing = 2;
+    for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
+      product(x, false, 0, kVelocity, [&](int i, T value) { next[i] = x[i] + (c[i] - value) / a.diagonal(i); });
+    }
+    return x;
+  }
+};
+
+}  // namespace prdp::gpu

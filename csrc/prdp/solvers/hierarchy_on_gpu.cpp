@@ -1,0 +1,117 @@
+#include "prdp/solvers/hierarchy_on_gpu.h"
+
+#include <ATen/Parallel.h>
+
+#include <algorithm>
+#include <limits>
+#include <sstream>
+#include <vector>
+
+#include "prdp/gpu/team_memory.h"
+#include "prdp/kernels/coarsening.h"
+
+namespace prdp::gpu {
+
+namespace {
+
+/// Registers are short: each thread has many numbers of a stencil at hand.
+constexpr int64_t kMostThreads = 512;
+constexpr int64_t kWarp = 32;
+
+int64_t points_of(const at::Tensor& b) { return b.numel() / (b.size(0) * b.size(1)); }
+int64_t offsets_of(const at::Tensor& b) {
+  int64_t all = 1;
+  for (int64_t d = 2; d < b.dim(); ++d) all *= 3;
+  return all;
+}
+
+/// Points of all coarse grids together, those between two axes included, at most: which axes are coarsened, and in what
+/// order, is known to the device alone.
+int64_t most_coarse_points(at::IntArrayRef shape) {
+  std::vector<std::vector<int64_t>> sizes(3, {1});
+  for (size_t d = 0; d < shape.size(); ++d) {
+    sizes[d][0] = shape[d];
+    while (sizes[d].back() > 1) sizes[d].push_back(kernels::coarse_points(sizes[d].back(), /*periodic=*/true));
+  }
+  const auto count = [&](size_t d) { return sizes[d].size(); };
+  std::vector<int64_t> most(count(0) * count(1) * count(2), 0);  // from each combination of sizes on
+  const auto place = [&](size_t i, size_t j, size_t k) { return (i * count(1) + j) * count(2) + k; };
+  for (size_t i = count(0); i-- > 0;)
+    for (size_t j = count(1); j-- > 0;)
+      for (size_t k = count(2); k-- > 0;) {
+        const auto then = [&](size_t a, size_t b, size_t c) {
+          if (a == count(0) || b == count(1) || c == count(2)) return int64_t{0};
+          return sizes[0][a] * sizes[1][b] * sizes[2][c] + most[place(a, b, c)];
+        };
+        most[place(i, j, k)] = std::max({then(i + 1, j, k), then(i, j + 1, k), then(i, j, k + 1)});
+      }
+  return most[0];
+}
+
+template <class T>
+void launch(const HierarchyKernel& of, int64_t samples, const MadeHierarchy& made, const at::TensorOptions& options) {
+  const int64_t teams = std::min(samples, of.kernel->teams());
+  const TeamMemory memory(of.blocks_of_team, teams, options);
+  const auto work = at::empty({teams * numbers_of_inverse(kMostOfCoarsest)}, options.dtype(at::kDouble));
+  HierarchyArguments<T> arguments{};
+  arguments.a = arguments_of(of.a);
+  arguments.grids = static_cast<Grids*>(made.grids.mutable_data_ptr());
+  arguments.numbers = made.numbers.mutable_data_ptr<T>();
+  arguments.numbers_of_sample = of.numbers_of_sample;
+  arguments.work = work.mutable_data_ptr<double>();
+  arguments.samples = samples;
+  arguments.nullity = of.nullity;
+  memory.put_into(arguments);
+  of.kernel->launch(teams, &arguments);
+}
+
+}  // namespace
+
+HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Tensor& b) {
+  const int64_t points = points_of(b), offsets = offsets_of(b);
+  if (offsets * points > std::numeric_limits<int32_t>::max())
+    throw Unavailable("a grid of " + std::to_string(points) + " points is too large for a kernel of multigrid");
+  const auto limits = runtime.limits(b.device());
+  const int64_t blocks = at::divup(points, limits.cells_of_block);
+  const int64_t threads =
+      std::min({limits.threads, kMostThreads, at::divup(at::divup(points, blocks), kWarp) * kWarp});
+  std::ostringstream text;
+  text << "#include \"prdp/gpu/device/hierarchy.h\"\nusing namespace prdp::gpu;\n"
+       << "using S = HierarchySetting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << b.dim() - 2 << ", "
+       << blocks << ", " << threads << ">;\n"
+       << "using Arguments = HierarchyArguments<S::T>;\n"
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"
+          "  make_hierarchies<S>(arguments);\n}\n";
+  const int64_t weights = 4 * points, inverse = kMostOfCoarsest * kMostOfCoarsest;
+  const int64_t numbers = offsets * (points + most_coarse_points(b.sizes().slice(2))) + weights + inverse;
+  const auto& basis = a.null_space;
+  const int64_t nullity = !a.leaks || !basis.defined() ? 0 : basis.numel() == 0 ? 1 : basis.size(0);
+  auto kernel = runtime.kernel(b.device(), {text.str(), threads, 0, blocks});
+  return {std::move(kernel), std::move(a), blocks, numbers, nullity};
+}
+
+MadeHierarchy make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
+  const bool shared = is_shared(kernel.a);
+  const int64_t samples = shared ? 1 : b.size(0);
+  const MadeHierarchy made{
+      at::empty({samples, static_cast<int64_t>(sizeof(Grids) / sizeof(int64_t))}, b.options().dtype(at::kLong)),
+      at::empty({samples, kernel.numbers_of_sample}, b.options()), shared ? 0 : kernel.numbers_of_sample};
+  (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, samples, made, b.options());
+  return made;
+}
+
+CycleMemory memory_of_cycle(const at::Tensor& b) {
+  constexpr int64_t vectors = 3;
+  auto shape = b.sizes().slice(2).vec();
+  int64_t usual = 0;
+  const auto is_long = [](int64_t n) { return n > kernels::kCoarsest; };
+  while (std::any_of(shape.begin(), shape.end(), is_long)) {
+    int64_t points = 1;
+    for (auto& n : shape) points *= n = is_long(n) ? kernels::coarse_points(n, /*periodic=*/true) : n;
+    usual += points;
+  }
+  const int64_t of_points = vectors * b.size(1);
+  return {of_points * most_coarse_points(b.sizes().slice(2)), of_points * usual};
+}
+
+}  // namespace prdp::gpu
