@@ -93,7 +93,7 @@ class Controller {
   std::string about_residual() const;
 
   std::optional<double> refused_;  // the metric of the last step(), if it raised an error
-  double idle_ = 0.0;              // of its solves
+  double idle_ = 0.0;  // of its solves
 };
 
 /// ⌈ratio · K⌉, the iterations of an adjoint solve: at least one where K is. Raises ValueError in the name of `who`

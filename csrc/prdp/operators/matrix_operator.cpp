@@ -155,11 +155,12 @@ void CsrOperator::check_parameters(bool /*kernel_checks*/) const {
 void CsrOperator::check_vector(const at::Tensor& b) const { check_matrix_vector(b, values_, n(), values_.dim() == 2); }
 
 at::Tensor CsrOperator::rows() const {
+  if (rows_.defined()) return rows_;
   // Row of each stored entry: how many row ends lie at or before its position.
   const auto position = at::arange(values_.size(-1), crow_.options());
   const auto ends = crow_.narrow(-1, 1, n()).contiguous();
   const auto wanted = values_.dim() == 2 ? position.expand_as(col_).contiguous() : position;
-  return at::searchsorted(ends, wanted, /*out_int32=*/false, /*right=*/true);
+  return rows_ = at::searchsorted(ends, wanted, /*out_int32=*/false, /*right=*/true);
 }
 
 at::Tensor CsrOperator::apply(const at::Tensor& v) const {
@@ -224,6 +225,7 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
   chosen->crow_ = crow_.index_select(0, index);
   chosen->col_ = col_.index_select(0, index);
   chosen->values_ = values_.index_select(0, index);
+  chosen->rows_ = at::Tensor();
   return chosen;
 }
 

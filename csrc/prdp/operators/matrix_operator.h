@@ -52,10 +52,12 @@ class CsrOperator final : public Operator {
 
  private:
   int64_t n() const { return crow_.size(-1) - 1; }
+  /// The row of each stored entry, which is kept: products ask for it again and again.
   at::Tensor rows() const;
   at::Tensor to_dense() const;
 
   at::Tensor crow_, col_, values_;
+  mutable at::Tensor rows_;
 };
 
 }  // namespace prdp

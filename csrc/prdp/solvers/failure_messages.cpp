@@ -75,8 +75,16 @@ std::string badly_scaled(const Solver& solver, const Operator& a, const at::Tens
   return {};
 }
 
+/// Whether A maps constants to no more than the rounding of its entries, though not to zero: what holds u is lost.
+bool holds_within_rounding(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const double held = a.apply(at::ones_like(b)).select(0, sample).abs().max().item<double>();
+  return held > 0.0 && held <= 64.0 * epsilon_of(b) * value_of_sample(a.norm(), sample);
+}
+
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (b.scalar_type() == at::kFloat && holds_within_rounding(a, b, sample))
+    return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   const double share = asymmetry(a, b, sample);
   if (share > 100.0 * epsilon_of(b))
     return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
@@ -106,6 +114,9 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
   };
   if (solver.preconditioner.is_operator() && !is_finite(*make_operator(solver.preconditioner.spec())))
     return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
+  if (solver.preconditioner && traits(solver.method).made_for == MadeFor::kSymmetric)
+    return "a number left the range of its dtype: its preconditioner may not be positive definite, as multigrid is not "
+           "where A is not; take MINRES without it";
   const bool single = b.scalar_type() == at::kFloat;
   const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
   const bool known = norm > 0.0;  // not of a function

@@ -53,6 +53,8 @@ struct SampleState {
     status = why;
     active = false;
   }
+  /// The last one changed nothing. A method may break down before the first.
+  void take_back_iteration() { iterations = std::max<int64_t>(iterations - 1, 0); }
   /// Back to the start, for another pass of at most `iterations_allowed`.
   void run_again(int64_t iterations_allowed) {
     cap = iterations_allowed;
@@ -97,7 +99,7 @@ inline void judge_progress(SampleState& s, bool exhausted) {
     return;
   }
   if (exhausted) {
-    --s.iterations;  // this one changed nothing
+    s.take_back_iteration();
     return s.stop(SolveStatus::kBreakdown);
   }
   if (++s.still >= patience) s.stop(SolveStatus::kStagnated);

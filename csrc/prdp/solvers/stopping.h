@@ -41,8 +41,8 @@ bool is_idle(const SampleState& s) {
 
 /// Stops those of the `doubtful` samples whose residual is rounding, floor = ε ‖A‖ ‖u‖: one that is no larger, or up to
 /// eight times as large where rtol lies below the floor. An exhausted space is judged with more slack. A floor near ‖b‖
-/// says nothing: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a product rounds: columns of A
-/// that differ much in size make ‖A‖ ‖u‖ large without.
+/// says nothing, nor does a residual near it: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a
+/// product rounds: columns of A that differ much in size make ‖A‖ ‖u‖ large without.
 template <class Space, class Method, class Predicate>
 void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                             const Predicate& doubtful) {
@@ -56,7 +56,9 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
     const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
-    if (doubtful(s) && floor <= 0.25 * b && std::sqrt(s.residual2) <= slack_of(s, floor) * floor) floors[i] = floor;
+    const double residual = std::sqrt(s.residual2);
+    const bool says_something = floor <= 0.25 * b && residual <= 0.1 * b;
+    if (doubtful(s) && says_something && residual <= slack_of(s, floor) * floor) floors[i] = floor;
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
   constexpr double far = 64.0;
@@ -86,7 +88,7 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     s.note(residual2[i]);
     if (broken[i]) {
       s.stop(SolveStatus::kBreakdown);
-      --s.iterations;  // the one that broke down changed nothing
+      s.take_back_iteration();
       continue;
     }
     judge(s, rtol);
