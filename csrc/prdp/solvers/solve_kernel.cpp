@@ -1,18 +1,16 @@
 #include "prdp/solvers/solve_kernel.h"
 
-#include <ATen/Parallel.h>
-
 #include <algorithm>
 #include <limits>
 #include <sstream>
 
+#include "prdp/gpu/launch.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp::gpu {
 
 namespace {
 
-constexpr int64_t kWarp = 32;
 /// Of GMRES: a thread keeps its triangle, so longer bases would fill the device with copies of it.
 constexpr int64_t kLongestBasis = 50;
 
@@ -44,8 +42,7 @@ SolveKernel solve_kernel(const OperatorView& a, const Solver& solver, at::Scalar
   const bool has_cycles = row.counts == Counts::kCycles;
   const int64_t restart = has_cycles ? std::min(solver.restart, unknowns) : 0;
   const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart);
-  const int64_t blocks = at::divup(unknowns, limits.cells_of_block);
-  const int64_t threads = std::min(limits.threads, at::divup(at::divup(unknowns, blocks), kWarp) * kWarp);
+  const auto [blocks, threads] = team_size(unknowns, limits);
   const int64_t in_block = blocks > 1 ? 0 : std::min(vectors, limits.block_memory / (unknowns * number));
   const bool by_diagonal = solver.preconditioner.is_diagonal();
 
@@ -55,9 +52,9 @@ SolveKernel solve_kernel(const OperatorView& a, const Solver& solver, at::Scalar
        << "using S = Setting<" << type_of(dtype) << ", " << a.type << ", " << blocks << ", " << threads << ", "
        << vectors << ", " << in_block << ", " << by_diagonal << ", " << divides_by_diagonal(solver) << ", "
        << bytes_of_arrays(solver.method, restart, number) << ", " << restart << ">;\n"
+       << "using Arguments = SolveArguments<S::T>;\n"
        << "using Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
-       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const SolveArguments<S::T> "
-          "arguments) "
+       << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) "
           "{\n  PRDP_BLOCK_MEMORY(memory);\n"
           "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
   return {{text.str(), threads, in_block * unknowns * number, blocks},
