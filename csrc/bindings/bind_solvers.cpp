@@ -2,12 +2,12 @@
 
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/gpu/fall_back.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/sum_over_axes.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 

@@ -4,12 +4,14 @@
 #include <dlfcn.h>
 #include <unistd.h>
 
+#include <atomic>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
 #include <functional>
 #include <map>
 #include <mutex>
+#include <set>
 
 #include "prdp/gpu/cuda_runtime.h"
 #include "prdp/gpu/nvrtc.h"
@@ -28,8 +30,10 @@ struct Settings {
   int order = 0;  // of fibers::Order
   int left_out = 0;  // the line of the barrier that is left out; 0: none
   std::string last{};  // text of a kernel
+  std::set<std::string> loops{};  // those that are loops over points or samples
 };
 Settings settings;
+std::atomic<int64_t> launches = 0;
 
 std::string read(const fs::path& file) {
   std::ifstream in(file);
@@ -92,6 +96,7 @@ class FiberKernel final : public prdp::gpu::Kernel {
   int64_t teams() const override { return 2; }
   void launch(int64_t teams, const void* arguments) const override {
     constexpr long spare = 64;
+    ++launches;
     const bool regular =
         run_(arguments, static_cast<int>(teams * source_.blocks_of_team), static_cast<int>(source_.threads),
              source_.block_memory + spare, settings.order, settings.left_out);
@@ -109,6 +114,7 @@ class FiberRuntime final : public prdp::gpu::Runtime {
   std::shared_ptr<const prdp::gpu::Kernel> kernel(c10::Device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
     settings.last = source.text;
+    if (source.text.find("run_each.h") != std::string::npos) settings.loops.insert(source.text);
     auto& kernel = kernels_[source.text];
     if (!kernel) kernel = std::make_shared<FiberKernel>(source);
     return kernel;
@@ -125,7 +131,7 @@ class FiberRuntime final : public prdp::gpu::Runtime {
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
                                   int left_out) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, settings.last};
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, settings.last, settings.loops};
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }
 /// Compiles the text of the last kernel for devices of this compute capability by NVRTC. Returns what went wrong, or
@@ -138,6 +144,18 @@ extern "C" const char* prdp_compile_last(int capability, int64_t* size) {
   } catch (const std::exception& e) {
     error = e.what();
   }
+  return error.c_str();
+}
+/// The same for all kernels that are loops; how many there are goes to `count`.
+extern "C" const char* prdp_compile_loops(int capability, int64_t* count) {
+  static std::string error;
+  error.clear();
+  *count = std::ssize(settings.loops);
+  for (const auto& text : settings.loops) try {
+      prdp::gpu::nvrtc::compile(text, capability);
+    } catch (const std::exception& e) {
+      error = e.what();
+    }
   return error.c_str();
 }
 /// Why CUDA cannot be used here; nothing where it can.
@@ -171,4 +189,6 @@ extern "C" const char* prdp_resources_of_last(int capability) {
   }
   return said.c_str();
 }
+/// How many kernels were launched so far.
+extern "C" int64_t prdp_fibers_launches() { return launches; }
 extern "C" void prdp_fibers_end() { prdp::gpu::set_runtime(c10::DeviceType::CPU, nullptr); }

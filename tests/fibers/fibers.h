@@ -20,6 +20,7 @@
 /// that wait at different barriers are an error.
 #define __device__
 #define __global__
+#define __grid_constant__
 #define __launch_bounds__(threads)
 #define __shared__ static thread_local
 #define PRDP_UNROLL
@@ -192,7 +193,7 @@ inline bool run_block(int index, int blocks, int threads, int64_t memory, Order 
   blockIdx.x = static_cast<unsigned>(index);
   constexpr size_t stack = size_t{1} << 17;
   for (auto& fiber : mine.fibers) {
-    fiber.stack = std::make_unique<char[]>(stack);
+    fiber.stack = std::make_unique_for_overwrite<char[]>(stack);
     getcontext(&fiber.context);
     fiber.context.uc_stack = {fiber.stack.get(), 0, stack};
     fiber.context.uc_link = &mine.scheduler;

@@ -23,6 +23,9 @@ class Fibers:
         library.prdp_compile_last.argtypes = [ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
         library.prdp_compile_last.restype = ctypes.c_char_p
         library.prdp_resources_of_last.restype = ctypes.c_char_p
+        library.prdp_fibers_launches.restype = ctypes.c_int64
+        library.prdp_compile_loops.argtypes = [ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
+        library.prdp_compile_loops.restype = ctypes.c_char_p
         library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2
         return library
 
@@ -31,6 +34,16 @@ class Fibers:
         size = ctypes.c_int64()
         error = self.library().prdp_compile_last(capability, ctypes.byref(size))
         return size.value, error.decode()
+
+    def launches(self):
+        """How many kernels were launched so far."""
+        return self.library().prdp_fibers_launches()
+
+    def compile_loops(self, capability):
+        """Compile every kernel that is a loop and has run; returns how many, and what failed."""
+        count = ctypes.c_int64()
+        error = self.library().prdp_compile_loops(capability, ctypes.byref(count))
+        return count.value, error.decode()
 
     def resources_of_last(self, capability):
         return self.library().prdp_resources_of_last(capability).decode()

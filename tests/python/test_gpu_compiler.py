@@ -9,7 +9,9 @@ import warnings
 import pytest
 import torch
 from fibers import ROOT, Fibers
+from test_gpu_flow import outcome
 from test_gpu_kernels import OPERATORS, right_hand_sides, solve, solver
+from test_gpu_products import gradients
 
 import prdp_torch as prdp
 
@@ -38,6 +40,15 @@ def test_kernels_compile_for_the_cards_that_are_about(cache):
     newer, error = fibers.compile_last(199)  # of tomorrow: PTX, which its driver compiles
     assert not error and newer > 0
     assert "knows no device of compute capability 1.0" in fibers.compile_last(10)[1]
+
+
+def test_the_kernels_of_a_flow_and_of_fields_compile(cache):
+    outcome("channel", F32, steps=1)  # makes the masks
+    with Fibers() as fibers:
+        outcome("channel", F32, steps=1)
+        gradients("diffusion", F32, threads=64)
+        count, error = fibers.compile_loops(90)
+    assert not error and count >= 10
 
 
 def test_a_damaged_file_is_made_again_and_no_folder_is_no_fault(cache, monkeypatch):

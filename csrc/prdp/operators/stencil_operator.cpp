@@ -9,6 +9,7 @@
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/stencil_products.h"
+#include "prdp/operators/products_by_kernel.h"
 #include "prdp/operators/stencil_direct.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
@@ -58,6 +59,24 @@ void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& 
                               out + p * points);
     }
   });
+}
+
+/// The same in one launch; undefined where there is no kernel.
+template <class T>
+at::Tensor products_by_kernel(const kernels::StencilPattern& pattern, const std::vector<kernels::Offset>& offsets,
+                              const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& coefficients) {
+  const auto out = at::empty(coefficients.sizes(), coefficients.options());
+  gpu::StencilProducts<T> of{};
+  of.pair = pair_of<T>(lambda, u, out.size(0));
+  of.count = static_cast<int>(offsets.size());
+  of.out = out.mutable_data_ptr<T>();
+  for (int axis = 0; axis < 3; ++axis) {
+    of.n[axis] = static_cast<int>(pattern.grid.shape[axis]);
+    of.periodic[axis] = pattern.grid.periodic[axis];
+    for (size_t k = 0; k < offsets.size(); ++k) of.offsets[k][axis] = static_cast<signed char>(offsets[k].along[axis]);
+  }
+  const bool launched = gpu::each_point(out.device(), product_body<T>("StencilProducts"), of, out.numel());
+  return launched ? out : at::Tensor();
 }
 
 }  // namespace
@@ -246,6 +265,12 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
 }
 
 std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (has_product_kernel(lambda, u)) {
+    const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
+    const kernels::StencilPattern pattern(grid_, offsets_);
+    const auto all = by_kernel(pattern, offsets_, lambda.contiguous(), u.contiguous(), coefficients_);
+    if (all.defined()) return {all};
+  }
   const bool plain = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);
   if (!at::GradMode::is_enabled() && plain && lambda.is_cpu()) {
     const auto all = at::zeros(coefficients_.sizes(), coefficients_.options());

@@ -1,11 +1,10 @@
 #include "prdp/solvers/solve_kernel.h"
 
-#include <ATen/Parallel.h>
-
 #include <algorithm>
 #include <limits>
 #include <sstream>
 
+#include "prdp/gpu/launch.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
 
@@ -13,7 +12,6 @@ namespace prdp::gpu {
 
 namespace {
 
-constexpr int64_t kWarp = 32;
 /// Of GMRES: a thread keeps its triangle, so longer bases would fill the device with copies of it.
 constexpr int64_t kLongestBasis = 50;
 
@@ -45,8 +43,7 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   const int64_t number = b.element_size(), restart = has_arrays ? std::min(solver.restart, unknowns) : 0;
   const int64_t of_cycles = !has_cycles ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
   const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart) + of_cycles;
-  const int64_t blocks = at::divup(unknowns, limits.cells_of_block);
-  const int64_t threads = std::min(limits.threads, at::divup(at::divup(unknowns, blocks), kWarp) * kWarp);
+  const auto [blocks, threads] = team_size(unknowns, limits);
   // Coarse grids come first into the memory of the block, then the vectors of the finest one.
   const CycleMemory cycle = has_cycles ? memory_of_cycle(b) : CycleMemory{};
   const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;

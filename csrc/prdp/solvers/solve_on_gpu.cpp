@@ -3,9 +3,8 @@
 #include <ATen/core/grad_mode.h>
 
 #include <algorithm>
-#include <mutex>
-#include <set>
 
+#include "prdp/gpu/fall_back.h"
 #include "prdp/gpu/team_memory.h"
 #include "prdp/solvers/first_result.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
@@ -23,30 +22,6 @@ constexpr const char* kDisagrees =
 std::string not_made(const Solver& solver) {
   return std::string(traits(solver.method).label) + (solver.preconditioner ? " with this preconditioner" : "") +
          " has no kernel";
-}
-
-/// Says why tensor operations take the place of a kernel: once for each reason.
-void fall_back(const std::string& reason) {
-  TORCH_CHECK(use() != Use::kRequired, "PRDP_GPU=required: ", reason);
-  static std::mutex mutex;
-  static auto* said = new std::set<std::string>;
-  const std::lock_guard lock(mutex);
-  if (said->insert(reason).second)
-    TORCH_WARN("prdp: no kernel on this device, so tensor operations take its place, which are slow: ", reason);
-}
-
-struct Made {
-  std::mutex mutex;
-  std::vector<std::string> names;
-};
-Made& made() {
-  static auto* all = new Made;
-  return *all;
-}
-void note_made(const std::string& name) {
-  const std::lock_guard lock(made().mutex);
-  auto& names = made().names;
-  if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
 }
 
 /// Entries of a vector that a null space belongs to: those of a channel.
@@ -176,10 +151,5 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
 }
 
 bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }
-
-std::vector<std::string> kernels_made() {
-  const std::lock_guard lock(made().mutex);
-  return made().names;
-}
 
 }  // namespace prdp::gpu

@@ -11,7 +11,4 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
 /// Whether solve() takes a kernel for vectors like b, if the operator has one: then the host need not wait for it.
 bool takes(const at::Tensor& b, const Solver& solver);
 
-/// The kernels that this process has made, in the order in which they were: "CG of Stencil<float, …>".
-std::vector<std::string> kernels_made();
-
 }  // namespace prdp::gpu

@@ -24,30 +24,51 @@ double largest_viscosity(const FlowEquation& e) {
 
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
   if (!is_incremental(e)) return {change, {}};
-  auto whole = project(*e.box, change, options, info);
   const double limit = largest_viscosity(e);
+  if (flow_kernels::take(change)) {
+    const ByKernels by{
+        {.added = {change}}, {.added = {change}, .share_by_nu = e.nu, .largest_nu = limit}, {.factor = -1.0}};
+    if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u, found->potential};
+  }
+  auto whole = project(*e.box, change, options, info);
   if (e.nu.item<double>() <= limit) return whole;
   const auto share = limit / e.nu;
   return {at::lerp(change, whole.u, share), whole.potential * share};
 }
 
-BalanceVjp balance_vjp(const FlowEquation& e, const at::Tensor& cotangent, const at::Tensor& of_potential,
-                       const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
-  if (!is_incremental(e)) return {cotangent, {}};
-  const auto& free = e.box->fields(cotangent.options()).free;
+namespace {
+
+FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& of_potential,
+                      const SolveOptions& options, CombinedInfo& info) {
   const double limit = largest_viscosity(e);
-  if (e.nu.item<double>() <= limit)
-    return {project_vjp(*e.box, cotangent * free, of_potential, options, info) * free, {}};
+  if (flow_kernels::take(cotangent[0])) {
+    const ByKernels by{{.added = cotangent, .of_potential = of_potential, .share_by_nu = e.nu, .largest_nu = limit},
+                       {.added = cotangent},
+                       {.factor = scale_of_pressure(*e.box)},
+                       /*reverse=*/true};
+    if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u};
+  }
+  const auto& free = e.box->fields(cotangent[0].options()).free;
+  const auto given = joined(cotangent) * free;
+  if (e.nu.item<double>() <= limit) return {project_vjp(*e.box, given, of_potential, {}, options, info).on_free_faces};
   const auto share = limit / e.nu;
   const auto of_whole = of_potential.defined() ? of_potential * share : of_potential;
-  const auto through = project_vjp(*e.box, cotangent * free * share, of_whole, options, info) * free;
-  BalanceVjp found{cotangent * free * (1.0 - share) + through, {}};
-  if (!change.defined()) return found;
+  return {given * (1.0 - share) + project_vjp(*e.box, given * share, of_whole, {}, options, info).on_free_faces};
+}
+
+}  // namespace
+
+BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& of_potential,
+                       const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
+  if (!is_incremental(e)) return {cotangent, {}};
+  BalanceVjp found{change_back(e, cotangent, of_potential, options, info), {}};
+  const double limit = largest_viscosity(e);
+  if (!change.defined() || e.nu.item<double>() <= limit) return found;
   CombinedInfo again;
   const auto whole = project(*e.box, change, options, again);
-  auto of_share = (cotangent * (whole.u - change)).sum();
+  auto of_share = (joined(cotangent) * (whole.u - change)).sum();
   if (of_potential.defined()) of_share = of_share + (of_potential * whole.potential).sum();
-  found.nu = -of_share * share / e.nu;
+  found.nu = -of_share * (limit / e.nu) / e.nu;
   return found;
 }
 

@@ -1,4 +1,5 @@
 #pragma once
+#include "prdp/steppers/flow/parts.h"
 #include "prdp/steppers/flow/projection.h"
 
 namespace prdp {
@@ -13,9 +14,10 @@ Projected balance(const FlowEquation& equation, const at::Tensor& change, const 
 
 /// The cotangents of the change and of ν from those of the result. ν's needs the change; both are undefined without.
 struct BalanceVjp {
-  at::Tensor change, nu;
+  FlowParts change;
+  at::Tensor nu;
 };
-BalanceVjp balance_vjp(const FlowEquation& equation, const at::Tensor& cotangent, const at::Tensor& of_potential,
+BalanceVjp balance_vjp(const FlowEquation& equation, const FlowParts& cotangent, const at::Tensor& of_potential,
                        const at::Tensor& change, const SolveOptions& options, CombinedInfo& info);
 
 }  // namespace prdp

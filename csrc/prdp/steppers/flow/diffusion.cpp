@@ -1,17 +1,28 @@
 #include "prdp/steppers/flow/diffusion.h"
 
 #include "prdp/operators/sums_in_order.h"
+#include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/stencil_of.h"
 
 namespace prdp {
 
 namespace {
 
-/// I - ν dt Δ from -Δ.
-OperatorSpec diffusion_operator(const FlowEquation& e, const at::Tensor& pattern) {
-  const auto scaled = pattern * (e.nu * e.dt);
-  const auto coefficients = at::cat({scaled.narrow(1, 0, 1) + 1.0, scaled.narrow(1, 1, scaled.size(1) - 1)}, 1);
-  return stencil_of(*e.box, coefficients);
+/// I - ν dt Δ from each -Δ.
+std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::Tensor& like) {
+  const auto& patterns = e.box->fields(like.options()).diffusion;
+  const auto made = flow_kernels::take(like) ? flow_kernels::diffusion_coefficients(e, like) : at::Tensor();
+  std::vector<OperatorSpec> operators;
+  for (size_t k = 0; k < patterns.size(); ++k) {
+    if (made.defined()) {
+      operators.push_back(stencil_of(*e.box, made.narrow(0, static_cast<int64_t>(k), 1)));
+      continue;
+    }
+    const auto scaled = patterns[k] * (e.nu * e.dt);
+    const auto coefficients = at::cat({scaled.narrow(1, 0, 1) + 1.0, scaled.narrow(1, 1, scaled.size(1) - 1)}, 1);
+    operators.push_back(stencil_of(*e.box, coefficients));
+  }
+  return operators;
 }
 
 }  // namespace
@@ -26,38 +37,38 @@ OperatorSpec stencil_of(const FlowBox& box, const at::Tensor& coefficients) {
   return spec;
 }
 
-at::Tensor diffuse(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
-                   CombinedInfo& info) {
-  const auto& patterns = equation.box->fields(change.options()).diffusion;
-  const auto width = change.size(1) / static_cast<int64_t>(patterns.size());
-  std::vector<at::Tensor> parts;
-  for (size_t k = 0; k < patterns.size(); ++k) {
-    const auto b = change.narrow(1, static_cast<int64_t>(k) * width, width);
-    parts.push_back(solve(diffusion_operator(equation, patterns[k]), b, options, info));
-  }
+FlowParts diffuse(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
+                  CombinedInfo& info) {
+  const auto operators = diffusion_operators(equation, change);
+  const auto width = change.size(1) / static_cast<int64_t>(operators.size());
+  FlowParts parts;
+  for (size_t k = 0; k < operators.size(); ++k)
+    parts.push_back(solve(operators[k], change.narrow(1, static_cast<int64_t>(k) * width, width), options, info));
   const auto& free = equation.box->fields(change.options()).free;
-  const auto all = parts.size() == 1 ? parts[0] : at::cat(parts, 1);
-  return free.defined() ? all * free : all;  // a preconditioner may leave something on the faces of solids
+  if (flow_kernels::take(change)) return parts;
+  const auto all = joined(parts);
+  return {free.defined() ? all * free : all};  // a preconditioner may leave something on the faces of solids
 }
 
 DiffuseVjp diffuse_vjp(const FlowEquation& equation, const at::Tensor& cotangent, const at::Tensor& result,
                        const SolveOptions& options, CombinedInfo& info) {
   const auto& patterns = equation.box->fields(cotangent.options()).diffusion;
   const auto width = cotangent.size(1) / static_cast<int64_t>(patterns.size());
-  std::vector<at::Tensor> parts;
+  const auto operators = diffusion_operators(equation, cotangent);
+  FlowParts parts;
   at::Tensor nu;
   for (size_t k = 0; k < patterns.size(); ++k) {
     const auto of_system = [&](const at::Tensor& t) {
       return t.defined() ? t.narrow(1, static_cast<int64_t>(k) * width, width) : t;
     };
-    const auto a = diffusion_operator(equation, patterns[k]);
-    const auto found = solve_vjp(a, of_system(cotangent), of_system(result), options, info);
+    const auto found = solve_vjp(operators[k], of_system(cotangent), of_system(result), options, info);
     parts.push_back(found.b);
     if (!found.coefficients.defined()) continue;
     const auto share = total(found.coefficients * patterns[k]) * equation.dt;
     nu = nu.defined() ? nu + share : share;
   }
-  return {parts.size() == 1 ? parts[0] : at::cat(parts, 1), nu};
+  if (!flow_kernels::take(cotangent)) parts = {joined(parts)};
+  return {parts, nu};
 }
 
 }  // namespace prdp

@@ -30,7 +30,9 @@ SolveOptions without_log(SolveOptions options) {
 at::Tensor flow_project(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
   equation.check(u);
   CombinedInfo info;
-  return project(*equation.box, with_boundary_values(equation.for_state(u), u), without_log(options), info).u;
+  return project(*equation.box, with_boundary_values(equation.for_state(u), u), /*added=*/{}, /*potential=*/{},
+                 without_log(options), info)
+      .u;
 }
 
 at::Tensor flow_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {

@@ -55,6 +55,11 @@ RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u) {
           diverged.masked_fill(finite.logical_not(), static_cast<int64_t>(SolveStatus::kNonfiniteInput))};
 }
 
+RefusedSamples refused_by(const at::Tensor& status) {
+  const auto mask = status.ne(0);
+  return mask.any().item<bool>() ? RefusedSamples{mask, status} : RefusedSamples{};
+}
+
 void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,
                     OnFailure on_failure) {
   if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;

@@ -11,6 +11,8 @@ struct RefusedSamples {
 };
 /// None of them: undefined tensors. u has its boundary values.
 RefusedSamples find_refused(const FlowEquation& equation, const at::Tensor& u);
+/// Those that a kernel found, where status, (batch,), is not 0. The host waits for it.
+RefusedSamples refused_by(const at::Tensor& status);
 /// Raises c10::LinAlgError or warns about them.
 void report_refused(const FlowEquation& equation, const at::Tensor& u, const RefusedSamples& refused,
                     OnFailure on_failure);

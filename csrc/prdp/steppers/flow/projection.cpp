@@ -16,10 +16,6 @@ namespace prdp {
 
 namespace {
 
-/// The equation of the pressure is multiplied by this: with square cells its coefficients are then whole numbers, and
-/// the sums of its rows are zero to the last bit in any dtype.
-double scale_of(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
-
 /// Whether the sums of rows are zero to the last bit, as all coefficients are whole numbers.
 bool has_square_cells(const FlowBox& box) {
   for (int64_t axis = 0; axis < box.dim(); ++axis)
@@ -77,7 +73,15 @@ at::Tensor add_gradient(const FlowBox& box, const at::Tensor& u, const at::Tenso
 
 }  // namespace
 
+// With square cells the coefficients are then whole numbers, and the sums of rows are zero to the last bit in any
+// dtype.
+double scale_of_pressure(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
+
 at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double factor) {
+  if (flow_kernels::take(u)) {
+    const auto b = flow_kernels::divergence(box, {.base = u}, factor, /*for_a_solve=*/false);
+    if (b.defined()) return b;
+  }
   const auto& cells = box.fields(u.options()).cells;
   if (flow_has_loops(u)) return masked(divergence_by_loops(box, u, factor), cells);
   at::Tensor sum;
@@ -89,24 +93,63 @@ at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double facto
   return masked(sum.unsqueeze(1), cells);
 }
 
+std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ByKernels& by,
+                                                          const SolveOptions& options, CombinedInfo& info) {
+  const double factor = by.reverse ? 1.0 : -scale_of_pressure(box);
+  const auto b = flow_kernels::divergence(box, by.given, factor, /*for_a_solve=*/true);
+  if (!b.defined()) return std::nullopt;
+  const auto a = pressure_operator(box, b, options);
+  const auto found = by.reverse ? solve_vjp(a, b, {}, options, info).b : solve(a, b, options, info);
+  return flow_kernels::correct(box, by.corrected, found, by.how);
+}
+
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(u.options());
-  const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of(box))));
+  const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
   // A preconditioner may leave something in the cells of solids.
   const auto found = masked(solve(pressure_operator(box, u, options), b, options, info), fields.cells);
   const auto phi = without_means(box, found);
   return {add_gradient(box, u, phi, -1.0, fields.free), phi};
 }
 
-at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at::Tensor& of_potential,
+Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
+                  const SolveOptions& options, CombinedInfo& info) {
+  const bool by_kernels = flow_kernels::take(u);
+  if (by_kernels) {
+    const flow_kernels::Correction of{.base = u, .added = added};
+    if (const auto found = project_by_kernels(box, {of, of, {.factor = -1.0, .before = potential}}, options, info))
+      return {found->u, found->potential};
+  }
+  auto rest = joined(added);
+  if (by_kernels && rest.defined()) rest = masked(rest, box.fields(u.options()).free);
+  auto all = project(box, rest.defined() ? u + rest : u, options, info);
+  add_to(all.potential, potential);
+  return all;
+}
+
+ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_potential, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
+  if (flow_kernels::take(cotangent)) {
+    const flow_kernels::How how{scale_of_pressure(box), /*on_all_faces=*/true, /*wants_on_free_faces=*/true};
+    const ByKernels by{{.added = {cotangent}, .of_potential = of_potential, .refused = refused},
+                       {.base = cotangent, .refused = refused},
+                       how,
+                       /*reverse=*/true};
+    if (const auto found = project_by_kernels(box, by, options, info)) return {found->u, found->on_free_faces};
+    const auto cleared = [&](const at::Tensor& t) {
+      return t.defined() && refused.defined() ? t.masked_fill(per_sample(refused.ne(0), t), 0.0) : t;
+    };
+    cotangent = cleared(cotangent);
+    of_potential = cleared(of_potential);
+  }
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
   if (of_potential.defined()) phi_bar = phi_bar + masked(of_potential, fields.cells);
   phi_bar = without_least_numbers(without_means(box, phi_bar));
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
-  return add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of(box), {});
+  const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});
+  return {u_bar, masked(u_bar, fields.free)};
 }
 
 }  // namespace prdp

@@ -1,4 +1,5 @@
 #pragma once
+#include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/solves.h"
 
 namespace prdp {
@@ -13,9 +14,28 @@ struct Projected {
   at::Tensor u, potential;
 };
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info);
+/// The same of u + added, if there is any, which is zero on the faces that are not free; and φ + potential, if it is
+/// defined.
+Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
+                  const SolveOptions& options, CombinedInfo& info);
 /// The cotangent of u from that of the projected one, the same projection, and from that of φ, if it is defined: by one
-/// adjoint solve.
-at::Tensor project_vjp(const FlowBox& box, const at::Tensor& cotangent, const at::Tensor& of_potential,
+/// adjoint solve. `refused`: samples whose status is not 0 have none; undefined: there are none.
+struct ProjectVjp {
+  at::Tensor u, on_free_faces;
+};
+ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_potential, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info);
+
+/// A projection of which all but the solve are two launches; nothing where there are no kernels. `given` is projected,
+/// `corrected` what the gradient is added to. In reverse by an adjoint solve.
+struct ByKernels {
+  flow_kernels::Correction given, corrected;
+  flow_kernels::How how;
+  bool reverse = false;
+};
+std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ByKernels& by,
+                                                          const SolveOptions& options, CombinedInfo& info);
+/// The equation of the pressure is that of grad and div multiplied by this.
+double scale_of_pressure(const FlowBox& box);
 
 }  // namespace prdp

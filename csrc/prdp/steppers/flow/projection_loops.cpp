@@ -2,6 +2,7 @@
 
 #include <c10/util/irange.h>
 
+#include "prdp/kernels/flow_points.h"
 #include "prdp/steppers/flow/each_sample.h"
 
 namespace prdp {
@@ -43,7 +44,7 @@ class Rows {
 /// out += k (after - here) of one row.
 template <class T>
 void add_difference(T k, const T* here, const T* after, T* out, int64_t n) {
-  for (int64_t i = 0; i < n; ++i) out[i] += k * (after[i] - here[i]);
+  for (int64_t i = 0; i < n; ++i) out[i] += kernels::difference(k, here[i], after[i]);
 }
 
 template <class T>
@@ -61,7 +62,7 @@ void divergence(const FlowBox& box, const T* u, double factor, T* out) {
       });
     for (int64_t at = 0; at < rows.cells(); at += n) {
       add_difference(k, low + at, low + at + 1, out + at, n - 1);
-      out[at + n - 1] += k * ((rows.periodic(axis) ? low[at] : T(0)) - low[at + n - 1]);
+      out[at + n - 1] += kernels::difference(k, low[at + n - 1], rows.periodic(axis) ? low[at] : T(0));
     }
   });
 }
@@ -79,7 +80,7 @@ void add_gradient(const FlowBox& box, const T* p, double factor, T* u) {
         add_difference(k, before < 0 ? zeros.data() : p + before, p + at, of_axis + at, n);
       });
     for (int64_t at = 0; at < rows.cells(); at += n) {
-      of_axis[at] += k * (p[at] - (rows.periodic(axis) ? p[at + n - 1] : T(0)));
+      of_axis[at] += kernels::difference(k, rows.periodic(axis) ? p[at + n - 1] : T(0), p[at]);
       add_difference(k, p + at, p + at + 1, of_axis + at + 1, n - 1);
     }
   });

@@ -1,18 +1,34 @@
 #include "prdp/steppers/flow/solves.h"
 
+#include <limits>
+
+#include "prdp/steppers/flow/kernels.h"
+
 namespace prdp {
 
-void CombinedInfo::add(const SolveInfo& info) {
-  if (!info_.status.defined()) {
-    info_ = info;
-    return;
-  }
-  const auto solved = info_.solved().logical_and(info.solved());
-  info_.iterations = info_.iterations + info.iterations;
-  info_.residual = at::maximum(info_.residual, info.residual);
-  info_.status = at::minimum(info_.status, info.status);  // the least is the worst
-  info_.operator_applications = info_.operator_applications + info.operator_applications;
-  info_.floor = at::maximum(info_.floor, info.floor) * solved;
+namespace {
+
+void add_to_report(SolveInfo& all, const SolveInfo& info) {
+  const auto solved = all.solved().logical_and(info.solved());
+  all.iterations = all.iterations + info.iterations;
+  all.residual = at::maximum(all.residual, info.residual);
+  all.status = at::minimum(all.status, info.status);  // the least is the worst
+  all.operator_applications = all.operator_applications + info.operator_applications;
+  all.floor = at::maximum(all.floor, info.floor) * solved;
+}
+
+}  // namespace
+
+SolveInfo CombinedInfo::info(const at::Tensor& refused) const {
+  if (infos_.empty() || (infos_.size() == 1 && !refused.defined())) return infos_.empty() ? SolveInfo{} : infos_[0];
+  if (auto joined = flow_kernels::joined_reports(infos_, refused)) return *std::move(joined);
+  auto all = infos_[0];
+  for (size_t k = 1; k < infos_.size(); ++k) add_to_report(all, infos_[k]);
+  if (!refused.defined()) return all;
+  const auto fine = refused.eq(0);
+  all.status = at::where(fine, all.status, refused);
+  all.residual = all.residual.masked_fill(fine.logical_not(), std::numeric_limits<double>::infinity());
+  return all;
 }
 
 at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info) {

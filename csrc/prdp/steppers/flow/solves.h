@@ -7,11 +7,12 @@ namespace prdp {
 /// The reports of the solves of a time step as one: the sum of their work, the worst status, the largest residual.
 class CombinedInfo {
  public:
-  void add(const SolveInfo& info);
-  const SolveInfo& info() const { return info_; }
+  void add(const SolveInfo& info) { infos_.push_back(info); }
+  /// `refused`, (batch,): 0, or the status of a sample that was refused before; undefined: none was.
+  SolveInfo info(const at::Tensor& refused = {}) const;
 
  private:
-  SolveInfo info_;
+  std::vector<SolveInfo> infos_;
 };
 
 /// A u = b, differentiable in b and the tensors of A.

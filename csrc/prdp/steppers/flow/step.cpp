@@ -3,12 +3,13 @@
 #include <ATen/core/grad_mode.h>
 #include <torch/csrc/autograd/autograd.h>
 
-#include <limits>
+#include <optional>
 
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/balance.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/explicit_loops.h"
+#include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/limits.h"
 #include "prdp/steppers/flow/projection.h"
 #include "prdp/steppers/flow/tendency.h"
@@ -25,10 +26,38 @@ at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
 struct ExplicitPart {
   at::Tensor velocity, change;
 };
-ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& u, const at::Tensor& refused) {
-  const auto velocity = cleared(with_boundary_values(e, u), refused);
+ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused) {
+  const auto velocity = cleared(with_boundary, refused);
   const auto change = cleared(tendency(e, velocity), refused);
-  return {velocity, flow_has_loops(u) ? change.mul_(e.dt) : change * e.dt};
+  return {velocity, flow_has_loops(velocity) ? change.mul_(e.dt) : change * e.dt};
+}
+
+/// The state of a step with its boundary values, and the samples that it cannot take.
+struct Beginning {
+  at::Tensor velocity;
+  RefusedSamples refused;                           // with kernels, only where the host looks
+  std::optional<flow_kernels::Start> of_kernels{};  // by these all values of such samples are zero
+
+  at::Tensor mask() const { return of_kernels ? at::Tensor() : refused.mask; }
+  /// 0, or why a sample was refused; undefined: none was.
+  at::Tensor status() const {
+    if (of_kernels) return of_kernels->status;
+    return refused.mask.defined() ? refused.status * refused.mask : at::Tensor();
+  }
+};
+Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks) {
+  if (auto start = flow_kernels::start(e, u))
+    return {start->velocity, looks ? refused_by(start->status) : RefusedSamples{}, start};
+  const auto velocity = with_boundary_values(e, u);
+  return {velocity, find_refused(e, velocity.detach())};
+}
+
+/// The same with its change.
+ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning) {
+  if (!beginning.of_kernels) return explicit_part(e, beginning.velocity, beginning.refused.mask);
+  const auto change = flow_kernels::change(e, *beginning.of_kernels);
+  if (change.defined()) return {beginning.velocity, change};
+  return explicit_part(e, beginning.velocity, beginning.of_kernels->status.ne(0));
 }
 
 bool is_implicit(const FlowEquation& e) { return e.diffusion == FlowDiffusion::kImplicit; }
@@ -80,22 +109,15 @@ std::vector<at::Tensor> explicit_vjp_recorded(const FlowEquation& equation, cons
   for (size_t i = 0; i < given.size(); ++i)
     inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
   const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
-  const auto part = explicit_part(e, inputs[0], refused);
-  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, back.change, back.nu}, inputs, needed,
+  const auto part = explicit_part(e, with_boundary_values(e, inputs[0]), refused);
+  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, joined(back.change), back.nu}, inputs, needed,
                    /*create_graph=*/false);
 }
 
-/// The same by loops.
-std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& refused,
-                                     const at::Tensor& velocity_bar, const DiffuseVjp& back, at::IntArrayRef needed) {
-  const auto e = equation.for_state(u);
-  const auto velocity = cleared(with_boundary_values(e, u), refused);
-  auto found = tendency_vjp(e, velocity, back.change * e.dt);
-  add_to(found.nu, back.nu);
-  auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
-  add_to(of_boundary.inflow, found.inflow);
-  std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
-  all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
+/// Those that are needed, of the sizes of what they belong to; `nu` is added to that of ν.
+std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::Tensor> all, const at::Tensor& nu,
+                                 at::IntArrayRef needed) {
+  add_to(all[1], nu);
   const auto given = equation.tensors();
   for (size_t i = 0; i < all.size(); ++i) {
     if (!needed[i]) all[i] = at::Tensor();
@@ -104,50 +126,67 @@ std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Ten
   return all;
 }
 
+/// The same by loops.
+std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& refused,
+                                     const at::Tensor& velocity_bar, const DiffuseVjp& back, at::IntArrayRef needed) {
+  const auto e = equation.for_state(u);
+  const auto velocity = cleared(with_boundary_values(e, u), refused);
+  auto found = tendency_vjp(e, velocity, back.change[0] * e.dt);
+  add_to(found.nu, back.nu);
+  auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
+  add_to(of_boundary.inflow, found.inflow);
+  std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
+  all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
+  return as_given(equation, std::move(all), {}, needed);
+}
+
 }  // namespace
 
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
   const auto e = equation.for_state(u);
-  const auto refused = find_refused(e, with_boundary_values(e, u).detach());
+  const bool looks = reported && (options.on_failure == OnFailure::kRaise || options.on_failure == OnFailure::kWarn);
+  const auto beginning = begin(e, u, looks);
+  const auto& refused = beginning.refused;
   if (reported && refused.mask.defined())
     report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
-  const auto [velocity, change] = explicit_part(e, u, refused.mask);
+  const auto [velocity, change] = explicit_part(e, beginning);
   CombinedInfo info;
   const auto balanced = balance(e, change, options, info);
-  const auto diffused = is_implicit(e) ? diffuse(e, balanced.u, options, info) : change;
-  auto [next, potential] = project(*e.box, velocity + diffused, options, info);
-  add_to(potential, balanced.potential);
-  FlowStep step{cleared(next, refused.mask), cleared(potential, refused.mask), info.info()};
-  if (refused.mask.defined()) {
-    step.info.status = at::where(refused.mask, refused.status, step.info.status);
-    step.info.residual = step.info.residual.masked_fill(refused.mask, std::numeric_limits<double>::infinity());
-  }
-  return step;
+  const auto diffused = is_implicit(e) ? diffuse(e, balanced.u, options, info) : FlowParts{change};
+  const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
+  const bool none = looks && !refused.mask.defined();
+  return {cleared(next, beginning.mask()), cleared(potential, beginning.mask()),
+          info.info(none ? at::Tensor() : beginning.status())};
 }
 
 std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
   if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
   const auto e = equation.for_state(u);
-  const auto refused = find_refused(e, with_boundary_values(e, u)).mask;
-  const auto& box = *e.box;
+  const auto beginning = begin(e, u, /*looks=*/false);
+  const auto refused = beginning.mask();
   CombinedInfo adjoint;
   const auto of_potential = cleared(cotangent.potential, refused);
-  const auto velocity_bar = project_vjp(box, cleared(cotangent.u, refused), of_potential, options, adjoint);
-  const auto& free = box.fields(u.options()).free;
-  DiffuseVjp back{free.defined() ? velocity_bar * free : velocity_bar, {}};
+  const auto velocity_bar =
+      project_vjp(*e.box, cleared(cotangent.u, refused), of_potential, beginning.status(), options, adjoint);
+  DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
   if (is_implicit(e)) {
     CombinedInfo again;
-    const auto change = needed[1] ? explicit_part(e, u, refused).change : at::Tensor();
-    const auto diffused = needed[1] ? diffuse(e, balance(e, change, options, again).u, options, again) : at::Tensor();
-    back = diffuse_vjp(e, back.change, diffused, options, adjoint);
+    const auto change = needed[1] ? explicit_part(e, beginning).change : at::Tensor();
+    const auto diffused = needed[1] ? joined(diffuse(e, balance(e, change, options, again).u, options, again)) : change;
+    back = diffuse_vjp(e, back.change[0], diffused, options, adjoint);
     auto balanced = balance_vjp(e, back.change, of_potential, change, options, adjoint);
     back.change = balanced.change;
     add_to(back.nu, balanced.nu);
   }
   info = adjoint.info();
+  if (beginning.of_kernels) {
+    auto found = flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, needed);
+    if (found) return as_given(equation, *std::move(found), back.nu, needed);
+    return explicit_vjp_recorded(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
+  }
   const auto by_loops = flow_has_loops(u);
-  return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar, back, needed);
+  return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar.u, back, needed);
 }
 
 }  // namespace prdp

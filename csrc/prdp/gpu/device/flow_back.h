@@ -1,0 +1,156 @@
+#pragma once
+#include "prdp/gpu/device/flow.h"
+
+/// The reverse of the explicit part: each cotangent gathers from the points that read its value.
+namespace prdp::gpu {
+
+template <class T>
+struct FlowReverse {
+  FlowTerms<T> terms;
+  FlowField<const T> change_bar;
+
+  /// The cotangent of the tendency at a face.
+  T given(int s, int c, const FlowPlace& p) const {
+    const T g = change_bar.at(s, c, p) * static_cast<T>(terms.dt);
+    return terms.free ? g * terms.free.at(s, c, p) : g;
+  }
+  kernels::AdvectionBars<T> bars(int s, int c, int axis, const FlowPlace& p) const {
+    const auto read = terms.point(s, c, axis, p);
+    const T diffusion = terms.diffusion(axis), quarter_dx = terms.quarter_dx(axis), g = given(s, c, p);
+    return terms.upwind ? kernels::advected_back<true>(read, diffusion, quarter_dx, g)
+                        : kernels::advected_back<false>(read, diffusion, quarter_dx, g);
+  }
+
+  /// Of a value with ghosts. The place of a reader is the value's without the offset at which it reads.
+  T of_padded(int s, int c, const FlowPlace& q) const {
+    const auto& grid = terms.grid;
+    const int own = 2 - c;
+    T sum = 0;
+    const auto from = [&](int channel, int axis, const FlowPlace& reader, auto&& part) {
+      if (grid.has(reader)) sum += part(bars(s, channel, axis, reader));
+    };
+    using Bars = kernels::AdvectionBars<T>;
+    for (int a = grid.first_axis(); a < 3; ++a) {
+      const bool is_own = a == own;
+      from(c, a, q.moved(a, 1), [&](const Bars& b) { return is_own ? b.before + b.low : b.before; });
+      from(c, a, q, [&](const Bars& b) { return is_own ? b.here + (b.low + b.high) : b.here; });
+      from(c, a, q.moved(a, -1), [&](const Bars& b) { return is_own ? b.after + b.high : b.after; });
+      if (is_own) continue;
+      // c carries the component along a through edges along its own axis.
+      const auto low = [](const Bars& b) { return b.low; };
+      const auto high = [](const Bars& b) { return b.high; };
+      const int carried = 2 - a;
+      from(carried, own, q, low);
+      from(carried, own, q.moved(a, 1), low);
+      from(carried, own, q.moved(own, -1), high);
+      from(carried, own, q.moved(own, -1).moved(a, 1), high);
+    }
+    return sum;
+  }
+
+  /// Of a value, with those of the ghosts that were made of it along the axes that `fold` says.
+  T with_ghosts(int s, int c, const FlowPlace& q, const bool (&fold)[3]) const {
+    const auto& grid = terms.grid;
+    T sum = 0;
+    for (int images = 0; images < 8; ++images) {
+      T factor = 1;
+      auto image = q;
+      bool exists = true;
+      for (int a = 0; a < 3 && exists; ++a)
+        if (images >> a & 1) exists = fold[a] && a >= grid.first_axis() && reflect(a, c, image, factor);
+      if (exists && factor != T(0)) sum += factor * of_padded(s, c, image);
+    }
+    return sum;
+  }
+
+ private:
+  /// The ghost along an axis that was made of the value at a place; false if there is none.
+  bool reflect(int axis, int c, FlowPlace& p, T& factor) const {
+    const auto& grid = terms.grid;
+    const int last = grid.n[axis] - 1;
+    const bool is_first = p.at[axis] == 0, is_last = p.at[axis] == last;
+    if (!is_first && !is_last) return false;
+    const bool high = (grid.ends[axis] == kPeriodicEnds) == is_first;
+    factor *= grid.template ghost_factor<T>(axis, high, c);
+    p.at[axis] = high ? last + 1 : -1;
+    return true;
+  }
+};
+
+/// The cotangent of u from those of the velocity with its boundary values and of its change.
+template <class T>
+struct FlowStateBars {
+  FlowReverse<T> reverse;
+  FlowField<const T> velocity_bar;
+  FlowField<T> u_bar;
+
+  void operator()(int i) const {
+    const auto& grid = reverse.terms.grid;
+    const int cells = grid.cells(), field = i / cells, s = field / grid.dim, c = field % grid.dim;
+    const auto p = grid.place(i % cells);
+    const auto& free = reverse.terms.free;
+    const T sum = of_velocity(s, c, p);
+    u_bar.at(s, c, p) = free ? sum * free.at(s, c, p) : sum;
+  }
+  /// Of the velocity with its boundary values.
+  T of_velocity(int s, int c, const FlowPlace& p) const {
+    const auto& terms = reverse.terms;
+    T sum = velocity_bar.at(s, c, p) + reverse.with_ghosts(s, c, p, {true, true, true});
+    if (terms.friction) sum -= *terms.nu * (terms.friction.at(s, c, p) * reverse.given(s, c, p));
+    return sum;
+  }
+};
+
+/// The cotangents of the inflow, or of the velocity of a wall, at the faces of an end: (batch, dim, faces).
+template <class T>
+struct FlowEndBars {
+  FlowStateBars<T> state;
+  FlowField<const T> inlet;  // of an inflow
+  int axis;
+  bool high;
+  bool fold[3];  // the axes whose ghosts were made of those here
+  FlowField<T> out;
+
+  void operator()(int i) const {
+    auto faces = state.reverse.terms.grid;
+    const int last = faces.n[axis];
+    faces.n[axis] = 1;
+    const int cells = faces.cells(), field = i / cells, s = field / faces.dim, c = field % faces.dim;
+    const auto p = faces.place(i % cells);
+    T sum = 2 * state.reverse.with_ghosts(s, c, p.moved(axis, high ? last : -1), fold);
+    if (inlet) sum += inlet.at(s, c, p) * state.of_velocity(s, c, p);
+    out.at(s, c, p) = sum;
+  }
+};
+
+/// The cotangent of ν of each sample.
+template <class T>
+struct FlowViscosityBars {
+  FlowReverse<T> reverse;
+  double* out;  // (batch,)
+
+  template <class Team>
+  void operator()(int s, Team& team) const {
+    const auto& grid = reverse.terms.grid;
+    double sum = 0;
+    for (int c = 0; c < grid.dim; ++c)
+      team.each(grid.cells(), [&](int i) { return at(s, c, grid.place(i)); }, [&](int, double v) { sum += v; });
+    sum = team.sum(sum);
+    if (team.leads()) out[s] = sum;
+  }
+
+ private:
+  double at(int s, int c, const FlowPlace& p) const {
+    const auto& terms = reverse.terms;
+    const auto& grid = terms.grid;
+    double sum = 0;
+    for (int a = grid.first_axis(); a < 3; ++a)
+      sum += static_cast<double>(reverse.bars(s, c, a, p).diffusion) / (grid.dx[a] * grid.dx[a]);
+    if (terms.friction)
+      sum -= static_cast<double>(terms.friction.at(s, c, p) * reverse.given(s, c, p)) *
+             static_cast<double>(terms.point(s, c, 2 - c, p).here);
+    return sum;
+  }
+};
+
+}  // namespace prdp::gpu

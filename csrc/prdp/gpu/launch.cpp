@@ -1,0 +1,86 @@
+#include "prdp/gpu/launch.h"
+
+#include <ATen/Parallel.h>
+
+#include <algorithm>
+#include <limits>
+
+#include "prdp/gpu/device/arguments.h"
+#include "prdp/gpu/fall_back.h"
+
+namespace prdp::gpu {
+
+namespace {
+
+constexpr int64_t kWarp = 32, kThreadsOfPoints = 256;
+
+/// A kernel counts its points by an int, and adds the number of its threads to it.
+void check_count(int64_t count) {
+  if (count > std::numeric_limits<int>::max() / 2)
+    throw Unavailable("a batch of " + std::to_string(count) + " numbers is too large for a kernel");
+}
+
+std::shared_ptr<const Kernel> kernel_of(Runtime& runtime, c10::Device device, const Body& body, const std::string& loop,
+                                        const std::string& sizes, const TeamSize& team) {
+  const auto text = c10::str("#include \"prdp/gpu/device/run_each.h\"\n#include \"", body.header,
+                             "\"\nusing namespace prdp::gpu;\nusing Arguments = ", loop, "<", body.type,
+                             ">;\nextern \"C\" __global__ void __launch_bounds__(", team.threads,
+                             ") prdp_kernel(const __grid_constant__ Arguments arguments) { run", sizes, "(arguments); }\n");
+  auto kernel = runtime.kernel(device, {text, team.threads, /*block_memory=*/0, team.blocks});
+  note_made(body.type);
+  return kernel;
+}
+
+}  // namespace
+
+TeamSize team_size(int64_t points, const Limits& limits) {
+  const int64_t blocks = at::divup(points, limits.cells_of_block);
+  return {blocks, std::min(limits.threads, at::divup(at::divup(points, blocks), kWarp) * kWarp)};
+}
+
+bool launch_points(c10::Device device, const Body& body, const void* arguments, int64_t count) {
+  auto* const runtime = runtime_of(device);
+  if (!runtime) return false;
+  try {
+    check_count(count);
+    const TeamSize team{1, std::min(kThreadsOfPoints, runtime->limits(device).threads)};
+    const auto kernel = kernel_of(*runtime, device, body, "EachPoint", "", team);
+    kernel->launch(std::min(at::divup(count, team.threads), 4 * kernel->teams()), arguments);
+    return true;
+  } catch (const Unavailable& reason) {
+    fall_back(reason.what());
+    return false;
+  }
+}
+
+SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int64_t batch) {
+  auto* const runtime = runtime_of(device);
+  if (!runtime) return {};
+  try {
+    check_count(points);
+    const auto team = team_size(points, runtime->limits(device));
+    const auto sizes = c10::str("<", team.blocks, ", ", team.threads, ">");
+    SampleLoop loop{kernel_of(*runtime, device, body, "EachSample", sizes, team)};
+    loop.teams = std::min(batch, team.blocks > 1 ? loop.kernel->teams() : 4 * loop.kernel->teams());
+    if (team.blocks == 1) return loop;
+    const auto on_device = at::TensorOptions().device(device);
+    loop.arrived = at::zeros({32 * loop.teams}, on_device.dtype(at::kInt));
+    loop.parts = at::empty({2 * kMostAtOnce * team.blocks * loop.teams}, on_device.dtype(at::kDouble));
+    return loop;
+  } catch (const Unavailable& reason) {
+    fall_back(reason.what());
+    return {};
+  }
+}
+
+bool launch_samples(const SampleLoop& loop, const void* arguments) {
+  try {
+    loop.kernel->launch(loop.teams, arguments);
+    return true;
+  } catch (const Unavailable& reason) {
+    fall_back(reason.what());
+    return false;
+  }
+}
+
+}  // namespace prdp::gpu

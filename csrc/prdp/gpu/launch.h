@@ -1,0 +1,49 @@
+#pragma once
+#include <ATen/ATen.h>
+
+#include "prdp/gpu/device/each.h"
+#include "prdp/gpu/runtime.h"
+
+/// Loops over points, or over the samples of a batch, in one launch.
+namespace prdp::gpu {
+
+/// What is called in a loop: "FlowChange<float>", and the header of gpu/device that has it.
+struct Body {
+  std::string type, header;
+};
+
+/// Blocks and threads that work on a sample of so many points: of the device and the sample alone.
+struct TeamSize {
+  int64_t blocks, threads;
+};
+TeamSize team_size(int64_t points, const Limits& limits);
+
+bool launch_points(c10::Device device, const Body& body, const void* arguments, int64_t count);
+
+/// The kernel of a loop over samples, and the memory of its teams.
+struct SampleLoop {
+  std::shared_ptr<const Kernel> kernel{};  // null: there is none
+  int64_t teams = 0;
+  at::Tensor arrived{}, parts{};
+};
+SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int64_t batch);
+bool launch_samples(const SampleLoop& loop, const void* arguments);
+
+/// Each returns false, after fall_back(), where there is no kernel.
+template <class Of>
+bool each_point(c10::Device device, const Body& body, const Of& of, int64_t count) {
+  const EachPoint<Of> arguments{of, static_cast<int>(count)};
+  return launch_points(device, body, &arguments, count);
+}
+/// `points`: of a sample.
+template <class Of>
+bool each_sample(c10::Device device, const Body& body, const Of& of, int64_t points, int64_t batch) {
+  const auto loop = sample_loop(device, body, points, batch);
+  const EachSample<Of> arguments{
+      of, static_cast<int>(batch),
+      loop.arrived.defined() ? static_cast<unsigned*>(loop.arrived.mutable_data_ptr()) : nullptr,
+      loop.parts.defined() ? loop.parts.mutable_data_ptr<double>() : nullptr};
+  return loop.kernel && launch_samples(loop, &arguments);
+}
+
+}  // namespace prdp::gpu

@@ -1,0 +1,223 @@
+"""`Flow` by the kernels of a GPU, run as fibers on the CPU, beside the CPU's own loops."""
+
+import contextlib
+import os
+
+import pytest
+import torch
+from fibers import BACKWARD, SHUFFLED, Fibers
+
+import prdp_torch as prdp
+
+F32, F64 = torch.float32, torch.float64
+CELLS = 20  # of a block: two and more for a sample
+
+
+def noise(*shape, seed=0, dtype=F64):
+    return torch.randn(*shape, dtype=F64, generator=torch.Generator().manual_seed(seed)).to(dtype)
+
+
+def obstacle(shape):
+    solid = torch.zeros(shape, dtype=torch.bool)
+    solid[2, 2:4] = True
+    return solid
+
+
+PLANE, BOX = (5, 6), (3, 4, 5)
+# A wall at an end of axis 0 moves along itself.
+ALONG = {2: torch.tensor([1.0, 0.0]).view(2, 1), 3: torch.tensor([1.0, 1.0, 0.0]).view(3, 1, 1)}
+CASES = {  # shape, settings, and tensors that get a gradient beside u and nu
+    "periodic": (PLANE, {"nu": 0.02}, {}),
+    "explicit, upwind": (
+        PLANE,
+        {"nu": 0.01, "diffusion": "explicit", "advection": "upwind"},
+        {"force": noise(2, 2, *PLANE)},
+    ),
+    "cavity": (
+        PLANE,
+        {"nu": 0.05, "boundary": "wall", "advection": "upwind", "length": (1.0, 2.0)},
+        {"lid": noise(1, 2, 6) * ALONG[2]},
+    ),
+    "viscous": (PLANE, {"nu": 5.0, "boundary": ("wall", "periodic")}, {"force": torch.tensor([1.0, -0.5])}),
+    "channel": (
+        PLANE,
+        {"nu": 0.02, "boundary": ("wall", "open"), "obstacle": obstacle(PLANE)},
+        {"inflow": noise(2, 2, 5, 1), "lid": torch.tensor([0.3, 0.0])},
+    ),
+    "box": (
+        BOX,
+        {"nu": 0.02, "boundary": ("wall", "open", "periodic"), "diffusion": "explicit"},
+        {"inflow": torch.tensor([0.1, 1.0, 0.2]), "lid": noise(2, 3, 4, 5) * ALONG[3]},
+    ),
+    "implicit box": (BOX, {"nu": 0.02, "boundary": ("wall", "wall", "periodic")}, {"force": noise(1, 3, *BOX)}),
+}
+
+
+def flow(name, dtype=F64, nu=None, given=None, **options):
+    shape, settings, tensors = CASES[name]
+    given = {key: t.to(dtype) for key, t in tensors.items()} if given is None else dict(given)
+    if "lid" in given:
+        given["wall_velocity"] = {(0, "high"): given.pop("lid")}
+    settings = {**settings, **given, **options, "nu": settings["nu"] if nu is None else nu}
+    return prdp.Flow(shape, dt=0.01, solver=prdp.CG(200, rtol=1e-13 if dtype == F64 else 1e-6), **settings)
+
+
+def outcome(name, dtype=F64, steps=2, **options):
+    """States and gradients of everything."""
+    shape, settings, tensors = CASES[name]
+    leaves = [0.5 * noise(2, len(shape), *shape, seed=1, dtype=dtype), torch.tensor(settings["nu"], dtype=dtype)]
+    leaves = [t.requires_grad_() for t in (*leaves, *(t.to(dtype) for t in tensors.values()))]
+    step = flow(name, dtype, leaves[1], dict(zip(tensors, leaves[2:], strict=True)), **options)
+    states = step.rollout(leaves[0], steps)
+    weights = noise(*states.shape, seed=2, dtype=dtype)
+    return states.detach(), *torch.autograd.grad((weights * states).sum(), leaves), step.info, step.adjoint_info
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_states_and_gradients_are_those_of_the_cpu(name):
+    *expected, info, adjoint = outcome(name)
+    with Fibers(cells=CELLS):
+        *found, report, adjoint_report = outcome(name)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-10)
+    assert torch.equal(report.status, info.status) and torch.equal(adjoint_report.status, adjoint.status)
+    assert report.way == "kernel"
+
+
+def test_the_explicit_part_has_the_bits_of_the_loops():
+    """No solve, and no multiply-add: the sums are the same."""
+    step, u = flow("periodic", F32), noise(2, 2, *PLANE, dtype=F32)
+    with torch.no_grad():
+        expected = step.divergence(u)
+        with Fibers():
+            assert torch.equal(step.divergence(u), expected)
+
+
+def test_float32_and_the_pressure():
+    shape = CASES["channel"][0]
+    u = noise(2, 2, *shape, seed=1, dtype=F32)
+    expected = [t.detach() for t in flow("channel", F32).step_and_pressure(u)]
+    with Fibers():
+        found = flow("channel", F32).step_and_pressure(u)
+        with torch.no_grad():
+            projected = flow("channel", F32).project(u)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(projected, flow("channel", F32).project(u), rtol=1e-4, atol=1e-5)
+
+
+def test_gradients_are_those_of_finite_differences():
+    shape, settings, tensors = CASES["channel"]
+
+    def both(u, nu, inflow, speed):
+        lid = torch.stack([speed, torch.zeros_like(speed)])  # through the wall must stay zero
+        return torch.cat(flow("channel", F64, nu, {"inflow": inflow, "lid": lid}).step_and_pressure(u), 1)
+
+    inputs = [
+        0.5 * noise(2, 2, *shape),
+        torch.tensor(settings["nu"], dtype=F64),
+        tensors["inflow"],
+        torch.tensor(0.3, dtype=F64),
+    ]
+    with Fibers():
+        assert torch.autograd.gradcheck(both, [t.clone().requires_grad_() for t in inputs], fast_mode=True, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "cells"), [("cavity", 16384), ("box", CELLS)])
+def test_bits_depend_neither_on_the_order_of_threads_nor_on_neighbours(name, cells):
+    shape = CASES[name][0]
+    u = noise(3, len(shape), *shape, seed=3, dtype=F32).mul_(0.5).requires_grad_()
+    given = {key: t[:1] if t.dim() > 1 else t for key, t in CASES[name][2].items()}
+
+    def run(u):
+        states = flow(name, F32, given={key: t.to(F32) for key, t in given.items()}).rollout(u, 2)
+        return states.detach(), *torch.autograd.grad(states.square().sum(), u)
+
+    with Fibers(cells=cells):
+        wanted = run(u)
+        alone = run(u[1:2])
+    assert all(torch.equal(one[0], all_[1]) for one, all_ in zip(alone, wanted, strict=True))
+    for order in (BACKWARD, SHUFFLED):
+        with Fibers(cells=cells, order=order):
+            assert all(torch.equal(mine, other) for mine, other in zip(run(u), wanted, strict=True))
+
+
+@pytest.mark.parametrize("on_failure", ["return", "zero_grad", "warn", "raise"])
+def test_samples_that_no_step_can_take_fail_alone(on_failure):
+    u = 0.5 * noise(4, 2, *CASES["cavity"][0], seed=1)
+    u[1] *= 1e4
+    u[2, 0, 1, 1] = torch.nan
+
+    def run():
+        leaf = u.clone().requires_grad_()
+        step = flow("cavity", on_failure=on_failure)
+        states = step.rollout(leaf, 1)
+        return states[:, 1].detach(), *torch.autograd.grad(states[:, 1].square().sum(), leaf), step.info
+
+    said = "2 of 4 samples failed: sample 1 DIVERGED: dt .* sample 2 NONFINITE_INPUT: the velocity"
+    if on_failure == "raise":
+        with Fibers(), pytest.raises(torch.linalg.LinAlgError, match=said):
+            run()
+        return
+    with pytest.warns(UserWarning, match=said) if on_failure == "warn" else contextlib.nullcontext():
+        *expected, info = run()
+    with Fibers(), pytest.warns(UserWarning, match=said) if on_failure == "warn" else contextlib.nullcontext():
+        *found, report = run()
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-10)
+        assert (mine[1:3] == 0).all() and mine[0].abs().max() > 0
+    assert torch.equal(report.status, info.status)
+    torch.testing.assert_close(report.residual, info.residual, rtol=1e-3, atol=1e-12)
+
+
+def test_pieces_without_a_kernel_are_done_by_tensor_operations(monkeypatch):
+    """Where no compiler is found, and some kernels are kept from before."""
+    *expected, _, _ = outcome("channel")
+    monkeypatch.setenv("PATH", "")
+    with Fibers(threads=224):  # as no other test has
+        os.environ["PRDP_GPU"] = "auto"
+        with pytest.warns(UserWarning, match="no kernel on this device, so tensor operations take its place"):
+            *found, _, _ = outcome("channel")
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9)
+
+
+def solves_of_step(name):
+    """Of the pressure, of the balance, and of the diffusion."""
+    shape, settings, _ = CASES[name]
+    if settings.get("diffusion") == "explicit":
+        return 1
+    return 2 if name == "periodic" else 2 + len(shape)
+
+
+@pytest.mark.parametrize("name", ["periodic", "explicit, upwind", "cavity", "implicit box"])
+def test_a_step_is_at_most_eight_launches_beside_its_solves(name):
+    shape = CASES[name][0]
+    u = 0.5 * noise(2, len(shape), *shape, seed=1)
+    step = flow(name, on_failure="return")
+
+    def counted(run):
+        before = fibers.launches()
+        with torch.autograd.profiler.profile() as profiler:
+            found = run()
+        names = [event.name for event in profiler.function_events if event.name.startswith("aten::")]
+        computing = [n for n in names if n not in FREE]
+        return found, fibers.launches() - before - solves_of_step(name), computing
+
+    with Fibers() as fibers:
+        torch.autograd.grad(step(u.requires_grad_()).sum(), u)  # masks are made once
+        states, forward, of_torch = counted(lambda: step(u))
+        _, backward, of_torch_back = counted(lambda: torch.autograd.grad(states, u, torch.ones_like(states)))
+    assert forward <= 8 and backward <= 8, (forward, backward)
+    assert len(of_torch) <= 4 and len(of_torch_back) <= 18, (of_torch, of_torch_back)  # those of the solves among them
+
+
+# Operations that compute nothing: memory, views, and reading a number of the host.
+FREE = {
+    f"aten::{name}"
+    for name in (
+        "empty", "empty_like", "empty_strided", "view", "narrow", "slice", "select", "transpose", "expand", "detach",
+        "alias", "as_strided", "reshape", "unsqueeze", "squeeze", "to", "item", "_local_scalar_dense", "contiguous",
+        "permute", "flatten", "is_nonzero", "result_type", "resolve_conj", "resolve_neg", "lift_fresh", "unbind",
+    )
+}  # fmt: skip
