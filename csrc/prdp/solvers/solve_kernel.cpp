@@ -32,7 +32,8 @@ int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
 
 bool has_kernel(const Solver& solver) {
   const auto& row = traits(solver.method);
-  return !row.kernel.empty() && !solver.preconditioner.is_operator() && (row.counts != Counts::kCycles || solver.restart <= kLongestBasis);
+  return !row.kernel.empty() && !solver.preconditioner.is_operator() &&
+         (row.counts != Counts::kCycles || solver.restart <= kLongestBasis);
 }
 
 SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solver& solver, const at::Tensor& b,
@@ -56,11 +57,12 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
        << "using namespace prdp::gpu;\n"
-       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << blocks << ", " << threads << ", "
-       << vectors << ", " << in_block << ", " << solver.preconditioner.is_diagonal() << ", "
+       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << blocks << ", " << threads
+       << ", " << vectors << ", " << in_block << ", " << solver.preconditioner.is_diagonal() << ", "
        << divides_by_diagonal(solver) << ", " << bytes_of_arrays(solver.method, restart, number) << ", " << restart
        << ", ";
-  if (has_cycles) text << "Cycles<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
+  if (has_cycles)
+    text << "Cycles<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
   else text << "NoCycles";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
        << "using Arguments = SolveArguments<S::T>;\n"

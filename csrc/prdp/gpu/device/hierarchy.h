@@ -50,8 +50,8 @@ class HierarchyMaker {
       const double radius = radius_of(stencil);
       if (!std::isfinite(radius)) return 0;
       const kernels::Axes axes = axes_to_coarsen(stencil);
-      CoarseGrid grid{{stencil.shape[0], stencil.shape[1], stencil.shape[2]}, 0, stencil.coefficients - numbers_, {},
-                      radius};
+      CoarseGrid grid{
+          {stencil.shape[0], stencil.shape[1], stencil.shape[2]}, 0, stencil.coefficients - numbers_, {}, radius};
       Stencil next = stencil;
       for (const int axis : axes) {
         grid.axes |= 1 << axis;

@@ -36,8 +36,8 @@ class Upwind {
   double nu() const { return nu_; }
   T wind(int channel, const G& at) const { return winds_[channel * G::kPoints + at.point()]; }
 
-  /// f(c_ij, j, dy, dx) at a point of the channel whose first unknown is `first`. The winds at the lower and the upper face of
-  /// a cell: lower(axis, point), upper(axis, point), with an Along.
+  /// f(c_ij, j, dy, dx) at a point of the channel whose first unknown is `first`. The winds at the lower and the upper
+  /// face of a cell: lower(axis, point), upper(axis, point), with an Along.
   template <class Lower, class Upper, class F>
   void for_each_entry(const G& at, int first, const Lower& lower, const Upper& upper, const F& f) const {
     T centre = alpha_;
