@@ -73,8 +73,7 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
     throw Unavailable("a grid of " + std::to_string(points) + " points is too large for a kernel of multigrid");
   const auto limits = runtime.limits(b.device());
   const int64_t blocks = at::divup(points, limits.cells_of_block);
-  const int64_t threads =
-      std::min({limits.threads, kMostThreads, at::divup(at::divup(points, blocks), kWarp) * kWarp});
+  const int64_t threads = std::min({limits.threads, kMostThreads, at::divup(at::divup(points, blocks), kWarp) * kWarp});
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/hierarchy.h\"\nusing namespace prdp::gpu;\n"
        << "using S = HierarchySetting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << b.dim() - 2 << ", "

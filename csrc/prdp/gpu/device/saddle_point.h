@@ -18,26 +18,20 @@ struct SaddlePoint {
   const typename S::Cycles::template Of<S>& cycle;
   T* memory[6];
 
-  /// z = M⁻¹ r, or M⁻ᵀ r where A is a transpose.
+  /// z = M⁻¹ r. That of Aᵀ is made of Aᵀ, as on the CPU.
   PRDP_ONCE void apply(const T* r, T* z) const {
     T *const c = memory[3], *const p = memory[4] + kVelocity;
-    const T* u;
     team.meet();
     const Shared<S::kBlocks, T> given{r};
-    if (cycle.hierarchy.transposed == 0) {
-      team.for_each(kPressure, [&](int i) { c[kVelocity + i] = given[kVelocity + i]; });
-      solve_schur(c + kVelocity, p);
-      product(memory[4], true, 0, kVelocity, [&](int i, T value) { c[i] = given[i] - value; });
-      u = solve_velocity(c);
-    } else {
-      team.for_each(kVelocity, [&](int i) { c[i] = given[i]; });
-      u = solve_velocity(c);
-      product(u, false, kVelocity, kPressure, [&](int i, T value) { c[i] = given[i] - value; });
-      solve_schur(c + kVelocity, p);
-    }
+    team.for_each(kPressure, [&](int i) { c[kVelocity + i] = given[kVelocity + i]; });
+    solve_schur(c + kVelocity, p);
+    team.meet();
+    const Part pressure{{memory[4]}, /*is_pressure=*/true};
+    team.for_each(kVelocity, [&](int i) { c[i] = given[i] - product(pressure, i); });
+    const T* const u = solve_velocity(c);
     team.meet();  // each thread has other cells of the whole vector than of its parts
-    const Shared<S::kBlocks, T> velocity{u}, pressure{memory[4]};
-    team.for_each(A::kUnknowns, [&](int i) { z[i] = i < kVelocity ? velocity[i] : pressure[i]; });
+    const Shared<S::kBlocks, T> velocity{u};
+    team.for_each(A::kUnknowns, [&](int i) { z[i] = i < kVelocity ? velocity[i] : pressure.v[i]; });
   }
 
  private:
@@ -47,13 +41,6 @@ struct SaddlePoint {
     bool is_pressure;
     T operator[](int i) const { return (i >= kVelocity) == is_pressure ? v[i] : T(0); }
   };
-  /// store(i, (A v)_i) for the rows from `first` on, where v is one part of a vector.
-  template <class Store>
-  void product(const T* v, bool is_pressure, int first, int rows, const Store& store) const {
-    team.meet();
-    const Part part{{v}, is_pressure};
-    team.for_each(rows, [&](int i) { store(first + i, product(part, first + i)); });
-  }
   PRDP_ONCE T product(const Part& v, int row) const { return a.product(v, row); }
 
   void solve_schur(const T* r, T* p) const {
@@ -67,7 +54,9 @@ struct SaddlePoint {
     team.for_each(kVelocity, [&](int i) { x[i] = c[i] / a.diagonal(i); });
     constexpr int64_t sweeps_per_smoothing = 2;
     for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
-      product(x, false, 0, kVelocity, [&](int i, T value) { next[i] = x[i] + (c[i] - value) / a.diagonal(i); });
+      team.meet();
+      const Part velocity{{x}, /*is_pressure=*/false};
+      team.for_each(kVelocity, [&](int i) { next[i] = x[i] + (c[i] - product(velocity, i)) / a.diagonal(i); });
     }
     return x;
   }
