@@ -22,10 +22,11 @@ void check_count(int64_t count) {
 
 std::shared_ptr<const Kernel> kernel_of(Runtime& runtime, c10::Device device, const Body& body, const std::string& loop,
                                         const std::string& sizes, const TeamSize& team) {
-  const auto text = c10::str("#include \"prdp/gpu/device/run_each.h\"\n#include \"", body.header,
-                             "\"\nusing namespace prdp::gpu;\nusing Arguments = ", loop, "<", body.type,
-                             ">;\nextern \"C\" __global__ void __launch_bounds__(", team.threads,
-                             ") prdp_kernel(const __grid_constant__ Arguments arguments) { run", sizes, "(arguments); }\n");
+  const auto text =
+      c10::str("#include \"prdp/gpu/device/run_each.h\"\n#include \"", body.header,
+               "\"\nusing namespace prdp::gpu;\nusing Arguments = ", loop, "<", body.type,
+               ">;\nextern \"C\" __global__ void __launch_bounds__(", team.threads,
+               ") prdp_kernel(const __grid_constant__ Arguments arguments) { run", sizes, "(arguments); }\n");
   auto kernel = runtime.kernel(device, {text, team.threads, /*block_memory=*/0, team.blocks});
   note_made(body.type);
   return kernel;

@@ -4,6 +4,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
+#include "prdp/operators/upwind_products.h"
 
 namespace prdp {
 
@@ -24,6 +25,8 @@ const AdvectionDiffusion& BurgersOperator::block() const {
 }
 
 std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (auto found = burgers_products(grid_, winds_, step_.dt, lambda, u))
+    return {found->winds, found->nu.to(step_.nu.options())};
   const auto [faces, nu] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;
   for (int64_t d = grid_.dim() - 1; d >= 0; --d)  // the means, transposed

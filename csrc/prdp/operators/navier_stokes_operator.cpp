@@ -4,6 +4,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/upwind_kernels.h"
+#include "prdp/operators/upwind_products.h"
 
 namespace prdp {
 
@@ -81,6 +82,8 @@ at::Tensor NavierStokesOperator::norm() const {
 }
 
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (auto found = navier_stokes_products(grid_, winds_, lambda, u))
+    return {found->winds, found->nu.to(step_.nu.options())};
   const auto& [c1, c2] = momentum();
   const auto g1 = c1.product_rule(part(lambda, 0), part(u, 0));
   const auto g2 = c2.product_rule(part(lambda, 1), part(u, 1));
