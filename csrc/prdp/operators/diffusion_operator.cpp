@@ -211,8 +211,8 @@ void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double larges
 
 void DiffusionOperator::warn_of_drift(double shift, double rounding) const {
   constexpr double most = 1e-4;  // half a per cent in fifty steps
-  for (const auto& of_axis : sides_)
-    for (const auto side : of_axis)
+  for (const auto& [low, high] : sides_)
+    for (const auto side : {low, high})
       if (side == Side::kZero || side == Side::kRobin) return;
   const double drift = rounding / (2.0 * shift);
   if (std::isfinite(drift) && shift > 0.0 && drift > most)
