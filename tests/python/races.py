@@ -6,6 +6,7 @@ import sys
 
 os.environ.pop("LD_PRELOAD", None)
 
+import test_gpu_multigrid as multigrid
 import torch
 from fibers import Fibers
 from test_gpu_kernels import OPERATORS, right_hand_sides, solver
@@ -19,6 +20,10 @@ def main():
         few = solver(method, rtol=0.0, max_iter=2)
         with Fibers(left_out=int(sys.argv[1]), block_memory=0):
             prdp.linear_solve(a, b, solver=few, on_failure="return")
+    for name in ("ring", "navier-stokes"):
+        a, b = multigrid.OPERATORS[name][0](torch.float32), multigrid.right_hand_sides(name, torch.float32)
+        with Fibers(left_out=int(sys.argv[1]), block_memory=0):
+            prdp.linear_solve(a, b, multigrid.with_cycles(prdp.GMRES, max_iter=1, rtol=0.0), on_failure="return")
 
 
 if __name__ == "__main__":

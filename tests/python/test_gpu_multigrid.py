@@ -1,8 +1,10 @@
 """Multigrid in the kernels of a GPU, run as fibers on the CPU, beside the CPU's own loops."""
 
+import re
+
 import pytest
 import torch
-from fibers import BACKWARD, SHUFFLED, Fibers
+from fibers import BACKWARD, FORWARD, ROOT, SHUFFLED, Fibers
 from test_gpu_kernels import F32, F64, OFFSETS, agree, noise, solve
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -160,6 +162,50 @@ def test_what_has_no_coarse_grids_fails_alone():
     names = [prdp.SolveStatus(s).name for s in info.status.tolist()]
     assert names == ["CONVERGED", "ZERO_DIAGONAL", "NONFINITE_OPERATOR", "NONFINITE_INPUT", "CONVERGED"]
     torch.testing.assert_close(u, v, rtol=1e-6, atol=1e-8)
+
+
+def barriers():
+    """As in test_gpu_kernels.py, of the files of multigrid."""
+    found = []
+    for name in ("cycle", "hierarchy", "pseudo_inverse", "saddle_point"):
+        for n, line in enumerate((ROOT / f"csrc/prdp/gpu/device/{name}.h").read_text().splitlines(), 1):
+            found += [n] if "__syncthreads()" in line else [10000 + n] if re.search(r"\bmeet\(\)", line) else []
+    return found
+
+
+@pytest.fixture
+def nan_where_nothing_was_written():
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def outcomes(left_out):
+    """One after the other."""
+    cases = [
+        ("ring", prdp.GMRES, {}, FORWARD),
+        ("jumps", prdp.GMRES, {}, BACKWARD),
+        ("navier-stokes", prdp.BiCGStab, TEAMS, FORWARD),
+        ("navier-stokes", prdp.BiCGStab, TEAMS, BACKWARD),
+    ]
+    for name, method, device, order in cases:
+        a, b = OPERATORS[name][0](F32), right_hand_sides(name, F32)
+        cycles = with_cycles(method, max_iter=1, rtol=0.0)
+        try:
+            u, info = solve(a, b, cycles, {**device, "order": order, "left_out": left_out})
+        except RuntimeError:
+            yield "irregular"
+            continue
+        yield u.nan_to_num(7.0).flatten().tolist(), info.residual.nan_to_num(7.0).tolist()
+
+
+@pytest.mark.usefixtures("nan_where_nothing_was_written")
+def test_every_barrier_is_needed():
+    wanted = list(outcomes(left_out=0))
+    unnoticed = [
+        line for line in barriers() if all(mine == other for mine, other in zip(outcomes(line), wanted, strict=True))
+    ]
+    assert not unnoticed
 
 
 class Operations(TorchDispatchMode):

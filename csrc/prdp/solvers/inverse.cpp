@@ -117,8 +117,10 @@ Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, co
       return ApplyCycles::apply(v, cycles, /*transposed=*/false);
     };
   TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(),
-                              "linear_solve: this operator has a multigrid preconditioner on the ",
-                              "CPU alone, got vectors on ", b.device(), "; take GMRES without it");
+                              "linear_solve: this operator has a multigrid preconditioner on the CPU ",
+                              "and in the kernels of a GPU, got vectors on ", b.device(),
+                              " without a kernel; take "
+                              "GMRES without it");
   const bool transposed = preconditioner.spec().transposed;
   const auto cycles = TensorCycles::find_or_make(a, transposed, preconditioner.smoothing(), like);
   return [cycles, transposed](const at::Tensor& v) { return cycles->apply(v, transposed); };

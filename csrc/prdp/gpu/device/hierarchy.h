@@ -1,4 +1,5 @@
 #pragma once
+#include "prdp/gpu/device/coarse_grid.h"
 #include "prdp/gpu/device/diffusion.h"
 #include "prdp/gpu/device/pseudo_inverse.h"
 #include "prdp/gpu/device/team.h"
@@ -44,11 +45,10 @@ class HierarchyMaker {
   int64_t make_grids(A& a) {
     if (!scale_operator<T>(team_, a)) return 0;
     Stencil stencil = finest(a);
-    symmetric_ = is_symmetric(stencil);
-    if (team_.leads()) grids_.is_symmetric = symmetric_;
     for (int level = 0; level < kMostGrids; ++level) {
       const double radius = radius_of(stencil);
       if (!std::isfinite(radius)) return 0;
+      if (level == 0) symmetric_ = is_symmetric(stencil);
       const kernels::Axes axes = axes_to_coarsen(stencil);
       CoarseGrid grid{
           {stencil.shape[0], stencil.shape[1], stencil.shape[2]}, 0, stencil.coefficients - numbers_, {}, radius};
@@ -59,7 +59,10 @@ class HierarchyMaker {
         next = collapse(next, axis);
       }
       if (team_.leads()) grids_.grid[level] = grid;
-      if (axes.empty()) return invert_coarsest(stencil) ? level + 1 : 0;
+      if (axes.empty()) {
+        if (team_.leads()) grids_.is_symmetric = symmetric_;
+        return invert_coarsest(stencil) ? level + 1 : 0;
+      }
       stencil = next;
     }
     return 0;
@@ -84,12 +87,11 @@ class HierarchyMaker {
         to[Stencil::place(dz, dy, dx) * n + i] += factor * value;
       });
     });
-    team_.meet();
     made.coefficients = to;
     return made;
   }
 
-  /// To the last bit.
+  /// To the last bit. Others' coefficients are there, as a radius has been found since they were written.
   PRDP_ONCE bool is_symmetric(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
@@ -249,6 +251,7 @@ class HierarchyMaker {
     if (n > kMostOfCoarsest) return false;
     T* const inverse = take(int64_t{n} * n);
     if (team_.leads()) grids_.inverse = inverse - numbers_;
+    T largest = 0;
     if (team_.is_first_block()) {
       const auto entry = shared(a.coefficients);
       for (int i = static_cast<int>(threadIdx.x); i < n; i += S::kThreads) {
@@ -257,13 +260,10 @@ class HierarchyMaker {
           if (there >= 0) work_[i * n + there] += static_cast<double>(entry[k * n + i]);
         });
       }
-      __syncthreads();
       const double tiny = 10.0 * n * static_cast<double>(std::numeric_limits<T>::epsilon());
-      pseudo_inverse<S::kThreads>(n, work_, nullity_, tiny, inverse);
+      largest = pseudo_inverse<S::kThreads>(n, work_, nullity_, tiny, inverse);
     }
-    team_.meet();
-    const auto found = shared(inverse);
-    return std::isfinite(largest_of(team_, n * n, [&](int i) { return std::abs(found[i]); }));
+    return std::isfinite(team_.largest(largest));
   }
 
   TeamOfSample& team_;

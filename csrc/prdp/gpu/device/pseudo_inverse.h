@@ -2,67 +2,65 @@
 #include <cmath>
 #include <cstdint>
 
-#include "prdp/gpu/device/coarse_grid.h"
+#include "prdp/gpu/device/views.h"
 
 /// The inverse of a small matrix, and of a singular one the pseudo-inverse, by the threads of one block: a complete
 /// orthogonal decomposition A P = Q [T 0; 0 0] Zᵀ by Householder's reflections (Golub and Van Loan 2013, section 5.5).
 namespace prdp::gpu {
 
-/// How many parts of at least two points there are that nothing couples to each other, of n ≤ kMostOfCoarsest points.
-template <int threads>
-PRDP_ONCE int count_parts(int n, const double* a, int* labels) {
-  const int t = static_cast<int>(threadIdx.x);
-  const auto coupled = [&](int i, int j) { return a[i * n + j] != 0.0 || a[j * n + i] != 0.0; };
-  for (int i = t; i < n; i += threads) labels[i] = i;
-  for (int pass = 0; pass < n; ++pass) {  // the least number of a part spreads
-    const int* const from = labels + pass % 2 * n;
-    int* const to = labels + (1 - pass % 2) * n;
-    __syncthreads();
-    for (int i = t; i < n; i += threads) {
-      int least = from[i];
-      for (int j = 0; j < n; ++j)
-        if (coupled(i, j) && from[j] < least) least = from[j];
-      to[i] = least;
-    }
-  }
-  __syncthreads();
-  const int* const found = labels + n % 2 * n;
+/// How many parts of at least two points there are that nothing couples to each other, where bit j of of_row[i] says
+/// whether there is an entry (i, j), and bit i of of_column[j] too.
+inline int count_parts(int n, const uint64_t* of_row, const uint64_t* of_column) {
+  uint64_t seen = 0;
   int parts = 0;
-  for (int i = 0; i < n; ++i) {
-    bool is_first = false;
-    for (int j = i + 1; j < n && found[i] == i; ++j) is_first = is_first || found[j] == i;
-    parts += is_first;
+  for (int first = 0; first < n; ++first) {
+    if (seen >> first & 1) continue;
+    uint64_t part = uint64_t{1} << first, before = 0;
+    while (part != before) {
+      before = part;
+      for (int i = first; i < n; ++i)
+        if (part >> i & 1) part |= of_row[i] | of_column[i];
+    }
+    seen |= part;
+    parts += (part & (part - 1)) != 0;
   }
   return parts;
 }
 
-/// `work` begins with A (n, n), which is overwritten; the inverse goes to `out`, (n, n) too. What is below `tiny`
-/// beside the largest is left out. Of a null space of `nullity` dimensions, rounding of the coefficients may have made
-/// the matrix regular, and its inverse would be rounding all the same: so many are left out, unless the null vectors of
-/// pockets are gone on so coarse a grid.
+/// `work` begins with A (n, n), whose rows the threads have written in turn, and which is overwritten; the inverse goes
+/// to `out`, (n, n) too. What is below `tiny` beside the largest is left out. Of a null space of `nullity` dimensions,
+/// rounding of the coefficients may have made the matrix regular, and its inverse would be rounding all the same: so
+/// many are left out, unless the null vectors of pockets are gone on so coarse a grid. Returns the largest number that
+/// this thread wrote.
 template <int threads, class T>
-PRDP_ONCE void pseudo_inverse(int n, double* work, int nullity, double tiny, T* out) {
+PRDP_ONCE T pseudo_inverse(int n, double* work, int nullity, double tiny, T* out) {
   const int t = static_cast<int>(threadIdx.x);
   double *const a = work, *const x = a + n * n, *const scale = x + n * n, *const norm2 = scale + n;
   double *const head = norm2 + n, *const beta = head + n, *const z_head = beta + n, *const z_beta = z_head + n;
-  int *const order = reinterpret_cast<int*>(z_beta + n), *const labels = order + n;
-  const bool all_are_there = nullity == 0 || count_parts<threads>(n, a, labels) >= nullity;
+  auto *const of_row = reinterpret_cast<uint64_t*>(z_beta + n), *const of_column = of_row + n;
+  int* const order = reinterpret_cast<int*>(of_column + n);
   // What is tiny may only be so beside a larger diagonal: it is brought to the order of one.
   for (int i = t; i < n; i += threads) {
     const double d = std::abs(a[i * n + i]);
     scale[i] = d == 0.0 ? 1.0 : std::ldexp(1.0, -std::ilogb(d) / 2);
     order[i] = i;
+    of_row[i] = 0;
+    for (int j = 0; j < n; ++j)
+      if (a[i * n + j] != 0.0) of_row[i] |= uint64_t{1} << j;
   }
   __syncthreads();
   for (int j = t; j < n; j += threads) {
     double sum = 0;
+    of_column[j] = 0;
     for (int i = 0; i < n; ++i) {
       const double v = a[i * n + j] *= scale[i] * scale[j];
       sum += v * v;
+      if (v != 0.0) of_column[j] |= uint64_t{1} << i;
     }
     norm2[j] = sum;
   }
   __syncthreads();
+  const bool all_are_there = nullity == 0 || count_parts(n, of_row, of_column) >= nullity;
 
   // A P = Q R: each thread has columns of its own.
   int rank = 0;
@@ -75,7 +73,6 @@ PRDP_ONCE void pseudo_inverse(int n, double* work, int nullity, double tiny, T* 
     if (rank == 0) first = size;
     const bool is_null = rank >= n - nullity && (all_are_there || size < 1e-3 * first);
     if (is_null || !(size > tiny * first)) break;
-    __syncthreads();
     for (int i = t; i < n; i += threads) std::swap(a[i * n + rank], a[i * n + pivot]);
     if (t == 0) std::swap(order[rank], order[pivot]);
     __syncthreads();
@@ -123,6 +120,7 @@ PRDP_ONCE void pseudo_inverse(int n, double* work, int nullity, double tiny, T* 
   }
   __syncthreads();
   // P Z T⁻¹ Qᵀ: each thread has columns of its own.
+  T largest = 0;
   for (int j = t; j < n; j += threads) {
     for (int i = 0; i < n; ++i) x[i * n + j] = i == j ? 1.0 : 0.0;
     for (int k = 0; k < rank; ++k) {
@@ -145,8 +143,13 @@ PRDP_ONCE void pseudo_inverse(int n, double* work, int nullity, double tiny, T* 
       x[k * n + j] -= along * z_head[k];
       for (int c = rank; c < n; ++c) x[c * n + j] -= along * a[k * n + c];
     }
-    for (int i = 0; i < n; ++i) out[order[i] * n + j] = static_cast<T>(scale[order[i]] * scale[j] * x[i * n + j]);
+    for (int i = 0; i < n; ++i) {
+      const T value = static_cast<T>(scale[order[i]] * scale[j] * x[i * n + j]);
+      out[order[i] * n + j] = value;
+      largest = larger_or_nan(largest, std::abs(value));
+    }
   }
+  return largest;
 }
 
 }  // namespace prdp::gpu

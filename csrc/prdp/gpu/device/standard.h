@@ -3,6 +3,7 @@
 /// there. The methods are the same text on the CPU, where they include the library's own.
 using int64_t = long;
 using int32_t = int;
+using uint64_t = unsigned long;
 
 #define PRDP_UNROLL _Pragma("unroll")
 /// Functions that are not copied to where they are called: else a kernel takes a minute to compile.
@@ -20,6 +21,7 @@ using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
 using ::int32_t;
 using ::int64_t;
 using ::size_t;
+using ::uint64_t;
 inline bool isfinite(float x) { return ::isfinite(x); }
 inline bool isfinite(double x) { return ::isfinite(x); }
 inline bool isnan(double x) { return ::isnan(x); }
