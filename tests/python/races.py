@@ -24,6 +24,9 @@ def main():
         a, b = multigrid.OPERATORS[name][0](torch.float32), multigrid.right_hand_sides(name, torch.float32)
         with Fibers(left_out=int(sys.argv[1]), block_memory=0):
             prdp.linear_solve(a, b, multigrid.with_cycles(prdp.GMRES, max_iter=1, rtol=0.0), on_failure="return")
+    flow = prdp.Flow((5, 6), nu=0.1, dt=0.01, solver=prdp.CG(2, 0.0), on_failure="return")
+    with torch.no_grad(), Fibers(left_out=int(sys.argv[1])):
+        flow.project(torch.randn(2, 2, 5, 6))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ template <class T>
 struct FlowStart {
   FlowBoundaryValues<T> boundary;
   FlowField<const T> force;
-  const T* nu;
+  FlowNumber<T> nu;
   double dt, free_per_nu;  // of the Courant number: at least 1, or √(ν free_per_nu)
   FlowField<T> padded;
   int64_t* status;
@@ -24,7 +24,7 @@ struct FlowStart {
     team.each(grid.cells(), [&](int i) { return others_at(s, grid.place(i)); }, [&](int, T k) { keep(k, others); });
     courant = team.largest(courant);
     others = team.largest(others);
-    const double limit = std::sqrt(static_cast<double>(*nu) * free_per_nu);
+    const double limit = std::sqrt(static_cast<double>(nu.value()) * free_per_nu);
     const bool finite = std::isfinite(courant) && std::isfinite(others);
     const auto verdict = !finite                                                ? SolveStatus::kNonfiniteInput
                          : courant <= static_cast<T>(limit > 1.0 ? limit : 1.0) ? SolveStatus{}
@@ -66,7 +66,7 @@ template <class T>
 struct FlowTerms {
   FlowGrid grid;
   const T* padded;  // (batch, dim, padded cells)
-  const T* nu;
+  FlowNumber<T> nu;
   bool upwind;
   double dt;
   FlowField<const T> free, friction;
@@ -81,7 +81,9 @@ struct FlowTerms {
                        : kernels::advection_point<false>(of_c, of_w, own_step, step);
   }
   T quarter_dx(int axis) const { return static_cast<T>(0.25 / grid.dx[axis]); }
-  T diffusion(int axis) const { return static_cast<T>(static_cast<double>(*nu) / (grid.dx[axis] * grid.dx[axis])); }
+  T diffusion(int axis) const {
+    return static_cast<T>(static_cast<double>(nu.value()) / (grid.dx[axis] * grid.dx[axis]));
+  }
 };
 
 /// dt (-(u·∇)u + ν Δu + f) on the free faces, zero on all others.
@@ -103,7 +105,7 @@ struct FlowChange {
                           : kernels::advected<false>(read, terms.diffusion(a), terms.quarter_dx(a));
     }
     if (terms.friction)
-      sum -= *terms.nu * terms.friction.at(s, c, p) *
+      sum -= terms.nu.value() * terms.friction.at(s, c, p) *
              terms.padded[(static_cast<int64_t>(s) * grid.dim + c) * grid.padded_cells() + grid.padded(p)];
     if (force) sum += force.at(s, c, p);
     if (terms.free) sum *= terms.free.at(s, c, p);
@@ -115,14 +117,14 @@ struct FlowChange {
 template <class T>
 struct FlowDiffusionEntries {
   const T* patterns[3];
-  const T* nu;
+  FlowNumber<T> nu;
   double dt;
   int entries, cells;
   T* out;
 
   void operator()(int i) const {
     const int of_pattern = entries * cells, at = i % of_pattern;
-    const T scaled = patterns[i / of_pattern][at] * (*nu * static_cast<T>(dt));
+    const T scaled = patterns[i / of_pattern][at] * (nu.value() * static_cast<T>(dt));
     out[i] = at < cells ? scaled + T(1) : scaled;
   }
 };

@@ -96,7 +96,7 @@ struct FlowStateBars {
   T of_velocity(int s, int c, const FlowPlace& p) const {
     const auto& terms = reverse.terms;
     T sum = velocity_bar.at(s, c, p) + reverse.with_ghosts(s, c, p, {true, true, true});
-    if (terms.friction) sum -= *terms.nu * (terms.friction.at(s, c, p) * reverse.given(s, c, p));
+    if (terms.friction) sum -= terms.nu.value() * (terms.friction.at(s, c, p) * reverse.given(s, c, p));
     return sum;
   }
 };

@@ -79,6 +79,14 @@ struct FlowField {
   }
 };
 
+/// A number of the device; of the host, where the first is null.
+template <class T>
+struct FlowNumber {
+  const T* of_device;
+  T of_host;
+  T value() const { return of_device ? *of_device : of_host; }
+};
+
 /// A velocity, and what the boundary makes of it.
 template <class T>
 struct FlowBoundaryValues {

@@ -6,7 +6,7 @@ namespace prdp::gpu {
 
 /// The closed parts of the fluid, where a pressure has no level.
 template <class T>
-struct FlowParts {
+struct FlowClosedParts {
   const T* of;  // (count, cells), 1 in the cells of a part; null: one of all cells
   int count;
 
@@ -34,9 +34,12 @@ struct FlowParts {
 /// How much of the pressure of the explicit part is taken off: all of it up to a largest ν.
 template <class T>
 struct FlowShare {
-  const T* nu;  // null: all
+  FlowNumber<T> nu;
   double largest_nu;
-  T value() const { return nu && static_cast<double>(*nu) > largest_nu ? static_cast<T>(largest_nu) / *nu : T(1); }
+  T value() const {
+    const T here = nu.value();
+    return static_cast<double>(here) > largest_nu ? static_cast<T>(largest_nu) / here : T(1);
+  }
 };
 
 /// A velocity: base + added, of which the second counts on free faces alone. Either may be absent. Zero in samples that
@@ -61,7 +64,7 @@ template <class T>
 struct FlowDivergence {
   FlowVelocity<T> u;
   FlowField<const T> cells, of_potential;
-  FlowParts<T> parts;
+  FlowClosedParts<T> parts;
   FlowShare<T> share;
   double factor;
   bool for_a_solve;  // else the divergence as it is
@@ -102,7 +105,7 @@ template <class T>
 struct FlowCorrection {
   FlowVelocity<T> u;
   FlowField<const T> cells;
-  FlowParts<T> parts;
+  FlowClosedParts<T> parts;
   FlowShare<T> share;
   double factor;
   bool on_all_faces;

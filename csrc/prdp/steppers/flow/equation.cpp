@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/steppers/flow/kernels.h"
 
 namespace prdp {
 
@@ -124,7 +125,9 @@ void FlowEquation::check(const at::Tensor& u) const {
 
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
   auto all = tensors();
-  all[0] = nu.to(u.options());
+  // Kernels take a number of the host as it is: a copy would make the host wait.
+  const bool stays = nu.is_cpu() && flow_kernels::take(u);
+  all[0] = stays ? nu.to(u.scalar_type()) : nu.to(u.options());
   for (size_t i = 1; i < all.size(); ++i) {
     if (i > 2 && all[i].defined() && all[i].dim() > 1) all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - 3) / 2);
     all[i] = with_all_axes(all[i], u);

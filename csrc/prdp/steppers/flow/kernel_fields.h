@@ -51,12 +51,19 @@ gpu::FlowField<T> field_of(const FlowParts& parts) {
   return field;
 }
 
+/// A tensor without axes, which may be on the host: nobody waits for it. Undefined: 0.
+template <class T>
+gpu::FlowNumber<T> number_of(const at::Tensor& t) {
+  if (t.defined() && t.is_cpu()) return {nullptr, t.item<T>()};
+  return {data_of<const T>(t), T(0)};
+}
+
 template <class T>
 gpu::FlowTerms<T> terms_of(const FlowEquation& e, const at::Tensor& padded) {
   const auto& fields = e.box->fields(padded.options());
   return {.grid = grid_of(*e.box),
           .padded = data_of<const T>(padded),
-          .nu = data_of<const T>(e.nu),
+          .nu = number_of<T>(e.nu),
           .upwind = e.advection == FlowAdvection::kUpwind,
           .dt = e.dt,
           .free = field_of<const T>(fields.free),

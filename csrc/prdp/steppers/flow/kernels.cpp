@@ -23,7 +23,7 @@ gpu::FlowVelocity<T> velocity_of(const FlowBox& box, const Correction& of, const
 }
 
 template <class T>
-gpu::FlowParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
+gpu::FlowClosedParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
   const auto& parts = box.fields(like.options()).closed_parts;
   if (!parts.defined()) return {nullptr, 0};
   if (parts.numel() == 0) return {nullptr, 1};
@@ -32,7 +32,7 @@ gpu::FlowParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
 
 template <class T>
 gpu::FlowShare<T> share_of(const Correction& of) {
-  return {data_of<const T>(of.share_by_nu), of.largest_nu};
+  return {number_of<T>(of.share_by_nu), of.largest_nu};
 }
 
 const at::Tensor& velocity_like(const Correction& of) { return of.base.defined() ? of.base : of.added[0]; }
@@ -63,7 +63,7 @@ std::optional<Start> start(const FlowEquation& e, const at::Tensor& u) {
                                       .inflow = field_of<const T>(e.inflow),
                                       .walls = {}},
                          .force = field_of<const T>(e.force),
-                         .nu = data_of<const T>(e.nu),
+                         .nu = number_of<T>(e.nu),
                          .dt = e.dt,
                          .free_per_nu = grows_with_nu ? e.dt * box.sum_of_couplings() / static_cast<double>(d) : 0.0,
                          .padded = field_of<T>(found.padded),
@@ -145,7 +145,7 @@ at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like)
   const bool launched = AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_diffusion", [&] {
     using T = scalar_t;
     gpu::FlowDiffusionEntries<T> of{.patterns = {},
-                                    .nu = data_of<const T>(e.nu),
+                                    .nu = number_of<T>(e.nu),
                                     .dt = e.dt,
                                     .entries = static_cast<int>(sizes[1]),
                                     .cells = static_cast<int>(cells_of(*e.box)),
