@@ -1,0 +1,79 @@
+"""How loose may the tolerance be that follows the error, and does a start from the state pay? Pairs of trainings with
+the same seeds: forward and adjoint ratio of `ToleranceController`, with and without the start.
+
+Products and errors are the same on a busy machine, so the trainings need no idle one, and seconds are left out."""
+
+import numpy as np
+
+from benchmarks.studies.evaluation import spread
+from benchmarks.studies.trainings import saved
+from prdp_torch.experiments.charts import make_figure
+
+SHORT = {  # hours else
+    "navier_stokes": {"training.epochs": 10, "training.cosine_updates": 80},
+    "heat_3d": {"training.epochs": 4},
+}
+SEEDS = {
+    "poisson_3p": 1, "poisson_3p_sd": 1, "heat_1d": 10, "diffusion_inverse": 10, "kolmogorov": 3, "darcy_inverse": 3,
+    "darcy_emulator": 3, "burgers_2d": 3, "burgers_1d": 3, "navier_stokes": 1, "heat_2d": 3, "heat_3d": 1,
+}  # fmt: skip
+WITHOUT_START = ("kolmogorov",)  # its solves are for changes, and start from zero
+BASE, STARTS = ".1, .1, start", (".1, .1, start", ".2, .2, start")
+WAYS = ("converged", BASE, ".1, .1", ".2, .2, start", ".2, .2")
+
+
+def run(study, seeds, quick):
+    for name, most in list(SEEDS.items())[:1] if quick else SEEDS.items():
+        for seed in range(min(seeds, most)):
+            for how in WAYS:
+                if name in WITHOUT_START and how in STARTS:
+                    continue
+                study.train(name, how, seed, SHORT.get(name, {}))
+                study.rows[-1].pop("seconds", None)
+
+
+def _of(rows, name, how):
+    return [row for row in rows if row["scene"] == name and row["how"] == how]
+
+
+def _mean(rows, key):
+    return np.mean([row[key] for row in rows])
+
+
+def table(rows):
+    lines = [
+        "| scene | ratio, adjoint ratio | error | products | products / base | saved |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in dict.fromkeys(row["scene"] for row in rows):
+        converged = _of(rows, name, "converged")
+        base = _of(rows, name, BASE) or _of(rows, name, ".1, .1")
+        for how in WAYS:
+            chosen = _of(rows, name, how)
+            if chosen and len(chosen) == len(base) == len(converged):
+                title = f"{name}, {len(chosen)} seeds" if how == "converged" and len(chosen) > 1 else name
+                share = "–" if how == "converged" else saved(chosen, converged, "products")
+                products = _mean(chosen, "products")
+                lines.append(
+                    f"| {title if how == 'converged' else ''} | {how} | {spread([row['error'] for row in chosen])} "
+                    f"| {products:,.0f} | {products / _mean(base, 'products'):.2f} | {share} |"
+                )
+    return "\n".join(lines)
+
+
+def chart(rows):
+    """Error and products of each way, over those of BASE with the same seeds, one point a scene."""
+    figure, (axes,) = make_figure(panels=1)
+    for how, colour in zip(WAYS[2:], ("#222222", "#ff9f1c", "#1f77b4"), strict=True):
+        points = []
+        for name in dict.fromkeys(row["scene"] for row in rows):
+            chosen, base = _of(rows, name, how), _of(rows, name, BASE) or _of(rows, name, ".1, .1")
+            if chosen and len(chosen) == len(base):
+                points.append([_mean(chosen, key) / _mean(base, key) for key in ("products", "error")])
+        axes.scatter(*np.transpose(points), color=colour, label=how)
+    axes.axhline(1, color="#888888", lw=0.6)
+    axes.axvline(1, color="#888888", lw=0.6)
+    axes.set(xlabel="products / those of .1, .1, start", ylabel="error / that of .1, .1, start")
+    axes.grid(alpha=0.3, lw=0.4)
+    axes.legend(frameon=False)
+    return figure
