@@ -5,6 +5,7 @@
 # make tidy   install clang-tidy and run it on the C++ code, six minutes on two cores; from then on make test runs it as well
 # make fuzz   fuzz what reads from outside, a minute for each target (needs clang, as apt-get install clang has it)
 # make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
+# make records-gpu  the records of a GPU, after make cuda: it goes on where it stopped (PARTS="kolmogorov_unet heat_3d/auto": some of them; python -m benchmarks.records_gpu does ten minutes of it)
 # make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU; HEADERS=folder where the system has no headers)
 # make kernels  compile the kernels of all methods and operators for three cards, without a GPU, and print what each takes
 # make wheel   a wheel in dist/, which runs on the CPU and on CUDA alike, for the torch of requirements.txt
@@ -18,7 +19,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs kernels tidy sanitize fuzz cuda wheel bench-peers records clean
+.PHONY: demo test docs kernels tidy sanitize fuzz cuda wheel bench-peers records records-gpu clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -53,6 +54,11 @@ records: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/python -m benchmarks.records
+
+PARTS ?=
+records-gpu:
+	@[ -x $(CUDA)/python ] || { echo "prdp: records-gpu needs a GPU, and what make cuda builds there"; exit 1; }
+	@until $(CUDA)/python -m benchmarks.records_gpu $(PARTS); do [ $$? -eq 3 ] || exit 1; done
 
 # An environment of its own, which sees the packages of PYTHON, whatever its version of torch. What is there is used, so it
 # takes no network where nothing is missing: HEADERS names a folder with the headers of Eigen, toml++ and nlohmann-json.

@@ -88,6 +88,7 @@ LIST = [
     study("inference", "--trainings {made}/refinement_navier_stokes", 60),
     study("loss", "--seeds 10", 10),
     study("precision", "--seeds 1", 60),
+    study("ratios", "--seeds 10", 45),
     study("residuals", "", 1),
     study("unroll", "--seeds 2", 120),
     study("updates", "--seeds 1", 120),

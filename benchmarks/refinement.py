@@ -45,7 +45,7 @@ def rows_of(scene):
         Row("auto", "auto: with the start as well", "auto", Refinement.auto()),
         *map(_constant, OF_PARAMETERS if scene.task == "parameters" else TOLERANCES),
     ]
-    if scene.physics.direct_is_cheap or scene.task == "field":
+    if scene.physics.direct_is_cheap or scene.task == "field" or scene.physics.force is not None:
         rows.append(Row("direct", "direct solver", "direct", Refinement.exact(), 1))
     if scene.name in MULTIGRID:
         rows.append(Row("multigrid", "converged, multigrid", "tolerance", Refinement.tolerance(1e-5, 100)))
@@ -78,7 +78,7 @@ def _constant(rtol, solver=None):
     return Row(label, title, "tolerance", Refinement(label, attach))
 
 
-def scene_of(name, row):
+def scene_of(name, row, device=None):
     """The scene as the row trains it."""
     scene = scenes.load(name)
     if row.label == "none":
@@ -87,7 +87,7 @@ def scene_of(name, row):
         solver = f'[solver]\n{MULTIGRID[scene.name]}\nrtol = 1e-5\nbackward = "implicit"\n\n'
         text = re.sub(r"\[solver\]\n.*?\n\n", lambda _: solver, scene.text, flags=re.DOTALL)
         scene = _C.parse_scene(text, scene.path)
-    return scene
+    return scenes.placed(scene, device)
 
 
 def main():
@@ -97,13 +97,14 @@ def main():
     parser.add_argument("--rows", nargs="+", help="labels of the rows to train; all where none is given")
     parser.add_argument("--keep", type=Path, help="a summary whose rows are kept where they are not trained")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--device", help="where to train; default: where the scene says")
     parser.add_argument("--resume", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    scene = scenes.load(options.scene)
+    scene = scenes.placed(scenes.load(options.scene), options.device)
     folder = records.prepare_folder(options.out or Path("runs") / f"{scene.name}-refinement")
     kept = json.loads(options.keep.read_text()) if options.keep else {"rows": [], "curves": {}}
-    environment = records.environment()
+    environment = records.environment(None if scene.device.type == "cpu" else scene.device)
     asked = [row for row in rows_of(scene) if not options.rows or row.label in options.rows]
     summary = {"settings": records.settings(scene), **environment, "seeds": options.seeds, **kept}
     for row in asked:
@@ -126,7 +127,7 @@ def train(row, options, folder, environment):
     1 where other programs had the core, None where the training was there before."""
     shares = []
     for seed in range(options.seeds):
-        scene = scene_of(options.scene, row)
+        scene = scene_of(options.scene, row, options.device)
         began, cpu = time.perf_counter(), time.process_time()
         run = compare.run_one(scene, row.label, row.refinement, seed, folder, environment, options.resume)
         passed, cpu = time.perf_counter() - began, time.process_time() - cpu

@@ -7,7 +7,7 @@ import json
 import re
 from pathlib import Path
 
-from benchmarks import records
+from benchmarks import records, records_gpu
 from docs import page_tables
 
 DOCS = Path(__file__).parent
@@ -16,12 +16,16 @@ SCRIPT = "record_tables.py"
 TABLE = page_tables.places(SCRIPT)
 ATLAS = "stability/*.json"
 CHECKS = DOCS / "checks.json"
-OTHERS = {  # that are not in the list, as they need two free cores or are long tests; with their minutes
+OTHERS = {  # that are not in the list, as they need two free cores or a GPU, or are long tests; with their minutes
     "performance/calls.json": ("python -m benchmarks.calls", 1),
     "performance/processes.json": ("python -m benchmarks.processes", 10),
     "checks.json": ("python -m benchmarks.check_records", 30),
     "stability/forgeries.json": ("python tests/python/forgeries.py --count 10000", 10),
     "stability/kills.json": ("python tests/python/kills.py --kills 100", 60),
+    **{
+        f"{records_gpu.KEPT}/{part.record}.json": (f"python -m benchmarks.records_gpu {part.record}", "")
+        for part in records_gpu.PARTS
+    },
 }
 
 

@@ -5,6 +5,7 @@ Run it after new records: python -m docs.result_tables
 """
 
 import importlib
+import re
 
 from docs import baseline_tables, page_tables
 from docs.baseline_tables import SCENES
@@ -169,15 +170,34 @@ def three_parameters():
     return page_tables.markdown(head, body)
 
 
-def what_a_warning_predicts():
-    """How many rows end worse than converged ones, by how many of their seeds warn; each training counts once."""
+def _ways_of_choosing():
+    """The rows of all scenes, each training once, by scene and label."""
     found = {}
     for path in sorted((DOCS / "results").glob("*.json")):
         scene = path.stem.removeprefix("refinement_").removesuffix("_implicit")
         for row in record(path.stem)["rows"]:
             if row["kind"] not in ("converged", "direct"):
                 found.setdefault((scene, row["label"]), row)
+    return found
+
+
+def residuals_of_warnings():
+    """What the first seed to warn said of its solves, over the limit's e / (1 + e), smallest first."""
     body = []
+    for (scene, _), row in _ways_of_choosing().items():
+        said = re.search(r"residual of (\S+) .* error of (\S+):", row["warning"] or "")
+        if said and not scene.startswith("poisson"):
+            residual, error_of_state = map(float, said.groups())
+            share = residual / (error_of_state / (1 + error_of_state))
+            ends = "as converged" if row["as_good"] else "fails"
+            body.append([f"{share:.2f}", scene, row["title"], said[1], said[2], f"{_which_warn(row)} warn", ends])
+    head = ["residual over e / (1 + e)", "scene", "", "residual", "e", "seeds", "ends"]
+    return page_tables.markdown(head, sorted(body, key=lambda cells: float(cells[0])))
+
+
+def what_a_warning_predicts():
+    """How many rows end worse than converged ones, by how many of their seeds warn; each training counts once."""
+    found, body = _ways_of_choosing(), []
     for what, of_poisson in (("networks and fields", False), ("parameters of Poisson", True)):
         of_these = [row for (scene, _), row in found.items() if scene.startswith("poisson") == of_poisson]
         for which in ("all", "some", "none"):
@@ -196,6 +216,7 @@ def _which_warn(row):
 
 
 TABLES = {
+    "the residuals of warnings": residuals_of_warnings,
     "what a warning predicts": what_a_warning_predicts,
     "the parts of auto": parts_of_auto,
     "the shares of auto": shares_of_auto,

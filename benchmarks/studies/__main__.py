@@ -7,7 +7,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-STUDIES = ("data", "inference", "loss", "precision", "residuals", "unroll", "updates", "widths")
+STUDIES = ("data", "inference", "loss", "precision", "ratios", "residuals", "unroll", "updates", "widths")
 
 
 def main():

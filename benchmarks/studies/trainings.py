@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from benchmarks.studies import evaluation
-from prdp_torch import PRDPController
+from prdp_torch import PRDPController, ToleranceController
 from prdp_torch.experiments import records, scenes
 from prdp_torch.experiments.networks import make_network
-from prdp_torch.experiments.refinement import Refinement
+from prdp_torch.experiments.refinement import Refinement, start_from_states
 from prdp_torch.experiments.training import train
 
 
@@ -58,12 +58,27 @@ class PRDPOnLoss(Refinement):
         return [lambda interval: self._controller.hear(interval)]
 
 
+def _following(ratio, adjoint_ratio, start):
+    """A tolerance that follows the error, with these settings whatever those of auto are."""
+
+    def attach(steppers):
+        if start:
+            start_from_states(steppers)
+        return ToleranceController(steppers, ratio=ratio, adjoint_ratio=adjoint_ratio)
+
+    return lambda scene: Refinement("following", attach, watches_error=True)
+
+
 REFINEMENTS = {
     "converged": lambda scene: Refinement.constant(scene.max_iter),
     "prdp": Refinement.prdp,
     "prdp_loss": PRDPOnLoss,
     "auto": lambda scene: Refinement.auto(),
     "direct": lambda scene: Refinement.exact(),
+    ".1, .1, start": _following(0.1, 0.1, start=True),
+    ".1, .1": _following(0.1, 0.1, start=False),
+    ".2, .2, start": _following(0.2, 0.2, start=True),
+    ".2, .2": _following(0.2, 0.2, start=False),
 }
 
 
@@ -79,7 +94,14 @@ class Study:
     def train(self, name, how, seed, changes, keep=()):
         """The row of one training; `keep` names curves of the trainer that the row holds as well."""
         scene = variant(name, changes)
-        label = "_".join([name, how, *(f"{key.split('.')[1]}{value}" for key, value in changes.items()), f"seed{seed}"])
+        label = "_".join(
+            [
+                name,
+                re.sub(r"\W+", "_", how),
+                *(f"{key.split('.')[1]}{value}" for key, value in changes.items()),
+                f"seed{seed}",
+            ]
+        )
         path = self.folder / f"{label}.json"
         row = records.read(path)
         if row is None or row["text"] != scene.text:

@@ -115,6 +115,9 @@ class Network:
     def hidden(self) -> list[int]:
         ...
     @property
+    def levels(self) -> int:
+        ...
+    @property
     def kind(self) -> str:
         ...
     @property

@@ -1,12 +1,12 @@
-"""The scenes' networks. `MLP` and `ResNet` are twins of those in C++: same names, order and initialisation."""
+"""The scenes' networks. `MLP`, `ResNet` and `UNet` are twins of those in C++: same names, order and initialisation."""
 
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from prdp_torch.experiments import _C, own_networks
 
@@ -32,6 +32,16 @@ class MLP(torch.nn.Module):
         return x.view(u.shape)
 
 
+def _convolution(
+    who: str, dim: int, before: int, after: int, kernel: int, periodic: bool = False
+) -> torch.nn.Conv1d | torch.nn.Conv2d | torch.nn.Conv3d:
+    """A convolution that keeps the extents of its input."""
+    if dim not in (1, 2, 3):
+        raise ValueError(f"{who}: dim must be 1, 2 or 3, got {dim}")
+    kind = (torch.nn.Conv1d, torch.nn.Conv2d, torch.nn.Conv3d)[dim - 1]
+    return kind(before, after, kernel, padding=kernel // 2, padding_mode="circular" if periodic else "zeros")
+
+
 class ResNet(torch.nn.Module):
     """A residual convolution network without normalisation. It maps a field (batch, channels, *shape) on any grid to
     one of the same shape.
@@ -51,18 +61,13 @@ class ResNet(torch.nn.Module):
 
     def __init__(self, dim: int, channels: int, blocks: int, width: int, periodic: bool) -> None:
         super().__init__()
-        if dim not in (1, 2, 3):
-            raise ValueError(f"ResNet: dim must be 1, 2 or 3, got {dim}")
-        conv = (torch.nn.Conv1d, torch.nn.Conv2d, torch.nn.Conv3d)[dim - 1]
-        three_wide: dict[str, Any] = {
-            "kernel_size": 3,
-            "padding": 1,
-            "padding_mode": "circular" if periodic else "zeros",
-        }
+
+        def conv(before: int, after: int, kernel: int) -> torch.nn.Module:
+            return _convolution("ResNet", dim, before, after, kernel, periodic and kernel > 1)
+
         self.lift = conv(channels, width, 1)
         self.blocks = torch.nn.ModuleList(
-            torch.nn.Sequential(conv(width, width, **three_wide), torch.nn.ReLU(), conv(width, width, **three_wide))
-            for _ in range(blocks)
+            torch.nn.Sequential(conv(width, width, 3), torch.nn.ReLU(), conv(width, width, 3)) for _ in range(blocks)
         )
         self.project = conv(width, channels, 1)
 
@@ -74,10 +79,59 @@ class ResNet(torch.nn.Module):
         return projected
 
 
+class UNet(torch.nn.Module):
+    """A U-net without normalisation. It maps a field (batch, channels, *shape) to one of the same shape; ValueError
+    unless 2^levels divides each extent.
+
+    A block is two convolutions with kernels of width three, a ReLU after each. On the way down there is a block on each
+    of levels + 1 grids, each half as fine as the one before by means of 2^dim cells, with width, 2 width, 4 width, …
+    channels. On the way up, each value is repeated into 2^dim cells, the output of the block of this grid on the way
+    down is added as further channels, and a block follows. A pointwise convolution ends it.
+
+    Args:
+        dim: number of axes in shape: 1, 2 or 3, else ValueError.
+        channels: of the field.
+        levels: how often the grid is halved.
+        width: channels of the blocks on the finest grid.
+        periodic: whether the convolutions continue at the other end of the grid; otherwise they see zeros.
+
+    Source: Ronneberger et al. 2015.
+    """
+
+    def __init__(self, dim: int, channels: int, levels: int, width: int, periodic: bool) -> None:
+        super().__init__()
+
+        def block(before: int, after: int) -> torch.nn.Sequential:
+            first, second = (_convolution("UNet", dim, n, after, 3, periodic) for n in (before, after))
+            return torch.nn.Sequential(first, torch.nn.ReLU(), second, torch.nn.ReLU())
+
+        widths = [width * 2**level for level in range(levels + 1)]
+        self.down = torch.nn.ModuleList(block(*pair) for pair in pairwise([channels, *widths]))
+        self.up = torch.nn.ModuleList(block(fine + coarse, fine) for fine, coarse in reversed(list(pairwise(widths))))
+        self.project = _convolution("UNet", dim, width, channels, 1)
+        self._pool = (functional.avg_pool1d, functional.avg_pool2d, functional.avg_pool3d)[dim - 1]
+
+    def forward(self, u: Tensor) -> Tensor:
+        if any(extent % 2 ** len(self.up) for extent in u.shape[2:]):
+            raise ValueError(f"UNet: expected extents that 2^{len(self.up)} divides, got {list(u.shape[2:])}")
+        passed = []
+        x: Tensor = self.down[0](u)
+        for block in self.down[1:]:
+            passed.append(x)
+            x = block(self._pool(x, 2))
+        for block in self.up:
+            x = block(torch.cat([functional.interpolate(x, scale_factor=2.0), passed.pop()], 1))
+        projected: Tensor = self.project(x)
+        return projected
+
+
 _KINDS: dict[str, Callable[[_C.Physics, _C.Network], torch.nn.Module]] = {
     "mlp": lambda physics, network: MLP(physics.channels * math.prod(physics.shape), network.hidden),
     "resnet": lambda physics, network: ResNet(
         len(physics.shape), physics.channels, network.blocks, network.width, physics.periodic
+    ),
+    "unet": lambda physics, network: UNet(
+        len(physics.shape), physics.channels, network.levels, network.width, physics.periodic
     ),
 }
 

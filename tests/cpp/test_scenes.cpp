@@ -11,6 +11,7 @@
 #include "prdp_experiments/data/data.h"
 #include "prdp_experiments/data/flow_data.h"
 #include "prdp_experiments/networks/resnet.h"
+#include "prdp_experiments/networks/unet.h"
 #include "prdp_experiments/scenes/scene.h"
 #include "prdp_experiments/training/loss.h"
 
@@ -219,6 +220,19 @@ TEST(ResNet, HasTheParametersOfItsPythonTwin) {
   EXPECT_EQ(parameters[27].key(), "project.bias");
   EXPECT_EQ(parameters["blocks.5.0.weight"].sizes(), (std::vector<int64_t>{32, 32, 3}));
   EXPECT_THROW(prdp::ResNet(4, 1, 1, 1, true), c10::ValueError);
+}
+
+TEST(UNet, HasTheParametersOfItsPythonTwin) {
+  prdp::UNet network(2, 3, 2, 4, true);
+  const auto parameters = network->named_parameters();
+  EXPECT_EQ(parameters.size(), (3u + 2u) * 4u + 2u);
+  EXPECT_EQ(parameters[0].key(), "down.0.0.weight");
+  EXPECT_EQ(parameters[12].key(), "up.0.0.weight");
+  EXPECT_EQ(parameters["up.0.0.weight"].sizes(), (std::vector<int64_t>{8, 16 + 8, 3, 3}));
+  EXPECT_EQ(parameters["up.1.0.weight"].sizes(), (std::vector<int64_t>{4, 8 + 4, 3, 3}));
+  EXPECT_EQ(parameters[21].key(), "project.bias");
+  EXPECT_THROW(prdp::UNet(4, 1, 1, 1, true), c10::ValueError);
+  EXPECT_THROW(network(at::zeros({1, 3, 8, 6})), c10::ValueError);
 }
 
 TEST(Loss, NormalisedErrorIsPerSample) {

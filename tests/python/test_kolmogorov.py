@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import assert_refused, written
+from stand_in_device import DEVICE, StandIn
 from test_corrector import cache  # noqa: F401, a fixture of every test here
 from test_trajectories import random_flow
 
@@ -29,6 +30,19 @@ SMALL = (
     ("batch = 8", "batch = 4"),
     ("epochs = 50", "epochs = 3"),
     ("rtol = 1e-5", "rtol = 1e-4"),  # on so small a grid float32 reaches no more
+)
+UNET = (  # of the scene kolmogorov_unet
+    ("shape = [128, 128]", "shape = [8, 12]"),
+    ("reference_shape = [512, 512]", "reference_shape = [24, 36]"),
+    ("spin_up = 60", "spin_up = 2"),
+    ("train = 64", "train = 6"),
+    ("valid = 8", "valid = 2"),
+    ("valid_steps = 20", "valid_steps = 3"),
+    ("levels = 3", "levels = 2"),
+    ("width = 32", "width = 4"),
+    ("batch = 8", "batch = 3"),
+    ("epochs = 100", "epochs = 2"),
+    ("rtol = 1e-5", "rtol = 1e-4"),
 )
 ZERO_GRAD = ("rtol = 1e-4", 'rtol = 1e-4\non_failure = "zero_grad"')
 DOUBLE = ('"float32"', '"float64"')
@@ -118,6 +132,39 @@ def test_both_languages_train_alike(tmp_path, arguments, refine, changes):
     np.testing.assert_allclose(cpp["rtol"], python["rtol"], rtol=1e-3)
     assert cpp["max_iter"] == python["max_iter"] and cpp["budget"] == python["budget"]
     np.testing.assert_allclose(cpp["operator_applications"], python["operator_applications"], rtol=2e-2)
+
+
+@pytest.mark.parametrize("flag, refine", [("--prdp", Refinement.prdp), ("--auto", lambda _: Refinement.auto())])
+def test_both_languages_train_a_unet_through_eight_steps_alike(tmp_path, flag, refine):
+    path = written(tmp_path, *UNET, scene="kolmogorov_unet", name="small")
+    subprocess.run([TRAINER, path, "--out", tmp_path / "cpp", flag], check=True, capture_output=True)
+    cpp = json.loads(next((tmp_path / "cpp").glob("*/seed_0.json")).read_text())["curves"]
+    scene = scenes.load(path)
+    assert scene.executions == 8 and scene.network.kind == "unet"
+    python = train(scene, refine(scene))
+    assert len(set(python["update_loss"])) == 4
+    for name in ("update_loss", "metric", "rtol"):
+        np.testing.assert_allclose(cpp[name], python[name], rtol=1e-4)
+    assert cpp["max_iter"] == python["max_iter"] and cpp["budget"] == python["budget"]
+    weights = prdp.load_trained(tmp_path / "cpp").network.state_dict()
+    assert weights.keys() == make_network(scene, 0).state_dict().keys()
+
+
+def test_data_are_made_on_the_device_and_kept_beside_those_of_the_cpu(tmp_path):
+    scene = scenes.load(small(tmp_path, DOUBLE))
+    expected = _C.make_dataset(scene)
+    there = scenes.load(small(tmp_path, DOUBLE))
+    with StandIn() as device:
+        found = _C.make_dataset(scenes.placed(there, DEVICE))
+        states = [device.fetch(x) for x in (found.train_start, found.train_between, found.train_end, found.valid_end)]
+    assert device.launched() > 100
+    for mine, other in zip(
+        states, (expected.train_start, expected.train_between, expected.train_end, expected.valid_end), strict=True
+    ):
+        torch.testing.assert_close(mine, other, rtol=0, atol=1e-5)
+        assert not torch.equal(mine, other)  # by FFT there, by CG here
+    again = _C.make_dataset(scene)
+    assert torch.equal(again.valid_end, expected.valid_end)
 
 
 def test_pictures_show_the_vorticity(tmp_path):

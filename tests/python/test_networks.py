@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from prdp_torch.experiments import scenes
-from prdp_torch.experiments.networks import MLP, ResNet, make_network
+from prdp_torch.experiments.networks import MLP, ResNet, UNet, make_network
 
 SHAPES = [(13,), (7, 9), (5, 6, 7)]
 
@@ -13,6 +13,28 @@ SHAPES = [(13,), (7, 9), (5, 6, 7)]
 def resnet(shape, periodic, channels=1, blocks=2, width=4):
     torch.manual_seed(0)
     return ResNet(len(shape), channels, blocks, width, periodic).double()
+
+
+def unet(shape, periodic, channels=1, levels=2, width=3):
+    torch.manual_seed(0)
+    return UNet(len(shape), channels, levels, width, periodic).double()
+
+
+def described(network, periodic):
+    """The convolutions of a network in numpy, by name: every tap of a kernel is a shift of the padded field."""
+    weights = {name: p.detach().numpy() for name, p in network.named_parameters()}
+
+    def conv(x, name):
+        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        shape, reach = x.shape[1:], weight.shape[2] // 2
+        padded = np.pad(x, [(0, 0)] + [(reach, reach)] * len(shape), mode="wrap" if periodic else "constant")
+        out = np.zeros((len(weight), *shape))
+        for tap in np.ndindex(*weight.shape[2:]):
+            window = padded[(slice(None), *(slice(k, k + n) for k, n in zip(tap, shape, strict=True)))]
+            out += np.tensordot(weight[(slice(None), slice(None), *tap)], window, axes=1)
+        return out + bias.reshape(-1, *[1] * len(shape))
+
+    return conv, list(weights)
 
 
 def test_the_perceptron_keeps_the_shape_and_has_the_papers_size():
@@ -61,23 +83,11 @@ def test_what_happens_at_one_end_is_seen_at_the_other_where_it_is_periodic(shape
 @pytest.mark.parametrize("shape", [(11,), (5, 6), (4, 5, 3)])
 @pytest.mark.parametrize("periodic", [True, False])
 def test_a_resnet_is_what_its_description_says(shape, periodic):
-    """Against numpy, with the weights read by name: every tap of a kernel is a shift of the padded field."""
     network = resnet(shape, periodic, channels=2, blocks=2, width=3)
-    weights = {name: p.detach().numpy() for name, p in network.named_parameters()}
-    assert list(weights)[:6] == [
+    conv, names = described(network, periodic)
+    assert names[:6] == [
         "lift.weight", "lift.bias", "blocks.0.0.weight", "blocks.0.0.bias", "blocks.0.2.weight", "blocks.0.2.bias",
     ]  # fmt: skip
-
-    def conv(x, name):
-        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
-        reach = weight.shape[2] // 2
-        padded = np.pad(x, [(0, 0)] + [(reach, reach)] * len(shape), mode="wrap" if periodic else "constant")
-        out = np.zeros((len(weight), *shape))
-        for tap in np.ndindex(*weight.shape[2:]):
-            window = padded[(slice(None), *(slice(k, k + n) for k, n in zip(tap, shape, strict=True)))]
-            out += np.tensordot(weight[(slice(None), slice(None), *tap)], window, axes=1)
-        return out + bias.reshape(-1, *[1] * len(shape))
-
     u = np.random.default_rng(0).standard_normal((2, *shape))
     x = conv(u, "lift")
     for i in range(2):
@@ -94,9 +104,54 @@ def test_a_resnet_has_as_many_parameters_as_its_kernels_say(dim, channels, block
     assert sum(p.numel() for p in ResNet(dim, channels, blocks, width, True).parameters()) == expected
 
 
-def test_a_resnet_has_at_most_three_axes():
-    with pytest.raises(ValueError, match="ResNet: dim must be 1, 2 or 3, got 4"):
-        ResNet(4, 1, 1, 8, True)
+@pytest.mark.parametrize("kind", [ResNet, UNet])
+def test_a_network_has_at_most_three_axes(kind):
+    with pytest.raises(ValueError, match=f"{kind.__name__}: dim must be 1, 2 or 3, got 4"):
+        kind(4, 1, 1, 8, True)
+
+
+@pytest.mark.parametrize("shape", [(12,), (8, 4), (4, 8, 4)])
+@pytest.mark.parametrize("periodic", [True, False])
+def test_a_unet_is_what_its_description_says(shape, periodic):
+    network = unet(shape, periodic, channels=2)
+    conv, names = described(network, periodic)
+    blocks = [f"{way}.{i}.{j}" for way, count in (("down", 3), ("up", 2)) for i in range(count) for j in (0, 2)]
+    assert names == [f"{layer}.{kind}" for layer in (*blocks, "project") for kind in ("weight", "bias")]
+
+    def block(x, name):
+        return np.maximum(conv(np.maximum(conv(x, f"{name}.0"), 0), f"{name}.2"), 0)
+
+    def halved(x):
+        for axis in range(1, x.ndim):
+            pairs = x.reshape(*x.shape[:axis], -1, 2, *x.shape[axis + 1 :])
+            x = pairs.mean(axis + 1)
+        return x
+
+    def doubled(x):
+        for axis in range(1, x.ndim):
+            x = x.repeat(2, axis)
+        return x
+
+    u = np.random.default_rng(0).standard_normal((2, *shape))
+    fine = block(u, "down.0")
+    middle = block(halved(fine), "down.1")
+    coarse = block(halved(middle), "down.2")
+    middle = block(np.concatenate([doubled(coarse), middle]), "up.0")
+    fine = block(np.concatenate([doubled(middle), fine]), "up.1")
+    np.testing.assert_allclose(network(torch.from_numpy(u)[None])[0].detach(), conv(fine, "project"), rtol=1e-12)
+
+
+def test_a_shift_by_coarse_cells_commutes_with_a_periodic_unet_alone():
+    u = torch.randn(2, 1, 16, 12, dtype=torch.float64)
+    periodic, zeros = unet((16, 12), True), unet((16, 12), False)
+    for axis in (2, 3):
+        torch.testing.assert_close(periodic(u.roll(4, axis)), periodic(u).roll(4, axis), rtol=1e-10, atol=1e-12)
+        assert not torch.allclose(zeros(u.roll(4, axis)), zeros(u).roll(4, axis), atol=1e-3)
+
+
+def test_a_unet_refuses_a_grid_that_it_cannot_halve():
+    with pytest.raises(ValueError, match=r"UNet: expected extents that 2\^2 divides, got \[8, 6\]"):
+        unet((8, 8), True)(torch.zeros(1, 1, 8, 6, dtype=torch.float64))
 
 
 def test_the_scenes_networks_see_beyond_the_grid_what_the_equation_sees():

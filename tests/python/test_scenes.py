@@ -73,7 +73,7 @@ def test_the_projects_scenes_hold_the_papers_settings():
         ("valid_steps = 2", "valid_steps = 0", "valid_steps", "data.valid_steps: must be >= 1, got 0"),
         ("valid_steps = 2", "", "[data]", "data.valid_steps: missing; the table holds: modes, seed, train, valid"),
         ('"heat"', '"wave"', "equation =", "physics.equation: unknown name 'wave'; allowed: poisson, heat, burgers"),
-        ('kind = "mlp"', 'kind = "cnn"', "kind", "network.kind: unknown name 'cnn'; allowed: mlp, resnet"),
+        ('kind = "mlp"', 'kind = "cnn"', "kind", "network.kind: unknown name 'cnn'; allowed: mlp, resnet, unet"),
         ("hidden", "blocks = 6\nhidden", "blocks", "network.blocks: only for `resnet`"),
         ("hidden", "zero_output = 1\nhidden", "zero_output", "network.zero_output: expected true or false"),
         ("rtol = 1e-5", "rtol = 1e-5\nrestart = 2", "restart", "solver.restart: only for `gmres`"),
@@ -116,6 +116,21 @@ def test_chebyshev_is_for_scenes_of_known_spectrum(tmp_path):
 )  # fmt: skip
 def test_mistakes_of_gmres_and_the_resnet_are_named_too(tmp_path, before, after, where, message):
     assert_refused(written(tmp_path, (before, after), scene="burgers_1d"), where, message)
+
+
+@pytest.mark.parametrize(
+    "before, after, where, message",
+    [
+        ("levels = 3", "", "[network]", "network.levels: missing; the table holds: kind, width, zero_output"),
+        ("levels = 3", "levels = 11", "levels", "network.levels: expected at most 10 levels"),
+        ("levels = 3", "levels = 8", "levels", "network.levels: expected 2^levels to divide each N of physics.shape"),
+        ("width = 32", "width = 200000", "width", "network.width: expected at most 1000000 channels in a block"),
+        ("levels = 3", "levels = 3\nblocks = 2", "blocks = 2", "network.blocks: only for `resnet`"),
+        ('"unet"', '"resnet"\nblocks = 2', "levels", "network.levels: only for `unet`"),
+    ],
+)  # fmt: skip
+def test_mistakes_of_the_unet_are_named_too(tmp_path, before, after, where, message):
+    assert_refused(written(tmp_path, (before, after), scene="kolmogorov_unet"), where, message)
 
 
 def test_missing_files_and_unknown_scenes():

@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import small_darcy, small_field, tiny, written
 from stand_in_device import DEVICE, StandIn
+from test_kolmogorov import UNET
 from trainings import frequent_checkpoints, without_seconds  # noqa: F401  # the fixture
 from typer.testing import CliRunner
 
@@ -33,12 +34,18 @@ KOLMOGOROV = (
     ("batch = 8", "batch = 4"),
     ("rtol = 1e-5", "rtol = 1e-4"),
 )
+FEWER_STEPS = (
+    ("train = 6", "train = 3"),
+    ("trained_steps = 8", "trained_steps = 2"),
+    ("valid_steps = 3", "valid_steps = 2"),
+)
 PATHS = {
     "emulator": written,
     "fresh emulator": lambda folder: written(folder, ("valid = 5", "valid = 5\nfresh = true")),
     "parameters": lambda folder: written(folder, scene="poisson_1p"),
     "corrector": tiny,
     "kolmogorov": lambda folder: written(folder, *KOLMOGOROV, scene="kolmogorov"),
+    "unet": lambda folder: written(folder, *UNET, *FEWER_STEPS, scene="kolmogorov_unet"),
     "field": small_field,
     "darcy": small_darcy,
 }
@@ -66,7 +73,7 @@ def expect_same(curves, others, rel=1e-4):
 @pytest.mark.parametrize("refine", [lambda scene: Refinement.auto(), Refinement.prdp], ids=["auto", "prdp"])
 @pytest.mark.parametrize("case", PATHS)
 def test_a_scene_trains_on_a_device_as_on_the_cpu(case, refine, tmp_path):
-    scene = scene_of(case, tmp_path, intervals=1 if case in ("corrector", "kolmogorov") else 2)
+    scene = scene_of(case, tmp_path, intervals=1 if case in ("corrector", "kolmogorov", "unet") else 2)
     intervals = []
     curves, device = on_device(scene, refine(scene), callbacks=[intervals.append])
     assert device.launched() > 1000  # of torch: the work was there

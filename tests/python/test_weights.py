@@ -34,10 +34,13 @@ def prdp_train(*arguments):
 
 
 def scene_of(kind, tmp_path):
+    if kind == "unet":
+        unet = ('kind = "mlp"\nhidden = [64, 64, 64]', 'kind = "unet"\nlevels = 1\nwidth = 4')
+        return written(tmp_path, unet, scene="heat_1d")
     return written(tmp_path) if kind == "mlp" else tiny(tmp_path)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "resnet"])
+@pytest.mark.parametrize("kind", ["mlp", "resnet", "unet"])
 def test_weights_pass_from_cpp_to_python_and_back(tmp_path, kind):
     path = scene_of(kind, tmp_path)
     scene = scenes.load(path)

@@ -40,6 +40,7 @@ void bind_scenes(py::module_& m) {
       .def_readonly("kind", &Scene::Network::kind)
       .def_readonly("hidden", &Scene::Network::hidden)
       .def_readonly("blocks", &Scene::Network::blocks)
+      .def_readonly("levels", &Scene::Network::levels)
       .def_readonly("width", &Scene::Network::width)
       .def_readonly("zero_output", &Scene::Network::zero_output);
   py::class_<Scene::Training>(m, "Training")

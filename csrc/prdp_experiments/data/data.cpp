@@ -17,6 +17,8 @@ at::Tensor shuffled(int64_t samples, at::Generator& generator) {
   return at::randperm(samples, generator, at::TensorOptions().dtype(at::kLong));
 }
 
+at::Device device_of_data(const Scene& scene) { return scene.physics.is_kolmogorov() ? scene.device : at::kCPU; }
+
 namespace {
 
 /// The unknowns' places on an axis, as parts of its length: i/N where it is periodic, (i + 1/2)/N in the centres of

@@ -23,6 +23,10 @@ at::Tensor converged_step(Step& reference, const at::Tensor& u) {
   return next;
 }
 
+/// Where the data of a scene are made: on the CPU; but those of "kolmogorov", whose reference flow is large, on its
+/// device, where they are the same to the tolerance of their solves.
+at::Device device_of_data(const Scene& scene);
+
 /// Called while data are made, with the number of steps done and of all steps. Steps are counted per sample.
 using OnProgress = std::function<void(int64_t, int64_t)>;
 
@@ -33,13 +37,12 @@ struct Dataset {
   at::Tensor train_start, train_end, valid_start, valid_end;
   at::Tensor train_between;  // (samples, trained_steps - 1, channels, *shape); only for the task "corrector"
 };
-/// Makes the samples of a scene, on the CPU, and moves them to its device: they are the same on every device. Flows in
-/// two dimensions take seconds to minutes, because their reference solves are iterative. Their data are kept on disk
-/// (data_cache.h).
+/// Makes the samples of a scene, and moves them to its device. Flows in two dimensions take seconds to minutes, because
+/// their reference solves are iterative. Their data are kept on disk (data_cache.h).
 Dataset make_dataset(const Scene& scene, const OnProgress& on_progress = {});
 /// The same on a device.
 Dataset moved(Dataset data, const at::Device& device);
-/// Those of make_dataset(), without the cache on disk and on the CPU.
+/// Those of make_dataset() as tensors of the CPU, without the cache on disk.
 Dataset compute_dataset(const Scene& scene, const OnProgress& on_progress = {});
 
 /// The training samples alone, in the train_ fields.

@@ -60,7 +60,9 @@ Dataset dataset_of(Saved saved, const Scene& scene) {
 
 Dataset cached_dataset(const Scene& scene, const std::function<Dataset()>& make) {
   constexpr const char *kKind = "data", *kRemedy = "it is made again";
-  const auto settings = c10::str("prdp data ", kFormat, ": ", data_settings(scene));
+  const auto device = device_of_data(scene);
+  const auto where = device.is_cpu() ? "" : " on " + c10::DeviceTypeName(device.type(), /*lower_case=*/true);
+  const auto settings = c10::str("prdp data ", kFormat, where, ": ", data_settings(scene));
   const auto path = cache_folder() / (scene.physics.equation + '-' + fingerprint(settings) + ".data");
   if (const auto found = open_sealed(path, kKind)) {
     if (!found->sealed) refuse_damaged(path, kKind, found->wrong, kRemedy);

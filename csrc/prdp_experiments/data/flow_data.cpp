@@ -79,7 +79,7 @@ Reference make_reference(const Scene& scene) {
 at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t steps, const OnSteps& on_steps) {
   const auto reference = make_reference(scene);
   std::vector<at::Tensor> parts;
-  for (auto u : start.split(kSamplesAtOnce)) {
+  for (auto u : start.to(device_of_data(scene)).split(kSamplesAtOnce)) {
     std::vector<at::Tensor> states;
     for (int64_t i = -scene.data.spin_up; i <= steps; ++i) {
       if (i >= 0) states.push_back(reference.coarse(u));
@@ -87,7 +87,7 @@ at::Tensor follow_flow(const Scene& scene, const at::Tensor& start, int64_t step
       u = reference.step(u);
       on_steps(u.size(0));
     }
-    parts.push_back(at::stack(states, 1));
+    parts.push_back(at::stack(states, 1).cpu());
   }
   return at::cat(parts);
 }

@@ -43,7 +43,7 @@ Flow kolmogorov_step(const Scene& scene, SolveOptions options) {
 KolmogorovReference::KolmogorovReference(const Scene& scene)
     : shape_(scene.physics.shape),
       factor_(scene.data.reference_shape[0] / shape_[0]),
-      flow_(make_flow(finer(scene, factor_), at::kCPU, FlowAdvection::kCentral,
+      flow_(make_flow(finer(scene, factor_), device_of_data(scene), FlowAdvection::kCentral,
                       SolveOptions{scene.reference_solver()})) {}
 
 at::Tensor KolmogorovReference::step(at::Tensor u) {
@@ -52,7 +52,7 @@ at::Tensor KolmogorovReference::step(at::Tensor u) {
 }
 
 at::Tensor KolmogorovReference::coarse(const at::Tensor& u) const {
-  const auto cells = u.view({u.size(0), 2, shape_[0], factor_, shape_[1], factor_});
+  const auto cells = u.reshape({u.size(0), 2, shape_[0], factor_, shape_[1], factor_});
   const auto low_in_x = cells.select(1, 0).select(-1, 0).mean(-2), low_in_y = cells.select(1, 1).select(-3, 0).mean(-1);
   return at::stack({low_in_x, low_in_y}, 1);
 }

@@ -54,9 +54,11 @@ struct Scene {
   };
   struct Network {
     std::string python{};  // "module:Class" of the Python trainer, in place of all the rest
-    std::string kind;  // "mlp" or "resnet"
+    std::string kind;  // "mlp", "resnet" or "unet"
     std::vector<int64_t> hidden;  // mlp
-    int64_t blocks = 0, width = 0;  // resnet
+    int64_t blocks = 0;  // resnet
+    int64_t levels = 0;  // unet
+    int64_t width = 0;  // resnet and unet
     bool zero_output = false;  // whether the last layer starts at zero
   };
   struct Training {

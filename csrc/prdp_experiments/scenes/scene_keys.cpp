@@ -160,15 +160,21 @@ void read_data(Section& s, Scene& scene) {
 template <class Section>
 void read_network(Section& s, Scene& scene) {
   auto& n = scene.network;
-  s.choice(n.kind, {"mlp", "resnet"}, {"kind", "multilayer perceptron or residual convolution network"});
+  s.choice(n.kind, {"mlp", "resnet", "unet"}, {"kind", "multilayer perceptron, residual convolution network or U-net"});
   const When mlp{n.kind == "mlp", "only for `mlp`"}, resnet{n.kind == "resnet", "only for `resnet`"};
+  const When unet{n.kind == "unet", "only for `unet`"}, convolutions{!mlp.holds, "not for `mlp`"};
   s.wholes(n.hidden, 1, {"hidden", "widths of the hidden layers", "", mlp});
   s.whole(n.blocks, 1, {"blocks", "residual blocks", "", resnet});
-  s.whole(n.width, 1, {"width", "channels of the blocks", "", resnet});
-  constexpr int64_t kWidest = 1'000'000, kMostBlocks = 10'000;
+  s.whole(n.levels, 1, {"levels", "how often the grid is halved, and the channels doubled", "", unet});
+  s.whole(n.width, 1, {"width", "channels of the blocks; of `unet` on the finest grid", "", convolutions});
+  constexpr int64_t kWidest = 1'000'000, kMostBlocks = 10'000, kMostLevels = 10;
   s.check(std::all_of(n.hidden.begin(), n.hidden.end(), [](int64_t width) { return width <= kWidest; }), "hidden",
           "expected layers of at most 1000000 units");
-  s.check(n.width <= kWidest, "width", "expected at most 1000000 channels");
+  s.check(n.levels <= kMostLevels, "levels", "expected at most 10 levels");
+  s.check(n.width <= kWidest >> n.levels, "width", "expected at most 1000000 channels in a block");
+  const auto& shape = scene.physics.shape;
+  s.check(std::all_of(shape.begin(), shape.end(), [&](int64_t extent) { return extent % (1 << n.levels) == 0; }),
+          "levels", "expected 2^levels to divide each N of physics.shape");
   s.check(n.blocks <= kMostBlocks, "blocks", "expected at most 10000 blocks");
   s.flag(n.zero_output, {.name = "zero_output", .means = "whether the last layer starts at zero", .optional = true});
 }

@@ -14,6 +14,7 @@
 #include "prdp_experiments/data/fresh_data.h"
 #include "prdp_experiments/networks/mlp.h"
 #include "prdp_experiments/networks/resnet.h"
+#include "prdp_experiments/networks/unet.h"
 #include "prdp_experiments/networks/weights.h"
 #include "prdp_experiments/scenes/device.h"
 #include "prdp_experiments/training/field.h"
@@ -63,9 +64,9 @@ torch::nn::AnyModule make_network(const Scene& scene, int64_t seed) {
   const auto& n = scene.network;
   const auto dim = static_cast<int64_t>(p.shape.size());
   torch::manual_seed(static_cast<uint64_t>(seed));
-  TORCH_CHECK_VALUE(n.kind == "mlp" || n.kind == "resnet", "network: unknown kind '", n.kind, "'");
-  auto network = n.kind == "mlp" ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
-                                 : AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()));
+  auto network = n.kind == "mlp"      ? AnyModule(MLP(p.channels() * c10::multiply_integers(p.shape), n.hidden))
+                 : n.kind == "resnet" ? AnyModule(ResNet(dim, p.channels(), n.blocks, n.width, p.periodic()))
+                                      : AnyModule(UNet(dim, p.channels(), n.levels, n.width, p.periodic()));
   if (n.zero_output) {
     const torch::NoGradGuard no_grad;
     const auto parameters = network.ptr()->parameters();
