@@ -327,3 +327,11 @@ def test_forward_mode_takes_the_mean_off_a_pressure():
     tangent = torch.func.jvp(solution, (b,), (torch.ones_like(b),))[1]
     expected = torch.ones(60, dtype=F64) @ pinv_of(a, (1, 3, 4, 5)).T
     torch.testing.assert_close(tangent.flatten(), expected, rtol=1e-7, atol=1e-7)
+
+
+def test_an_operator_that_knows_its_null_space_takes_none():
+    v, constant = torch.ones(1, 1, 4), torch.empty(0)
+    with pytest.raises(ValueError, match="operator: Poisson takes no null spaces"):
+        torch.ops.prdp.apply(v, [constant, constant], "singular_poisson", [4], [], False)
+    with pytest.raises(ValueError, match="unknown kind 'none'; allowed: heat, "):
+        torch.ops.prdp.apply(v, [constant, constant], "singular_none", [4], [], False)

@@ -3,9 +3,10 @@
 #include <tuple>
 #include <utility>
 
-#include "prdp/solvers/solver.h"
+#include "prdp/solvers/solve.h"
 
-/// SolveOptions as they cross torch's dispatcher: names and numbers at the end of an op's arguments.
+/// SolveOptions and results as they cross torch's dispatcher: the options as names and numbers at the end of an op's
+/// arguments, a result as a tuple.
 namespace prdp {
 
 /// Behind them an op has either of these.
@@ -91,6 +92,32 @@ auto call_with_options(const Op& op, const SolveOptions& o, const Front&... fron
 template <class Op, class... Front>
 auto call_with_x0(const Op& op, const SolveOptions& o, const at::Tensor& x0, const Front&... front) {
   return detail::call_with(op, o, x0.defined() ? std::optional<at::Tensor>(x0) : std::nullopt, front...);
+}
+
+/// A SolveResult as an op returns it, and back.
+#define PRDP_REPORT_SCHEMA \
+  "Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications, Tensor floor"
+using SolveOutputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
+inline SolveOutputs outputs_of(SolveResult result) {
+  auto& info = result.info;
+  return {std::move(result.u),
+          std::move(info.iterations),
+          std::move(info.residual),
+          std::move(info.status),
+          std::move(info.operator_applications),
+          std::move(info.floor)};
+}
+inline SolveResult result_of(SolveOutputs outputs) {
+  auto& [u, iterations, residual, status, applications, floor] = outputs;
+  return {std::move(u),
+          {std::move(iterations), std::move(residual), std::move(status), std::move(applications), std::move(floor)}};
+}
+
+/// The same of fake tensors: a report of numbers of these sizes, in the dtype of `like`.
+inline SolveInfo fake_info(const at::Tensor& like, c10::SymIntArrayRef sizes) {
+  const auto counts = [&] { return at::empty_symint(sizes, like.options().dtype(at::kLong)); };
+  const auto numbers = [&] { return at::empty_symint(sizes, like.options()); };
+  return {counts(), numbers(), counts(), counts(), numbers()};
 }
 
 }  // namespace prdp

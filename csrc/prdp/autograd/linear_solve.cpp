@@ -18,14 +18,11 @@ namespace prdp {
 
 namespace {
 
-using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-
 constexpr const char* kSchema =
     "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
     "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
     ") -> "
-    "(Tensor u, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications, "
-    "Tensor floor)";
+    "(Tensor u, " PRDP_REPORT_SCHEMA ")";
 
 /// The arguments of the op but b.
 struct Call {
@@ -34,10 +31,10 @@ struct Call {
   at::Tensor x0;
 };
 
-using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                           at::ArrayRef<double>, bool)>;
+using Signature = WithOptionsAndX0<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                                at::ArrayRef<double>, bool)>;
 
-Outputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
+SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::linear_solve", "").typed<Signature>();
   return call_with_x0(op, o, x0, b, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
                       at::ArrayRef<double>(a.parameters), a.transposed);
@@ -81,24 +78,17 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 }
 
 template <class... Args>
-Outputs solve_kernel(const at::Tensor& b, Args... args) {
+SolveOutputs solve_kernel(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack(std::move(args)...);
-  const auto [u, info] = linear_solve_kernel(a, b, options, x0);
-  return {u, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+  return outputs_of(linear_solve_kernel(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
-Outputs fake_kernel(const at::Tensor& b, Args... args) {
+SolveOutputs fake_kernel(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack(std::move(args)...);
   checked_operator(a, b, options, x0);
-  const auto counts = [&] { return at::empty_symint({b.sym_size(0)}, b.options().dtype(at::kLong)); };
-  return {at::empty_symint(b.sym_sizes(), b.options()),
-          counts(),
-          at::empty_symint({b.sym_size(0)}, b.options()),
-          counts(),
-          counts(),
-          at::empty_symint({b.sym_size(0)}, b.options())};
+  return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), fake_info(b, {b.sym_size(0)})});
 }
 
 /// Whether all tensors of a call are plain.
@@ -108,11 +98,10 @@ bool is_plain_call(const at::Tensor& b, const OperatorSpec& a, const SolveOption
 }
 
 /// The op below autograd.
-Outputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
+SolveOutputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
   if (!is_plain_call(b, a, o, x0)) return call_op(b, a, o, x0);
-  const auto [u, info] = linear_solve_kernel(a, b, o, x0);
-  return {u, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+  return outputs_of(linear_solve_kernel(a, b, o, x0));
 }
 
 /// A start is a constant of the derivatives.
@@ -122,8 +111,8 @@ at::Tensor without_derivative(const at::Tensor& x0) {
 }
 
 /// The op's autograd kernel.
-Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
-                         const at::Tensor& x0) {
+SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                              const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
   if (differentiable && at::GradMode::is_enabled() && is_function(a) && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
@@ -141,7 +130,7 @@ Outputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const Solve
 }
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
-Outputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
+SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
   const bool plain = no_mode_is_on() && is_plain_call(b, a, options, x0);
   return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
 }
@@ -150,10 +139,10 @@ Outputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& opt
 template <class>
 struct Kernels;
 template <class... Args>
-struct Kernels<Outputs(const at::Tensor&, Args...)> {
-  static Outputs solve(const at::Tensor& b, Args... args) { return solve_kernel<Args...>(b, args...); }
-  static Outputs fake(const at::Tensor& b, Args... args) { return fake_kernel<Args...>(b, args...); }
-  static Outputs autograd(const at::Tensor& b, Args... args) {
+struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
+  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel<Args...>(b, args...); }
+  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel<Args...>(b, args...); }
+  static SolveOutputs autograd(const at::Tensor& b, Args... args) {
     const auto [a, options, x0] = unpack(args...);
     return solve_and_record(b, a, options, x0);
   }
@@ -164,9 +153,10 @@ struct Kernels<Outputs(const at::Tensor&, Args...)> {
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
-  auto [u, iterations, residual, status, applications, floor] =
-      call(lone_vector ? b.unsqueeze(0) : b, a, options, lone_vector && x0.defined() ? x0.unsqueeze(0) : x0);
-  return {lone_vector ? u.squeeze(0) : u, {iterations, residual, status, applications, floor}};
+  if (!lone_vector) return result_of(call(b, a, options, x0));
+  auto result = result_of(call(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
+  result.u = result.u.squeeze(0);
+  return result;
 }
 
 SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,

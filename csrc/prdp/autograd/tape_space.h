@@ -11,13 +11,13 @@ namespace prdp {
 /// A sample as a space whose operations can be taken back. A method runs in it as in any other. While it records, every
 /// operation writes to new memory and notes on the tape what it did; so no method needs a derivative of its own.
 template <class T>
-class TapeSpace {
+class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
  public:
   using Scalar = TapeNumber<T>;
-  using States = std::array<SampleState, 1>;
   /// The version that it holds now, and the one whose memory it uses while nothing is recorded.
   struct Vector {
     int32_t version = -1, home = -1;
+    bool operator==(const Vector& other) const { return version == other.version; }
   };
 
   TapeSpace(Tape<T>& tape, SampleSpace<T>& values) : tape_(tape), values_(values) {
@@ -78,7 +78,6 @@ class TapeSpace {
           .factor_node = beta.node,
           .factor = beta.value});
   }
-  void xmby(const Vector& x, const Scalar& beta, Vector& y) { xpby(x, -beta, y); }
   Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
     xpby(x, beta, y);
     return number(Kind::kSquare, values_.dot(value(y), value(y)), y.version);
@@ -121,15 +120,10 @@ class TapeSpace {
     const auto first = number(Kind::kDot, dots[0], of, out.version);
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
-  std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
-    const auto dots = apply_with_dots(v, out);
-    return {v.version == w.version ? dots[0] : dot(w, out), dots[1]};
-  }
   Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) const {
     return values_.sum_of_squares(rr.value, beta.value, pp.value);
   }
   bool is_preconditioned() const { return values_.is_preconditioned(); }
-  void correct(const Vector& v, Vector& out) { precondition(v, out); }
   Scalar precondition(const Vector& v, Vector& out) {
     const T* from = value(v);
     const auto of = v.version;
@@ -171,8 +165,6 @@ class TapeSpace {
     note({.kind = Kind::kResidual, .out = r.version, .a = of});
     return number(Kind::kSquare, rr, r.version);
   }
-  Scalar solution2(const Vector& x) { return values_.solution2(value(x)); }
-  Scalar terms2(const Vector& x) { return values_.terms2(value(x)); }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
   Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
@@ -236,13 +228,6 @@ class TapeSpace {
   Scalar is_zero(const Scalar& a) const { return values_.is_zero(a.value); }
   Scalar is_not_zero(const Scalar& a) const { return values_.is_not_zero(a.value); }
   bool surely_all(const Scalar& a) const { return values_.surely_all(a.value); }
-
-  std::array<double, 1> lanes(const Scalar& a) const { return values_.lanes(a.value); }
-  std::array<bool, 1> broken() const { return values_.broken(); }
-  std::array<double, 1> operator_norm() const { return values_.operator_norm(); }
-  template <class Predicate>
-  void freeze_unless(const States&, const Predicate&) {}
-  void reset() {}
 
  private:
   using Kind = typename Tape<T>::Kind;

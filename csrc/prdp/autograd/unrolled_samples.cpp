@@ -36,27 +36,31 @@ std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotan
   return residuals;
 }
 
-class SampleVjps {
- public:
-  SampleVjps(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec, const SolveOptions& options,
-             at::IntArrayRef needed, OfIterations of_iterations, decltype(linear_solve)& any_solve)
-      : cotangent_(cotangent),
-        solved_(solved),
-        spec_(spec),
-        options_(options),
-        needed_(needed),
-        of_iterations_(of_iterations),
-        any_solve_(any_solve),
-        batch_(solved.b.size(0)),
-        a_(make_operator(spec)),
-        counts_(to_host<int64_t>(solved.iterations, batch_)),
-        outcomes_(batch_) {
-    for (const auto status : to_host<int64_t>(solved.status, batch_))
-      status_.push_back(static_cast<SolveStatus>(status));
-    for_a_ = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
-    zero_grad_ = options.on_failure == OnFailure::kZeroGrad;
-    asked_ = options.adjoint_rtol.value_or(options.solver.rtol);
-  }
+/// The derivatives of a batch, sample by sample: classify, differentiate, retry, report.
+struct SampleVjps {
+  const at::Tensor& cotangent_;
+  const Solved& solved_;
+  const OperatorSpec& spec_;
+  const SolveOptions& options_;
+  at::IntArrayRef needed_;
+  OfIterations of_iterations_;
+  decltype(linear_solve)& any_solve_;
+
+  const int64_t batch_ = solved_.b.size(0);
+  const std::unique_ptr<Operator> a_ = make_operator(spec_);
+  const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);  // and the status, of the solve
+  const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
+  const bool for_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
+  const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
+  const double asked_ = options_.adjoint_rtol.value_or(options_.solver.rtol);  // tolerance of adjoint solves
+  std::vector<Way> ways_{};
+  Rows rows_ = finite_rows(cotangent_);        // whose gradients are finite
+  at::Tensor bar_ = only(cotangent_, rows_);   // the cotangent of samples that are not refused
+  std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
+  std::vector<at::Tensor> gradients_{};
+  at::Tensor u_{};
+
+  SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses_[i]); }
 
   SolveVjp find() {
     classify();
@@ -69,16 +73,13 @@ class SampleVjps {
     return {std::move(gradients_), report()};
   }
 
- private:
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
-    rows_ = finite_rows(cotangent_);
-    bar_ = only(cotangent_, rows_);
     for (int64_t i = 0; i < batch_; ++i)
-      ways_.push_back(!rows_[i]                              ? Way::kRefused
-                      : exact[i]                             ? Way::kImplicit
-                      : zero_grad_ && is_failure(status_[i]) ? Way::kNone
-                                                             : Way::kIterations);
+      ways_.push_back(!rows_[i]                             ? Way::kRefused
+                      : exact[i]                            ? Way::kImplicit
+                      : zero_grad_ && is_failure(status(i)) ? Way::kNone
+                                                            : Way::kIterations);
   }
 
   /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`.
@@ -96,7 +97,7 @@ class SampleVjps {
     auto caps = at::zeros({batch_}, at::kLong);
     const bool of_none = !any(rows);  // what the iterations make of no cotangent, finite or not
     for (int64_t i = 0; i < batch_; ++i) {
-      outcomes_[i] = {status_[i], counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
+      outcomes_[i] = {status(i), counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
       if ((rows[i] || of_none) && ways_[i] == Way::kIterations) caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
     }
     if (!caps.any().item<bool>()) return std::vector<at::Tensor>(needed_.size());
@@ -135,7 +136,7 @@ class SampleVjps {
     const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
     bool any_far = false;
     for (int64_t i = 0; i < batch_; ++i) {
-      const bool ended = status_[i] == SolveStatus::kConverged || status_[i] == SolveStatus::kStagnated;
+      const bool ended = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
       if (!ended || ways_[i] != Way::kIterations || !rows_[i] || !(residual[i] > 1.0)) continue;
       ways_[i] = Way::kImplicit;
       any_far = true;
@@ -176,26 +177,6 @@ class SampleVjps {
     if (!u_.defined()) u_ = any_solve_(spec_, solved_.b, silent, solved_.x0).u;
     return u_;
   }
-
-  const at::Tensor& cotangent_;
-  const Solved& solved_;
-  const OperatorSpec& spec_;
-  const SolveOptions& options_;
-  at::IntArrayRef needed_;
-  OfIterations of_iterations_;
-  decltype(linear_solve)& any_solve_;
-  int64_t batch_;
-  std::unique_ptr<Operator> a_;
-  std::vector<int64_t> counts_;      // of iterations, and the status, in the solve
-  std::vector<SolveStatus> status_;
-  bool for_a_, zero_grad_;
-  double asked_;  // tolerance of adjoint solves
-  std::vector<Way> ways_;
-  Rows rows_;       // whose gradients are finite
-  at::Tensor bar_;  // the cotangent of samples that are not refused
-  std::vector<SampleOutcome> outcomes_;
-  std::vector<at::Tensor> gradients_;
-  at::Tensor u_;
 };
 
 }  // namespace
@@ -203,7 +184,7 @@ class SampleVjps {
 SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
                         const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
                         decltype(linear_solve)& any_solve) {
-  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).find();
+  return SampleVjps{cotangent, solved, spec, options, needed, of_iterations, any_solve}.find();
 }
 
 }  // namespace prdp

@@ -18,9 +18,7 @@ namespace {
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
     "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
-    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
-    ") -> (Tensor[] gradients, Tensor iterations, Tensor residual, Tensor status, "
-    "Tensor operator_applications, Tensor floor)";
+    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                                            const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
@@ -96,11 +94,8 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
     if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
-  const auto of_dtype = [&](at::ScalarType dtype) {
-    return at::empty_symint({b.sym_size(0)}, b.options().dtype(dtype));
-  };
-  return {gradients,           of_dtype(at::kLong), of_dtype(b.scalar_type()),
-          of_dtype(at::kLong), of_dtype(at::kLong), of_dtype(b.scalar_type())};
+  const auto info = fake_info(b, {b.sym_size(0)});
+  return {gradients, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
 }  // namespace

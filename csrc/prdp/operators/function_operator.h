@@ -49,7 +49,7 @@ class RegisteredProducts {
 };
 
 /// Whether the operator is made of RegisteredProducts, whose number is the first entry of its shape.
-inline bool is_function(const OperatorSpec& a) { return a.kind == "function" || a.kind == "singular_function"; }
+inline bool is_function(const OperatorSpec& a) { return a.kind.ends_with("function"); }
 /// What keeps the products of a Function alive; null for other operators. Nodes of autograd hold it, as their backward
 /// pass may come when nobody else does.
 std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a);

@@ -18,46 +18,38 @@ std::unique_ptr<Operator> make(const OperatorSpec& spec) {
   return std::make_unique<T>(spec);
 }
 
-constexpr const char* kDiffusion = "Diffusion";
-constexpr const char* kStencil = "Stencil";
-constexpr const char* kMatrix = "Matrix";
-constexpr const char* kFunction = "Function";
-
-/// With the bases of the two null spaces behind the other tensors.
-template <class T, const char* const& title>
-std::unique_ptr<Operator> singular(const OperatorSpec& spec) {
-  return make_singular<T>(spec, title);
-}
-
 using Axes = std::vector<int64_t>;
 
 const std::vector<OperatorKind> kKinds{
     {"heat", "Heat", make<HeatOperator>, Axes{0}},
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
     {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
-    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, /*has_pressure=*/true},
-    {"diffusion", kDiffusion, make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide}},
-    {"stencil", kStencil, make<StencilOperator>, Axes{kLikeState}},
-    {"dense", kMatrix, make<DenseOperator>, Axes{3}},
-    {"function", kFunction, make<FunctionOperator>, std::nullopt},
-    {"csr", kMatrix, make<CsrOperator>, Axes{2, 2, 2}},
-    {"singular_diffusion", kDiffusion, singular<DiffusionOperator, kDiffusion>, Axes{kLikeField, kLikeField, 0, 0}},
-    {"singular_stencil", kStencil, singular<StencilOperator, kStencil>, Axes{kLikeState, 0, 0}},
-    {"singular_dense", kMatrix, singular<DenseOperator, kMatrix>, Axes{3, 0, 0}},
-    {"singular_csr", kMatrix, singular<CsrOperator, kMatrix>, Axes{2, 2, 2, 0, 0}},
-    {"singular_function", kFunction, singular<FunctionOperator, kFunction>, std::nullopt},
+    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, false, /*has_pressure=*/true},
+    {"diffusion", "Diffusion", make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide},
+     /*takes_null_spaces=*/true},
+    {"stencil", "Stencil", make<StencilOperator>, Axes{kLikeState}, true},
+    {"dense", "Matrix", make<DenseOperator>, Axes{3}, true},
+    {"csr", "Matrix", make<CsrOperator>, Axes{2, 2, 2}, true},
+    {"function", "Function", make<FunctionOperator>, std::nullopt, true},
 };
 
 }  // namespace
 
-const OperatorKind& operator_kind(const std::string& kind) { return row_of(kKinds, "operator", kind); }
+const OperatorKind& operator_kind(const std::string& kind) {
+  if (!is_singular(kind)) return row_of(kKinds, "operator", kind);
+  const auto& row = row_of(kKinds, "operator", kind.substr(kSingular.size()));
+  TORCH_CHECK_VALUE(row.takes_null_spaces, "operator: ", row.title, " takes no null spaces");
+  return row;
+}
 
 std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_t axes, size_t tensors) {
   auto of_tensors = operator_kind(kind).batched_axes;
   if (!of_tensors) return std::nullopt;
-  if (!of_tensors->empty()) of_tensors->resize(tensors, of_tensors->back());
+  const size_t bases = is_singular(kind) ? 2 : 0;  // of null spaces, which all samples share
+  if (!of_tensors->empty()) of_tensors->resize(tensors - bases, of_tensors->back());
   for (auto& n : *of_tensors)
     if (n < 0) n += axes - kLikeSide;
+  of_tensors->resize(of_tensors->size() + bases, 0);
   return of_tensors;
 }
 

@@ -4,6 +4,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "prdp/operators/operator.h"
@@ -18,8 +19,14 @@ struct OperatorKind {
   /// The number of axes of each tensor where it has one for the batch: 0 if all samples share it, or one of the below.
   /// The last stands for all that follow. nullopt if that is not known, as for the tensors of a function.
   std::optional<std::vector<int64_t>> batched_axes;
+  bool takes_null_spaces = false;  // a kind "singular_…" names its null spaces, by two tensors behind the others
   bool has_pressure = false;  // rows without a diagonal, and a mean that A maps to zero
 };
+
+/// Before the kind of an operator whose null spaces are named (singular_operator.h).
+inline constexpr std::string_view kSingular = "singular_";
+inline bool is_singular(const std::string& kind) { return kind.starts_with(kSingular); }
+inline bool is_singular(const OperatorSpec& a) { return is_singular(a.kind); }
 
 /// Of a tensor that is (batch, channel, *shape), (batch, *shape), or (batch, *side) with a side of that shape.
 inline constexpr int64_t kLikeState = -1, kLikeField = -2, kLikeSide = -3;

@@ -4,7 +4,7 @@
 
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/factor_cache.h"
-#include "prdp/operators/kinds.h"
+#include "prdp/operators/singular_operator.h"
 
 namespace prdp {
 
@@ -94,7 +94,16 @@ class Transposed final : public Operator {
 }  // namespace
 
 std::unique_ptr<Operator> make_operator(const OperatorSpec& spec) {
-  auto a = operator_kind(spec.kind).make(spec);
+  const auto& kind = operator_kind(spec.kind);
+  std::unique_ptr<Operator> a;
+  if (is_singular(spec)) {
+    TORCH_CHECK_VALUE(spec.tensors.size() >= 2, kind.title, ": its null spaces are missing");
+    auto regular = spec;
+    regular.tensors.resize(spec.tensors.size() - 2);
+    a = std::make_unique<SingularOperator>(kind.make(regular), spec);
+  } else {
+    a = kind.make(spec);
+  }
   if (spec.transposed) return std::make_unique<Transposed>(std::move(a));
   return a;
 }

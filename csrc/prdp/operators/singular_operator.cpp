@@ -43,16 +43,16 @@ OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right, std::optio
   };
   const auto given = basis(right);
   a.tensors.insert(a.tensors.end(), {given, left ? basis(*left) : given});
-  a.kind = "singular_" + a.kind;
+  a.kind.insert(0, kSingular);
   return a;
 }
 
-SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title)
+SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec)
     : a_(std::move(a)),
       spec_(spec),
       right_{spec.tensors[spec.tensors.size() - 2].detach(), {}},
       left_{spec.tensors.back().detach(), {}},
-      title_(title) {
+      title_(operator_kind(spec.kind).title) {
   TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
                     ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
                     left_.count());
@@ -220,7 +220,7 @@ std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda,
 
 std::unique_ptr<Operator> SingularOperator::select(const at::Tensor& index) const {
   auto chosen = a_->select(index);
-  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), spec_, title_) : nullptr;
+  return chosen ? std::make_unique<SingularOperator>(std::move(chosen), spec_) : nullptr;
 }
 
 std::optional<kernels::FactorKey> SingularOperator::key(bool transposed) const {

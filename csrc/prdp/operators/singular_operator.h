@@ -1,7 +1,7 @@
 #pragma once
 #include <memory>
 
-#include "prdp/operators/operator.h"
+#include "prdp/operators/kinds.h"
 
 namespace prdp {
 
@@ -20,7 +20,7 @@ class SingularOperator final : public Operator {
   /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are the same for every sample:
   /// (k, *shape) for each channel of a vector (batch, channel, *shape), (k, channels, *shape) for all channels
   /// together, or empty for the constant of each channel. Raises ValueError if they do not fit each other.
-  SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec, const char* title);
+  SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
   void check_parameters(bool kernel_checks) const override { a_->check_parameters(kernel_checks); }
@@ -73,17 +73,5 @@ class SingularOperator final : public Operator {
   Basis right_, left_;
   const char* title_;
 };
-
-/// Whether the null spaces of an operator are named.
-inline bool is_singular(const OperatorSpec& a) { return a.kind.starts_with("singular_"); }
-
-/// For `kind` of the operator, which is not singular, and its two bases.
-template <class T>
-std::unique_ptr<Operator> make_singular(const OperatorSpec& spec, const char* title) {
-  TORCH_CHECK_VALUE(spec.tensors.size() >= 2, title, ": its null spaces are missing");
-  OperatorSpec regular = spec;
-  regular.tensors.resize(spec.tensors.size() - 2);
-  return std::make_unique<SingularOperator>(std::make_unique<T>(regular), spec, title);
-}
 
 }  // namespace prdp

@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "prdp/solvers/energy.h"
+#include "prdp/solvers/space.h"
 #include "prdp/solvers/stopping.h"
 
 // Functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
@@ -172,7 +173,7 @@ void replay(Space& space, Method& method, typename Space::States& states, double
 /// Solves every sample that `states` holds active, from zero or the space's start; the result is method.x, but for
 /// that start. A sample that overflows or diverges, or ends worse than zero without an excuse, is run again for as many
 /// iterations as gave its smallest residual, unless the iterations are wanted as they come.
-template <class Space, class Method>
+template <LoopSpace Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   const bool track = rtol > 0.0;
   detail::run(space, method, states, rtol, track);

@@ -35,17 +35,6 @@ at::Tensor settle_beforehand(const Operator& a, const Solver& solver, const at::
   return status;
 }
 
-/// b with its rows scaled, and zero in the rows that do not take part.
-struct ScaledRhs {
-  at::Tensor b, scale;
-};
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
-  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
-  const auto scale = per_sample(power_of_two_scale(safe), b);
-  const auto rows = per_sample(takes_part, b);
-  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
-}
-
 /// Of which samples' right-hand sides so much lies outside the range of a singular operator: more than rtol and than
 /// their `rounding`; all.
 struct OutsideRange {
@@ -59,6 +48,17 @@ OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, dou
 }
 
 }  // namespace
+
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
+  if (!takes_part.defined()) {
+    const auto scale = per_sample(power_of_two_scale(magnitude), b);
+    return {b * scale, scale};
+  }
+  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
+  const auto scale = per_sample(power_of_two_scale(safe), b);
+  const auto rows = per_sample(takes_part, b);
+  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
+}
 
 at::Tensor largest_magnitude(const at::Tensor& b) {
   const auto plain = b.detach();

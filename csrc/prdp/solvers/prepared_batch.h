@@ -21,6 +21,13 @@ struct PreparedBatch {
 
 PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
+/// b with its rows scaled by powers of two to the order of one, by `magnitude`, and zero in those that do not take
+/// part; all do where `takes_part` is undefined. Differentiable.
+struct ScaledRhs {
+  at::Tensor b, scale;
+};
+ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part = {});
+
 bool takes_start(Method method, const at::Tensor& x0);
 /// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
 /// operator keeps what it computes first, for later products as well.

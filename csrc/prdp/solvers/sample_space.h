@@ -12,6 +12,7 @@
 #include "prdp/solvers/sample_system.h"
 #include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
+#include "prdp/solvers/space.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -19,7 +20,7 @@ namespace prdp {
 /// One sample after the other as a space for iterate(): vectors are padded memory of the thread's
 /// workspace, and every operation is a plain loop in place.
 template <class T>
-class SampleSpace : public SampleNumbers<T> {
+class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>> {
   using SampleNumbers<T>::broken_;
 
  public:
@@ -96,7 +97,6 @@ class SampleSpace : public SampleNumbers<T> {
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
   void add(const T* d, Vector x) { vectors_.axpy(T(1), d, x, length()); }
   void xpby(const T* x, Scalar beta, Vector y) { vectors_.xpby(x, beta, y, length()); }
-  void xmby(const T* x, Scalar beta, Vector y) { xpby(x, -beta, y); }
   Scalar xpby_with_square(const T* x, Scalar beta, Vector y) { return vectors_.xpby_with_square(x, beta, y, length()); }
   Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
   Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
@@ -114,10 +114,6 @@ class SampleSpace : public SampleNumbers<T> {
     count(1);
     return system_.a().apply_with_dots(v, out);
   }
-  std::array<Scalar, 2> apply_along(const T* v, const T* w, Vector out) {
-    const auto found = apply_with_dots(v, out);
-    return {v == w ? found[0] : dot(w, out), found[1]};
-  }
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
@@ -132,7 +128,6 @@ class SampleSpace : public SampleNumbers<T> {
     project_solution(out);  // cycles leave rounding there, which they would amplify
     return dot(v, out);
   }
-  void correct(const T* v, Vector out) { precondition(v, out); }
   /// The transpose of this without a diagonal; v is overwritten.
   void precondition_transpose(Vector v, Vector out) {
     project_solution(v);

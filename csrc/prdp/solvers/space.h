@@ -6,84 +6,103 @@
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample in padded memory (sample_space.h), or a batch of plain tensors (tensor_space.h). An operation
-/// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new space
-/// needs all of these operations, a new method none but those that it calls.
+/// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new method needs
+/// none of them but those that it calls. A new space needs the operations of each group; those of SpaceDefaults it may
+/// leave to that class, until fusing them is worth its lines.
 namespace prdp {
 
 /// A few numbers or handles of vectors that a method keeps beside its vectors, as array<X>() of the space gives them.
 template <class Space, class X>
 using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
 
+/// Ten operations that all methods are made of, and where their vectors come from.
+template <class S>
+concept Primitives =
+    requires(S s, typename S::Vector x, typename S::Vector y, typename S::Vector p, typename S::Vector q,
+             typename S::Vector r, typename S::Scalar alpha, typename S::Scalar beta) {
+      /// A vector of zeros, which the method keeps.
+      { s.vector() } -> std::convertible_to<typename S::Vector>;
+      /// The right-hand side, scaled to the order of one; with a start, the residual of the start. And ‖b‖².
+      { s.b() } -> std::convertible_to<typename S::Vector>;
+      { s.b2() } -> std::convertible_to<typename S::Scalar>;
+      /// Entries of a vector; unit roundoff.
+      { s.unknowns() } -> std::same_as<int64_t>;
+      { s.epsilon() } -> std::same_as<double>;
+
+      /// x = 0, of frozen samples too.
+      s.fill_zero(x);
+      /// y = x
+      s.copy(x, y);
+      /// x takes the value of y, and y that of x.
+      s.advance(x, y);
+      /// y += x
+      s.add(x, y);
+      /// y = x + beta y
+      s.xpby(x, beta, y);
+      /// x·y
+      { s.dot(x, y) } -> std::same_as<typename S::Scalar>;
+      /// x += alpha p and r -= alpha q; returns ‖r‖². p may be r.
+      { s.descend(alpha, p, q, x, r) } -> std::same_as<typename S::Scalar>;
+      /// y = A x
+      s.apply(x, y);
+      /// r = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖r‖².
+      { s.residual(x, r) } -> std::same_as<typename S::Scalar>;
+      /// y = M⁻¹ x, which returns x·y; and whether there is a preconditioner M.
+      { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
+      { s.is_preconditioned() } -> std::same_as<bool>;
+    };
+
+/// What can be made of them, and faster in one pass (SpaceDefaults).
+template <class S>
+concept FusedOperations =
+    requires(S s, typename S::Vector x, typename S::Vector y, typename S::Vector p, typename S::Scalar beta) {
+      /// y = x - beta y
+      s.xmby(x, beta, y);
+      /// y = x + beta y; returns ‖y‖².
+      { s.xpby_with_square(x, beta, y) } -> std::same_as<typename S::Scalar>;
+      /// y = A x; returns x·y and ‖y‖².
+      { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+      /// y = A x; returns p·y and, for a step_length() whose step the next descend() takes, ‖y‖².
+      { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+      /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
+      s.correct(x, y);
+    };
+
+/// Numbers, one per sample: quotients that tell a breakdown from nothing left to do, and choices per sample, as 1 or 0.
+template <class S>
+concept NumberOperations =
+    requires(S s, typename S::Vector x, typename S::Vector y, typename S::Scalar a, typename S::Scalar b,
+             typename S::Scalar num, typename S::Scalar den, typename S::Scalar a2, typename S::Scalar b2,
+             typename S::Scalar active, typename S::Scalar where, double factor) {
+      /// b = a
+      s.assign(a, b);
+      /// num/den for a step, where |den| <= √a2 √b2. 0 where num is negligible; 0 and a breakdown of the sample where
+      /// |den| <= ε √a2 √b2.
+      { s.step_length(num, den, a2, b2) } -> std::same_as<typename S::Scalar>;
+      /// 1 where step_length() would break down and `active` is not zero, else 0; for restore() alone.
+      { s.breaks_down(den, a2, b2, active) } -> std::same_as<typename S::Scalar>;
+      /// num/den for den >= 0; 0 where den is negligible.
+      { s.ratio(num, den) } -> std::same_as<typename S::Scalar>;
+      /// A breakdown of the samples where a is not positive, and b2 not negligible.
+      s.break_down_unless_positive(a, b2);
+      /// a2 + a² b2, the square of the norm of v + a w for orthogonal v and w, for step_length() alone.
+      { s.sum_of_squares(a2, a, b2) } -> std::same_as<typename S::Scalar>;
+      /// 1 where |a| < factor √a2 √b2, else 0; for restore() alone.
+      { s.is_rounding(a, a2, b2, factor) } -> std::same_as<typename S::Scalar>;
+      /// a where b and `active` are not zero, else 0.
+      { s.unless_zero(a, b, active) } -> std::same_as<typename S::Scalar>;
+      /// 1 where a is not zero, else 0; the other way round; and 1 where a > b, else 0.
+      { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
+      { s.is_zero(a) } -> std::same_as<typename S::Scalar>;
+      { s.is_larger(a, b) } -> std::same_as<typename S::Scalar>;
+      /// y = x, and b = a, where `where` is not zero.
+      s.restore(where, x, y);
+      s.restore(where, a, b);
+    };
+
 /// What every method needs.
 template <class S>
-concept VectorSpace = requires(S s, typename S::Vector x, typename S::Vector y, typename S::Vector p,
-                               typename S::Vector q, typename S::Scalar a, typename S::Scalar b) {
-  /// A vector of zeros, which the method keeps.
-  { s.vector() } -> std::convertible_to<typename S::Vector>;
-  /// The right-hand side, scaled to the order of one; with a start, the residual of the start.
-  { s.b() } -> std::convertible_to<typename S::Vector>;
-  /// ‖b‖²
-  { s.b2() } -> std::convertible_to<typename S::Scalar>;
-  /// Entries of a vector.
-  { s.unknowns() } -> std::same_as<int64_t>;
-  /// x = 0, of frozen samples too.
-  s.fill_zero(x);
-  /// y = x
-  s.copy(x, y);
-  /// b = a
-  s.assign(a, b);
-  /// x takes the value of y, and y that of x.
-  s.advance(x, y);
-  /// y += x
-  s.add(x, y);
-  /// y = x + a y; and the same, returning ‖y‖².
-  s.xpby(x, a, y);
-  /// y = x - a y
-  s.xmby(x, a, y);
-  { s.xpby_with_square(x, a, y) } -> std::same_as<typename S::Scalar>;
-  /// x·y
-  { s.dot(x, y) } -> std::same_as<typename S::Scalar>;
-  /// x += a p and y -= a q; returns ‖y‖². p may be y.
-  { s.descend(a, p, q, x, y) } -> std::same_as<typename S::Scalar>;
-  /// y = A x
-  s.apply(x, y);
-  /// y = A x; returns x·y and ‖y‖².
-  { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-  /// y = A x; returns p·y and, for a step_length() whose step the next descend() takes, ‖y‖².
-  { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-  /// a + b² c, the square of the norm of r + b p for orthogonal r and p, for step_length() alone.
-  { s.sum_of_squares(a, b, a) } -> std::same_as<typename S::Scalar>;
-  /// Whether there is a preconditioner M; y = M⁻¹ x, which returns x·y.
-  { s.is_preconditioned() } -> std::same_as<bool>;
-  { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
-  /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
-  s.correct(x, y);
-  /// y = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖y‖².
-  { s.residual(x, y) } -> std::same_as<typename S::Scalar>;
-  /// a/b for a step, where the third and fourth are the squares of the norms whose product bounds b: 0 where a is
-  /// negligible, and 0 with a breakdown where b is rounding beside that bound.
-  { s.step_length(a, b, a, b) } -> std::same_as<typename S::Scalar>;
-  /// 1 where step_length() would break down dividing by a, and the last is not zero, else 0; for restore() alone.
-  { s.breaks_down(a, a, b, b) } -> std::same_as<typename S::Scalar>;
-  /// a/b for b >= 0; 0 where b is negligible.
-  { s.ratio(a, b) } -> std::same_as<typename S::Scalar>;
-  /// A breakdown of the samples where a is not positive, and b not negligible.
-  s.break_down_unless_positive(a, b);
-  /// 1 where a is less than the number times the root of b c, else 0; for restore() alone.
-  { s.is_rounding(a, b, a, 0.0) } -> std::same_as<typename S::Scalar>;
-  /// a where b and the last are not zero, else 0.
-  { s.unless_zero(a, b, b) } -> std::same_as<typename S::Scalar>;
-  /// 1 where a is not zero, else 0; and the other way round.
-  { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
-  { s.is_zero(a) } -> std::same_as<typename S::Scalar>;
-  /// 1 where a > b, else 0.
-  { s.is_larger(a, b) } -> std::same_as<typename S::Scalar>;
-  /// y = x, and b = a, where the first is not zero.
-  s.restore(a, x, y);
-  s.restore(a, a, b);
-  /// Unit roundoff.
-  { s.epsilon() } -> std::same_as<double>;
-};
+concept VectorSpace = Primitives<S> && FusedOperations<S> && NumberOperations<S>;
 
 /// What Jacobi's and Chebyshev's sweeps need beside.
 template <class S>
@@ -104,25 +123,27 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
 /// What GMRES needs beside: a basis, and numbers that may vanish.
 template <class S>
 concept KrylovSpace =
-    VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y, ArrayOf<S, typename S::Vector> v,
-                               int64_t n, int64_t m, typename S::Scalar a, typename S::Scalar b,
-                               const typename S::Scalar* w, const typename S::Scalar* g, typename S::Scalar* h) {
+    VectorSpace<S> &&
+    requires(S s, typename S::Vector x, ArrayOf<S, typename S::Vector> v, int64_t n, int64_t m, typename S::Scalar a,
+             typename S::Scalar b, typename S::Scalar left2, typename S::Scalar taken2, typename S::Scalar loss,
+             typename S::Scalar scale, typename S::Scalar keep, const typename S::Scalar* R,
+             const typename S::Scalar* g, typename S::Scalar* h) {
       /// h_i = v_i·(a x) for the first n of v, as constants.
       s.dots(v, n, a, x, h);
       /// x = a x - Σ h_i v_i with a constant a; returns ‖x‖² as a constant.
       { s.subtract_combination(h, v, n, a, x) } -> std::same_as<typename S::Scalar>;
       /// x += Σ h_i v_i
       s.add_combination(h, v, n, x);
-      /// Whether a vector, of which a is left beside the b that went along the basis (both squared), is to be made
-      /// orthogonal once more; the last keeps count of the digits lost.
-      { s.lost_orthogonality(a, b, a) } -> std::same_as<bool>;
-      /// 1/a; 0 where a is rounding beside b.
-      { s.inverse(a, b) } -> std::same_as<typename S::Scalar>;
+      /// Whether to make a vector orthogonal once more, by the squared norms of what is left of it and of what was
+      /// taken off along the basis; `loss` accumulates the digits lost.
+      { s.lost_orthogonality(left2, taken2, loss) } -> std::same_as<bool>;
+      /// 1/a; 0 where a is rounding beside `scale`.
+      { s.inverse(a, scale) } -> std::same_as<typename S::Scalar>;
       /// max(a, b)
       { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
-      /// Where the last but one is zero: h = argmin ‖g - R h‖² + (ε b)² ‖h‖², for the upper triangle R in the first n
-      /// columns of w, of which each has m entries. A constant.
-      s.damp(w, m, g, n, b, a, h);
+      /// Where `keep` is zero: h = argmin ‖g - R h‖² + (ε scale)² ‖h‖², for the upper triangle in the first n columns
+      /// of R, of which each has m entries. A constant.
+      s.damp(R, m, g, n, scale, keep, h);
       /// Whether a differs from zero in every sample; a space that would have to look closely may say no.
       { s.surely_all(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.
@@ -140,24 +161,56 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
   s.solve_directly(x, y);
 };
 
-/// All of it, and what the loop around the methods needs (iterate.h).
+/// All that methods need.
 template <class S>
-concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S> &&
-                         requires(S s, typename S::Vector x, typename S::Scalar a, typename S::States states,
-                                  bool (*wanted)(const typename S::States::value_type&)) {
-                           /// One number per sample, on the host.
-                           s.lanes(a);
-                           /// Which samples broke down; ‖A‖ of each; ‖u‖², where u is x and the start.
-                           s.broken();
-                           s.operator_norm();
-                           { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-                           /// ‖A v‖² for u with its signs changed without a pattern: about ‖|A| |u|‖², as the terms of
-                           /// a product do not cancel.
-                           { s.terms2(x) } -> std::same_as<typename S::Scalar>;
-                           /// From here on, operations write to the samples alone that are wanted.
-                           s.freeze_unless(states, wanted);
-                           /// Forgets breakdowns and frozen samples, before the iterations run again.
-                           s.reset();
-                         };
+concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S>;
+
+/// What the loop around the methods needs (iterate.h).
+template <class S>
+concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
+                             typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
+  /// One number per sample, on the host: a; whether it broke down; ‖A‖.
+  s.lanes(a);
+  s.broken();
+  s.operator_norm();
+  /// ‖u‖², where u is x and the start.
+  { s.solution2(x) } -> std::same_as<typename S::Scalar>;
+  /// ‖A v‖² for u with its signs changed without a pattern: about ‖|A| |u|‖², as the terms of a product do not cancel.
+  { s.terms2(x) } -> std::same_as<typename S::Scalar>;
+  /// A vector that the next operation may overwrite.
+  { s.scratch() } -> std::convertible_to<typename S::Vector>;
+  /// From here on, operations write to the samples alone that are wanted.
+  s.freeze_unless(states, wanted);
+  /// wanted(state) of each sample, as lanes() are.
+  s.map(states, wanted);
+  /// x of the samples that are wanted, `kept` of the others.
+  { s.select(s.map(states, wanted), kept, x) } -> std::convertible_to<typename S::Vector>;
+  /// Forgets breakdowns and frozen samples, before the iterations run again.
+  s.reset();
+};
+
+/// The fused operations, one after the other. A space derives from it, and defines anew what it does in one pass.
+template <class Space>
+class SpaceDefaults {
+ public:
+  void xmby(const auto& x, const auto& beta, auto&& y) { self().xpby(x, -beta, y); }
+  auto xpby_with_square(const auto& x, const auto& beta, auto&& y) {
+    self().xpby(x, beta, y);
+    return self().dot(y, y);
+  }
+  auto apply_with_dots(const auto& x, auto&& y) {
+    self().apply(x, y);
+    return std::array{self().dot(x, y), self().dot(y, y)};
+  }
+  auto apply_along(const auto& x, const auto& p, auto&& y) {
+    auto found = self().apply_with_dots(x, y);
+    if (!(x == p)) found[0] = self().dot(p, y);
+    return found;
+  }
+  void correct(const auto& x, auto&& y) { self().precondition(x, y); }
+
+ private:
+  Space& self() { return static_cast<Space&>(*this); }
+};
 
 }  // namespace prdp

@@ -10,6 +10,7 @@
 #include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
+#include "prdp/solvers/space.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -17,7 +18,7 @@ namespace prdp {
 /// A whole batch as a space for iterate(), in plain tensor operations: it serves every device,
 /// operators without CPU loops, and, run under autograd, the derivative of the iterations. Nothing
 /// is written in place but by batch_loops. A frozen sample keeps its values by at::where.
-class TensorSpace {
+class TensorSpace : public SpaceDefaults<TensorSpace> {
  public:
   using Vector = at::Tensor;  // (batch, ...)
   using Scalar = at::Tensor;  // (batch, 1, ...)
@@ -66,10 +67,6 @@ class TensorSpace {
   void xmby(const Vector& x, const Scalar& beta, Vector& y) {
     if (in_loops_) return batch_loops::xpby(x, -beta, y, active_);
     y = keep_frozen(at::addcmul(x, beta, y, -1), y);
-  }
-  Scalar xpby_with_square(const Vector& x, const Scalar& beta, Vector& y) {
-    xpby(x, beta, y);
-    return dot(y, y);
   }
   Scalar dot(const Vector& a, const Vector& b) const { return in_loops_ ? batch_loops::dot(a, b) : dot_in_order(a, b); }
   Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {

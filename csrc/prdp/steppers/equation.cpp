@@ -71,17 +71,14 @@ SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptio
 
 namespace {
 
-using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-
 template <class... Options>
-Outputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                    at::ArrayRef<double> parameters, int64_t picard_steps, Options... options) {
+SolveOutputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                         at::ArrayRef<double> parameters, int64_t picard_steps, Options... options) {
   const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
-  const auto [next, info] = step(equation, u, unflatten(std::move(options)...));
-  return {next, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+  return outputs_of(step(equation, u, unflatten(std::move(options)...)));
 }
-using StepSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                          at::ArrayRef<double>, int64_t)>;
+using StepSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                               at::ArrayRef<double>, int64_t)>;
 
 at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters) {
   return equation_rhs({std::string(kind), shape.vec(), parameters.vec(), {}}, u);
@@ -97,9 +94,7 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(
       "step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
-      "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
-      ") -> (Tensor u_next, Tensor iterations, Tensor residual, Tensor status, "
-      "Tensor operator_applications, Tensor floor)",
+      "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor u_next, " PRDP_REPORT_SCHEMA ")",
       static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
   m.def(

@@ -25,9 +25,6 @@ const std::vector<EquationKind> kKinds{
     {"heat", false, 1, false},  // b is the state
     {"burgers", true, kPerAxis, true},
     {"navier_stokes", true, 3, true, flow_rhs, velocity_over_dt},
-    {"diffusion", true, 1, false},  // these three of scenes alone, which make their steps
-    {"kolmogorov", true, kPerAxis, false},
-    {"darcy", false, 1, false},
 };
 
 }  // namespace

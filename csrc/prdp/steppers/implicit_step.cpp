@@ -41,21 +41,15 @@ at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
 at::Tensor ImplicitStep::rollout(const at::Tensor& u, int64_t steps) {
   info_.reset();  // a step that raises has none
   TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
-  std::vector<at::Tensor> states{u};
   std::vector<AdjointLog> logs;
-  Reports reports;
-  for (int64_t step = 1; step <= steps; ++step) {
-    const FailuresOfStep here(step, steps);
+  auto [states, info] = solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) {
     logs.push_back(open_adjoint_log());
-    auto [next, info] = solve(states.back(), *logs.back());
-    states.push_back(std::move(next));
-    reports.push(info);
-  }
-  auto all = at::stack(states, 1);
+    return solve(state, *logs.back());
+  });
   // A rollout without gradients, such as a validation, leaves the reports of the last backward pass.
-  if (all.requires_grad()) logs_of_steps_ = std::move(logs);
-  info_ = reports.joined(u);
-  return all;
+  if (states.requires_grad()) logs_of_steps_ = std::move(logs);
+  info_ = std::move(info);
+  return states;
 }
 
 }  // namespace prdp

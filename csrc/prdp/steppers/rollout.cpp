@@ -26,7 +26,6 @@ namespace {
 
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
-using Outputs = std::tuple<at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
 
 // A rollout is a row of solves, picard_steps to a step: solve s takes its winds from solution s and its
 // right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
@@ -34,29 +33,47 @@ constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
     "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
     ") -> "
-    "(Tensor solutions, Tensor iterations, Tensor residual, Tensor status, Tensor operator_applications, Tensor floor)";
+    "(Tensor solutions, " PRDP_REPORT_SCHEMA ")";
 constexpr const char* kVjpSchema =
     "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
     "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
     "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> Tensor[]";
 
-using SolvesSignature = WithOptions<Outputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                            at::ArrayRef<double>, int64_t, c10::SymInt)>;
+using SolvesSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                                 at::ArrayRef<double>, int64_t, c10::SymInt)>;
 using OptionalTensor = std::optional<at::Tensor>;
 using VjpSignature = WithOptions<std::vector<at::Tensor>(
     const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
     at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
 
-Outputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
+SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_solves", "").typed<SolvesSignature>();
   return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind), at::IntArrayRef(e.shape),
                            at::ArrayRef<double>(e.parameters), e.picard_steps, solves);
 }
 
+/// The arguments of an op but u; the forward pass hands them on to the backward pass.
+struct Call : torch::CustomClassHolder {
+  Equation equation;
+  c10::SymInt solves;
+  SolveOptions options;
+  std::shared_ptr<const RegisteredProducts> products{};  // of the preconditioner
+};
+
 Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
                      at::ArrayRef<double> parameters, int64_t picard_steps) {
   return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
+}
+
+template <class... Options>
+Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+            int64_t picard_steps, c10::SymInt solves, Options... flat) {
+  Call call;
+  call.equation = equation_of(tensors, kind, shape, parameters, picard_steps);
+  call.solves = std::move(solves);
+  call.options = unflatten(std::move(flat)...);
+  return call;
 }
 
 void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
@@ -70,45 +87,28 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
 }
 
 /// Below autograd.
-template <class... Options>
-Outputs solves_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                      at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt count, Options... flat) {
-  const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  const auto options = unflatten(std::move(flat)...);
-  check(equation, u, count, options);
-  const int64_t solves = count.expect_int(), unknowns = u.numel();
-  std::vector<at::Tensor> solutions{u};
-  Reports reports;
+template <class... Args>
+SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
+  const auto call = unpack(std::move(args)...);
+  const auto& equation = call.equation;
+  const auto& options = call.options;
+  check(equation, u, call.solves, options);
+  const int64_t solves = call.solves.expect_int(), picard = equation.picard_steps, unknowns = u.numel();
   at::Tensor b;
-  for (int64_t s = 0; s < solves; ++s) {
-    const FailuresOfStep here(s / picard_steps + 1, solves / picard_steps);
+  return outputs_of(solve_by_solve(u, solves, picard, [&](const at::Tensor& last, int64_t s) {
     interruption::Watch::local().spend(unknowns);
-    const auto& last = solutions.back();
-    if (s % picard_steps == 0) b = equation_rhs(equation, last);
-    auto [next, info] =
-        linear_solve_kernel(equation_operator(equation, last), b, options, start_of_step(options, last));
-    solutions.push_back(std::move(next));
-    reports.push(info);
-  }
-  auto info = reports.joined(u);
-  return {at::stack(solutions, 1), info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+    if (s % picard == 0) b = equation_rhs(equation, last);
+    return linear_solve_kernel(equation_operator(equation, last), b, options, start_of_step(options, last));
+  }));
 }
 
-template <class... Options>
-Outputs fake_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                    at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves, Options... flat) {
-  check(equation_of(tensors, kind, shape, parameters, picard_steps), u, solves, unflatten(std::move(flat)...));
+template <class... Args>
+SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
+  const auto call = unpack(std::move(args)...);
+  check(call.equation, u, call.solves, call.options);
   auto sizes = u.sym_sizes().vec();
-  sizes.insert(sizes.begin() + 1, solves + 1);
-  const auto of_dtype = [&](at::ScalarType dtype) {
-    return at::empty_symint({u.sym_size(0), solves}, u.options().dtype(dtype));
-  };
-  return {at::empty_symint(sizes, u.options()),
-          of_dtype(at::kLong),
-          of_dtype(u.scalar_type()),
-          of_dtype(at::kLong),
-          of_dtype(at::kLong),
-          of_dtype(u.scalar_type())};
+  sizes.insert(sizes.begin() + 1, call.solves + 1);
+  return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.solves})});
 }
 
 template <class... Options>
@@ -147,22 +147,14 @@ std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTens
   return gradients;
 }
 
-/// What travels from the forward to the backward pass.
-struct Call : torch::CustomClassHolder {
-  Equation equation;
-  c10::SymInt solves;
-  SolveOptions options;
-  std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
-};
-
 class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
  public:
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
     const auto& options = call->options;
-    const auto [solutions, iterations, residual, status, applications, floor] =
-        call_solves(call->equation, u, call->solves, options);
+    auto outputs = call_solves(call->equation, u, call->solves, options);
+    const auto& [solutions, iterations, residual, status, applications, floor] = outputs;
     ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
     ctx->set_materialize_grads(false);
     const bool unrolled = options.backward == Backward::kUnrolled;
@@ -217,15 +209,12 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
   }
 };
 
-template <class... Options>
-Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                        at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt solves, Options... flat) {
+template <class... Args>
+SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
+  auto call = c10::make_intrusive<Call>(unpack(std::move(args)...));
+  const auto tensors = call->equation.tensors;
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
-  auto call = c10::make_intrusive<Call>();
-  call->equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  call->solves = std::move(solves);
-  call->options = unflatten(std::move(flat)...);
   call->products = products_of(call->options.solver.preconditioner.spec());
   const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
                               (u.requires_grad() || any_requires_grad(tensors));
@@ -233,7 +222,7 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
     const at::AutoDispatchBelowADInplaceOrView below;
     return call_solves(call->equation, u, call->solves, call->options);
   }
-  const auto out = RolloutSolves::apply(u, tensors, call);
+  const auto out = RolloutSolves::apply(u, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }
 
@@ -241,15 +230,13 @@ Outputs autograd_solves(const at::Tensor& u, at::TensorList tensors, c10::string
 SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
   check(equation, u, steps * equation.picard_steps, options);
   options.adjoint_log = 0;  // it would hold the first step's alone
-  return step_by_step(u, steps, [&](const at::Tensor& state) { return step(equation, state, options); });
+  return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) { return step(equation, state, options); });
 }
 
-template <class... Options>
-Outputs rollout_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                       at::ArrayRef<double> parameters, int64_t picard_steps, c10::SymInt steps, Options... flat) {
-  const auto [states, info] =
-      rollout(equation_of(tensors, kind, shape, parameters, picard_steps), u, steps, unflatten(std::move(flat)...));
-  return {states, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
+template <class... Args>
+SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
+  const auto call = unpack(std::move(args)...);  // its solves are steps here
+  return outputs_of(rollout(call.equation, u, call.solves, call.options));
 }
 
 }  // namespace
@@ -263,14 +250,14 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   TORCH_CHECK_VALUE(
       steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  auto [solutions, iterations, residual, status, applications, floor] =
-      call_solves(equation, u, steps * picard, options);
-  if (picard == 1) return {solutions, {iterations, residual, status, applications, floor}};
+  auto [solutions, info] = result_of(call_solves(equation, u, steps * picard, options));
+  if (picard == 1) return {solutions, info};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
-  const auto worst = of_steps(status).amin(-1);
+  const auto last = [&](const at::Tensor& t) { return of_steps(t).select(-1, picard - 1); };
+  const auto worst = of_steps(info.status).amin(-1);
   return {solutions.slice_symint(1, 0, std::nullopt, picard),
-          {of_steps(iterations).sum(-1), of_steps(residual).select(-1, picard - 1), worst,
-           of_steps(applications).sum(-1), floor_of(of_steps(floor).select(-1, picard - 1), worst)}};
+          {of_steps(info.iterations).sum(-1), last(info.residual), worst, of_steps(info.operator_applications).sum(-1),
+           floor_of(last(info.floor), worst)}};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
@@ -278,9 +265,7 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
   m.def(
       "rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-      "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
-      ") -> (Tensor states, Tensor iterations, Tensor residual, "
-      "Tensor status, Tensor operator_applications, Tensor floor)",
+      "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor states, " PRDP_REPORT_SCHEMA ")",
       static_cast<SolvesSignature*>(rollout_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {

@@ -18,19 +18,19 @@ class Reports {
   std::vector<at::Tensor> iterations_, residual_, status_, applications_, floor_;
 };
 
-/// The states u, …, (batch, steps + 1, …), where `next` returns the one after a state with its report. Autograd sees
-/// each step by itself.
+/// The solutions u, …, (batch, solves + 1, …), where `next(solution, s)` returns what solve s makes of the one before
+/// it, with its report; so many solves are a step. Autograd sees each solve by itself.
 template <class Next>
-SolveResult step_by_step(const at::Tensor& u, int64_t steps, const Next& next) {
-  std::vector<at::Tensor> states{u};
+SolveResult solve_by_solve(const at::Tensor& u, int64_t solves, int64_t of_step, const Next& next) {
+  std::vector<at::Tensor> solutions{u};
   Reports reports;
-  for (int64_t s = 0; s < steps; ++s) {
-    const FailuresOfStep here(s + 1, steps);
-    auto [state, info] = next(states.back());
-    states.push_back(std::move(state));
+  for (int64_t s = 0; s < solves; ++s) {
+    const FailuresOfStep here(s / of_step + 1, solves / of_step);
+    auto [solution, info] = next(solutions.back(), s);
+    solutions.push_back(std::move(solution));
     reports.push(info);
   }
-  return {at::stack(states, 1), reports.joined(u)};
+  return {at::stack(solutions, 1), reports.joined(u)};
 }
 
 /// What the solves of a rollout store for their derivative; undefined if it is not needed.

@@ -9,11 +9,25 @@
 
 namespace prdp {
 
+namespace {
+
+/// The equations of scenes alone, which make their steps themselves, and those of the library.
+const EquationKind& kind_of(const std::string& equation) {
+  static const std::vector<EquationKind> own{{"diffusion", /*periodic=*/true, /*channels=*/1, /*linearised=*/false},
+                                             {"kolmogorov", true, kPerAxis, false},
+                                             {"darcy", false, 1, false}};
+  for (const auto& kind : own)
+    if (kind.kind == equation) return kind;
+  return equation_kind(equation);
+}
+
+}  // namespace
+
 // The list of scene keys is made from a scene without an equation.
-bool Scene::Physics::periodic() const { return !equation.empty() && equation_kind(equation).periodic; }
+bool Scene::Physics::periodic() const { return !equation.empty() && kind_of(equation).periodic; }
 
 int64_t Scene::Physics::channels() const {
-  const int64_t channels = equation_kind(equation).channels;
+  const int64_t channels = kind_of(equation).channels;
   return channels == kPerAxis ? static_cast<int64_t>(shape.size()) : channels;
 }
 

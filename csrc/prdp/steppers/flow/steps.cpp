@@ -196,7 +196,8 @@ SolveResult next(const FlowEquation& equation, const at::Tensor& u, Returned ret
 SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
-  return step_by_step(u, steps, [&](const at::Tensor& state) { return unrolled_step(equation, state, options); });
+  return solve_by_solve(u, steps, 1,
+                        [&](const at::Tensor& state, int64_t) { return unrolled_step(equation, state, options); });
 }
 
 }  // namespace

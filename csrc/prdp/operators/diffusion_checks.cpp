@@ -1,0 +1,193 @@
+#include <ATen/TensorSubclassLikeUtils.h>
+
+#include <cmath>
+#include <sstream>
+
+#include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/singular_operator.h"
+#include "prdp/operators/tensors.h"
+
+/// What a Diffusion is made of, what of it is refused, and what it warns of.
+namespace prdp {
+
+namespace {
+
+/// The least mean of a sample.
+double mean_of_least_sample(const at::Tensor& t) {
+  return t.dim() == 0 ? t.item<double>() : t.to(at::kDouble).flatten(1).mean(1).min().item<double>();
+}
+
+}  // namespace
+
+OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<std::array<Side, 2>>& sides,
+                       const std::vector<double>& lengths, FaceMean faces, const std::vector<at::Tensor>& robin) {
+  TORCH_CHECK_VALUE(kappa.dim() >= 2 && kappa.dim() <= 4,
+                    "Diffusion: kappa must have shape (batch or 1, *shape) with 1 to 3 axes in shape, got ",
+                    kappa.sizes());
+  const auto dim = static_cast<size_t>(kappa.dim() - 1);
+  TORCH_CHECK_VALUE(sides.size() == 1 || sides.size() == dim, "Diffusion: boundary must be one for all axes or ", dim,
+                    ", one for each, got ", sides.size());
+  TORCH_CHECK_VALUE(lengths.size() == 1 || lengths.size() == dim, "Diffusion: length must be one number or ", dim,
+                    ", one for each axis, got ", lengths.size());
+  OperatorSpec spec{"diffusion", kappa.sizes().slice(1).vec(), {}, {kappa, shift}};
+  spec.tensors.insert(spec.tensors.end(), robin.begin(), robin.end());
+  for (size_t d = 0; d < dim; ++d)
+    for (const auto side : sides[sides.size() == 1 ? 0 : d]) spec.parameters.push_back(static_cast<double>(side));
+  for (size_t d = 0; d < dim; ++d) spec.parameters.push_back(lengths[lengths.size() == 1 ? 0 : d]);
+  spec.parameters.push_back(static_cast<double>(faces));
+  [[maybe_unused]] const DiffusionOperator checks_the_rest(spec);
+  bool held = shift.dim() > 0 || shift.item<double>() != 0.0;
+  for (const auto& axis : sides)
+    for (const auto side : axis) held = held || side == Side::kZero || side == Side::kRobin;
+  if (held) return spec;
+  return with_null_space(std::move(spec), at::empty({0}, kappa.options()));
+}
+
+DiffusionOperator::DiffusionOperator(const OperatorSpec& spec) : shape_(spec.shape) {
+  TORCH_CHECK_VALUE(spec.tensors.size() >= 2, "Diffusion: takes the tensors kappa, shift, and h of each Robin side");
+  const auto &kappa = spec.tensors[0], &shift = spec.tensors[1];
+  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa.dim() == dim() + 1 &&
+                        kappa.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_)),
+                    "Diffusion: kappa must have shape (batch or 1, *shape), got ", kappa.sym_sizes());
+  TORCH_CHECK_TYPE(kappa.scalar_type() == at::kFloat || kappa.scalar_type() == at::kDouble,
+                   "Diffusion: kappa must be float32 or float64, got ", kappa.scalar_type());
+  TORCH_CHECK_VALUE(
+      shift.dim() == 0 || (shift.dim() == kappa.dim() && shift.sym_sizes().slice(1) == kappa.sym_sizes().slice(1)),
+      "Diffusion: shift must be a number or have the shape of kappa, got ", shift.sym_sizes());
+  kappa_ = kappa.unsqueeze(1);
+  shift_ = shift.to(kappa.scalar_type());
+  if (shift.dim() > 0) shift_ = shift_.unsqueeze(1);
+  const auto axes = static_cast<size_t>(dim());
+  TORCH_CHECK_VALUE(spec.parameters.size() == 3 * axes + 1, "Diffusion: expected ", 3 * axes + 1, " parameters, got ",
+                    spec.parameters.size());
+  for (size_t d = 0; d < axes; ++d) {
+    sides_.push_back({static_cast<Side>(static_cast<int>(spec.parameters[2 * d])),
+                      static_cast<Side>(static_cast<int>(spec.parameters[2 * d + 1]))});
+    TORCH_CHECK_VALUE((sides_[d][0] == Side::kPeriodic) == (sides_[d][1] == Side::kPeriodic),
+                      "Diffusion: both sides of an axis are periodic or none is");
+    lengths_.push_back(spec.parameters[2 * axes + d]);
+    TORCH_CHECK_VALUE(std::isfinite(lengths_[d]) && lengths_[d] > 0.0, "Diffusion: length must be > 0, got ",
+                      lengths_[d]);
+  }
+  mean_ = static_cast<FaceMean>(static_cast<int>(spec.parameters.back()));
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    for (size_t end = 0; end < 2; ++end)
+      if (sides_[axis][end] == Side::kRobin) take_robin(spec.tensors, axis, end);
+  TORCH_CHECK_VALUE(spec.tensors.size() == 2 + robin_.size(), "Diffusion: takes h of each Robin side, ", robin_.size(),
+                    " here, got ", spec.tensors.size() - 2);
+}
+
+void DiffusionOperator::take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end) {
+  TORCH_CHECK_VALUE(2 + robin_.size() < tensors.size(), "Diffusion: takes h of each Robin side, got ",
+                    tensors.size() - 2);
+  const auto& h = tensors[2 + robin_.size()];
+  auto side = shape_;
+  side.erase(side.begin() + axis);
+  const auto whole = c10::fromIntArrayRefSlow(side);
+  TORCH_CHECK_VALUE(h.dim() == 0 || (h.dim() == dim() && h.sym_sizes().slice(1) == c10::SymIntArrayRef(whole)),
+                    "Diffusion: h of the ", end == 0 ? "low" : "high", " side of axis ", axis,
+                    " must be a number or have shape (batch or 1, *side), where side is ", at::IntArrayRef(side),
+                    ", got ", h.sym_sizes());
+  const auto taken = h.to(kappa_.scalar_type());
+  robin_.push_back(h.dim() == 0 ? taken : taken.unsqueeze(1 + axis).unsqueeze(1));
+}
+
+const at::Tensor& DiffusionOperator::robin(int64_t axis, size_t end) const {
+  size_t before = 0;
+  for (int64_t d = 0; d < dim(); ++d)
+    for (size_t e = 0; e < 2; ++e) {
+      if (d == axis && e == end) return robin_[before];
+      before += sides_[d][e] == Side::kRobin;
+    }
+  TORCH_INTERNAL_ASSERT(false);
+}
+
+std::vector<std::pair<const char*, at::Tensor>> DiffusionOperator::tensors() const {
+  std::vector<std::pair<const char*, at::Tensor>> all{{"kappa", kappa_}, {"shift", shift_}};
+  for (const auto& h : robin_) all.emplace_back("h of a Robin side", h);
+  return all;
+}
+
+void DiffusionOperator::check_vector(const at::Tensor& b) const {
+  TORCH_CHECK_VALUE(b.dim() == dim() + 2 && b.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2) && b.sym_size(1) != 0,
+                    "Diffusion: expected kappa (batch or 1, *shape) and b (batch, channel, *shape), got kappa ",
+                    kappa_.squeeze(1).sym_sizes(), " and b ", b.sym_sizes());
+  for (const auto& [name, t] : tensors())
+    TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
+                      " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));
+  TORCH_CHECK_TYPE(b.scalar_type() == kappa_.scalar_type(), "Diffusion: kappa is ", kappa_.scalar_type(),
+                   " but the vector is ", b.scalar_type());
+  for (const auto& [name, t] : tensors())
+    TORCH_CHECK_VALUE(t.device() == b.device() || (t.dim() == 0 && t.is_cpu()), "Diffusion: its tensors are on ",
+                      t.device(), " but the vector is on ", b.device());
+}
+
+void DiffusionOperator::check_parameters(bool kernel_checks) const {
+  for (const auto& [name, t] : tensors())
+    if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
+  for (const auto& h : robin_) {
+    if (kernel_checks && (h.dim() > 0 || !h.is_cpu())) continue;
+    const double least = h.min().item<double>();
+    TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
+                      "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
+  }
+  if (kernel_checks) return;
+  const auto [low, high] = at::aminmax(kappa_);
+  const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
+  const auto* least_and_most = ends.const_data_ptr<double>();
+  if (least_and_most[0] > 0.0) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
+  const auto wrong = kappa_.le(0);
+  if (!wrong.any().item<bool>()) return;
+  const auto index = first_true(wrong);
+  TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
+                    kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
+                    " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(2));
+}
+
+void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double largest_kappa) const {
+  if (kappa_.scalar_type() != at::kFloat || !kappa_.is_cpu() || !shift_.is_cpu()) return;
+  double diagonal = 0.0;
+  for (int64_t axis = 0; axis < dim(); ++axis) diagonal += 2.0 * largest_kappa * per_cell2(axis);
+  const double rounding = 10.0 * epsilon_of(kappa_) * diagonal;
+  const double least_shift = shift_.min().item<double>();
+  warn_of_drift(least_shift, epsilon_of(kappa_) * diagonal);
+  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa)) return;
+  const double shift = mean_of_least_sample(shift_);
+  const double held = held_by(shift, least_shift, std::exp(kappa_.log().mean().item<double>()));
+  if (!(held > 0.0) || rounding <= held) return;
+  std::ostringstream what;
+  if (held == shift) what << "a shift of " << shift;
+  else what << "what holds u, a shift and sides that act as one of about " << held << ',';
+  TORCH_WARN_ONCE("Diffusion: in float32, ", what.str(), " is lost in the rounding of a diagonal of up to ", diagonal,
+                  ", so that u may be off by per cents and its mean is not conserved; take float64");
+}
+
+void DiffusionOperator::warn_of_drift(double shift, double rounding) const {
+  constexpr double most = 1e-4;  // half a per cent in fifty steps
+  for (const auto& [low, high] : sides_)
+    for (const auto side : {low, high})
+      if (side == Side::kZero || side == Side::kRobin) return;
+  const double drift = rounding / (2.0 * shift);
+  if (!std::isfinite(drift) || !(shift > 0.0) || drift <= most) return;
+  TORCH_WARN_ONCE("Diffusion: in float32 the mean of u, which nothing but the shift holds, may drift by up to ", drift,
+                  " of itself in each solve, as a shift of ", shift,
+                  " is small beside the diagonal; take float64, or more than one step to the same time");
+}
+
+double DiffusionOperator::held_by(double shift, double least_shift, double kappa) const {
+  double by_sides = 0.0, through_cells = 0.0;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    through_cells += 8.0 * kappa / (lengths_[axis] * lengths_[axis]);
+    for (size_t end = 0; end < 2; ++end) {
+      const auto side = sides_[axis][end];
+      if (side != Side::kZero && side != Side::kRobin) continue;
+      const double within = 2.0 * kappa * per_cell(axis);
+      const double beyond = side == Side::kRobin ? mean_of_least_sample(robin(axis, end)) : 0.0;
+      by_sides += (side == Side::kZero ? within : within * beyond / (within + beyond)) / lengths_[axis];
+    }
+  }
+  const double at_some_cells = shift - least_shift + by_sides;
+  return least_shift + at_some_cells / (1.0 + at_some_cells / through_cells);
+}
+
+}  // namespace prdp
