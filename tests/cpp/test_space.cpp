@@ -42,7 +42,7 @@ class PlainSpace : public SampleNumbers<double>, public SpaceDefaults<PlainSpace
     for (int64_t i = 0; i < unknowns(); ++i) sum += x[i] * y[i];
     return sum;
   }
-  Scalar descend(Scalar alpha, const double* p, const double* q, Vector x, Vector r) {
+  Scalar update_iterate_and_residual(Scalar alpha, const double* p, const double* q, Vector x, Vector r) {
     for (int64_t i = 0; i < unknowns(); ++i) x[i] += alpha * p[i], r[i] -= alpha * q[i];
     return dot(r, r);
   }

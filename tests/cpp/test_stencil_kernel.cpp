@@ -52,7 +52,7 @@ std::unique_ptr<Kernel<T>> make_kernel(const StencilGrid& grid, std::vector<Offs
   if (transposed)
     for (auto& offset : offsets)
       for (auto& cells : offset.along) cells = -cells;
-  return GivenStencil<T>{coefficients.data(), 0, std::make_shared<StencilPattern>(grid, offsets), transposed}.make(
+  return GivenStencil<T>{coefficients.data(), 0, std::make_shared<StencilSparsity>(grid, offsets), transposed}.make(
       0, channels);
 }
 
@@ -96,7 +96,7 @@ void expect_stencils(int64_t dim, const std::vector<std::array<int64_t, 3>>& sha
   for (const auto& n : shapes)
     for (int boundary = 0; boundary < 1 << dim; ++boundary) {
       const StencilGrid grid{dim, {n[0], n[1], n[2]}, {(boundary & 4) != 0, (boundary & 2) != 0, (boundary & 1) != 0}};
-      for (const auto& offsets : {StencilPattern::nearest_neighbours(dim), far}) {
+      for (const auto& offsets : {StencilSparsity::nearest_neighbours(dim), far}) {
         expect_stencil<float>(grid, offsets);
         expect_stencil<double>(grid, offsets);
       }
@@ -114,10 +114,10 @@ TEST(StencilKernel, EqualsItsMatrixInThreeDimensions) {
   expect_stencils(3, {{1, 1, 1}, {2, 1, 3}, {3, 2, 4}, {2, 3, 17}}, kFarInSpace);
 }
 
-TEST(StencilPattern, OffsetsThatLeadToOneNeighbourAreOne) {
+TEST(StencilSparsity, OffsetsThatLeadToOneNeighbourAreOne) {
   const std::vector<Offset> five{{{0, 0, -2}}, {{0, 0, -1}}, {{0, 0, 0}}, {{0, 0, 1}}, {{0, 0, 2}}};
   const auto places = [&](int64_t n, bool periodic) {
-    return StencilPattern({1, {1, 1, n}, {false, false, periodic}}, five).places;
+    return StencilSparsity({1, {1, 1, n}, {false, false, periodic}}, five).places;
   };
   using Places = std::vector<int64_t>;
   EXPECT_EQ(places(1, true), (Places{0, 0, 0, 0, 0}));
@@ -126,8 +126,8 @@ TEST(StencilPattern, OffsetsThatLeadToOneNeighbourAreOne) {
   EXPECT_EQ(places(4, true), (Places{1, 2, 0, 3, 1}));
   EXPECT_EQ(places(1, false), (Places{-1, -1, 0, -1, -1}));
   EXPECT_EQ(places(2, false), (Places{-1, 1, 0, 2, -1}));
-  EXPECT_TRUE(StencilPattern({1, {1, 1, 3}, {false, false, true}}, five).nearest);
-  EXPECT_FALSE(StencilPattern({1, {1, 1, 4}, {false, false, true}}, five).nearest);
+  EXPECT_TRUE(StencilSparsity({1, {1, 1, 3}, {false, false, true}}, five).nearest);
+  EXPECT_FALSE(StencilSparsity({1, {1, 1, 4}, {false, false, true}}, five).nearest);
 }
 
 TEST(Stencil, KnowsItsNormWhereNeighboursCoincide) {

@@ -4,8 +4,8 @@
 #include "helpers.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/tensor_cycles.h"
+#include "prdp/solvers/tensor_preconditioner.h"
 
 using namespace prdp;
 

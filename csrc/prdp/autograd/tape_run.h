@@ -48,9 +48,9 @@ class TapeRun {
   /// Vectors and numbers of a state. x is kept where an iteration reads it.
   static constexpr int64_t kNumbers = []<class... Part>(std::tuple<Part&...>*) {
     return (int64_t{std::is_same_v<Part, Number>} + ... + 0);
-  }(static_cast<decltype(std::declval<Method&>().carried())*>(nullptr));
+  }(static_cast<decltype(std::declval<Method&>().iteration_state())*>(nullptr));
   static constexpr int64_t kVectors =
-      static_cast<int64_t>(std::tuple_size_v<decltype(std::declval<Method&>().carried())>) - kNumbers + 1;
+      static_cast<int64_t>(std::tuple_size_v<decltype(std::declval<Method&>().iteration_state())>) - kNumbers + 1;
 
   /// The cotangent of the last iterate is in x_bar, memory of the tape.
   TapeRun(Tape<T>& tape, Space& space, TapeBack<T>& back, Method method, KeptStates<T>& kept, T* x_bar, Stop stop)
@@ -152,7 +152,7 @@ class TapeRun {
   template <class Body>
   void each(const Body& body) {
     size_t i = 0;
-    auto carried = method_.carried();
+    auto carried = method_.iteration_state();
     carries_x_ = std::apply([&](auto&... part) { return ((static_cast<void*>(&part) == &method_.x) || ...); }, carried);
     if (!carries_x_) body(method_.x, i++);
     std::apply([&](auto&... part) { (body(part, i++), ...); }, carried);

@@ -85,11 +85,11 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   Scalar dot(const Vector& a, const Vector& b) {
     return number(Kind::kDot, values_.dot(value(a), value(b)), a.version, b.version);
   }
-  Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
+  Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     const auto p_then = p.version, x_before = x.version, r_before = r.version;
     const T* direction = value(p);
     T* const x_now = changed(x);
-    const T rr = values_.descend(alpha.value, direction, value(q), x_now, changed(r));
+    const T rr = values_.update_iterate_and_residual(alpha.value, direction, value(q), x_now, changed(r));
     note({.kind = Kind::kAxpy,
           .out = x.version,
           .a = x_before,
@@ -167,8 +167,8 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
-  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
-    const T length = values_.step_length(num.value, den.value, a2.value, b2.value);
+  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
+    const T length = values_.guarded_quotient(num.value, den.value, a2.value, b2.value);
     return length == T(0) ? Scalar(length) : num / den;
   }
   Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const {

@@ -19,7 +19,7 @@ struct OperatorView {
   /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.
   at::Tensor null_space{}, left_null_space{};
   int64_t null_field = -1;  // the one channel that these belong to; -1: each has its own
-  bool leaks = false;       // Operator::leaks()
+  bool needs_projection = false;       // Operator::needs_projection()
 };
 
 /// Its tensors and numbers as a kernel takes them.

@@ -6,10 +6,10 @@ namespace prdp::kernels {
 
 /// The coefficients of a stencil of nearest neighbours on a periodic grid as contiguous fields.
 template <class T>
-RawStencil<T> raw_stencil(const StencilRows<T>& rows) {
-  RawStencil<T> a(rows.grid());
+StencilFields<T> raw_stencil(const PackedStencil<T>& rows) {
+  StencilFields<T> a(rows.grid());
   std::vector<T*> fields;
-  for (const auto& o : rows.pattern().offsets) fields.push_back(a.add(RawStencil<T>::place(o)));
+  for (const auto& o : rows.pattern().offsets) fields.push_back(a.add(StencilFields<T>::place(o)));
   const auto& [nz, ny, nx] = rows.grid().shape;
   rows.for_each_coefficient([&](int64_t row, int64_t k, int64_t i, T value) { fields[k][row * nx + i] = value; });
   return a;
@@ -31,8 +31,8 @@ std::unique_ptr<Kernel<T>> burgers(const UpwindParameters<T>& p, int64_t dim) {
     return {scratch, scratch + 1, scratch + 2};
   };
   UpwindTerms terms{factor, p.dt * factor, p.nu * p.dt * factor, p.transposed, p.length_y, p.length_x};
-  auto rows = std::make_shared<StencilRows<T>>(upwind_rows<T>(p.pattern, terms, winds));
-  const auto raw = [p, dim]() -> std::optional<RawStencil<T>> {
+  auto rows = std::make_shared<PackedStencil<T>>(upwind_rows<T>(p.pattern, terms, winds));
+  const auto raw = [p, dim]() -> std::optional<StencilFields<T>> {
     auto untransposed = p;
     untransposed.transposed = false;
     const auto kernel = burgers(untransposed, dim);

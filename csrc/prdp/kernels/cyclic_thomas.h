@@ -4,7 +4,7 @@
 #include <limits>
 #include <vector>
 
-#include "prdp/kernels/stencil_rows.h"
+#include "prdp/kernels/packed_stencil.h"
 
 namespace prdp::kernels {
 
@@ -15,7 +15,7 @@ namespace prdp::kernels {
 class CyclicThomas {
  public:
   template <class T>
-  explicit CyclicThomas(const StencilRows<T>& a)
+  explicit CyclicThomas(const PackedStencil<T>& a)
       : n_(a.grid().shape[2]), lower_(n_), inverse_pivot_(n_), upper_(n_), column_(n_) {
     const int64_t last = n_ - 1;
     double corner = 0;

@@ -9,7 +9,7 @@ namespace prdp::kernels {
 
 namespace {
 
-/// Coefficients as StencilPattern::nearest_neighbours() orders them: that of the neighbour one step (-1 or 1) along an
+/// Coefficients as StencilSparsity::nearest_neighbours() orders them: that of the neighbour one step (-1 or 1) along an
 /// axis, where x is axis 2.
 int64_t place_of(int axis, int64_t step) { return 1 + 2 * (2 - axis) + (step > 0); }
 
@@ -17,7 +17,7 @@ int64_t place_of(int axis, int64_t step) { return 1 + 2 * (2 - axis) + (step > 0
 template <class T>
 class Reader {
  public:
-  explicit Reader(const StencilRows<T>& a)
+  explicit Reader(const PackedStencil<T>& a)
       : a_(a), n_(a.grid().shape), slack_(slack_of_sum(a.norm(), std::numeric_limits<T>::epsilon())) {}
 
   /// A_d, as it is on the line of points through the first one.
@@ -90,7 +90,7 @@ class Reader {
     return farther == 0;
   }
 
-  const StencilRows<T>& a_;
+  const PackedStencil<T>& a_;
   const int64_t* n_;
   double slack_;
 };
@@ -188,7 +188,7 @@ DiagonalisedSum diagonalise(const SumOverAxes& a, double epsilon, int64_t null_v
 }
 
 template <class T>
-std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a) {
+std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<T>& a) {
   const auto& grid = a.grid();
   if (!has_axes_to_diagonalise(grid.dim, grid.shape) || !a.pattern().nearest) return std::nullopt;
   const Reader<T> reader(a);
@@ -232,7 +232,7 @@ int64_t FastDiagonalisation<T>::bytes() const {
 }
 
 template <class T>
-std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const StencilRows<T>& a, const FactorKey& key,
+std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const PackedStencil<T>& a, const FactorKey& key,
                                                                    int64_t null_vectors) {
   using Solver = FastDiagonalisation<T>;
   const auto of_both = FactorKeyMaker().add(key).add(null_vectors).key();
@@ -246,11 +246,11 @@ std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const Stencil
 
 template class FastDiagonalisation<float>;
 template class FastDiagonalisation<double>;
-template std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<float>&);
-template std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<double>&);
-template std::shared_ptr<const FastDiagonalisation<float>> fast_diagonalisation(const StencilRows<float>&,
+template std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<float>&);
+template std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<double>&);
+template std::shared_ptr<const FastDiagonalisation<float>> fast_diagonalisation(const PackedStencil<float>&,
                                                                                 const FactorKey&, int64_t);
-template std::shared_ptr<const FastDiagonalisation<double>> fast_diagonalisation(const StencilRows<double>&,
+template std::shared_ptr<const FastDiagonalisation<double>> fast_diagonalisation(const PackedStencil<double>&,
                                                                                  const FactorKey&, int64_t);
 
 }  // namespace prdp::kernels

@@ -8,7 +8,7 @@
 #include "prdp/kernels/axis_products.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/fourier_multiplier.h"
-#include "prdp/kernels/stencil_rows.h"
+#include "prdp/kernels/packed_stencil.h"
 
 namespace prdp::kernels {
 
@@ -18,7 +18,7 @@ namespace prdp::kernels {
 using SumOverAxes = std::array<Eigen::MatrixXd, 3>;
 /// Nothing if the stencil is none, up to rounding.
 template <class T>
-std::optional<SumOverAxes> as_sum_over_axes(const StencilRows<T>& a);
+std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<T>& a);
 
 /// Whether such a sum is looked for on a grid of these extents (z, y, x): shorter axes have no three points, and the
 /// eigenvectors of longer ones take longer than sparse factors.
@@ -62,7 +62,7 @@ class FastDiagonalisation {
 
 /// That of a stencil, from the cache or made; null if the stencil is no such sum.
 template <class T>
-std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const StencilRows<T>& a, const FactorKey& key,
+std::shared_ptr<const FastDiagonalisation<T>> fast_diagonalisation(const PackedStencil<T>& a, const FactorKey& key,
                                                                    int64_t null_vectors);
 
 }  // namespace prdp::kernels

@@ -47,14 +47,14 @@ template <class T>
 using Sums = std::array<Field<T>, 3>;
 
 template <class T>
-Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
+Sums<T> sums_along(const StencilFields<T>& a, int axis, bool transposed) {
   Sums<T> sums;
   for (auto& s : sums) s.resize(a.points());
   const int64_t nx = a.grid.shape[2];
   for_each_row(a.grid, [&](int64_t z, int64_t y, int64_t at) {
     for (auto& s : sums) std::fill_n(s.data() + at, nx, T(0));
     for (int k = 0; k < 27; ++k) {
-      const Offset o = RawStencil<T>::offset(k);
+      const Offset o = StencilFields<T>::offset(k);
       const T *own = a.coefficients[k], *of_transpose = a.coefficients[26 - k];
       if (!(transposed ? of_transpose : own)) continue;
       T* to = sums[o.along[axis] + 1].data() + at;
@@ -76,9 +76,9 @@ Sums<T> sums_along(const RawStencil<T>& a, int axis, bool transposed) {
 
 /// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros.
 template <class T>
-Weights<T> weights_of(const RawStencil<T>& a, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
+Weights<T> weights_of(const StencilFields<T>& a, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
   const StencilGrid& grid = a.grid;
-  const T* diagonal = a.coefficients[RawStencil<T>::kCentre];
+  const T* diagonal = a.coefficients[StencilFields<T>::kCentre];
   const Ringed ringed(grid);
   Weights<T> w{zeros<T>(Ringed::size(grid)), zeros<T>(Ringed::size(grid))};
   const auto& [nz, ny, nx] = grid.shape;
@@ -124,12 +124,12 @@ struct Constants {
 template <class T>
 class CollapseOf {
  public:
-  CollapseOf(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer, const Constants<T>& constants,
+  CollapseOf(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer, const Constants<T>& constants,
              int centre, T* const out[3])
       : a_(a), axis_(axis), transfer_(transfer), constants_(constants), ringed_(a.grid), out_(out) {
     const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
     for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[centre + (d - 1) * step];
-    offset_ = RawStencil<T>::offset(centre);
+    offset_ = StencilFields<T>::offset(centre);
   }
   bool is_empty() const { return !fine_[0] && !fine_[1] && !fine_[2]; }
 
@@ -157,31 +157,31 @@ class CollapseOf {
     };
     const T *zeros = constants_.zeros.data(), *ones = constants_.ones.data();
     const auto& [p, r] = transfer_;
-    const Collapse<T> c{coefficient(0, before),
-                        coefficient(0, middle),
-                        coefficient(0, after),
-                        fine_[1] ? coefficient(1, before) : zeros,
-                        fine_[1] ? coefficient(1, middle) : zeros,
-                        fine_[1] ? coefficient(1, after) : zeros,
-                        coefficient(2, before),
-                        coefficient(2, middle),
-                        coefficient(2, after),
-                        has_before ? weight(p.left, before, true) : ones,
-                        has_before ? weight(p.right, before, true) : zeros,
-                        has_after ? weight(p.left, after, true) : zeros,
-                        has_after ? weight(p.right, after, true) : ones,
-                        has_before ? weight(r.right, before, false) : zeros,
-                        has_after ? weight(r.left, after, false) : zeros,
-                        out_[0] + to,
-                        out_[1] + to,
-                        out_[2] + to};
-    loops<T>().collapse(c, axis_ == 2 ? 2 : 1, n);
+    const GalerkinProduct<T> c{coefficient(0, before),
+                               coefficient(0, middle),
+                               coefficient(0, after),
+                               fine_[1] ? coefficient(1, before) : zeros,
+                               fine_[1] ? coefficient(1, middle) : zeros,
+                               fine_[1] ? coefficient(1, after) : zeros,
+                               coefficient(2, before),
+                               coefficient(2, middle),
+                               coefficient(2, after),
+                               has_before ? weight(p.left, before, true) : ones,
+                               has_before ? weight(p.right, before, true) : zeros,
+                               has_after ? weight(p.left, after, true) : zeros,
+                               has_after ? weight(p.right, after, true) : ones,
+                               has_before ? weight(r.right, before, false) : zeros,
+                               has_after ? weight(r.left, after, false) : zeros,
+                               out_[0] + to,
+                               out_[1] + to,
+                               out_[2] + to};
+    loops<T>().galerkin_product(c, axis_ == 2 ? 2 : 1, n);
   }
 
  private:
   bool has_sides() const { return fine_[0] || fine_[2]; }
 
-  const RawStencil<T>& a_;
+  const StencilFields<T>& a_;
   int axis_;
   const AxisTransfer<T>& transfer_;
   const Constants<T>& constants_;
@@ -194,7 +194,7 @@ class CollapseOf {
 }  // namespace
 
 template <class T>
-AxisTransfer<T> make_transfer(const RawStencil<T>& a, int axis, bool symmetric) {
+AxisTransfer<T> make_transfer(const StencilFields<T>& a, int axis, bool symmetric) {
   const auto own = sums_along(a, axis, false);
   if (symmetric) {
     auto w = weights_of(a, own);
@@ -208,12 +208,12 @@ namespace {
 
 /// See kVanishing.
 template <class T>
-void keep_vanishing_diagonals(const RawStencil<T>& a, int axis, RawStencil<T>& coarse) {
-  const T* const fine = a.coefficients[RawStencil<T>::kCentre];
-  T* const diagonal = const_cast<T*>(coarse.coefficients[RawStencil<T>::kCentre]);  // in its own memory
+void keep_vanishing_diagonals(const StencilFields<T>& a, int axis, StencilFields<T>& coarse) {
+  const T* const fine = a.coefficients[StencilFields<T>::kCentre];
+  T* const diagonal = const_cast<T*>(coarse.coefficients[StencilFields<T>::kCentre]);  // in its own memory
   const auto is_alone = [&](int64_t i) {
     for (int k = 0; k < 27; ++k)
-      if (k != RawStencil<T>::kCentre && coarse.coefficients[k] && coarse.coefficients[k][i] != T(0)) return false;
+      if (k != StencilFields<T>::kCentre && coarse.coefficients[k] && coarse.coefficients[k][i] != T(0)) return false;
     return true;
   };
   const auto roundings = [](double n) { return static_cast<T>(n) * std::numeric_limits<T>::epsilon(); };
@@ -232,12 +232,12 @@ void keep_vanishing_diagonals(const RawStencil<T>& a, int axis, RawStencil<T>& c
 
 /// The only point of a periodic axis is its own neighbour.
 template <class T>
-void fold_onto_centre(RawStencil<T>& a, int axis) {
+void fold_onto_centre(StencilFields<T>& a, int axis) {
   for (int k = 0; k < 27; ++k) {
-    auto to = RawStencil<T>::offset(k);
+    auto to = StencilFields<T>::offset(k);
     if (!a.coefficients[k] || to.along[axis] == 0) continue;
     to.along[axis] = 0;
-    const int centre = RawStencil<T>::place(to);
+    const int centre = StencilFields<T>::place(to);
     const T* const more = std::exchange(a.coefficients[k], nullptr);
     const T* const own = a.coefficients[centre];
     T* const sum = a.add(centre);
@@ -248,15 +248,15 @@ void fold_onto_centre(RawStencil<T>& a, int axis) {
 }  // namespace
 
 template <class T>
-RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer) {
+StencilFields<T> galerkin_product(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer) {
   const bool periodic = a.grid.periodic[axis];
-  RawStencil<T> coarse(a.grid);
+  StencilFields<T> coarse(a.grid);
   const int64_t count = coarse_points(a.grid.shape[axis], periodic);
   coarse.grid.shape[axis] = count;
   const Constants<T> constants(a.grid.shape[2] + 2);
   const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
   for (int centre = 0; centre < 27; ++centre) {
-    if (RawStencil<T>::offset(centre).along[axis] != 0) continue;
+    if (StencilFields<T>::offset(centre).along[axis] != 0) continue;
     T* out[3] = {};
     if (CollapseOf<T>(a, axis, transfer, constants, centre, out).is_empty()) continue;
     for (int d = 0; d < 3; ++d) out[d] = coarse.add(centre + (d - 1) * step);
@@ -275,14 +275,14 @@ RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& 
 }
 
 template <class T>
-bool is_symmetric(const RawStencil<T>& a) {
+bool is_symmetric(const StencilFields<T>& a) {
   const int64_t nx = a.grid.shape[2];
   std::atomic<bool> symmetric = true;
-  for (int k = 0; k < RawStencil<T>::kCentre; ++k) {
+  for (int k = 0; k < StencilFields<T>::kCentre; ++k) {
     const T *one = a.coefficients[k], *other = a.coefficients[26 - k];
     if (!one && !other) continue;
     if (!one || !other) return false;
-    const Offset o = RawStencil<T>::offset(k);
+    const Offset o = StencilFields<T>::offset(k);
     for_each_row(a.grid, [&](int64_t z, int64_t y, int64_t at) {
       const int64_t row = row_at(a.grid, z, y, o);
       if (row < 0 || !symmetric) return;
@@ -297,11 +297,11 @@ bool is_symmetric(const RawStencil<T>& a) {
   return symmetric;
 }
 
-template AxisTransfer<float> make_transfer(const RawStencil<float>&, int, bool);
-template AxisTransfer<double> make_transfer(const RawStencil<double>&, int, bool);
-template RawStencil<float> collapse(const RawStencil<float>&, int, const AxisTransfer<float>&);
-template RawStencil<double> collapse(const RawStencil<double>&, int, const AxisTransfer<double>&);
-template bool is_symmetric(const RawStencil<float>&);
-template bool is_symmetric(const RawStencil<double>&);
+template AxisTransfer<float> make_transfer(const StencilFields<float>&, int, bool);
+template AxisTransfer<double> make_transfer(const StencilFields<double>&, int, bool);
+template StencilFields<float> galerkin_product(const StencilFields<float>&, int, const AxisTransfer<float>&);
+template StencilFields<double> galerkin_product(const StencilFields<double>&, int, const AxisTransfer<double>&);
+template bool is_symmetric(const StencilFields<float>&);
+template bool is_symmetric(const StencilFields<double>&);
 
 }  // namespace prdp::kernels

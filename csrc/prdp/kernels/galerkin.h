@@ -2,7 +2,7 @@
 #include <vector>
 
 #include "prdp/kernels/coarsening.h"
-#include "prdp/kernels/raw_stencil.h"
+#include "prdp/kernels/stencil_fields.h"
 
 /// Coarser grids by dropping every second point of one axis, and operators on them (black-box multigrid, Dendy 1982,
 /// one axis at a time). The coarse points are the odd ones of an axis that ends with zeros, and the even ones of a
@@ -23,14 +23,14 @@ struct AxisTransfer {
   Weights<T> interpolation, restriction;
 };
 template <class T>
-AxisTransfer<T> make_transfer(const RawStencil<T>& a, int axis, bool symmetric);
+AxisTransfer<T> make_transfer(const StencilFields<T>& a, int axis, bool symmetric);
 
 /// RᵀAP along the axis.
 template <class T>
-RawStencil<T> collapse(const RawStencil<T>& a, int axis, const AxisTransfer<T>& transfer);
+StencilFields<T> galerkin_product(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer);
 
 /// Whether A = Aᵀ, to the last bit.
 template <class T>
-bool is_symmetric(const RawStencil<T>& a);
+bool is_symmetric(const StencilFields<T>& a);
 
 }  // namespace prdp::kernels

@@ -24,9 +24,9 @@ inline std::array<Run, 2> runs(int64_t offset, int64_t n, bool periodic, bool tr
 /// The rows of factor times the stencil with these coefficients, each (nz, ny, nx) and one for each offset that
 /// `pattern` was given; or of its transpose: the stencil of the opposite offsets, of which `pattern` is then to be.
 template <class T>
-StencilRows<T> assemble_rows(std::shared_ptr<const StencilPattern> pattern, const std::vector<const T*>& coefficients,
-                             T factor, bool transposed) {
-  StencilRows<T> a(pattern);
+PackedStencil<T> assemble_rows(std::shared_ptr<const StencilSparsity> pattern,
+                               const std::vector<const T*>& coefficients, T factor, bool transposed) {
+  PackedStencil<T> a(pattern);
   const auto& [nz, ny, nx] = pattern->grid.shape;
   const auto& loops = kernels::loops<T>();
   std::vector<bool> holds(pattern->offsets.size());
@@ -65,7 +65,7 @@ template <class T>
 struct GivenStencil {
   const T* coefficients;
   int64_t sample_stride;  // 0: all samples share them
-  std::shared_ptr<const StencilPattern> pattern;
+  std::shared_ptr<const StencilSparsity> pattern;
   bool transposed;
 
   /// Whether each given offset leads to a neighbour of its own.
@@ -109,7 +109,7 @@ struct GivenStencil {
     std::vector<const T*> fields;
     for (int64_t k = 0; k < given; ++k) fields.push_back(from + k * points);
     const T factor = scale_of_operator(magnitude);
-    auto rows = std::make_shared<StencilRows<T>>(assemble_rows(pattern, fields, factor, transposed));
+    auto rows = std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, factor, transposed));
     const auto key = [given_stencil = *this, from, count = given * points] {
       return given_stencil.of_matrix().add_field(from, count).key();
     };
@@ -158,15 +158,15 @@ struct GivenStencil {
     return o;
   }
   /// The coefficients, times the factor, as multigrid takes them; nothing if neighbours lie further away.
-  std::optional<RawStencil<T>> raw(const std::vector<const T*>& fields, T factor, int64_t points) const {
-    RawStencil<T> a(pattern->grid);
+  std::optional<StencilFields<T>> raw(const std::vector<const T*>& fields, T factor, int64_t points) const {
+    StencilFields<T> a(pattern->grid);
     for (size_t given = 0; given < fields.size(); ++given) {
       const int64_t k = pattern->places[given];
       if (k < 0) continue;
       const Offset o = untransposed(k);
       for (const int64_t cells : o.along)
         if (std::abs(cells) > 1) return std::nullopt;
-      const int place = RawStencil<T>::place(o);
+      const int place = StencilFields<T>::place(o);
       if (factor == T(1) && !a.coefficients[place]) {
         a.coefficients[place] = fields[given];
         continue;
@@ -177,7 +177,7 @@ struct GivenStencil {
         for (int64_t i = begin; i < end; ++i) sum[i] = (before ? before[i] : T(0)) + factor * fields[given][i];
       });
     }
-    if (!a.coefficients[RawStencil<T>::kCentre]) fill_zero(a.add(RawStencil<T>::kCentre), points);
+    if (!a.coefficients[StencilFields<T>::kCentre]) fill_zero(a.add(StencilFields<T>::kCentre), points);
     return a;
   }
 };

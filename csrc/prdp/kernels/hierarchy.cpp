@@ -13,8 +13,8 @@ namespace {
 
 /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero.
 template <class T>
-double radius_of(const RawStencil<T>& a) {
-  const T* diagonal = a.coefficients[RawStencil<T>::kCentre];
+double radius_of(const StencilFields<T>& a) {
+  const T* diagonal = a.coefficients[StencilFields<T>::kCentre];
   const T largest = largest_of_blocks<T>(a.points(), [&](int64_t begin, int64_t end) {
     std::vector<T> ratios(end - begin, T(0));
     for (const T* field : a.coefficients)
@@ -28,7 +28,7 @@ double radius_of(const RawStencil<T>& a) {
 
 /// By a sample of the points.
 template <class T>
-Axes axes_to_coarsen(const RawStencil<T>& a) {
+Axes axes_to_coarsen(const StencilFields<T>& a) {
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
   Couplings couplings;
   for (int k = 0; k < 27; ++k) {
@@ -36,7 +36,7 @@ Axes axes_to_coarsen(const RawStencil<T>& a) {
     double sum = 0;
     for (int64_t i = 0; i < n; i += step) sum += std::abs(static_cast<double>(a.coefficients[k][i]));
     for (int d = 0; d < 3; ++d)
-      if (RawStencil<T>::offset(k).along[d] != 0) couplings.along[d] += sum;
+      if (StencilFields<T>::offset(k).along[d] != 0) couplings.along[d] += sum;
   }
   const auto& [nz, ny, nx] = a.grid.shape;
   if (!may_need_one_point(a.grid.shape, 3)) return kernels::axes_to_coarsen(a.grid.shape, 3, couplings);
@@ -48,7 +48,7 @@ Axes axes_to_coarsen(const RawStencil<T>& a) {
       const double value = static_cast<double>(a.coefficients[k][i]);
       bool inside = true;
       for (int d = 0; d < 3; ++d) {
-        const auto o = RawStencil<T>::offset(k).along[d];
+        const auto o = StencilFields<T>::offset(k).along[d];
         if (o != 0) net[d][o > 0] += value;
         inside = inside && neighbour(at[d], o, a.grid.shape[d], a.grid.periodic[d]) >= 0;
       }
@@ -61,20 +61,20 @@ Axes axes_to_coarsen(const RawStencil<T>& a) {
 }
 
 template <class T>
-std::shared_ptr<const StencilRows<T>> rows_of(const RawStencil<T>& a, bool transposed) {
+std::shared_ptr<const PackedStencil<T>> rows_of(const StencilFields<T>& a, bool transposed) {
   std::vector<Offset> offsets;
   std::vector<const T*> fields;
   for (int k = 0; k < 27; ++k)
     if (a.coefficients[k]) {
       fields.push_back(a.coefficients[k]);
-      offsets.push_back(RawStencil<T>::offset(transposed ? 26 - k : k));
+      offsets.push_back(StencilFields<T>::offset(transposed ? 26 - k : k));
     }
-  const auto pattern = std::make_shared<StencilPattern>(a.grid, offsets);
-  return std::make_shared<StencilRows<T>>(assemble_rows(pattern, fields, T(1), transposed));
+  const auto pattern = std::make_shared<StencilSparsity>(a.grid, offsets);
+  return std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, T(1), transposed));
 }
 
 template <class T>
-bool all_finite(const RawStencil<T>& a) {
+bool all_finite(const StencilFields<T>& a) {
   return std::all_of(a.memory.begin(), a.memory.end(), [](const auto& field) {
     return std::isfinite(largest_magnitude(field.data(), static_cast<int64_t>(field.size())));
   });
@@ -146,22 +146,22 @@ MatrixXd invert(const MatrixXd& m, int64_t nullity, double tiny) {
 }  // namespace
 
 template <class T>
-std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(RawStencil<T> finest, int64_t nullity) {
+std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, int64_t nullity) {
   std::unique_ptr<Hierarchy> h(new Hierarchy);
   h->symmetric_ = is_symmetric(finest);
-  RawStencil<T> a = std::move(finest);
+  StencilFields<T> a = std::move(finest);
   for (;;) {
     const double radius = radius_of(a);
     if (!std::isfinite(radius) || !all_finite(a)) return nullptr;
     h->levels_.push_back({a.grid, radius, {}});
     if (h->levels_.size() > 1) h->rows_.push_back(rows_of(a, false));
     const auto axes = axes_to_coarsen(a);
-    RawStencil<T> coarse(a.grid);
+    StencilFields<T> coarse(a.grid);
     for (const int axis : axes) {
       const auto& fine = axis == axes.front() ? a : coarse;
       const auto weights = make_transfer(fine, axis, h->symmetric_);
       h->levels_.back().transfers.emplace_back(fine.grid, axis, weights, h->symmetric_);
-      coarse = collapse(fine, axis, weights);
+      coarse = galerkin_product(fine, axis, weights);
     }
     if (axes.empty()) break;
     if (h->levels_.size() > 1 && !h->symmetric_) h->raw_.push_back(std::move(a));
@@ -174,7 +174,7 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(RawStencil<T> finest, int
 }
 
 template <class T>
-bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a, int64_t nullity) {
+bool Hierarchy<T>::invert_coarsest(const StencilFields<T>& a, int64_t nullity) {
   const auto rows = rows_of(a, false);
   const int64_t n = a.points();
   MatrixXd m = MatrixXd::Zero(n, n);
@@ -188,7 +188,7 @@ bool Hierarchy<T>::invert_coarsest(const RawStencil<T>& a, int64_t nullity) {
 }
 
 template <class T>
-std::shared_ptr<const StencilRows<T>> Hierarchy<T>::rows(size_t l, bool transposed) const {
+std::shared_ptr<const PackedStencil<T>> Hierarchy<T>::rows(size_t l, bool transposed) const {
   if (!transposed || symmetric_) return rows_[l - 1];
   const std::lock_guard lock(mutex_);
   auto& rows = transposed_[l - 1];

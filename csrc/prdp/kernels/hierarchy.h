@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "prdp/kernels/kernel.h"
-#include "prdp/kernels/stencil_rows.h"
+#include "prdp/kernels/packed_stencil.h"
 #include "prdp/kernels/transfer.h"
 
 namespace prdp::kernels {
@@ -23,25 +23,25 @@ class Hierarchy {
 
   /// `nullity`: how many vectors A is said to map to zero. Null if a diagonal is zero on some grid, or a number left
   /// the range of T.
-  static std::unique_ptr<const Hierarchy> make(RawStencil<T> finest, int64_t nullity);
+  static std::unique_ptr<const Hierarchy> make(StencilFields<T> finest, int64_t nullity);
 
   const std::vector<Level>& levels() const { return levels_; }
   /// A, or Aᵀ, on level `l` >= 1.
-  std::shared_ptr<const StencilRows<T>> rows(size_t l, bool transposed) const;
+  std::shared_ptr<const PackedStencil<T>> rows(size_t l, bool transposed) const;
   /// (n, n): the inverse on the last level; of a singular matrix the pseudo-inverse.
   const std::vector<T>& coarsest_inverse() const { return coarsest_inverse_; }
   int64_t bytes() const;
 
  private:
   Hierarchy() = default;
-  bool invert_coarsest(const RawStencil<T>& a, int64_t nullity);
+  bool invert_coarsest(const StencilFields<T>& a, int64_t nullity);
 
   bool symmetric_ = true;
   std::vector<Level> levels_;
-  std::vector<std::shared_ptr<const StencilRows<T>>> rows_;  // of the levels from 1 on
-  std::vector<RawStencil<T>> raw_;                           // the same, where Aᵀ is another operator
+  std::vector<std::shared_ptr<const PackedStencil<T>>> rows_;  // of the levels from 1 on
+  std::vector<StencilFields<T>> raw_;                           // the same, where Aᵀ is another operator
   mutable std::mutex mutex_;
-  mutable std::vector<std::shared_ptr<const StencilRows<T>>> transposed_;
+  mutable std::vector<std::shared_ptr<const PackedStencil<T>>> transposed_;
   std::vector<T> coarsest_inverse_;
 };
 

@@ -10,7 +10,7 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/layout.h"
 #include "prdp/kernels/null_space.h"
-#include "prdp/kernels/raw_stencil.h"
+#include "prdp/kernels/stencil_fields.h"
 
 namespace prdp::kernels {
 
@@ -26,7 +26,7 @@ class Factors {
 /// factor()·A on one channel of one sample, as a stencil on a grid.
 template <class T>
 struct GridOperator {
-  std::function<std::optional<RawStencil<T>>()> make;  // not transposed; nothing if neighbours lie far away
+  std::function<std::optional<StencilFields<T>>()> make;  // not transposed; nothing if neighbours lie far away
   FactorKey key;                                       // tells it from others
   bool transposed;
 };
@@ -105,7 +105,7 @@ class Kernel {
   }
   /// Whether A maps a null space that somebody named to zero up to rounding only. Then products are to be projected:
   /// what is left there would add up in the residuals that a method carries on.
-  bool leaks() const { return leaks_; }
+  bool needs_projection() const { return leaks_; }
   void set_leaks() { leaks_ = true; }
 
  protected:

@@ -92,7 +92,7 @@ class Laplacian final : public Kernel<T> {
     return {nz, ny, nx, row, plane, Dim == 1 ? kLanes<T> : Dim == 2 ? row : plane};
   }
 
-  PaddedStencil<T> stencil(const std::vector<T>& weights) const {
+  ConstantStencil<T> stencil(const std::vector<T>& weights) const {
     return {layout().rows, layout().planes, layout().row, layout().plane, centre_, weights.data()};
   }
   /// A large sample in parts for several threads: values of the only row, rows of the only plane, or planes.
@@ -103,7 +103,7 @@ class Laplacian final : public Kernel<T> {
   int64_t in_all() const { return Dim == 1 ? layout().row : Dim == 2 ? layout().rows : layout().planes; }
   int64_t parts() const { return length() <= kBlock ? 1 : std::max<int64_t>(in_all() / each(), 1); }
   /// Part p, and where it begins.
-  std::pair<PaddedStencil<T>, int64_t> part(int64_t p, const std::vector<T>& weights) const {
+  std::pair<ConstantStencil<T>, int64_t> part(int64_t p, const std::vector<T>& weights) const {
     auto a = stencil(weights);
     if (parts() == 1) return {a, 0};
     const int64_t first = p * each(), count = p + 1 < parts() ? each() : in_all() - first;
@@ -126,10 +126,10 @@ class Laplacian final : public Kernel<T> {
 template <class T, int Dim>
 std::optional<GridOperator<T>> Laplacian<T, Dim>::grid_operator() const {
   const auto make = [p = parameters_] {
-    RawStencil<T> a({Dim, {1, 1, 1}, {false, false, false}});
+    StencilFields<T> a({Dim, {1, 1, 1}, {false, false, false}});
     for (int d = 0; d < Dim; ++d) a.grid.shape[3 - Dim + d] = p.shape[d];
     const auto add = [&](const Offset& o, double value) {
-      std::fill_n(a.add(RawStencil<T>::place(o)), a.points(), static_cast<T>(value));
+      std::fill_n(a.add(StencilFields<T>::place(o)), a.points(), static_cast<T>(value));
     };
     add({{0, 0, 0}}, p.centre);
     for (int d = 0; d < Dim; ++d)

@@ -19,7 +19,7 @@ struct Planes {
 /// registers. For each register v, body.start(i, v) is what the weighted sum of the 2·Dim neighbours of
 /// v is added to, and body.finish(i, k, v, sum) takes it; it may overwrite v where this is the WholeRow.
 template <int Dim, int Columns, bool WholeRow, class T, class Body>
-void go_down(const PaddedStencil<T>& a, const Planes<T>& plane, int64_t i, Body& shared) {
+void go_down(const ConstantStencil<T>& a, const Planes<T>& plane, int64_t i, Body& shared) {
   using V = Register<T>;
   constexpr int width = kWidth<T>;
   // Copies, which no store can change for all the compiler knows.
@@ -58,7 +58,7 @@ void go_down(const PaddedStencil<T>& a, const Planes<T>& plane, int64_t i, Body&
 }
 
 template <int Dim, class T, class Body>
-void go_through(const PaddedStencil<T>& a, const Planes<T>& plane, Body& body) {
+void go_through(const ConstantStencil<T>& a, const Planes<T>& plane, Body& body) {
   const int64_t registers = a.row / kWidth<T>;
   for_each_block<kColumns>(0, registers, [&](int64_t first, auto columns) {
     if (columns.value == registers) go_down<Dim, columns.value, true>(a, plane, 0, body);
@@ -82,7 +82,7 @@ struct Product {
 };
 
 template <int Dim, class T>
-void apply(const PaddedStencil<T>& a, const T* v, T* out, T* dots) {
+void apply(const ConstantStencil<T>& a, const T* v, T* out, T* dots) {
   Product<T> body{a.centre, out};
   for (int64_t z = 0; z < a.nz; ++z, v += a.plane, body.out += a.plane)
     go_through<Dim>(a, {v - a.plane, v, v + a.plane}, body);
@@ -115,13 +115,13 @@ struct Sweep {
 };
 
 template <int Dim, class T, class Body>
-void one_sweep(const PaddedStencil<T>& a, const T* x, Body& body) {
+void one_sweep(const ConstantStencil<T>& a, const T* x, Body& body) {
   for (int64_t z = 0; z < a.nz; ++z, x += a.plane, body.c += a.plane, body.y += a.plane)
     go_through<Dim>(a, {x - a.plane, x, x + a.plane}, body);
 }
 
 template <int Dim, bool Accelerated, class T>
-T measured_sweep(const PaddedStencil<T>& a, const T* c, const T* x, T* y, T omega) {
+T measured_sweep(const ConstantStencil<T>& a, const T* c, const T* x, T* y, T omega) {
   Sweep<Accelerated, true, T> body{c, y, omega};
   one_sweep<Dim>(a, x, body);
   return sum_lanes<T>(body.squares[0] + body.squares[1]);
@@ -129,7 +129,7 @@ T measured_sweep(const PaddedStencil<T>& a, const T* c, const T* x, T* y, T omeg
 
 /// All sweeps of a short line without memory in between; the result is in x.
 template <int Columns, bool Accelerated, class T>
-void sweeps_in_registers(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
+void sweeps_in_registers(const ConstantStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
   using V = Register<T>;
   V weight[Columns], source[Columns], here[Columns], before[Columns];
   for (int k = 0; k < Columns; ++k) {
@@ -157,7 +157,7 @@ void sweeps_in_registers(const PaddedStencil<T>& a, const T* c, T* x, T* y, int6
 
 /// Two sweeps in one pass over memory, x → y → x, the second a plane behind the first.
 template <bool Accelerated, class T>
-void two_sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, const T* omega) {
+void two_sweeps(const ConstantStencil<T>& a, const T* c, T* x, T* y, const T* omega) {
   const auto sweep = [&](const T* from, T* to, int64_t z, int s) {
     from += z * a.plane;
     Sweep<Accelerated, false, T> body{c + z * a.plane, to + z * a.plane, Accelerated ? omega[s] : T(1)};
@@ -170,7 +170,7 @@ void two_sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, const T* omeg
 }
 
 template <int Dim, bool Accelerated, class T>
-T* many_sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
+T* many_sweeps(const ConstantStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
   const int64_t registers = a.row / kWidth<T>;
   if constexpr (Dim == 1) {
     if (registers <= kColumns) {
@@ -210,7 +210,7 @@ struct Smoothing {
 };
 
 template <int Dim, class T>
-void smooth(const PaddedStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal) {
+void smooth(const ConstantStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal) {
   Smoothing<T> body{b, y, p, q * inverse_diagonal, a.centre};
   for (int64_t z = 0; z < a.nz; ++z, x += a.plane, body.b += a.plane, body.y += a.plane)
     go_through<Dim>(a, {x - a.plane, x, x + a.plane}, body);
@@ -227,18 +227,18 @@ struct Residual {
 };
 
 template <int Dim, class T>
-void residual(const PaddedStencil<T>& a, const T* b, const T* x, T* r) {
+void residual(const ConstantStencil<T>& a, const T* b, const T* x, T* r) {
   Residual<T> body{b, r, a.centre};
   for (int64_t z = 0; z < a.nz; ++z, x += a.plane, body.b += a.plane, body.y += a.plane)
     go_through<Dim>(a, {x - a.plane, x, x + a.plane}, body);
 }
 
 template <int Dim, class T>
-T* sweeps(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
+T* sweeps(const ConstantStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega) {
   return omega ? many_sweeps<Dim, true>(a, c, x, y, n, omega) : many_sweeps<Dim, false>(a, c, x, y, n, omega);
 }
 template <int Dim, class T>
-T sweep_and_measure(const PaddedStencil<T>& a, const T* c, const T* x, T* y, const T* omega) {
+T sweep_and_measure(const ConstantStencil<T>& a, const T* c, const T* x, T* y, const T* omega) {
   return omega ? measured_sweep<Dim, true>(a, c, x, y, *omega) : measured_sweep<Dim, false>(a, c, x, y, T(1));
 }
 

@@ -24,7 +24,7 @@ constexpr Loops<T> table(const char* level) {
           add_product<T>,
           xpby<T>,
           xpby_with_square<T>,
-          descend<T>,
+          update_iterate_and_residual<T>,
           weigh<T>,
           multi_dot<T>,
           multi_axpy<T>,
@@ -47,7 +47,7 @@ constexpr Loops<T> table(const char* level) {
           add_interpolated<T>,
           split<T>,
           add_merged<T>,
-          collapse<T>,
+          galerkin_product<T>,
           multiply<T>,
           advect_row<T>,
           advect_row_back<T>};

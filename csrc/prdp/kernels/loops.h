@@ -2,7 +2,7 @@
 #include <cstdint>
 #include <string_view>
 
-#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/stencil_sparsity.h"
 
 /// The inner loops of all kernels. Their one source, loops.cpp, is compiled for several instruction
 /// sets, and the best one that the processor has is chosen when they are first used.
@@ -17,7 +17,7 @@ inline constexpr int64_t kLanes = 64 / static_cast<int64_t>(sizeof(T));
 /// weights of the neighbours hold a row each for x, y and z, with zeros in the padding so that it stays
 /// zero. The centre has one weight; sweeps have none.
 template <class T>
-struct PaddedStencil {
+struct ConstantStencil {
   int64_t ny, nz, row, plane;
   T centre;
   const T* weights;
@@ -68,7 +68,7 @@ struct StaggeredStencil {
 /// weights by which a fine point is interpolated from the coarse points to its left and right belong to the column,
 /// those of the restriction to the row.
 template <class T>
-struct Collapse {
+struct GalerkinProduct {
   const T *lower_before, *lower_here, *lower_after;
   const T *centre_before, *centre_here, *centre_after;
   const T *upper_before, *upper_here, *upper_after;
@@ -122,7 +122,7 @@ struct Loops {
   void (*xpby)(const T* x, T beta, T* y, int64_t n);
   T (*xpby_with_square)(const T* x, T beta, T* y, int64_t n);
   /// x += alpha p and r -= alpha q in one pass; returns ‖r‖². p may be r itself.
-  T (*descend)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
+  T (*update_iterate_and_residual)(T alpha, const T* p, const T* q, T* x, T* r, int64_t n);
   /// out = w∘x, entry by entry; returns x·out.
   T (*weigh)(const T* w, const T* x, T* out, int64_t n);
   /// For `count` vectors, at least one: h_j = v_j·(factor·w); and w = factor·w + sign·Σ alpha_j v_j, which returns
@@ -131,13 +131,13 @@ struct Loops {
   T (*multi_axpy)(T sign, const T* alpha, const T* const* v, int64_t count, T factor, T* w, int64_t n);
 
   /// By the number of dimensions less one. out = A v; dots = {v·out, ‖out‖²}.
-  void (*apply[3])(const PaddedStencil<T>& a, const T* v, T* out, T* dots);
+  void (*apply[3])(const ConstantStencil<T>& a, const T* v, T* out, T* dots);
   /// n sweeps x ← c + (neighbours of x, weighted). Returns the one of x and y that holds the result; the
   /// other one is overwritten. With omega, one for each sweep, x ← y + omega (that - y) instead, where y
   /// holds the iterate before x, before and after.
-  T* (*sweeps[3])(const PaddedStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega);
+  T* (*sweeps[3])(const ConstantStencil<T>& a, const T* c, T* x, T* y, int64_t n, const T* omega);
   /// One of them, with its result in y; returns ‖c + neighbours - x‖².
-  T (*sweep_and_measure[3])(const PaddedStencil<T>& a, const T* c, const T* x, T* y, const T* omega);
+  T (*sweep_and_measure[3])(const ConstantStencil<T>& a, const T* c, const T* x, T* y, const T* omega);
 
   /// Upwind differences and diffusion along one axis: advection (max(w⁻, 0) B + min(w⁺, 0) F) plus
   /// diffusion times minus the second difference, with w⁻ and w⁺ the means of the winds here and on
@@ -157,11 +157,11 @@ struct Loops {
   /// after. On Laplacians the same with 1/D for the last argument.
   void (*smooth_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
   void (*smooth_offsets)(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* y, T p, T q);
-  void (*smooth[3])(const PaddedStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal);
+  void (*smooth[3])(const ConstantStencil<T>& a, const T* b, const T* x, T* y, T p, T q, T inverse_diagonal);
   /// r = b - A x
   void (*residual_neighbours[3])(const NeighbourStencil<T>& a, Lines lines, const T* b, const T* x, T* r);
   void (*residual_offsets)(const OffsetStencil<T>& a, Lines lines, const T* b, const T* x, T* r);
-  void (*residual[3])(const PaddedStencil<T>& a, const T* b, const T* x, T* r);
+  void (*residual[3])(const ConstantStencil<T>& a, const T* b, const T* x, T* r);
   /// out = middle + weight_before∘before + weight_after∘after; and out += the last two; any n.
   void (*restrict_row)(const T* middle, const T* before, const T* weight_before, const T* after, const T* weight_after,
                        T* out, int64_t n);
@@ -171,7 +171,7 @@ struct Loops {
   void (*split)(const T* row, T* first, T* second, int64_t n);
   void (*add_merged)(const T* first, const T* second, T* row, int64_t n);
   /// For n coarse points, whose fine ones lie one or two values apart.
-  void (*collapse)(const Collapse<T>& c, int64_t step, int64_t n);
+  void (*galerkin_product)(const GalerkinProduct<T>& c, int64_t step, int64_t n);
 
   void (*multiply)(const DenseProduct<T>& p);
 

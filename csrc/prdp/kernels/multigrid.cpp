@@ -14,7 +14,7 @@ std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kerne
     std::shared_ptr<const Hierarchy<T>> hierarchy;
     int64_t bytes() const { return hierarchy ? hierarchy->bytes() : 0; }
   };
-  const int64_t nullity = a.leaks() ? a.null_space()->count_in_one_field() : 0;
+  const int64_t nullity = a.needs_projection() ? a.null_space()->count_in_one_field() : 0;
   const auto key = FactorKeyMaker().add(given->key).add(nullity).key();
   const auto kept = factor_cache::find_or_make<Kept>(key, [&] {
     auto finest = given->make();

@@ -40,7 +40,7 @@ void add_merged(const T* first, const T* second, T* __restrict row, int64_t n) {
 
 /// Galerkin products with the same offset in the other axes, for points that lie `Step` apart.
 template <int Step, bool Sides, class T>
-void collapse_points(const Collapse<T>& c, int64_t n) {
+void collapse_points(const GalerkinProduct<T>& c, int64_t n) {
   for (int64_t i = 0; i < n; ++i) {
     const int64_t f = Step * i;
     CollapsedPoint<T> point;
@@ -61,7 +61,7 @@ void collapse_points(const Collapse<T>& c, int64_t n) {
 }
 
 template <class T>
-void collapse(const Collapse<T>& c, int64_t step, int64_t n) {
+void galerkin_product(const GalerkinProduct<T>& c, int64_t step, int64_t n) {
   const bool sides = c.lower_here != nullptr;
   if (step == 1) return sides ? collapse_points<1, true>(c, n) : collapse_points<1, false>(c, n);
   sides ? collapse_points<2, true>(c, n) : collapse_points<2, false>(c, n);

@@ -63,7 +63,7 @@ class NavierStokes final : public Kernel<T> {
   bool transposed() const { return parameters_.transposed; }
   const UpwindParameters<T>& parameters() const { return parameters_; }
   /// C1 or C2, times factor().
-  const std::shared_ptr<const StencilRows<T>>& velocity(int64_t channel) const { return velocity_[channel]; }
+  const std::shared_ptr<const PackedStencil<T>>& velocity(int64_t channel) const { return velocity_[channel]; }
 
  private:
   enum Weight { kX, kXLower, kXUpper, kY, kWeights };  // of StaggeredStencil
@@ -73,7 +73,7 @@ class NavierStokes final : public Kernel<T> {
         parameters_(p),
         inverse_dx_(inverse_spacing(p.nx, p.length_x, factor)),
         inverse_dy_(inverse_spacing(p.ny, p.length_y, factor)),
-        velocity_{std::make_shared<StencilRows<T>>(c1(p, factor)), std::make_shared<StencilRows<T>>(c2(p, factor))},
+        velocity_{std::make_shared<PackedStencil<T>>(c1(p, factor)), std::make_shared<PackedStencil<T>>(c2(p, factor))},
         weights_(kWeights * layout().row, T(0)) {
     for (int64_t i = 0; i < nx(); ++i) {
       weight(kX)[i] = inverse_dx_;
@@ -104,7 +104,7 @@ class NavierStokes final : public Kernel<T> {
     for (int64_t i = 0; i < nx; ++i) sum[i] = T(0.25) * (sum[i] + sum[i + 1]);
     return sum;
   }
-  static StencilRows<T> c1(const UpwindParameters<T>& p, double factor) {
+  static PackedStencil<T> c1(const UpwindParameters<T>& p, double factor) {
     return upwind_rows<T>(p.pattern, terms(p, factor), [&](int axis, int64_t j, T* mean) {
       if (axis == 0) return at_point(wind(p, 0, j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i + 1] = wind(p, 1, j)[i] + wind(p, 1, j + 1)[i];
@@ -112,7 +112,7 @@ class NavierStokes final : public Kernel<T> {
       return at_point(finish_mean(mean, p.nx));
     });
   }
-  static StencilRows<T> c2(const UpwindParameters<T>& p, double factor) {
+  static PackedStencil<T> c2(const UpwindParameters<T>& p, double factor) {
     return upwind_rows<T>(p.pattern, terms(p, factor), [&](int axis, int64_t j, T* mean) {
       if (axis == 1) return at_point(wind(p, 1, j));
       for (int64_t i = 0; i < p.nx; ++i) mean[i] = wind(p, 0, j - 1)[i] + wind(p, 0, j)[i];
@@ -132,7 +132,7 @@ class NavierStokes final : public Kernel<T> {
 
   UpwindParameters<T> parameters_;
   T inverse_dx_, inverse_dy_;  // negative in the transpose
-  std::shared_ptr<const StencilRows<T>> velocity_[2];
+  std::shared_ptr<const PackedStencil<T>> velocity_[2];
   std::vector<T> weights_;  // rows of the padded length
 };
 

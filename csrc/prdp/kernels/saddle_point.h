@@ -66,12 +66,12 @@ class SaddlePointPreconditioner final : public Preconditioner<T> {
   static std::unique_ptr<Stencil<T>> laplacian_of(const UpwindParameters<T>& p, const Spacing& of) {
     const T y = static_cast<T>(-of.y / of.largest), x = static_cast<T>(-of.x / of.largest);
     const T along[] = {static_cast<T>(2 * (of.x + of.y) / of.largest), x, x, y, y};
-    auto rows = std::make_shared<StencilRows<T>>(p.pattern);
+    auto rows = std::make_shared<PackedStencil<T>>(p.pattern);
     for (int64_t j = 0; j < p.ny; ++j)
       for (int64_t k = 0; k < 5; ++k) std::fill_n(rows->coefficient(j, k), p.nx, along[k]);
     rows->close();
     const auto key = [p] { return FactorKeyMaker().add(p.ny).add(p.nx).add(p.length_y).add(p.length_x).key(); };
-    const auto raw = [rows]() -> std::optional<RawStencil<T>> { return raw_stencil(*rows); };
+    const auto raw = [rows]() -> std::optional<StencilFields<T>> { return raw_stencil(*rows); };
     return std::make_unique<Stencil<T>>(rows, 1, T(1), typename Stencil<T>::Source{key, raw, false});
   }
 

@@ -3,7 +3,7 @@
 #include <utility>
 
 #include "prdp/kernels/kernel.h"
-#include "prdp/kernels/stencil_rows.h"
+#include "prdp/kernels/packed_stencil.h"
 
 namespace prdp::kernels {
 
@@ -18,11 +18,11 @@ class Stencil final : public Kernel<T> {
   /// What the rows were made of; `transposed` says which way round.
   struct Source {
     std::function<FactorKey()> key;                    // of the matrix that is not transposed
-    std::function<std::optional<RawStencil<T>>()> raw;  // its coefficients; nothing if neighbours lie far away
+    std::function<std::optional<StencilFields<T>>()> raw;  // its coefficients; nothing if neighbours lie far away
     bool transposed = false;
   };
 
-  Stencil(std::shared_ptr<const StencilRows<T>> rows, int64_t channels, T factor, Source source = {})
+  Stencil(std::shared_ptr<const PackedStencil<T>> rows, int64_t channels, T factor, Source source = {})
       : Base(Layout<T>::of_fields(channels, rows->rows(), rows->grid().shape[2]), factor),
         rows_(std::move(rows)),
         coefficients_(*rows_),
@@ -30,7 +30,7 @@ class Stencil final : public Kernel<T> {
 
   int64_t channels() const { return layout().planes; }
   /// Of one channel.
-  const StencilRows<T>& coefficients() const { return coefficients_; }
+  const PackedStencil<T>& coefficients() const { return coefficients_; }
   double norm() const override { return coefficients_.norm(); }
 
   void apply(const T* v, T* out) const override {
@@ -112,8 +112,8 @@ class Stencil final : public Kernel<T> {
     return {{first, std::min(first + rows_each(), layout().rows)}, p / of_channel() * layout().plane};
   }
 
-  std::shared_ptr<const StencilRows<T>> rows_;
-  const StencilRows<T>& coefficients_;
+  std::shared_ptr<const PackedStencil<T>> rows_;
+  const PackedStencil<T>& coefficients_;
   Source source_;
 };
 

@@ -4,7 +4,7 @@
 namespace prdp::kernels {
 
 /// out[i] += λ[i] · v[i + offset] for all points i that have a neighbour there; fields are (nz, ny, nx), and
-/// `offset` is one of a StencilPattern's.
+/// `offset` is one of a StencilSparsity's.
 template <class T>
 void add_products(const StencilGrid& grid, const Offset& offset, const T* lambda, const T* v, T* out) {
   const auto& [nz, ny, nx] = grid.shape;

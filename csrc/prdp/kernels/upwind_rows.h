@@ -2,7 +2,7 @@
 #include <algorithm>
 
 #include "prdp/kernels/factor_cache.h"
-#include "prdp/kernels/stencil_rows.h"
+#include "prdp/kernels/packed_stencil.h"
 
 namespace prdp::kernels {
 
@@ -15,11 +15,11 @@ struct UpwindParameters {
   double nu, dt;
   bool transposed;
   double length_y = 1.0, length_x = 1.0;         // of the domain
-  std::shared_ptr<const StencilPattern> pattern;  // of_grid(), made once for a batch
+  std::shared_ptr<const StencilSparsity> pattern;  // of_grid(), made once for a batch
 
-  static std::shared_ptr<const StencilPattern> of_grid(int64_t dim, int64_t ny, int64_t nx) {
-    return std::make_shared<StencilPattern>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
-                                            StencilPattern::nearest_neighbours(dim));
+  static std::shared_ptr<const StencilSparsity> of_grid(int64_t dim, int64_t ny, int64_t nx) {
+    return std::make_shared<StencilSparsity>(StencilGrid{dim, {1, ny, nx}, {true, true, true}},
+                                             StencilSparsity::nearest_neighbours(dim));
   }
   /// NaN or Inf where a wind is: max(w, 0) would lose it.
   T largest_wind(int64_t channels) const { return largest_magnitude(winds, channels * ny * nx); }
@@ -54,9 +54,9 @@ struct UpwindTerms {
 /// the Laplacian L. Along an axis of one point all differences vanish. `winds(axis, j, scratch)` is the
 /// WindRow along the axis (0: x, 1: y) at row j; it may lie in scratch, which holds nx + 2 values.
 template <class T, class Winds>
-StencilRows<T> upwind_rows(std::shared_ptr<const StencilPattern> pattern, const UpwindTerms& terms,
-                           const Winds& winds) {
-  StencilRows<T> a(std::move(pattern));
+PackedStencil<T> upwind_rows(std::shared_ptr<const StencilSparsity> pattern, const UpwindTerms& terms,
+                             const Winds& winds) {
+  PackedStencil<T> a(std::move(pattern));
   const auto& loops = kernels::loops<T>();
   const int64_t ny = a.grid().shape[1], nx = a.grid().shape[2];
   std::vector<T> scratch(3 * nx + 2);

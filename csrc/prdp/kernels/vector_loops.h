@@ -137,7 +137,7 @@ T xpby_with_square(const T* x, T beta, T* y, int64_t n) {
 }
 
 template <class T>
-T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
+T update_iterate_and_residual(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) {
   Register<T> squares[2] = {};
   for_each_in_turn<T>(n, [&](int64_t i, int k) {
     store(x + i, load(x + i) + alpha * load(p + i));

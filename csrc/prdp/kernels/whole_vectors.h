@@ -109,8 +109,10 @@ class WholeVectors {
     return sum(n, [&](int64_t i, int64_t end) { return loops_.xpby_with_square(x + i, beta, y + i, end - i); });
   }
   /// x += alpha p and r -= alpha q; returns ‖r‖². p may be r.
-  T descend(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) const {
-    return sum(n, [&](int64_t i, int64_t end) { return loops_.descend(alpha, p + i, q + i, x + i, r + i, end - i); });
+  T update_iterate_and_residual(T alpha, const T* p, const T* q, T* x, T* r, int64_t n) const {
+    return sum(n, [&](int64_t i, int64_t end) {
+      return loops_.update_iterate_and_residual(alpha, p + i, q + i, x + i, r + i, end - i);
+    });
   }
   /// out = w∘x, entry by entry; returns x·out.
   T weigh(const T* w, const T* x, T* out, int64_t n) const {

@@ -9,7 +9,7 @@
 namespace prdp {
 
 BurgersOperator::BurgersOperator(const OperatorSpec& spec)
-    : FlowOperator("Burgers", spec, static_cast<int64_t>(spec.shape.size())) {
+    : UpwindOperator("Burgers", spec, static_cast<int64_t>(spec.shape.size())) {
   TORCH_CHECK_VALUE(grid_.dim() <= 2, "Burgers: shape must have 1 or 2 extents, got ", at::IntArrayRef(grid_.shape()));
   grid_.check_field(winds_, channels_);
 }

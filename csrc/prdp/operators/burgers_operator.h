@@ -2,7 +2,7 @@
 #include <optional>
 
 #include "prdp/operators/advection_diffusion.h"
-#include "prdp/operators/flow_operator.h"
+#include "prdp/operators/upwind_operator.h"
 
 namespace prdp {
 
@@ -10,7 +10,7 @@ namespace prdp {
 /// the winds: A = I + Δt (Γ - ν L) on each of the dim() velocity channels. Γ is first-order upwind with
 /// the winds averaged to the faces of a cell, (w_{i-1} + w_i)/2 and (w_i + w_{i+1})/2. Row sums are 1
 /// and off-diagonal entries <= 0.
-class BurgersOperator final : public FlowOperator {
+class BurgersOperator final : public UpwindOperator {
  public:
   /// Raises ValueError unless the winds have shape (batch or 1, dim, *shape) with dim <= 2.
   explicit BurgersOperator(const OperatorSpec& spec);

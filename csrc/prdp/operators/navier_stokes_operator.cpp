@@ -32,7 +32,7 @@ at::Tensor without_mean_pressure(const at::Tensor& u) {
   return at::cat({u.narrow(-3, 0, 2), p - mean_in_order(p, {-2, -1})}, -3);
 }
 
-NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec) : FlowOperator("NavierStokes", spec, 3) {
+NavierStokesOperator::NavierStokesOperator(const OperatorSpec& spec) : UpwindOperator("NavierStokes", spec, 3) {
   TORCH_CHECK_VALUE(grid_.dim() == 2, "NavierStokes: shape must have 2 extents, got ", at::IntArrayRef(grid_.shape()));
   grid_.check_field(winds_, winds_.dim() == 4 && winds_.sym_size(1) == 2 ? 2 : 3);
 }

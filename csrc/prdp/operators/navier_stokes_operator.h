@@ -2,7 +2,7 @@
 #include <optional>
 
 #include "prdp/operators/advection_diffusion.h"
-#include "prdp/operators/flow_operator.h"
+#include "prdp/operators/upwind_operator.h"
 
 namespace prdp {
 
@@ -18,7 +18,7 @@ at::Tensor without_mean_pressure(const at::Tensor& u);
 /// with divergence D by forward and gradient G = -Dᵀ by backward differences. Γ_k is first-order upwind
 /// with the wind at the points of u_k, the other component averaged over its four neighbours there.
 /// A and Aᵀ have one null vector, constant pressure.
-class NavierStokesOperator final : public FlowOperator {
+class NavierStokesOperator final : public UpwindOperator {
  public:
   /// Raises ValueError unless the winds have shape (batch or 1, 2 or 3, Ny, Nx); a third channel, the
   /// pressure, has no influence.

@@ -63,7 +63,7 @@ class Transposed final : public Operator {
   }
   at::Tensor project(const at::Tensor& v) const override { return a_->project_solution(v); }
   at::Tensor project_solution(const at::Tensor& v) const override { return a_->project(v); }
-  bool leaks() const override { return a_->leaks(); }
+  bool needs_projection() const override { return a_->needs_projection(); }
   bool may_be_singular() const override { return a_->may_be_singular(); }
   at::Tensor jacobi_radius() const override { return a_->jacobi_radius(); }
   bool knows_jacobi_radius() const override { return a_->knows_jacobi_radius(); }

@@ -59,7 +59,7 @@ class Operator {
   virtual at::Tensor project_solution(const at::Tensor& v) const { return project(v); }
   /// Whether rounding leaves parts along the null spaces in what methods carry on, which no product takes away; as of
   /// operators whose null space somebody named.
-  virtual bool leaks() const { return false; }
+  virtual bool needs_projection() const { return false; }
   /// Whether it is of somebody's own numbers or functions, and may be singular though nobody said so. Then Aᵀ v is to
   /// be had without derivatives.
   virtual bool may_be_singular() const { return false; }

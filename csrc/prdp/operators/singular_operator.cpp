@@ -240,7 +240,7 @@ std::optional<gpu::OperatorView> SingularOperator::gpu_view(const at::Tensor& b,
   };
   view->null_space = given(transposed ? left_ : right_);
   view->left_null_space = given(transposed ? right_ : left_);
-  view->leaks = true;
+  view->needs_projection = true;
   return view;
 }
 

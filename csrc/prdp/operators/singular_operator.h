@@ -35,7 +35,7 @@ class SingularOperator final : public Operator {
   at::Tensor norm() const override { return a_->norm(); }
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
   at::Tensor project_solution(const at::Tensor& v) const override { return without(right_, v); }
-  bool leaks() const override { return true; }
+  bool needs_projection() const override { return true; }
   at::Tensor solve_directly(const at::Tensor& b) const override;
   at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;

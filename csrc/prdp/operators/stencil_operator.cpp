@@ -42,7 +42,7 @@ std::vector<kernels::Offset> turned(std::vector<kernels::Offset> offsets) {
 
 /// The product rule by loops: products (batch or 1, k, *shape) from λ and u (batch, channel, *shape).
 template <class T>
-void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& lambda, const at::Tensor& u,
+void add_all_products(const kernels::StencilSparsity& pattern, const at::Tensor& lambda, const at::Tensor& u,
                       const at::Tensor& products) {
   const int64_t samples = lambda.size(0), channels = lambda.size(1), given = products.size(1);
   const int64_t points = products.numel() / (products.size(0) * given);
@@ -63,7 +63,7 @@ void add_all_products(const kernels::StencilPattern& pattern, const at::Tensor& 
 
 /// The same in one launch; undefined where there is no kernel.
 template <class T>
-at::Tensor products_by_kernel(const kernels::StencilPattern& pattern, const std::vector<kernels::Offset>& offsets,
+at::Tensor products_by_kernel(const kernels::StencilSparsity& pattern, const std::vector<kernels::Offset>& offsets,
                               const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& coefficients) {
   const auto out = at::empty(coefficients.sizes(), coefficients.options());
   gpu::StencilProducts<T> of{};
@@ -204,7 +204,7 @@ at::Tensor StencilOperator::apply_transpose(const at::Tensor& v) const {
 }
 
 at::Tensor StencilOperator::diagonal() const {
-  const kernels::StencilPattern pattern(grid_, offsets_);
+  const kernels::StencilSparsity pattern(grid_, offsets_);
   at::Tensor sum;
   for (int64_t k = 0; k < count(); ++k)
     if (pattern.places[k] == 0) add_to(sum, coefficient(k));
@@ -212,7 +212,7 @@ at::Tensor StencilOperator::diagonal() const {
 }
 
 at::Tensor StencilOperator::norm() const {
-  const kernels::StencilPattern pattern(grid_, offsets_);
+  const kernels::StencilSparsity pattern(grid_, offsets_);
   const auto inside = at::ones(coefficients_.sizes().slice(2), coefficients_.options());
   std::vector<at::Tensor> entries(pattern.offsets.size());
   auto rows = coefficients_.mul(0).sum(1);  // NaN where a coefficient is not finite
@@ -242,7 +242,7 @@ OperatorSpec StencilOperator::spec() const {
 
 at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
   const auto offsets = transposed ? turned(offsets_) : offsets_;
-  const kernels::StencilPattern pattern(grid_, offsets);
+  const kernels::StencilSparsity pattern(grid_, offsets);
   if (!pattern.nearest) return {};
   std::vector<at::Tensor> fields(1 + 2 * dim());
   for (int64_t k = 0; k < count(); ++k) {
@@ -267,14 +267,14 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
 std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   if (has_product_kernel(lambda, u)) {
     const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
-    const kernels::StencilPattern pattern(grid_, offsets_);
+    const kernels::StencilSparsity pattern(grid_, offsets_);
     const auto all = by_kernel(pattern, offsets_, lambda.contiguous(), u.contiguous(), coefficients_);
     if (all.defined()) return {all};
   }
   const bool plain = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);
   if (!at::GradMode::is_enabled() && plain && lambda.is_cpu()) {
     const auto all = at::zeros(coefficients_.sizes(), coefficients_.options());
-    const kernels::StencilPattern pattern(grid_, offsets_);
+    const kernels::StencilSparsity pattern(grid_, offsets_);
     const auto add = lambda.scalar_type() == at::kFloat ? add_all_products<float> : add_all_products<double>;
     add(pattern, lambda.contiguous(), u.contiguous(), all);
     return {all};
@@ -302,7 +302,7 @@ std::vector<int64_t> StencilOperator::vector_shape() const {
 }
 
 bool StencilOperator::has_coarse_grids() const {
-  const kernels::StencilPattern pattern(grid_, offsets_);
+  const kernels::StencilSparsity pattern(grid_, offsets_);
   return std::all_of(pattern.offsets.begin(), pattern.offsets.end(), [](const kernels::Offset& o) {
     return std::all_of(std::begin(o.along), std::end(o.along), [](int64_t cells) { return std::abs(cells) <= 1; });
   });
@@ -312,7 +312,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
   const auto offsets = transposed ? turned(offsets_) : offsets_;
   const auto of_samples =
       [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
-       pattern = std::make_shared<kernels::StencilPattern>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
+       pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                          transposed};
     kernels::KernelBatch<T> batch{c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};

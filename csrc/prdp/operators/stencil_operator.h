@@ -1,6 +1,6 @@
 #pragma once
 #include "prdp/grid/grid.h"
-#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/stencil_sparsity.h"
 #include "prdp/operators/operator.h"
 
 namespace prdp {

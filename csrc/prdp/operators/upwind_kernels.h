@@ -1,13 +1,13 @@
 #pragma once
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/upwind_rows.h"
-#include "prdp/operators/flow_operator.h"
+#include "prdp/operators/upwind_operator.h"
 
 namespace prdp {
 
 template <class Make>
-std::shared_ptr<const kernels::Kernels> FlowOperator::upwind_kernels(const at::Tensor& b, bool transposed,
-                                                                     const Make& make) const {
+std::shared_ptr<const kernels::Kernels> UpwindOperator::upwind_kernels(const at::Tensor& b, bool transposed,
+                                                                       const Make& make) const {
   const auto dim = static_cast<size_t>(grid_.dim());
   double length[2] = {1.0, 1.0};
   int64_t extent[2] = {1, 1};  // along y and x

@@ -117,7 +117,8 @@ void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active) 
   });
 }
 
-at::Tensor descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r, const Active& active) {
+at::Tensor update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r,
+                                       const Active& active) {
   auto rr = numbers_like(r);
   with_type(r, [&]<class T>(T) {
     T *to_x = own<T>(x), *to_r = own<T>(r), *square = rr.mutable_data_ptr<T>();
@@ -125,8 +126,9 @@ at::Tensor descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector
     const kernels::WholeVectors<T> loops;
     for_each_sample(r, [&](int64_t s, int64_t at) {
       const int64_t n = unknowns(r);
-      square[s] = goes_on(active, s) ? loops.descend(factor[s], along + at, taken + at, to_x + at, to_r + at, n)
-                                     : loops.dot(to_r + at, to_r + at, n);
+      square[s] = goes_on(active, s)
+                      ? loops.update_iterate_and_residual(factor[s], along + at, taken + at, to_x + at, to_r + at, n)
+                      : loops.dot(to_r + at, to_r + at, n);
     });
   });
   return rr;
@@ -213,8 +215,8 @@ Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const 
   return where;
 }
 
-Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
-                 double negligible) {
+Step guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
+                      double negligible) {
   Step step{at::empty_like(num), {}};
   const auto note = [&](int64_t sample) {
     if (!step.vanishes.defined()) step.vanishes = at::zeros_like(num, num.options().dtype(at::kBool));

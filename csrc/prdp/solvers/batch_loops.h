@@ -28,7 +28,8 @@ std::array<Scalar, 2> scale_with_dots(const Scalar& factor, const Vector& v, con
 /// y = x + beta y
 void xpby(const Vector& x, const Scalar& beta, Vector& y, const Active& active);
 /// x += alpha p and r -= alpha q; returns ‖r‖².
-Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r, const Active& active);
+Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r,
+                                   const Active& active);
 /// h_i = v_i·(factor w) for the first `count` of v.
 void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h);
 /// w = factor w + sign Σ h_i v_i; returns ‖w‖². Without a factor, w keeps its length.
@@ -45,8 +46,8 @@ struct Step {
   Scalar length;
   at::Tensor vanishes;  // undefined: nowhere
 };
-Step step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
-                 double negligible);
+Step guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
+                      double negligible);
 Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going, double epsilon);
 
 }  // namespace prdp::batch_loops

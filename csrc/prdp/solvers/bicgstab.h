@@ -47,7 +47,7 @@ class BiCGStabMethod {
     space_.restore(lost, rr_, rho);
     space_.restore(lost, zero_, inverse_);
 
-    const Scalar over_omega = space_.step_length(tt_, st_, ss_, tt_);
+    const Scalar over_omega = space_.guarded_quotient(tt_, st_, ss_, tt_);
     space_.xmby(v_, over_omega, p_);
     space_.xmby(r_, rho * inverse_, p_);
     auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
@@ -55,13 +55,14 @@ class BiCGStabMethod {
     space_.restore(starts_anew, zero_, rho);
     space_.restore(starts_anew, zero_, hh_);
     space_.restore(starts_anew, vv, hv);  // a number to divide by, which ρ = 0 takes out again
-    inverse_ = space_.ratio(space_.step_length(rr_, hv, hh_, vv), rr_);
+    inverse_ = space_.ratio(space_.guarded_quotient(rr_, hv, hh_, vv), rr_);
     const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_); };
-    ss_ = space_.descend(moves(rho * inverse_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
+    ss_ = space_.update_iterate_and_residual(moves(rho * inverse_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
     const auto [st, tt] = apply_to(r_, t_);
     st_ = st;
     tt_ = tt;
-    rr_ = space_.descend(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x, r_);
+    rr_ = space_.update_iterate_and_residual(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x,
+                                             r_);
     space_.restore(starts_anew, r_, hat_);
     space_.restore(starts_anew, rr_, hh_);
     space_.restore(starts_anew, zero_, inverse_);
@@ -77,7 +78,7 @@ class BiCGStabMethod {
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_); }
+  auto iteration_state() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;

@@ -31,16 +31,16 @@ class ConjugateGradientMethod {
   void step() {
     if (space_.is_preconditioned()) space_.break_down_unless_positive(rz_, rr_);  // r·M⁻¹ r has changed its sign
     const auto [pq, qq] = space_.apply_along(p_, p_, q_);
-    alpha_ = space_.step_length(rz_, pq, pp_, qq);  // 0 where r·z has changed its sign
+    alpha_ = space_.guarded_quotient(rz_, pq, pp_, qq);  // 0 where r·z has changed its sign
     if (!space_.is_preconditioned()) {
-      const auto rr = space_.descend(alpha_, p_, q_, x, r_);
+      const auto rr = space_.update_iterate_and_residual(alpha_, p_, q_, x, r_);
       beta_ = space_.ratio(rr, rz_);
       space_.xpby(r_, beta_, p_);
       pp_ = space_.sum_of_squares(rr, beta_, pp_);
       rr_ = rz_ = rr;
       return;
     }
-    rr_ = space_.descend(alpha_ * sign_, p_, q_, x, r_);
+    rr_ = space_.update_iterate_and_residual(alpha_ * sign_, p_, q_, x, r_);
     const Scalar rz = sign_ * space_.precondition(r_, z_);
     beta_ = space_.ratio(rz, rz_);
     pp_ = space_.xpby_with_square(z_, beta_, p_);
@@ -56,7 +56,7 @@ class ConjugateGradientMethod {
   const typename Space::Vector& residual() const { return r_; }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, p_, rr_, rz_, pp_, sign_); }
+  auto iteration_state() { return std::tie(r_, p_, rr_, rz_, pp_, sign_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;

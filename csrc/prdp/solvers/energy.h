@@ -40,9 +40,10 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
   const auto &r = method.residual(), &b = space.b();
   auto ar = space.scratch();
   space.apply(r, ar);
-  const auto lanes = [&](const auto& v, const auto& w) { return space.lanes(space.dot(v, w)); };
-  const auto xb = lanes(x, b), xr = lanes(x, r), rb = lanes(r, b), rr = lanes(r, r), bb = lanes(b, b);
-  const auto x_ar = lanes(x, ar), r_ar = lanes(r, ar), xx = lanes(x, x), ar2 = lanes(ar, ar);
+  const auto values_of = [&](const auto& v, const auto& w) { return space.values_of(space.dot(v, w)); };
+  const auto xb = values_of(x, b), xr = values_of(x, r), rb = values_of(r, b), rr = values_of(r, r),
+             bb = values_of(b, b);
+  const auto x_ar = values_of(x, ar), r_ar = values_of(r, ar), xx = values_of(x, x), ar2 = values_of(ar, ar);
   space.fill_zero(ar);
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];

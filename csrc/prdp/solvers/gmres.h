@@ -82,7 +82,7 @@ class GmresMethod {
   const Scalar& exhausted() const { return problem_.exhausted(); }
 
   /// What the next cycle starts from once residual2() is known; resume() once it has been put back.
-  auto carried() { return std::tie(x, problem_.scale()); }
+  auto iteration_state() { return std::tie(x, problem_.scale()); }
   void resume(int64_t done) {
     if (done == 0) return start();
     residual2_ = space_.b2() / 0;  // no cycle before to take back

@@ -84,7 +84,7 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
   const int64_t weights = 4 * points, inverse = kMostOfCoarsest * kMostOfCoarsest;
   const int64_t numbers = offsets * (points + most_coarse_points(b.sizes().slice(2))) + weights + inverse;
   const auto& basis = a.null_space;
-  const int64_t nullity = !a.leaks || !basis.defined() ? 0 : basis.numel() == 0 ? 1 : basis.size(0);
+  const int64_t nullity = !a.needs_projection || !basis.defined() ? 0 : basis.numel() == 0 ? 1 : basis.size(0);
   auto kernel = runtime.kernel(b.device(), {text.str(), threads, 0, blocks});
   return {std::move(kernel), std::move(a), blocks, numbers, nullity};
 }

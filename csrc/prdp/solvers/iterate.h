@@ -69,14 +69,14 @@ void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& 
 /// Recomputes the residual of what is not settled and gives it its final status.
 template <class Space, class Method>
 PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
-  const auto open = [](const SampleState& s) { return !s.settled; };
+  const auto open = [](const SampleState& s) { return !s.concluded; };
   if (std::none_of(states.begin(), states.end(), open)) return;
   space.freeze_unless(states, open);
-  const auto residual2 = space.lanes(method.recompute_residual());
+  const auto residual2 = space.values_of(method.recompute_residual());
   const auto broken = space.broken();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    if (s.settled) continue;
+    if (s.concluded) continue;
     s.residual2 = residual2[i];
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!ran_away(s)) judge(s, rtol);
@@ -84,11 +84,11 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
   stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
     const bool unsolved =
         s.status == SolveStatus::kMaxIter || (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
-    return rtol > 0.0 && !s.settled && unsolved;
+    return rtol > 0.0 && !s.concluded && unsolved;
   });
   for (auto& s : states) {
     s.active = false;
-    s.settled = true;
+    s.concluded = true;
   }
 }
 
@@ -98,7 +98,7 @@ template <class Space, class Method>
 void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {
-    const auto norm_a = space.operator_norm(), u2 = space.lanes(space.solution2(method.x));
+    const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
       if (is_doubtful(s) && space.epsilon() * norm_a[i] * std::sqrt(u2[i]) > 0.25 * std::sqrt(s.b2))

@@ -49,7 +49,7 @@ class JacobiMethod {
   bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_contract(); }
 
   /// What the next iteration starts from; resume() once it has been put back, as after `done` iterations.
-  auto carried() { return std::tie(x); }
+  auto iteration_state() { return std::tie(x); }
   void resume(int64_t done) {
     ready_ = false;
     done_ = done;
@@ -100,7 +100,7 @@ class ChebyshevMethod : public JacobiMethod<Space> {
  public:
   explicit ChebyshevMethod(Space& space) : JacobiMethod<Space>(space, /*accelerated=*/true) {}
 
-  auto carried() { return std::tie(this->x, this->next_); }
+  auto iteration_state() { return std::tie(this->x, this->next_); }
 };
 
 }  // namespace prdp

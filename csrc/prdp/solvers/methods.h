@@ -6,7 +6,7 @@
 
 #include "prdp/solvers/bicgstab.h"
 #include "prdp/solvers/conjugate_gradient.h"
-#include "prdp/solvers/correction.h"
+#include "prdp/solvers/defect_correction.h"
 #include "prdp/solvers/gmres.h"
 #include "prdp/solvers/jacobi.h"
 #include "prdp/solvers/minres.h"

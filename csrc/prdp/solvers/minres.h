@@ -75,7 +75,7 @@ class MinresMethod {
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() {
+  auto iteration_state() {
     return std::tie(r_, z_, v_, last_v_, w_, last_w_, rr_, eta_, gamma_, last_gamma_, coupling_, c_, last_c_, s_,
                     last_s_);
   }

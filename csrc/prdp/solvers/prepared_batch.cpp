@@ -83,7 +83,7 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   const auto y = of_order_one(x0.detach()).b;
   auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
   auto z = a.project_solution(y);
-  if (a.leaks()) {
+  if (a.needs_projection()) {
     takes_product =
         takes_product.logical_and(leaves_rounding(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
     z = at::where(takes_product, z, at::zeros_like(z));
@@ -118,7 +118,7 @@ PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveR
   const auto rhs = a.project(whole);
   const auto rounding = rounding_of_least_numbers(scale, b);
   auto inconsistent = at::zeros_like(takes_part);
-  if (a.leaks()) {
+  if (a.needs_projection()) {
     const auto outside = outside_range(whole, rhs, solver.rtol, rounding);
     const auto hopeless = outside.all.logical_and(takes_part);
     inconsistent = outside.some.logical_and(takes_part);

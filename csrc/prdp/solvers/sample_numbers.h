@@ -18,7 +18,7 @@ class SampleNumbers {
 
   /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
   /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
-  Scalar step_length(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+  Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2) {
     if (num < kNegligible) return 0;
     if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
     if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹

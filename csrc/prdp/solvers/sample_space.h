@@ -99,15 +99,15 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   void xpby(const T* x, Scalar beta, Vector y) { vectors_.xpby(x, beta, y, length()); }
   Scalar xpby_with_square(const T* x, Scalar beta, Vector y) { return vectors_.xpby_with_square(x, beta, y, length()); }
   Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
-  Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
-    const Scalar rr = vectors_.descend(alpha, p, q, x, r, length());
-    if (!system_.a().leaks()) return rr;
+  Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
+    const Scalar rr = vectors_.update_iterate_and_residual(alpha, p, q, x, r, length());
+    if (!system_.a().needs_projection()) return rr;
     project(r);  // no product takes away what rounding leaves there
     return dot(r, r);
   }
 
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    if (system_.a().leaks()) {
+    if (system_.a().needs_projection()) {
       apply(v, out);
       return {dot(v, out), dot(out, out)};
     }
@@ -117,9 +117,9 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
-    if (system_.a().leaks()) project(out);
+    if (system_.a().needs_projection()) project(out);
   }
-  bool projects_products() const { return system_.a().leaks(); }
+  bool projects_products() const { return system_.a().needs_projection(); }
   bool is_preconditioned() const { return system_.preconditioner(); }
   bool is_preconditioned_by_diagonal() const { return system_.by_diagonal(); }
   Scalar precondition(const T* v, Vector out) {
@@ -208,7 +208,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     if (where != 0) copy(from, to);
   }
 
-  std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
+  std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {system_.a().norm()}; }
   template <class Predicate>

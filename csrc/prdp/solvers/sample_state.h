@@ -25,20 +25,20 @@ struct SampleState {
   int64_t cap = 0;     // iterations allowed
   double b2 = 0.0;     // ‖b‖²
   bool active = true;  // still iterating; a frozen sample's u no longer changes
-  bool claims = false; // its residual has just come below rtol, to be confirmed
-  bool settled = false;  // residual2 is the true one of the returned u, and status is final
+  bool candidate = false; // its residual has just come below rtol, to be confirmed
+  bool concluded = false;  // residual2 is the true one of the returned u, and status is final
   SolveStatus status = SolveStatus::kMaxIter;
   int64_t iterations = 0;
   int64_t applications = 0;
   double residual2 = 0.0;
   int64_t looked = 0;   // iterations when the residual was last looked at; when it is to be next
   int64_t look = 0;
-  double looked2 = 0.0; // the residual then
+  double checked2 = 0.0; // the residual then
   int64_t best = 0;  // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
   int64_t still = 0;   // cycles since the residual last fell, for methods whose residual never grows
-  double fallen2 = std::numeric_limits<double>::infinity();  // the residual then
-  double refuted2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
+  double last_progress2 = std::numeric_limits<double>::infinity();  // the residual then
+  double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
   Verdict verdict = Verdict::kStands;
@@ -59,12 +59,12 @@ struct SampleState {
   void run_again(int64_t iterations_allowed) {
     cap = iterations_allowed;
     active = cap > 0;
-    settled = claims = false;
+    concluded = candidate = false;
     status = SolveStatus::kMaxIter;
     iterations = still = look = 0;
     floor2 = 0.0;
-    fallen2 = std::numeric_limits<double>::infinity();
-    refuted2 = std::numeric_limits<double>::infinity();
+    last_progress2 = std::numeric_limits<double>::infinity();
+    rejected2 = std::numeric_limits<double>::infinity();
   }
 };
 
@@ -85,7 +85,7 @@ inline void judge(SampleState& s, double rtol) {
 /// The true residual no longer follows the method's own: a second false claim, after the method has
 /// gone on from the true residual of the first, has not even halved it. Just above rtol that is noise.
 inline bool parted_ways(const SampleState& s, double rtol) {
-  return s.residual2 > 0.25 * s.refuted2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
+  return s.residual2 > 0.25 * s.rejected2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
 }
 
 /// A method of least residuals that no longer moves: a breakdown where its space is exhausted, and
@@ -93,8 +93,8 @@ inline bool parted_ways(const SampleState& s, double rtol) {
 inline void judge_progress(SampleState& s, bool exhausted) {
   constexpr double progress2 = 0.998;
   constexpr int64_t patience = 10;
-  if (s.residual2 < progress2 * s.fallen2) {
-    s.fallen2 = s.residual2;
+  if (s.residual2 < progress2 * s.last_progress2) {
+    s.last_progress2 = s.residual2;
     s.still = 0;
     return;
   }
@@ -112,12 +112,12 @@ inline void plan_next_look(SampleState& s, bool log_convex, double rtol) {
   constexpr double longest = 64.0;
   double stride = 1.0;
   if (log_convex && rtol > 0.0 && s.iterations > 0 && s.residual2 > 4.0 * rtol * rtol * s.b2) {
-    const double fall = std::log(s.residual2 / s.looked2) / static_cast<double>(s.iterations - s.looked);
+    const double fall = std::log(s.residual2 / s.checked2) / static_cast<double>(s.iterations - s.looked);
     const double to_go = std::log(4.0 * rtol * rtol * s.b2 / s.residual2);
     stride = fall < 0.0 ? std::min(std::ceil(to_go / fall), longest) : longest;
   }
   s.looked = s.iterations;
-  s.looked2 = s.residual2;
+  s.checked2 = s.residual2;
   s.look = s.iterations + static_cast<int64_t>(stride);
 }
 

@@ -85,7 +85,7 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   arguments.max_iter = request.solver.max_iter.expect_int();
   arguments.rtol = request.solver.rtol;
   arguments.guarded = request.guarded;
-  arguments.leaks = a.leaks;
+  arguments.needs_projection = a.needs_projection;
   MadeHierarchy made;
   if (hierarchy) {
     made = make_hierarchy(*hierarchy, b);

@@ -2,9 +2,9 @@
 
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/prepared_batch.h"
+#include "prdp/solvers/tensor_preconditioner.h"
 #include "prdp/solvers/tensor_space.h"
 
 /// Solves that autograd records, all iterations at once or one at a time.
@@ -23,12 +23,12 @@ void iterate_again(TensorSpace& space, M& method, std::vector<SampleState>& stat
   const auto wanted = [&](const SampleState& s) { return done < s.cap; };
   space.freeze_unless(states, wanted);
   detail::repeat_iteration(method, rtol, done, [&] {
-    const auto residual2 = space.lanes(method.residual2());
+    const auto residual2 = space.values_of(method.residual2());
     for (size_t i = 0; i < states.size(); ++i)
-      states[i].claims = wanted(states[i]) && is_within(residual2[i], rtol, states[i].b2);
-    const auto claims = [](const SampleState& s) { return s.claims; };
-    if (std::none_of(states.begin(), states.end(), claims)) return;
-    space.freeze_unless(states, claims);
+      states[i].candidate = wanted(states[i]) && is_within(residual2[i], rtol, states[i].b2);
+    const auto candidate = [](const SampleState& s) { return s.candidate; };
+    if (std::none_of(states.begin(), states.end(), candidate)) return;
+    space.freeze_unless(states, candidate);
     method.recompute_residual();
     space.freeze_unless(states, wanted);
   });
@@ -59,7 +59,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, whole, states, /*recording=*/true);
-  const auto b2 = space.lanes(space.b2());
+  const auto b2 = space.values_of(space.b2());
   for (size_t i = 0; i < states.size(); ++i) {
     states[i].cap = host_caps[i];
     states[i].b2 = b2[i];
@@ -107,7 +107,7 @@ StepwiseSolve::State StepwiseSolve::step(const Operator& a, const at::Tensor& rh
   State after;
   with_method(solver_.method, solver_.restart, space, [&](auto method) {
     method.start();
-    auto state = std::tuple_cat(std::tie(method.x), method.carried());
+    auto state = std::tuple_cat(std::tie(method.x), method.iteration_state());
     if (!before.empty()) {
       size_t next = 0;
       std::apply([&](auto&... part) { ((part = before[next++]), ...); }, state);

@@ -3,10 +3,10 @@
 #include <cstdlib>
 
 #include "prdp/operators/tensors.h"
-#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/prepared_batch.h"
 #include "prdp/solvers/tensor_gmres.h"
+#include "prdp/solvers/tensor_preconditioner.h"
 #include "prdp/solvers/tensor_space.h"
 
 namespace prdp {
@@ -28,7 +28,7 @@ void prepare(std::vector<SampleState>& states, const PreparedBatch& batch, const
     s.b2 = norm2[i];
     s.rounding2 = rounding[i] * rounding[i];
     s.active = s.status == SolveStatus::kMaxIter;
-    s.settled = !s.active;
+    s.concluded = !s.active;
     if (s.active) s.applications += static_cast<int64_t>(products[i]);
   }
 }
@@ -51,11 +51,11 @@ std::vector<SampleOutcome> outcomes_of(std::vector<SampleState>& states, const P
       at::stack({batch.status.to(largest.scalar_type()), batch.inconsistent.to(largest.scalar_type()), before, largest})
           .to(at::kCPU, at::kDouble);
   const auto rows = host.accessor<double, 2>();
-  const auto settled = rows[0], inconsistent = rows[1], digits = rows[2], most = rows[3];
+  const auto concluded = rows[0], inconsistent = rows[1], digits = rows[2], most = rows[3];
   const bool is_float = largest.scalar_type() == at::kFloat;
   std::vector<SampleOutcome> outcomes(states.size());
   for (size_t i = 0; i < states.size(); ++i) {
-    const auto beforehand = static_cast<SolveStatus>(static_cast<int64_t>(settled[i]));
+    const auto beforehand = static_cast<SolveStatus>(static_cast<int64_t>(concluded[i]));
     const auto is_nonzero = [&] { return digits[i] > 0.0; };
     const bool consistent = inconsistent[i] == 0.0;
     outcomes[i] = beforehand != SolveStatus::kMaxIter ? zero_instead(beforehand)

@@ -42,7 +42,7 @@ concept Primitives =
       /// x·y
       { s.dot(x, y) } -> std::same_as<typename S::Scalar>;
       /// x += alpha p and r -= alpha q; returns ‖r‖². p may be r.
-      { s.descend(alpha, p, q, x, r) } -> std::same_as<typename S::Scalar>;
+      { s.update_iterate_and_residual(alpha, p, q, x, r) } -> std::same_as<typename S::Scalar>;
       /// y = A x
       s.apply(x, y);
       /// r = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖r‖².
@@ -62,7 +62,8 @@ concept FusedOperations =
       { s.xpby_with_square(x, beta, y) } -> std::same_as<typename S::Scalar>;
       /// y = A x; returns x·y and ‖y‖².
       { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-      /// y = A x; returns p·y and, for a step_length() whose step the next descend() takes, ‖y‖².
+      /// y = A x; returns p·y and, for a guarded_quotient() whose step the next update_iterate_and_residual() takes,
+      /// ‖y‖².
       { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
       /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
       s.correct(x, y);
@@ -78,14 +79,14 @@ concept NumberOperations =
       s.assign(a, b);
       /// num/den for a step, where |den| <= √a2 √b2. 0 where num is negligible; 0 and a breakdown of the sample where
       /// |den| <= ε √a2 √b2.
-      { s.step_length(num, den, a2, b2) } -> std::same_as<typename S::Scalar>;
-      /// 1 where step_length() would break down and `active` is not zero, else 0; for restore() alone.
+      { s.guarded_quotient(num, den, a2, b2) } -> std::same_as<typename S::Scalar>;
+      /// 1 where guarded_quotient() would break down and `active` is not zero, else 0; for restore() alone.
       { s.breaks_down(den, a2, b2, active) } -> std::same_as<typename S::Scalar>;
       /// num/den for den >= 0; 0 where den is negligible.
       { s.ratio(num, den) } -> std::same_as<typename S::Scalar>;
       /// A breakdown of the samples where a is not positive, and b2 not negligible.
       s.break_down_unless_positive(a, b2);
-      /// a2 + a² b2, the square of the norm of v + a w for orthogonal v and w, for step_length() alone.
+      /// a2 + a² b2, the square of the norm of v + a w for orthogonal v and w, for guarded_quotient() alone.
       { s.sum_of_squares(a2, a, b2) } -> std::same_as<typename S::Scalar>;
       /// 1 where |a| < factor √a2 √b2, else 0; for restore() alone.
       { s.is_rounding(a, a2, b2, factor) } -> std::same_as<typename S::Scalar>;
@@ -170,7 +171,7 @@ template <class S>
 concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
                              typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
   /// One number per sample, on the host: a; whether it broke down; ‖A‖.
-  s.lanes(a);
+  s.values_of(a);
   s.broken();
   s.operator_norm();
   /// ‖u‖², where u is x and the start.
@@ -181,7 +182,7 @@ concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept,
   { s.scratch() } -> std::convertible_to<typename S::Vector>;
   /// From here on, operations write to the samples alone that are wanted.
   s.freeze_unless(states, wanted);
-  /// wanted(state) of each sample, as lanes() are.
+  /// wanted(state) of each sample, as values_of() are.
   s.map(states, wanted);
   /// x of the samples that are wanted, `kept` of the others.
   { s.select(s.map(states, wanted), kept, x) } -> std::convertible_to<typename S::Vector>;

@@ -22,8 +22,8 @@ class SteepestDescentMethod {
   }
   void step() {
     const auto [rq, qq] = space_.apply_along(r_, r_, q_);
-    alpha_ = space_.step_length(rr_, rq, rr_, qq);
-    rr_ = space_.descend(alpha_, r_, q_, x, r_);
+    alpha_ = space_.guarded_quotient(rr_, rq, rr_, qq);
+    rr_ = space_.update_iterate_and_residual(alpha_, r_, q_, x, r_);
   }
   auto residual2() const { return rr_; }
   auto recompute_residual() {
@@ -35,7 +35,7 @@ class SteepestDescentMethod {
   const typename Space::Vector& residual() const { return r_; }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto carried() { return std::tie(r_, rr_); }
+  auto iteration_state() { return std::tie(r_, rr_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;

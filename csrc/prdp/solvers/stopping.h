@@ -48,7 +48,7 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
                             const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
-  const auto u2 = space.lanes(space.solution2(method.x));
+  const auto u2 = space.values_of(space.solution2(method.x));
   const auto slack_of = [&](const SampleState& s, double floor) {
     return s.status == SolveStatus::kBreakdown ? 100.0 : rtol * std::sqrt(s.b2) <= floor ? 8.0 : 1.0;
   };
@@ -62,7 +62,7 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
   constexpr double far = 64.0;
-  const auto terms2 = space.lanes(space.terms2(method.x));
+  const auto terms2 = space.values_of(space.terms2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     const double of_product = far * space.epsilon() * std::sqrt(terms2[i]);
@@ -76,14 +76,14 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
 /// confirms what seems converged by the true residual: a recursive one may have drifted from it.
 template <class Space, class Method>
 void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
-  const auto residual2 = space.lanes(method.residual2());
+  const auto residual2 = space.values_of(method.residual2());
   const auto broken = space.broken();
-  [[maybe_unused]] decltype(space.lanes(method.residual2())) exhausted{};
-  if constexpr (kLeastResidual<Method>) exhausted = space.lanes(method.exhausted());
+  [[maybe_unused]] decltype(space.values_of(method.residual2())) exhausted{};
+  if constexpr (kLeastResidual<Method>) exhausted = space.values_of(method.exhausted());
   bool any_claims = false;
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    s.claims = false;
+    s.candidate = false;
     if (!s.active) continue;
     s.note(residual2[i]);
     if (broken[i]) {
@@ -99,35 +99,35 @@ void observe(Space& space, Method& method, typename Space::States& states, doubl
     if (s.status != SolveStatus::kConverged) continue;
     s.status = SolveStatus::kMaxIter;  // only a claim so far; with rtol = 0 nothing stops early
     s.active = true;
-    s.claims = rtol > 0.0;
-    any_claims = any_claims || s.claims;
+    s.candidate = rtol > 0.0;
+    any_claims = any_claims || s.candidate;
   }
   // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
   if constexpr (kTakesStrides<Method> || kContracts<Method>) {
     stop_at_rounding_floor(space, method, states, rtol,
-                           [rtol](const SampleState& s) { return rtol > 0.0 && !s.claims && is_idle<Method>(s); });
+                           [rtol](const SampleState& s) { return rtol > 0.0 && !s.candidate && is_idle<Method>(s); });
   }
   if constexpr (kLeastResidual<Method>)
     stop_at_rounding_floor(space, method, states, rtol,
-                           [](const SampleState& s) { return s.active && !s.claims && s.still > 0; });
+                           [](const SampleState& s) { return s.active && !s.candidate && s.still > 0; });
   if (!any_claims) return;
 
-  space.freeze_unless(states, [](const SampleState& s) { return s.claims; });
-  const auto true2 = space.lanes(method.recompute_residual());
+  space.freeze_unless(states, [](const SampleState& s) { return s.candidate; });
+  const auto true2 = space.values_of(method.recompute_residual());
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    if (!s.claims) continue;
+    if (!s.candidate) continue;
     s.residual2 = true2[i];
     judge(s, rtol);
     if (s.active && parted_ways(s, rtol)) s.stop(SolveStatus::kStagnated);
     if constexpr (kLeastResidual<Method>) {
       if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
     }
-    s.refuted2 = s.residual2;
+    s.rejected2 = s.residual2;
   }
-  stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) { return s.claims && s.active; });
+  stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) { return s.candidate && s.active; });
   for (auto& s : states)
-    if (s.claims) s.settled = !s.active;
+    if (s.candidate) s.concluded = !s.active;
 }
 
 }  // namespace prdp::detail

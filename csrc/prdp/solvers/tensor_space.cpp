@@ -55,7 +55,7 @@ TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
   if (system_.inverse) {
     define_scale(z, v, system_.scale_of_inverse);
     z = z * system_.scale_of_inverse;
-    if (system_.a.leaks()) z = system_.a.project_solution(z);
+    if (system_.a.needs_projection()) z = system_.a.project_solution(z);
   }
   out = keep_frozen(z, out);
   return dot(v, z);
@@ -79,13 +79,14 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   d = laid_out(at::where(every, solution, at::zeros_like(solution)));
 }
 
-TensorSpace::Scalar TensorSpace::step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
+TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2,
+                                                  const Scalar& b2) {
   if (in_loops_) {
-    const auto [length, vanishes] = batch_loops::step_length(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
+    const auto [length, vanishes] = batch_loops::guarded_quotient(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
     if (vanishes.defined()) note_broken(vanishes);
     return length;
   }
-  // As SampleSpace::step_length; the inner where keeps 0/0 out of the derivative.
+  // As SampleSpace::guarded_quotient; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
   const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
   const auto vanishes =
@@ -134,7 +135,7 @@ void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t
   for (int64_t j = 0; j < n; ++j) y[j] = at::where(wanted, found.select(1, j).view_as(wanted), y[j]);
 }
 
-std::vector<double> TensorSpace::lanes(const Scalar& value) const {
+std::vector<double> TensorSpace::values_of(const Scalar& value) const {
   return to_host<double>(value, static_cast<int64_t>(states_.size()));
 }
 

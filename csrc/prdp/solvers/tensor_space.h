@@ -7,10 +7,10 @@
 #include "prdp/operators/operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/solvers/batch_loops.h"
-#include "prdp/solvers/inverse.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/solver.h"
 #include "prdp/solvers/space.h"
+#include "prdp/solvers/tensor_preconditioner.h"
 #include "prdp/threads/interruption.h"
 
 namespace prdp {
@@ -29,7 +29,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   struct System {
     const Operator& a;
     const Preconditioner& preconditioner;
-    Inverse inverse{};
+    TensorPreconditioner inverse{};
     at::Tensor scale_of_a{}, scale_of_inverse{};  // (batch, 1, …); undefined before the first product
   };
   /// b must be finite and scaled to the order of one, or zero.
@@ -69,11 +69,12 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     y = keep_frozen(at::addcmul(x, beta, y, -1), y);
   }
   Scalar dot(const Vector& a, const Vector& b) const { return in_loops_ ? batch_loops::dot(a, b) : dot_in_order(a, b); }
-  Scalar descend(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
-    if (in_loops_ && !system_.a.leaks()) return batch_loops::descend(alpha, p, q, x, r, active_);
+  Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
+    if (in_loops_ && !system_.a.needs_projection())
+      return batch_loops::update_iterate_and_residual(alpha, p, q, x, r, active_);
     x = keep_frozen(at::addcmul(x, alpha, p), x);
     const auto left = at::addcmul(r, alpha, q, -1);
-    r = keep_frozen(system_.a.leaks() ? system_.a.project(left) : left, r);
+    r = keep_frozen(system_.a.needs_projection() ? system_.a.project(left) : left, r);
     return dot(r, r);
   }
 
@@ -100,7 +101,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar precondition(const Vector& v, Vector& out);
   void correct(const Vector& v, Vector& out) {
     const auto z = laid_out(system_.inverse(v));
-    out = keep_frozen(system_.a.leaks() ? system_.a.project_solution(z) : z, out);
+    out = keep_frozen(system_.a.needs_projection() ? system_.a.project_solution(z) : z, out);
   }
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
   void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
@@ -135,7 +136,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar terms2(const Vector& x) const;
   void solve_directly(const Vector& r, Vector& d);
 
-  Scalar step_length(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
+  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
   Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const;
   Scalar ratio(const Scalar& num, const Scalar& den);
   void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
@@ -183,7 +184,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar is_not_zero(const Scalar& value) const { return value.ne(0).to(b_.scalar_type()); }
   bool surely_all(const Scalar&) const { return false; }  // the basis goes on with zeros
 
-  std::vector<double> lanes(const Scalar& value) const;
+  std::vector<double> values_of(const Scalar& value) const;
   std::vector<bool> broken() const;
   std::vector<double> operator_norm() const;
   template <class Predicate>

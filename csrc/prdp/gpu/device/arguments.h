@@ -80,7 +80,7 @@ struct SolveArguments {
   int64_t batch, max_iter;
   double rtol;
   int64_t guarded;
-  int64_t leaks;  // products leave the range of A by their rounding, and are projected
+  int64_t needs_projection;  // products leave the range of A by their rounding, and are projected
   HierarchyView<T> hierarchy;
 };
 

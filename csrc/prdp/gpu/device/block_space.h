@@ -75,7 +75,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
         cycle_{of.hierarchy, sample, in_block, beyond + beyond_of(S::kRestart)},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
-        leaks_(of.leaks != 0) {}
+        leaks_(of.needs_projection != 0) {}
 
   // ---- a sample (solve_sample.h)
   void begin(SampleState& state) {
@@ -170,7 +170,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
     return team_.sum(s);
   }
-  PRDP_ONCE Scalar descend(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
+  PRDP_ONCE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
     T s = 0;
     each([&](int i) { return Pair{x[i] + alpha * p[i], r[i] - alpha * q[i]}; },
          [&](int i, Pair next) {
@@ -321,7 +321,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
 
   // ---- what iterate.h asks for
-  std::array<double, 1> lanes(Scalar value) const { return {static_cast<double>(value)}; }
+  std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {norm_}; }
   template <class Predicate>

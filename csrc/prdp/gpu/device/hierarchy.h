@@ -56,7 +56,7 @@ class HierarchyMaker {
       for (const int axis : axes) {
         grid.axes |= 1 << axis;
         grid.weights[axis] = used_;
-        next = collapse(next, axis);
+        next = galerkin_product(next, axis);
       }
       if (team_.leads()) grids_.grid[level] = grid;
       if (axes.empty()) {
@@ -143,7 +143,7 @@ class HierarchyMaker {
   }
 
   /// The weights of the axis, which are kept, and the operator on the coarse points.
-  PRDP_ONCE Stencil collapse(const Stencil& a, int axis) {
+  PRDP_ONCE Stencil galerkin_product(const Stencil& a, int axis) {
     const CoarsenedAxis line(a.shape, axis, A::periodic(axis));
     T* const weights = take(int64_t{symmetric_ ? 2 : 4} * line.weights());
     make_weights(a, line, axis, weights);

@@ -1,6 +1,6 @@
 #pragma once
+#include "prdp/steppers/flow/counted_solves.h"
 #include "prdp/steppers/flow/kernels.h"
-#include "prdp/steppers/flow/solves.h"
 
 namespace prdp {
 

@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/steppers/flow/solves.h"
+#include "prdp/steppers/flow/counted_solves.h"
 
 namespace prdp {
 

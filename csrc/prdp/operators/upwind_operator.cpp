@@ -1,14 +1,14 @@
-#include "prdp/operators/flow_operator.h"
+#include "prdp/operators/upwind_operator.h"
 
 namespace prdp {
 
-FlowOperator::FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels)
+UpwindOperator::UpwindOperator(const char* owner, const OperatorSpec& spec, int64_t channels)
     : grid_(owner, spec.shape, Boundary::kPeriodic, lengths_of(spec, 1)),
       step_(owner, spec, 2, "two tensors, the winds and nu"),
       winds_(spec.tensors[0]),
       channels_(channels) {}
 
-void FlowOperator::check_vector(const at::Tensor& b) const {
+void UpwindOperator::check_vector(const at::Tensor& b) const {
   grid_.check_field(b, channels_);
   TORCH_CHECK_VALUE(winds_.sym_size(0) == 1 || winds_.sym_size(0) == b.sym_size(0), step_.owner, ": the winds hold ",
                     winds_.sym_size(0), " samples, the vector holds ", b.sym_size(0));
@@ -18,30 +18,30 @@ void FlowOperator::check_vector(const at::Tensor& b) const {
                     " but the vector is on ", b.device());
 }
 
-std::vector<int64_t> FlowOperator::vector_shape() const {
+std::vector<int64_t> UpwindOperator::vector_shape() const {
   std::vector<int64_t> shape{channels_};
   shape.insert(shape.end(), grid_.shape().begin(), grid_.shape().end());
   return shape;
 }
 
-std::vector<int64_t> FlowOperator::first_nonfinite(int64_t sample) const {
+std::vector<int64_t> UpwindOperator::first_nonfinite(int64_t sample) const {
   return first_true(nonfinite(winds_.select(0, winds_.size(0) == 1 ? 0 : sample)));
 }
 
-at::Tensor FlowOperator::as_winds(std::vector<at::Tensor> channels) const {
+at::Tensor UpwindOperator::as_winds(std::vector<at::Tensor> channels) const {
   if (winds_.sym_size(1) > static_cast<int64_t>(channels.size()))
     channels.push_back(at::zeros_like(channels[0]));  // a pressure channel blows nowhere
   const auto all = at::cat(channels, 1);
   return winds_.sym_size(0) == 1 ? all.sum(0, /*keepdim=*/true) : all;
 }
 
-at::Tensor FlowOperator::largest(const at::Tensor& row_norms) const {
+at::Tensor UpwindOperator::largest(const at::Tensor& row_norms) const {
   const auto norms = row_norms.flatten(1).amax(1);
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
 }
 
-gpu::OperatorView FlowOperator::upwind_view(const at::Tensor& b, const std::string& name, const std::string& others,
-                                            double alpha, double beta) const {
+gpu::OperatorView UpwindOperator::upwind_view(const at::Tensor& b, const std::string& name, const std::string& others,
+                                              double alpha, double beta) const {
   gpu::OperatorView view{name + "<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(grid_.shape()) + ", " +
                          others + ">"};
   const auto dim = grid_.dim();

@@ -26,8 +26,8 @@ struct StencilWrap {
 
 /// The neighbours that a stencil couples a point to. On a short periodic axis several offsets may lead to the same
 /// neighbour. On a short axis with zeros beyond its ends an offset may lead nowhere.
-struct StencilPattern {
-  StencilPattern(const StencilGrid& on, const std::vector<Offset>& given);
+struct StencilSparsity {
+  StencilSparsity(const StencilGrid& on, const std::vector<Offset>& given);
 
   /// The point itself and its nearest neighbours.
   static std::vector<Offset> nearest_neighbours(int64_t dim);

@@ -1,4 +1,4 @@
-#include "prdp/steppers/flow/solves.h"
+#include "prdp/steppers/flow/counted_solves.h"
 
 #include <limits>
 

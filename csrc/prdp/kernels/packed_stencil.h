@@ -4,7 +4,7 @@
 #include <cmath>
 #include <memory>
 
-#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/stencil_sparsity.h"
 #include "prdp/kernels/vector.h"
 
 namespace prdp::kernels {
@@ -12,10 +12,10 @@ namespace prdp::kernels {
 /// The coefficients of a stencil on one field as the loops take them. Whoever assembles them fills the rows
 /// as if each were closed in itself, then calls close(): what leaves a row goes where the loops expect it.
 template <class T>
-class StencilRows {
+class PackedStencil {
  public:
   /// All zero; `pattern` says which neighbours there are.
-  explicit StencilRows(std::shared_ptr<const StencilPattern> pattern)
+  explicit PackedStencil(std::shared_ptr<const StencilSparsity> pattern)
       : pattern_(std::move(pattern)),
         nx_(pattern_->grid.shape[2]),
         row_(round_up_to_lanes<T>(nx_)),
@@ -27,10 +27,10 @@ class StencilRows {
     const auto address = reinterpret_cast<std::uintptr_t>(memory_.data());
     coefficients_ = reinterpret_cast<T*>((address + 63) / 64 * 64);
   }
-  StencilRows(StencilRows&&) = default;  // a copy would lie at another alignment
-  StencilRows& operator=(StencilRows&&) = default;
+  PackedStencil(PackedStencil&&) = default;  // a copy would lie at another alignment
+  PackedStencil& operator=(PackedStencil&&) = default;
 
-  const StencilPattern& pattern() const { return *pattern_; }
+  const StencilSparsity& pattern() const { return *pattern_; }
   const StencilGrid& grid() const { return pattern_->grid; }
   int64_t rows() const { return grid().shape[0] * grid().shape[1]; }
   /// From a coefficient at a point to the same one in the next row.
@@ -164,7 +164,7 @@ class StencilRows {
     return coupled(r)[e];
   }
 
-  std::shared_ptr<const StencilPattern> pattern_;
+  std::shared_ptr<const StencilSparsity> pattern_;
   int64_t nx_, row_, count_;
   int64_t coupled_;  // values for what leaves a row
   Field<T> memory_;

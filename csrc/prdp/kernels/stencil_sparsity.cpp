@@ -1,4 +1,4 @@
-#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/stencil_sparsity.h"
 
 #include <algorithm>
 #include <cstdlib>
@@ -17,7 +17,7 @@ int64_t distance(const Offset& o) { return std::abs(o.along[0]) + std::abs(o.alo
 
 }  // namespace
 
-std::vector<Offset> StencilPattern::nearest_neighbours(int64_t dim) {
+std::vector<Offset> StencilSparsity::nearest_neighbours(int64_t dim) {
   std::vector<Offset> found{{{0, 0, 0}}};
   for (int64_t axis = 2; axis > 2 - dim; --axis)
     for (const int64_t step : {-1, 1}) {
@@ -27,7 +27,7 @@ std::vector<Offset> StencilPattern::nearest_neighbours(int64_t dim) {
   return found;
 }
 
-StencilPattern::StencilPattern(const StencilGrid& on, const std::vector<Offset>& given)
+StencilSparsity::StencilSparsity(const StencilGrid& on, const std::vector<Offset>& given)
     : grid(on), nearest(true), offsets(nearest_neighbours(on.dim)) {
   std::vector<Offset> wanted = given;
   std::vector<bool> leads_nowhere(given.size());

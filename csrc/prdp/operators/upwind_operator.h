@@ -10,7 +10,7 @@ namespace prdp {
 /// Parameters: dt, and the length per axis if not 1. Tensors: the winds and nu. The winds are (batch, channels,
 /// *shape), or (1, channels, *shape) if all samples share them. Channel 0 is the velocity along x, the last axis;
 /// channel 1 along y.
-class FlowOperator : public Operator {
+class UpwindOperator : public Operator {
  public:
   void check_vector(const at::Tensor& b) const override;
   void check_parameters(bool kernel_checks) const override { step_.check_values(kernel_checks); }
@@ -19,7 +19,7 @@ class FlowOperator : public Operator {
 
  protected:
   /// Vectors have `channels` channels.
-  FlowOperator(const char* owner, const OperatorSpec& spec, int64_t channels);
+  UpwindOperator(const char* owner, const OperatorSpec& spec, int64_t channels);
 
   /// The kernels that make(parameters) makes of the winds of each sample, kernels::UpwindParameters; Make is a
   /// template.

@@ -2,7 +2,7 @@
 #include <memory>
 #include <vector>
 
-#include "prdp/kernels/stencil_pattern.h"
+#include "prdp/kernels/stencil_sparsity.h"
 #include "prdp/kernels/whole_vectors.h"
 
 namespace prdp::kernels {
@@ -10,10 +10,10 @@ namespace prdp::kernels {
 /// A stencil with neighbours at most one cell away, as contiguous fields (nz, ny, nx) of coefficients. What points
 /// beyond the grid is kept: no product uses it, but the weights of interpolation need it.
 template <class T>
-struct RawStencil {
-  explicit RawStencil(const StencilGrid& on) : grid(on) {}
-  RawStencil(RawStencil&&) = default;  // a copy would point to the memory of the other
-  RawStencil& operator=(RawStencil&&) = default;
+struct StencilFields {
+  explicit StencilFields(const StencilGrid& on) : grid(on) {}
+  StencilFields(StencilFields&&) = default;  // a copy would point to the memory of the other
+  StencilFields& operator=(StencilFields&&) = default;
 
   StencilGrid grid;
   /// By offset, 9 (z + 1) + 3 (y + 1) + x + 1; null where there is no such neighbour.

@@ -1,4 +1,4 @@
-#include "prdp/solvers/inverse.h"
+#include "prdp/solvers/tensor_preconditioner.h"
 
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
@@ -104,7 +104,7 @@ auto in_its_name(const Call& call) {
 
 }  // namespace
 
-Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
+TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b) {
   if (preconditioner.is_operator()) {
     const std::shared_ptr<Operator> inverse = make_operator(preconditioner.spec());
     in_its_name([&] { inverse->check_vector(b); });

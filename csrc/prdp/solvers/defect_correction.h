@@ -33,7 +33,7 @@ class CorrectionMethod {
   }
 
   /// What the next iteration starts from; resume() once it has been put back.
-  auto carried() { return std::tie(x); }
+  auto iteration_state() { return std::tie(x); }
   void resume(int64_t) { ready_ = false; }
 
   typename Space::Vector x;

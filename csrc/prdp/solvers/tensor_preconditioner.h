@@ -10,11 +10,11 @@ namespace prdp {
 
 /// v → M⁻¹ v for vectors (batch, …) in plain tensor operations; differentiable in v any number of times, M being a
 /// constant.
-using Inverse = std::function<at::Tensor(const at::Tensor& v)>;
+using TensorPreconditioner = std::function<at::Tensor(const at::Tensor& v)>;
 
 /// That of the preconditioner of `a` for vectors like b: an operator of the user's own, or V-cycles, on the CPU by its
 /// loops; empty for none and for the diagonal. Raises ValueError or TypeError unless it takes vectors as b, and
 /// NotImplementedError for the block preconditioner of Navier-Stokes on other devices.
-Inverse make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b);
+TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b);
 
 }  // namespace prdp
