@@ -153,7 +153,7 @@ inline constexpr std::tuple kMethods{
         .nanoseconds = 4.0,
         .is_polynomial = true,
         .kernel = "MultigridMethod",
-        .kernel_header = "correction.h",
+        .kernel_header = "defect_correction.h",
     }},
     MethodRow<DirectMethod>{{
         .method = Method::kDirect,
