@@ -83,6 +83,7 @@ struct numeric_limits<int64_t> {
 
 template <class T, size_t n>
 struct array {
+  using value_type = T;
   T values[n];
   T& operator[](size_t i) { return values[i]; }
   const T& operator[](size_t i) const { return values[i]; }

@@ -44,8 +44,6 @@ struct FlowEquation {
   FlowEquation with_tensors(at::TensorList tensors) const;
   /// The velocity of the wall at an end of an axis; undefined at rest.
   at::Tensor velocity_of_wall(int64_t axis, bool high) const;
-  /// How much of the pressure of the explicit part is taken off before the implicit diffusion.
-  double incremental_share() const;
 };
 
 /// "wall_velocity of side (0, 'high')", for the i-th of FlowEquation::wall_velocity.
