@@ -65,7 +65,7 @@ class PlainSpace : public SampleNumbers<double>, public SpaceDefaults<PlainSpace
     if (where != 0.0) copy(x, y);
   }
 
-  std::array<double, 1> lanes(double a) const { return {a}; }
+  std::array<double, 1> values_of(double a) const { return {a}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {a_.abs().sum(1).max().item<double>()}; }
   Scalar solution2(const double* x) const { return dot(x, x); }
