@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -165,8 +165,8 @@ def way_of_last_solve() -> str:
 CHECKPOINT_SQRT: int = -1
 DEFAULT_RESTART: int = 10
 DEFAULT_RTOL: float = 1e-05
-SMALL_RESIDUAL: float = 0.0001
 PRDP_DEFAULTS: dict = {'tau_step': 0.95, 'tau_stop': 0.9, 'delta': 3, 'window': 6, 'initial': 1, 'increment': 1, 'maximum': None, 'growth': 1.0, 'adjoint_ratio': None}
+SMALL_RESIDUAL: float = 0.0001
 SOLVE_STATUSES: dict = {'CONVERGED_BREAKDOWN': 2, 'CONVERGED': 1, 'MAX_ITER': -1, 'STAGNATED': -2, 'DIVERGED': -3, 'OVERFLOW': -4, 'BREAKDOWN': -5, 'ZERO_DIAGONAL': -6, 'INCONSISTENT': -7, 'NONFINITE_INPUT': -8, 'NONFINITE_OPERATOR': -9}
 TOLERANCE_DEFAULTS: dict = {'ratio': 0.1, 'adjoint_ratio': 0.1, 'floor': 1e-05, 'adjoint_floor': 0.01, 'maximum': 10000}
 VERSION: str = '0.1.0'
