@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -124,8 +124,9 @@ class _Attached(_Compiled):
         The residual is that where the last solves ended: the mean over the samples, of several steppers the largest;
         `idle` is the share of solves that took no iteration."""
         ended = [getattr(stepper, "info", None) for stepper in self.steppers]
-        residuals = [torch.zeros(0) if info is None else _beyond_rounding(info) for info in ended]
-        idle = max((_idle(info) for info in ended if info is not None and info.status.numel()), default=0.0)
+        reports = [_Ended(torch.zeros(0), 0.0) if info is None else _Ended.of(info) for info in ended]
+        residuals = [report.residual for report in reports]
+        idle = max((report.idle for report in reports), default=0.0)
         many = data_parallel.count(self.process_group)
         if many > 1:
             # One that is refused must be refused in every process.
@@ -172,14 +173,19 @@ def _kind(controller: type) -> str:
     return next(base.__name__ for base in controller.__mro__ if base.__module__ == __name__)
 
 
-def _beyond_rounding(info: SolveInfo) -> Tensor:
-    """The residuals of a report, with 0 where it is rounding alone."""
-    return info.residual.double().masked_fill(info.floor > 0, 0.0)
+class _Ended(NamedTuple):
+    """How solves ended, on the host."""
 
+    residual: Tensor  # 0 where it is rounding alone
+    idle: float  # the share of samples whose solve took no iteration, though its residual is not small
 
-def _idle(info: SolveInfo) -> float:
-    """The share of samples whose solve took no iteration, though its residual is not small."""
-    return float(((info.iterations == 0) & (_beyond_rounding(info) > _C.SMALL_RESIDUAL)).double().mean())
+    @classmethod
+    def of(cls, info: SolveInfo) -> Self:
+        parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations)])
+        residual, floor, iterations = parts.cpu()  # one copy of a device
+        residual = residual.masked_fill(floor > 0, 0.0)
+        idle = ((iterations == 0) & (residual > _C.SMALL_RESIDUAL)).double()
+        return cls(residual, float(idle.mean()) if idle.numel() else 0.0)
 
 
 def _remade(

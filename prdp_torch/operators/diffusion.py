@@ -186,7 +186,11 @@ def _sides(boundary: Any, dim: int) -> list[tuple[Any, Any]]:
         return _is_robin(side) or (side in KINDS and side != "robin")
 
     axes = [boundary] * dim if is_side(boundary) else boundary
-    pairs = [(of_axis, of_axis) if is_side(of_axis) else tuple(of_axis) for of_axis in axes]
+    pairs = []
+    if isinstance(axes, tuple | list) and all(
+        is_side(of_axis) or isinstance(of_axis, tuple | list) for of_axis in axes
+    ):
+        pairs = [(of_axis, of_axis) if is_side(of_axis) else tuple(of_axis) for of_axis in axes]
     if len(pairs) != dim or any(len(pair) != 2 or not all(map(is_known, pair)) for pair in pairs):
         raise ValueError(
             "Diffusion: boundary must be 'zero', 'flux', 'periodic' or ('robin', h): one for all sides, or one, or a "

@@ -44,6 +44,14 @@ class Matrix(Operator):
         like = given["values" if self.kind == "csr" else "matrix"]
         super().__init__([], [], given, null_spaces_of("Matrix", nullspace, left_nullspace, like))
 
+    def __repr__(self) -> str:
+        values = self.tensors[2] if self.kind.endswith("csr") else self.tensors[0]
+        of_one = values.dim() == 1 + (not self.kind.endswith("csr"))
+        samples = "" if of_one else f"batch={values.shape[0]}, "
+        stored = f"{values.shape[-1]} entries" if self.kind.endswith("csr") else "dense"
+        n = self._unknowns()
+        return f"Matrix({samples}{n} × {n}, {stored}, {values.dtype})"
+
     def _unknowns(self) -> int:
         return self.tensors[0].shape[-1] - self.kind.endswith("csr")
 

@@ -59,7 +59,8 @@ class Stencil(Operator):
                 f"{tuple(coefficients.shape)}"
             )
         self.offsets = _offsets(offsets, tuple(coefficients.shape))
-        self.boundary = (boundary,) * dim if isinstance(boundary, str) else tuple(boundary)
+        several = tuple(boundary) if isinstance(boundary, tuple | list) else ()
+        self.boundary = (boundary,) * dim if isinstance(boundary, str) else several
         if len(self.boundary) != dim or not set(self.boundary) <= {"zero", "periodic"}:
             raise ValueError(
                 f"Stencil: boundary must be 'zero' or 'periodic', one for all axes or one for each of {dim}, "

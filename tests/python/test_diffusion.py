@@ -205,6 +205,8 @@ def test_arguments_are_checked():
     kappa = rand(1, 4, 4)
     for arguments, message in (
         ({"boundary": "neumann"}, r"boundary must be 'zero', 'flux', 'periodic' or \('robin', h\)"),
+        ({"boundary": None}, r"boundary must be 'zero', 'flux', .*got None"),
+        ({"boundary": [None]}, r"boundary must be 'zero', 'flux', .*got \[None\]"),
         ({"boundary": [("periodic", "zero"), "zero"]}, "both sides of an axis are periodic or none is"),
         ({"boundary": ["zero"]}, "for each of 2 axes"),
         ({"faces": "upwind"}, "faces must be 'harmonic' or 'arithmetic'"),

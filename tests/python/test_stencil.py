@@ -235,6 +235,7 @@ C = torch.ones(2, 5, 4, 6)
     (lambda: operators.Stencil(C, 5), TypeError, "offsets must be a list of tuples"),
     (lambda: operators.Stencil(C[:, :0], []), ValueError, "at least one offset"),
     (lambda: operators.Stencil(C[..., :0], NEAREST[2]), ValueError, "every extent >= 1"),
+    (lambda: operators.Stencil(C, NEAREST[2], None), ValueError, "boundary must be 'zero' or 'periodic'.*got None"),
     (lambda: operators.Stencil(C, NEAREST[2], "wrap"), ValueError, "boundary must be 'zero' or 'periodic'.*got 'wrap'"),
     (lambda: operators.Stencil(C, NEAREST[2], ["zero"]), ValueError, "one for all axes or one for each of 2"),
     (lambda: solve(C, field((4, 7))), ValueError, r"Stencil: expected \(batch, channel, 4, 6\), got \[2, 1, 4, 7\]"),

@@ -78,8 +78,8 @@ five = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
 operators = {
     "poisson 2D": ((190, 201), lambda k, w: Poisson((190, 201))),
     "poisson 3D": ((34, 31, 35), lambda k, w: Poisson((34, 31, 35))),
-    "constant": ((190, 201), lambda k, w: Diffusion(torch.ones_like(k), 1.0, boundary=("flux", "periodic"))),
-    "varying": ((190, 201), lambda k, w: Diffusion(k, 100.0, boundary="flux")),
+    "constant": ((190, 201), lambda k, w: Diffusion(torch.ones_like(k), 500.0, boundary=("flux", "periodic"))),
+    "varying": ((190, 201), lambda k, w: Diffusion(k, 1e4, boundary="flux")),
     "wind": ((190, 201), lambda k, w: Stencil(torch.stack([4 + w, -1 - w, -k / k, -k / k, -k / k], 1), five)),
 }
 solvers = {
