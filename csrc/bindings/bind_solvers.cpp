@@ -3,6 +3,7 @@
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/gpu/fall_back.h"
+#include "prdp/gpu/runtime.h"
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
@@ -143,9 +144,11 @@ void bind_solvers(py::module_& m) {
       "check_operator",
       [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters,
          std::vector<at::Tensor> tensors) {
+        const bool kernels_check = std::any_of(tensors.begin(), tensors.end(),
+                                               [](const at::Tensor& t) { return gpu::runtime_of(t.device()); });
         HANDLE_TH_ERRORS  // hands warnings to Python's
             make_operator(spec(kind, shape, parameters, tensors))
-                ->check_parameters();
+                ->check_parameters(kernels_check);
         END_HANDLE_TH_ERRORS_PYBIND
       },
       py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 import torch
-from fibers import BACKWARD, ROOT, Fibers
+from fibers import ROOT, SHUFFLED, Fibers
 from test_gpu_kernels import noise
 
 import prdp_torch as prdp
@@ -111,30 +111,34 @@ def test_a_kernel_refuses_numbers_that_are_not_allowed(name):
     """Without a look of the host: the sample alone, and in the words of the CPU where failures raise."""
     kappa, h = 1 + noise(3, *SHAPE).square(), 1 + noise(3, SHAPE[0], seed=1).square()
     (kappa if name == "kappa" else h)[1, 2] = -0.5
-    a = operators.Diffusion(kappa, 1.0, boundary=("zero", (("robin", h), "flux")))
     b, solver = noise(3, 1, *SHAPE), prdp.CG(max_iter=100, rtol=1e-10)
+
+    def make(kappa, h):
+        return operators.Diffusion(kappa, 1.0, boundary=("zero", (("robin", h), "flux")))
+
     with pytest.raises(ValueError, match=name) as expected:
-        prdp.linear_solve(a, b, solver)
+        make(kappa, h)
     with Fibers():
+        a = make(kappa, h)
         with pytest.raises(ValueError) as found:
             prdp.linear_solve(a, b, solver)
         u, info = prdp.linear_solve(a, b, solver, on_failure="return")
     assert str(found.value) == str(expected.value)
     assert [prdp.SolveStatus(int(s)).name for s in info.status] == ["CONVERGED", "NONFINITE_OPERATOR", "CONVERGED"]
     assert not u[1].any()
-    good = operators.Diffusion(kappa[::2], 1.0, boundary=("zero", (("robin", h[::2]), "flux")))
-    torch.testing.assert_close(u[::2], prdp.linear_solve(good, b[::2], solver)[0], rtol=1e-8, atol=1e-10)
+    exact = prdp.linear_solve(make(kappa[::2], h[::2]), b[::2], solver)[0]
+    torch.testing.assert_close(u[::2], exact, rtol=1e-8, atol=1e-10)
 
 
 def test_a_kernel_with_a_wrong_first_result_is_not_used(monkeypatch):
-    """As of a fault of a compiler or a driver; here a barrier is left out, so that threads read what is not written."""
+    """As of a fault of a compiler or a driver; here a barrier is left out, so that threads add up what is not there."""
     a, b = operators.Heat((9, 8), 1e-2, 1.0), noise(2, 1, 9, 8)
     solver = prdp.CG(max_iter=11, rtol=1e-10)
     expected = prdp.linear_solve(a, b, solver)[0]
-    text = (ROOT / "csrc/prdp/gpu/device/block_space.h").read_text().splitlines()
-    product = next(i for i, line in enumerate(text) if "void product(" in line)
-    barrier = next(i for i in range(product, len(text)) if "team_.meet()" in text[i]) + 1
-    with Fibers(order=BACKWARD, left_out=10000 + barrier):
+    text = (ROOT / "csrc/prdp/gpu/device/team.h").read_text().splitlines()
+    reduce = next(i for i, line in enumerate(text) if "void reduce(" in line)
+    barrier = next(i for i in range(reduce, len(text)) if "__syncthreads()" in text[i]) + 1
+    with Fibers(order=SHUFFLED, left_out=barrier):
         monkeypatch.setenv("PRDP_GPU", "auto")
         with pytest.warns(UserWarning, match="does not have the residual that it reports"):
             u, info = prdp.linear_solve(a, b, solver)

@@ -150,8 +150,8 @@ void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double larges
   for (int64_t axis = 0; axis < dim(); ++axis) diagonal += 2.0 * largest_kappa * per_cell2(axis);
   const double rounding = 10.0 * epsilon_of(kappa_) * diagonal;
   const double least_shift = shift_.min().item<double>();
-  warn_of_drift(least_shift, epsilon_of(kappa_) * diagonal);
-  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa)) return;
+  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa))
+    return warn_of_drift(least_shift, epsilon_of(kappa_) * diagonal);
   const double shift = mean_of_least_sample(shift_);
   const double held = held_by(shift, least_shift, std::exp(kappa_.log().mean().item<double>()));
   if (!(held > 0.0) || rounding <= held) return;
@@ -168,7 +168,7 @@ void DiffusionOperator::warn_of_drift(double shift, double rounding) const {
     for (const auto side : {low, high})
       if (side == Side::kZero || side == Side::kRobin) return;
   const double drift = rounding / (2.0 * shift);
-  if (!std::isfinite(drift) || !(shift > 0.0) || drift <= most) return;
+  if (!(shift > 0.0) || !(drift > most) || !std::isfinite(drift)) return;
   TORCH_WARN_ONCE("Diffusion: in float32 the mean of u, which nothing but the shift holds, may drift by up to ", drift,
                   " of itself in each solve, as a shift of ", shift,
                   " is small beside the diagonal; take float64, or more than one step to the same time");

@@ -6,7 +6,7 @@
 
 namespace prdp::gpu {
 
-bool residuals_agree(const Operator& a, const at::Tensor& b, const SolveResult& result) {
+Trust trust_by(const Operator& a, const at::Tensor& b, const SolveResult& result) {
   constexpr double share = 0.25, roundings = 200.0, least = 1e-15, most = 1e15;
   const at::NoGradGuard no_grad;
   const auto norm = [](const at::Tensor& v) { return v.to(at::kDouble).flatten(1).norm(2, 1); };
@@ -17,7 +17,9 @@ bool residuals_agree(const Operator& a, const at::Tensor& b, const SolveResult& 
   const auto rounding = roundings * epsilon_of(b) * (a.norm().to(at::kDouble).reshape({-1}) * u / whole + 1.0);
   const auto judged = (status >= static_cast<int64_t>(SolveStatus::kStagnated)) & (size > least) & (size < most) &
                       (u < most) & (whole > 1e-3 * size);
-  return ((found - told).abs() <= share * told + rounding).logical_or(judged.logical_not()).all().item<bool>();
+  const auto wrong = judged & ((found - told).abs() <= share * told + rounding).logical_not();
+  if (wrong.any().item<bool>()) return Trust::kNone;
+  return judged.any().item<bool>() ? Trust::kGood : Trust::kUnknown;
 }
 
 }  // namespace prdp::gpu

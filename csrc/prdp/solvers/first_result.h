@@ -1,10 +1,12 @@
 #pragma once
+#include "prdp/gpu/runtime.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp::gpu {
 
-/// Whether the residuals that a kernel reports are those of its solutions, which tensor operations compute from A, to
-/// rounding. Samples that failed, and those whose numbers may leave the range of the dtype, are passed over.
-bool residuals_agree(const Operator& a, const at::Tensor& b, const SolveResult& result);
+/// What a result tells of its kernel: whether the residuals that it reports are those of its solutions, which tensor
+/// operations compute from A, to rounding. Nothing by samples that failed, or whose numbers may leave the range of the
+/// dtype.
+Trust trust_by(const Operator& a, const at::Tensor& b, const SolveResult& result);
 
 }  // namespace prdp::gpu

@@ -140,7 +140,7 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
     if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     auto found = run(*prepared, rhs, request);
     if (trust == Trust::kUnknown && request.guarded) {
-      trust = residuals_agree(a, rhs, found) ? Trust::kGood : Trust::kNone;
+      trust = trust_by(a, rhs, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     }
     return found;
