@@ -170,9 +170,10 @@ def _field_name(scene: _C.Scene) -> str:
 
 
 def _field_caption(scene: _C.Scene) -> str:
-    return (
-        f"{_field_name(scene)[0].upper()}{_field_name(scene)[1:]} over the unit square; each time has its colour scale."
-    )
+    name, sides = _field_name(scene), scene.physics.length or [1.0]
+    square = len(set(sides)) == 1
+    box = f"a square of side {sides[0]:g}" if square else f"a box of {' × '.join(f'{side:g}' for side in sides)}"
+    return f"{name[0].upper()}{name[1:]} over {box}; each time has its colour scale."
 
 
 def _error_caption(scene: _C.Scene, shown: Trajectories) -> str:

@@ -1,5 +1,7 @@
 """What needs no tuning: auto on scenes that nobody tuned, its warnings, and comparisons that name failures."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers import written
@@ -97,7 +99,8 @@ def test_a_failure_is_named_and_no_headline(untuned):
     scene, _, table = untuned
     entries = list(table.values())
     headline = report.headline(scene, entries)
-    assert "auto ends at an error of" in headline and "% fewer products with A." in headline
+    assert "auto ends at an error of" in headline
+    assert re.search(r"% fewer products with A; [\d.e-]+ s, where converged solves take [\d.e-]+ s\.", headline)
     assert headline.endswith("it fails.") and headline.count("fewer") == 1
     first, *warnings = report.failures(scene, entries)
     assert first.startswith("Do not reach the error of K = 2000: PRDP") and first.endswith("K = 10.")
