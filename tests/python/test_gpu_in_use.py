@@ -106,6 +106,20 @@ def test_caps_of_their_own_and_long_bases():
     torch.testing.assert_close(a.apply(u), b, rtol=1e-8, atol=1e-8)
 
 
+def test_a_step_with_its_own_kappa_is_one_launch_alone():
+    """A κ that is new in each step: no operation of torch but views and memory, so no look of the host either."""
+    b, solver = noise(3, 1, *SHAPE), prdp.CG(max_iter=50, rtol=1e-8)
+    memory = {"empty", "as_strided", "detach", "detach_", "unsqueeze", "to", "lift_fresh"}
+    of_host = {"item", "_local_scalar_dense"}  # the shift, a number
+    with Fibers():
+        for seed in (0, 1):  # the first result of the kernel is compared
+            kappa = 1 + noise(3, *SHAPE, seed=seed).square()
+            with torch.autograd.profiler.profile() as profiler:
+                prdp.linear_solve(operators.Diffusion(kappa, 1.0), b, solver, on_failure="return")
+    names = {e.name.removeprefix("aten::") for e in profiler.function_events if e.name.startswith("aten::")}
+    assert names <= memory | of_host, names
+
+
 @pytest.mark.parametrize("name", ["kappa", "h of a Robin side"])
 def test_a_kernel_refuses_numbers_that_are_not_allowed(name):
     """Without a look of the host: the sample alone, and in the words of the CPU where failures raise."""
