@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <limits>
 
-#include "prdp/gpu/device/arguments.h"
 #include "prdp/gpu/fall_back.h"
 
 namespace prdp::gpu {
@@ -63,10 +62,7 @@ SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int
     const auto sizes = c10::str("<", team.blocks, ", ", team.threads, ">");
     SampleLoop loop{kernel_of(*runtime, device, body, "EachSample", sizes, team)};
     loop.teams = std::min(batch, team.blocks > 1 ? loop.kernel->teams() : 4 * loop.kernel->teams());
-    if (team.blocks == 1) return loop;
-    const auto on_device = at::TensorOptions().device(device);
-    loop.arrived = at::zeros({32 * loop.teams}, on_device.dtype(at::kInt));
-    loop.parts = at::empty({2 * kMostAtOnce * team.blocks * loop.teams}, on_device.dtype(at::kDouble));
+    loop.memory = {team.blocks, loop.teams, at::TensorOptions().device(device)};
     return loop;
   } catch (const Unavailable& reason) {
     fall_back(reason.what());

@@ -3,6 +3,7 @@
 
 #include "prdp/gpu/device/each.h"
 #include "prdp/gpu/runtime.h"
+#include "prdp/gpu/team_memory.h"
 
 /// Loops over points, or over the samples of a batch, in one launch.
 namespace prdp::gpu {
@@ -24,7 +25,7 @@ bool launch_points(c10::Device device, const Body& body, const void* arguments, 
 struct SampleLoop {
   std::shared_ptr<const Kernel> kernel{};  // null: there is none
   int64_t teams = 0;
-  at::Tensor arrived{}, parts{};
+  TeamMemory memory{};
 };
 SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int64_t batch);
 bool launch_samples(const SampleLoop& loop, const void* arguments);
@@ -39,10 +40,8 @@ bool each_point(c10::Device device, const Body& body, const Of& of, int64_t coun
 template <class Of>
 bool each_sample(c10::Device device, const Body& body, const Of& of, int64_t points, int64_t batch) {
   const auto loop = sample_loop(device, body, points, batch);
-  const EachSample<Of> arguments{
-      of, static_cast<int>(batch),
-      loop.arrived.defined() ? static_cast<unsigned*>(loop.arrived.mutable_data_ptr()) : nullptr,
-      loop.parts.defined() ? loop.parts.mutable_data_ptr<double>() : nullptr};
+  EachSample<Of> arguments{of, static_cast<int>(batch), nullptr, nullptr};
+  loop.memory.put_into(arguments);
   return loop.kernel && launch_samples(loop, &arguments);
 }
 

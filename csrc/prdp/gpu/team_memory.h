@@ -7,6 +7,7 @@ namespace prdp::gpu {
 
 /// Where the blocks of a team meet, and where they add up; nothing for teams of one block.
 struct TeamMemory {
+  TeamMemory() = default;
   TeamMemory(int64_t blocks, int64_t teams, const at::TensorOptions& options) {
     if (blocks == 1) return;
     arrived = at::zeros({32 * teams}, options.dtype(at::kInt));

@@ -7,6 +7,7 @@
 #include <sstream>
 #include <vector>
 
+#include "prdp/gpu/launch.h"
 #include "prdp/gpu/team_memory.h"
 #include "prdp/kernels/coarsening.h"
 
@@ -16,7 +17,6 @@ namespace {
 
 /// Registers are short: each thread has many numbers of a stencil at hand.
 constexpr int64_t kMostThreads = 512;
-constexpr int64_t kWarp = 32;
 
 int64_t points_of(const at::Tensor& b) { return b.numel() / (b.size(0) * b.size(1)); }
 int64_t offsets_of(const at::Tensor& b) {
@@ -71,9 +71,9 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
   const int64_t points = points_of(b), offsets = offsets_of(b);
   if (offsets * points > std::numeric_limits<int32_t>::max())
     throw Unavailable("a grid of " + std::to_string(points) + " points is too large for a kernel of multigrid");
-  const auto limits = runtime.limits(b.device());
-  const int64_t blocks = at::divup(points, limits.cells_of_block);
-  const int64_t threads = std::min({limits.threads, kMostThreads, at::divup(at::divup(points, blocks), kWarp) * kWarp});
+  auto limits = runtime.limits(b.device());
+  limits.threads = std::min(limits.threads, kMostThreads);
+  const auto [blocks, threads] = team_size(points, limits);
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/hierarchy.h\"\nusing namespace prdp::gpu;\n"
        << "using S = HierarchySetting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << b.dim() - 2 << ", "

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <sstream>
 #include <utility>
 
@@ -62,8 +63,10 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   for (int64_t i = 0; i < batch; ++i)
     if (is_failure(static_cast<SolveStatus>(status[i]))) failed.push_back(i);
   if (failed.empty()) return;
-  for (const int64_t i : failed)
-    if (static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator) a.check_parameters();
+  const auto is_of_a = [&](int64_t i) {
+    return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
+  };
+  if (std::any_of(failed.begin(), failed.end(), is_of_a)) a.check_parameters();  // a kernel may have found it
 
   constexpr size_t named = 4;
   std::ostringstream text;

@@ -7,6 +7,7 @@
 
 #include "prdp/gpu/device/cycle.h"
 #include "prdp/gpu/device/saddle_point.h"
+#include "prdp/gpu/device/setting.h"
 #include "prdp/gpu/device/team.h"
 #include "prdp/gpu/device/views.h"
 #include "prdp/kernels/scales.h"
@@ -18,40 +19,6 @@
 /// One sample as a space for iterate(), on a GPU: a team of threads owns it. A number is the same in every thread; a
 /// vector lies in the memory of the block, or of the device, and every operation is a loop over a thread's share of it.
 namespace prdp::gpu {
-
-/// Constants of a kernel.
-template <class Number, class Operator, int blocks, int threads, int vectors, int vectors_in_block, bool by_diagonal,
-          bool divides_by_diagonal, int numbers, int restart, class WithCycles>
-struct Setting {
-  using T = Number;                                 // float or double
-  using A = Operator;                               // of views.h
-  static constexpr int kBlocks = blocks;            // that work on one sample
-  static constexpr int kThreads = threads;          // in each
-  static constexpr int kVectors = vectors;          // of a sample
-  static constexpr int kInBlock = vectors_in_block; // the first so many of them lie in the block's own memory
-  static constexpr bool kByDiagonal = by_diagonal;  // the preconditioner is the diagonal
-  static constexpr bool kDividesByDiagonal = divides_by_diagonal;  // by it, or by the method
-  static constexpr int kNumbers = numbers;          // bytes of small arrays that the method keeps
-  static constexpr int kRestart = restart;          // of GMRES
-  using Cycles = WithCycles;                        // the preconditioner is a V-cycle (cycle.h)
-  static_assert(blocks == 1 || vectors_in_block == 0);
-};
-
-/// A few numbers in a thread's own memory.
-template <class X>
-class Slice {
- public:
-  Slice(X* first, int64_t n) : first_(first) {
-    for (int64_t i = 0; i < n; ++i) first_[i] = X{};
-  }
-  X& operator[](int64_t i) { return first_[i]; }
-  const X& operator[](int64_t i) const { return first_[i]; }
-  X* data() { return first_; }
-  const X* data() const { return first_; }
-
- private:
-  X* first_;
-};
 
 template <class S>
 class BlockSpace : public SampleNumbers<typename S::T> {

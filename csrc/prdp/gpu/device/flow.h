@@ -19,11 +19,8 @@ struct FlowStart {
   template <class Team>
   void operator()(int s, Team& team) const {
     const auto& grid = boundary.grid;
-    T courant = 0, others = 0;
-    team.each(grid.cells(), [&](int i) { return courant_at(s, grid.place(i)); }, [&](int, T k) { keep(k, courant); });
-    team.each(grid.cells(), [&](int i) { return others_at(s, grid.place(i)); }, [&](int, T k) { keep(k, others); });
-    courant = team.largest(courant);
-    others = team.largest(others);
+    const T courant = largest_of(team, grid.cells(), [&](int i) { return courant_at(s, grid.place(i)); });
+    const T others = largest_of(team, grid.cells(), [&](int i) { return others_at(s, grid.place(i)); });
     const double limit = std::sqrt(static_cast<double>(nu.value()) * free_per_nu);
     const bool finite = std::isfinite(courant) && std::isfinite(others);
     const auto verdict = !finite                                                ? SolveStatus::kNonfiniteInput
@@ -38,9 +35,6 @@ struct FlowStart {
   }
 
  private:
-  static void keep(T value, T& most) {
-    if (value > most || value != value) most = value;  // NaN stays
-  }
   /// dt Σ_axes |u| / dx
   T courant_at(int s, const FlowPlace& p) const {
     const auto& grid = boundary.grid;
@@ -149,8 +143,8 @@ struct FlowReport {
       work += iterations[k][s];
       products += applications[k][s];
       worst = statuses[k][s] < worst ? statuses[k][s] : worst;
-      residual = larger(residual, residuals[k][s]);
-      floor = larger(floor, floors[k][s]);
+      residual = larger_or_nan(residual, residuals[k][s]);
+      floor = larger_or_nan(floor, floors[k][s]);
       solved = solved && (statuses[k][s] > 0 || floors[k][s] > T(0));
     }
     const bool is_refused = refused && refused[s] != 0;
@@ -160,9 +154,6 @@ struct FlowReport {
     residual_out[s] = is_refused ? std::numeric_limits<T>::infinity() : residual;
     floor_out[s] = solved || solves == 1 ? floor : T(0);
   }
-
- private:
-  static T larger(T a, T b) { return b > a || b != b ? b : a; }
 };
 
 }  // namespace prdp::gpu

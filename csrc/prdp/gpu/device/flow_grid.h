@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <limits>
 
+#include "prdp/gpu/device/largest.h"
 #include "prdp/kernels/flow_points.h"
 
 /// The staggered grid of a flow, its fields and its boundary, as kernels know them. Sizes are arguments: a kernel

@@ -79,9 +79,8 @@ struct FlowDivergence {
     team.each(n, [&](int i) { return at(s, grid.place(i)); }, store);
     if (!for_a_solve) return;
     parts.without_means(team, n, mine);
-    T largest = 0;
-    team.each(n, [&](int i) { return std::abs(mine[i]); }, [&](int, T v) { largest = v <= largest ? largest : v; });
-    if (team.largest(largest) < std::numeric_limits<T>::min()) team.each(n, [](int) { return T(0); }, store);
+    const T largest = largest_of(team, n, [&](int i) { return std::abs(mine[i]); });
+    if (largest < std::numeric_limits<T>::min()) team.each(n, [](int) { return T(0); }, store);
   }
 
  private:

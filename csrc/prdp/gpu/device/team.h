@@ -42,13 +42,12 @@ class Team {
   /// f(i), and then store(i, f(i)), for each of this thread's share of 0 … n - 1. f only reads.
   template <class F, class Store>
   void each(int n, const F& f, const Store& store) const {
-    const int share = kBlocks == 1 ? n : (n + kBlocks - 1) / kBlocks;
-    const int begin = share * rank_, end = kBlocks == 1 ? n : begin + share < n ? begin + share : n;
-    for (int first = begin + static_cast<int>(threadIdx.x); first < end; first += kThreads * kCellsAtOnce) {
+    const Share mine = share_of(n);
+    for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end; first += kThreads * kCellsAtOnce) {
       decltype(f(0)) value[kCellsAtOnce];
-      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < end) value[k] =
+      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
           f(first + k * kThreads);
-      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < end)
+      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < mine.end)
           store(first + k * kThreads, value[k]);
     }
   }
@@ -56,9 +55,8 @@ class Team {
   /// f(i) likewise, one after the other.
   template <class F>
   void for_each(int n, const F& f) const {
-    const int share = kBlocks == 1 ? n : (n + kBlocks - 1) / kBlocks;
-    const int begin = share * rank_, end = kBlocks == 1 ? n : begin + share < n ? begin + share : n;
-    for (int i = begin + static_cast<int>(threadIdx.x); i < end; i += kThreads) f(i);
+    const Share mine = share_of(n);
+    for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
   }
 
   /// Waits for all threads of the team, and sees what they wrote. Tests leave out the one of a line, and must notice.
@@ -99,6 +97,15 @@ class Team {
   }
 
  private:
+  struct Share {
+    int begin, end;
+  };
+  /// What this block takes of 0 … n - 1.
+  Share share_of(int n) const {
+    if constexpr (kBlocks == 1) return {0, n};
+    const int share = (n + kBlocks - 1) / kBlocks, begin = share * rank_;
+    return {begin, begin + share < n ? begin + share : n};
+  }
   /// Every lane gets the same bits, as both of a pair add the same two numbers.
   template <class T, class Join>
   static T over_warp(T v, const Join& join) {

@@ -133,11 +133,7 @@ class PressureLaplacian {
   double norm_of_row(int) const { return 2 * static_cast<double>(centre_); }
   template <class F>
   void for_each_offset(int, const F& f) const {
-    f(centre_, 0, 0, 0);
-    for (int side = -1; side <= 1; side += 2) {
-      f(x_, 0, 0, side);
-      f(y_, 0, side, 0);
-    }
+    for_each_nearest(centre_, T(0), y_, x_, f);
   }
   template <class V>
   T product(const V& v, int i) const {

@@ -4,6 +4,7 @@
 #include <limits>
 
 #include "prdp/gpu/device/arguments.h"
+#include "prdp/gpu/device/largest.h"
 #include "prdp/kernels/scales.h"
 
 /// Operators as a kernel knows them: what stands in a row of A. The sizes are constants. `v` is anything with v[i].
@@ -41,20 +42,6 @@ inline int moved(int index) {
   }
 }
 
-/// The larger one; NaN if one of them is.
-template <class T>
-T larger_or_nan(T a, T b) {
-  return b > a || b != b ? b : a;
-}
-
-/// The largest f(i), with the same bits in every thread of the team; infinite if one is not finite.
-template <class Team, class F>
-auto largest_of(Team& team, int n, const F& f) {
-  decltype(f(0)) most = 0;
-  team.each(n, f, [&](int, auto value) { most = larger_or_nan(most, value); });
-  return team.largest(most);
-}
-
 /// Brings A to the order of one; false where it is not finite.
 template <class T, class Team, class A>
 bool scale_operator(Team& team, A& a) {
@@ -65,6 +52,17 @@ bool scale_operator(Team& team, A& a) {
     if (!std::isfinite(most)) return false;
     a.scale(kernels::scale_of_operator(most));
     return true;
+  }
+}
+
+/// f(a, dz, dy, dx) for a point that is coupled to its nearest neighbours, the same on both sides of an axis.
+template <class T, class F>
+void for_each_nearest(T centre, T z, T y, T x, const F& f) {
+  f(centre, 0, 0, 0);
+  for (int side = -1; side <= 1; side += 2) {
+    f(x, 0, 0, side);
+    f(y, 0, side, 0);
+    f(z, side, 0, 0);
   }
 }
 
@@ -107,12 +105,7 @@ class Laplacian {
   /// Scaled only where the view always is.
   template <class F>
   void for_each_offset(int, const F& f) const {
-    f(centre_, 0, 0, 0);
-    for (int side = -1; side <= 1; side += 2) {
-      f(x_, 0, 0, side);
-      f(y_, 0, side, 0);
-      f(z_, side, 0, 0);
-    }
+    for_each_nearest(centre_, z_, y_, x_, f);
   }
   T factor() const { return factor_; }
   double norm_of_row(int) const { return norm_; }
