@@ -153,6 +153,26 @@ def test_gradients_are_those_of_the_cpu():
     assert info.adjoint.iterations.tolist() == told.adjoint.iterations.tolist()
 
 
+@pytest.mark.parametrize(("name", "method"), [("winds", prdp.GMRES), ("jumps", prdp.CG)])
+def test_second_derivatives_of_unrolled_solves_are_those_of_the_cpu(name, method):
+    """Iterations that autograd records take their cycles, and those of the transpose, in launches."""
+    a = OPERATORS[name][0](F64)
+
+    def derivatives():
+        b = right_hand_sides(name, F64).requires_grad_()
+        solver = with_cycles(method, max_iter=2, rtol=0.0)
+        u, _ = prdp.linear_solve(a, b, solver, backward="unrolled", on_failure="return")
+        (first,) = torch.autograd.grad((u**3).sum(), b, create_graph=True)
+        return u.detach(), first.detach(), *torch.autograd.grad(first.square().sum(), b)
+
+    expected, device = derivatives(), Fibers()
+    with device:
+        before = device.launches()
+        found = derivatives()
+    assert device.launches() > before + 4
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-14)
+
+
 def test_what_has_no_coarse_grids_fails_alone():
     c, b = winds(F64, samples=5), noise(5, 1, 9, 11, seed=3)
     c[1, 0, 2, 3], c[2, 1, 0, 0], b[3, 0, 1, 1], b[4] = 0.0, torch.inf, torch.nan, 0.0

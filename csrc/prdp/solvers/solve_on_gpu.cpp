@@ -47,7 +47,7 @@ struct Prepared {
   std::shared_ptr<const Kernel> kernel;
   SolveKernel source;
   OperatorView a;
-  std::optional<HierarchyKernel> hierarchy;
+  MadeHierarchy hierarchy;  // nothing without cycles
 };
 
 template <class T>
@@ -86,13 +86,11 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   arguments.rtol = request.solver.rtol;
   arguments.guarded = request.guarded;
   arguments.needs_projection = a.needs_projection;
-  MadeHierarchy made;
-  if (hierarchy) {
-    made = make_hierarchy(*hierarchy, b);
+  if (hierarchy.grids.defined()) {
     const auto& preconditioner = request.solver.preconditioner;
-    arguments.hierarchy = {.grids = static_cast<const Grids*>(made.grids.const_data_ptr()),
-                           .numbers = made.numbers.const_data_ptr<T>(),
-                           .numbers_of_sample = made.numbers_of_sample,
+    arguments.hierarchy = {.grids = static_cast<const Grids*>(hierarchy.grids.const_data_ptr()),
+                           .numbers = hierarchy.numbers.const_data_ptr<T>(),
+                           .numbers_of_sample = hierarchy.numbers_of_sample,
                            .smoothing = preconditioner.smoothing(),
                            .transposed = preconditioner.spec().transposed};
   }
@@ -100,8 +98,8 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   return result;
 }
 
-/// Nothing where there is none.
-std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const Solver& solver) {
+/// For A, or Aᵀ. Nothing where there is none.
+std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver) {
   auto* const runtime = runtime_of(b.device());
   if (!runtime || b.numel() == 0) return std::nullopt;
   const auto by_design = [](const std::string& reason) {
@@ -109,17 +107,17 @@ std::optional<Prepared> prepare(const Operator& a, const at::Tensor& b, const So
     return std::nullopt;
   };
   if (!has_kernel(solver)) return by_design(not_made(solver));
-  auto view = a.gpu_view(b, /*transposed=*/false);
+  auto view = a.gpu_view(b, transposed);
   if (!view) return by_design("this operator has no kernel");
-  const bool has_cycles = solver.preconditioner.is_multigrid();
   try {
     std::optional<HierarchyKernel> hierarchy;
-    if (has_cycles)  // of A, where this is its transpose
-      hierarchy = hierarchy_kernel(*runtime, *a.gpu_view(b, solver.preconditioner.spec().transposed), b);
+    if (const auto& m = solver.preconditioner; m.is_multigrid())  // of A, where this is its transpose
+      hierarchy = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
     const auto source = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
     auto kernel = runtime->kernel(b.device(), source.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
-    return Prepared{std::move(kernel), source, *std::move(view), std::move(hierarchy)};
+    return Prepared{std::move(kernel), source, *std::move(view),
+                    hierarchy ? make_hierarchy(*hierarchy, b) : MadeHierarchy{}};
   } catch (const Unavailable& reason) {
     fall_back(reason.what());
     return std::nullopt;
@@ -132,7 +130,7 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   if (!runtime_of(b.device())) return std::nullopt;
   const at::NoGradGuard no_grad;
   const auto rhs = b.contiguous();
-  const auto prepared = prepare(a, rhs, request.solver);
+  const auto prepared = prepare(a, /*transposed=*/false, rhs, request.solver);
   if (!prepared) return std::nullopt;
   const auto run = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
   auto& trust = prepared->kernel->trust;
@@ -148,6 +146,17 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
     fall_back(reason.what());
     return std::nullopt;
   }
+}
+
+Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, const at::Tensor& like) {
+  if (!a.has_coarse_grids()) return {};  // the blocks of NavierStokes for Aᵀ are not the transpose of those for A
+  const Solver solver{Method::kMultigrid, 1, 0.0, kDefaultRestart, transposed ? m.transposed() : m};
+  auto made = prepare(a, transposed, like, solver);
+  if (!made) return {};
+  return [prepared = *std::move(made), solver](const at::Tensor& v) {
+    const auto run = v.scalar_type() == at::kFloat ? launch<float> : launch<double>;
+    return run(prepared, v.contiguous(), {.solver = solver, .guarded = false}).u;
+  };
 }
 
 bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }

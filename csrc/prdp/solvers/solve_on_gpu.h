@@ -1,4 +1,6 @@
 #pragma once
+#include <functional>
+
 #include "prdp/solvers/solve.h"
 
 namespace prdp::gpu {
@@ -7,6 +9,11 @@ namespace prdp::gpu {
 /// operations take its place: with one warning for each reason that is not the method or the operator itself. With
 /// PRDP_GPU=required, every reason is an error. The report stays on the device.
 std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
+
+/// A cycle of multigrid, M⁻¹ v or M⁻ᵀ v, for vectors like these, in one launch: an iteration of Multigrid from zero.
+/// Empty where there is no kernel.
+using Product = std::function<at::Tensor(const at::Tensor& v)>;
+Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, const at::Tensor& like);
 
 /// Whether solve() takes a kernel for vectors like b, if the operator has one: then the host need not wait for it.
 bool takes(const at::Tensor& b, const Solver& solver);

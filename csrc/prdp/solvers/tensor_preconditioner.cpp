@@ -8,7 +8,7 @@
 
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/preconditioner.h"
-#include "prdp/solvers/tensor_cycles.h"
+#include "prdp/solvers/solve_on_gpu.h"
 
 namespace prdp {
 
@@ -17,17 +17,27 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-/// V-cycles of every sample of a batch.
+/// V-cycles of every sample of a batch: M⁻¹ v, or M⁻ᵀ v.
 class Cycles : public torch::CustomClassHolder {
  public:
   virtual at::Tensor apply(const at::Tensor& v, bool transposed) = 0;
 };
 
-template <class T>
-class CyclesOf final : public Cycles {
+class CyclesOnGpu final : public Cycles {
  public:
-  CyclesOf(std::shared_ptr<const kernels::Kernels> a, std::shared_ptr<const kernels::Kernels> transpose,
-           int64_t smoothing, int64_t batch)
+  CyclesOnGpu(gpu::Product product, gpu::Product transpose)
+      : product_(std::move(product)), transpose_(std::move(transpose)) {}
+  at::Tensor apply(const at::Tensor& v, bool transposed) override { return (transposed ? transpose_ : product_)(v); }
+
+ private:
+  gpu::Product product_, transpose_;
+};
+
+template <class T>
+class CyclesOnLoops final : public Cycles {
+ public:
+  CyclesOnLoops(std::shared_ptr<const kernels::Kernels> a, std::shared_ptr<const kernels::Kernels> transpose,
+                int64_t smoothing, int64_t batch)
       : memory_of_a_(std::move(a)), memory_of_transpose_(std::move(transpose)) {
     const auto& kernels = std::get<kernels::KernelBatch<T>>(memory_of_a_->of_dtype);
     const auto& transposes = std::get<kernels::KernelBatch<T>>(memory_of_transpose_->of_dtype);
@@ -83,11 +93,17 @@ class ApplyCycles : public torch::autograd::Function<ApplyCycles> {
   }
 };
 
-c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, int64_t smoothing, const at::Tensor& b) {
+c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, const Preconditioner& m, const at::Tensor& b) {
+  if (auto product = gpu::make_cycle(a, /*transposed=*/false, m, b))
+    return c10::make_intrusive<CyclesOnGpu>(std::move(product), gpu::make_cycle(a, /*transposed=*/true, m, b));
+  TORCH_CHECK_NOT_IMPLEMENTED(b.is_cpu(),
+                              "linear_solve: multigrid runs on the CPU and in the kernels of a GPU, got vectors on ",
+                              b.device(), " without a kernel for this; take another preconditioner, or the CPU");
   auto kernels = a.kernels(b, false), transpose = a.kernels(b, true);
   if (b.scalar_type() == at::kFloat)
-    return c10::make_intrusive<CyclesOf<float>>(std::move(kernels), std::move(transpose), smoothing, b.size(0));
-  return c10::make_intrusive<CyclesOf<double>>(std::move(kernels), std::move(transpose), smoothing, b.size(0));
+    return c10::make_intrusive<CyclesOnLoops<float>>(std::move(kernels), std::move(transpose), m.smoothing(),
+                                                     b.size(0));
+  return c10::make_intrusive<CyclesOnLoops<double>>(std::move(kernels), std::move(transpose), m.smoothing(), b.size(0));
 }
 
 /// What an operator refuses, said of the preconditioner.
@@ -111,19 +127,9 @@ TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preco
     return [inverse](const at::Tensor& v) { return in_its_name([&] { return inverse->apply(v); }); };
   }
   if (!preconditioner.is_multigrid()) return {};
-  const auto like = b.detach();
-  if (like.is_cpu())
-    return [cycles = make_cycles(a, preconditioner.smoothing(), like)](const at::Tensor& v) {
-      return ApplyCycles::apply(v, cycles, /*transposed=*/false);
-    };
-  TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(),
-                              "linear_solve: this operator has a multigrid preconditioner on the CPU ",
-                              "and in the kernels of a GPU, got vectors on ", b.device(),
-                              " without a kernel; take "
-                              "GMRES without it");
-  const bool transposed = preconditioner.spec().transposed;
-  const auto cycles = TensorCycles::find_or_make(a, transposed, preconditioner.smoothing(), like);
-  return [cycles, transposed](const at::Tensor& v) { return cycles->apply(v, transposed); };
+  return [cycles = make_cycles(a, preconditioner, b.detach())](const at::Tensor& v) {
+    return ApplyCycles::apply(v, cycles, /*transposed=*/false);
+  };
 }
 
 }  // namespace prdp
