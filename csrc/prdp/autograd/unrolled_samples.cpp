@@ -10,6 +10,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/verdicts.h"
 
 namespace prdp {
 

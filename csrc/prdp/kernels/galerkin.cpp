@@ -74,6 +74,29 @@ Sums<T> sums_along(const StencilFields<T>& a, int axis, bool transposed) {
   return sums;
 }
 
+/// Fills the ring of a field: the other end of a periodic axis. Else it stays as it is.
+template <class T>
+void wrap_ring(const StencilGrid& grid, const Ringed& ringed, T* f) {
+  const auto& [nz, ny, nx] = grid.shape;
+  const auto row = [&](int64_t z, int64_t y) { return f + ringed.at(z, y, -1); };
+  if (grid.periodic[2])
+    for (int64_t z = 0; z < nz; ++z)
+      for (int64_t y = 0; y < ny; ++y) {
+        row(z, y)[0] = row(z, y)[nx];
+        row(z, y)[nx + 1] = row(z, y)[1];
+      }
+  if (grid.periodic[1])
+    for (int64_t z = 0; z < nz; ++z) {
+      std::copy_n(row(z, ny - 1), nx + 2, row(z, -1));
+      std::copy_n(row(z, 0), nx + 2, row(z, ny));
+    }
+  if (grid.periodic[0]) {
+    const int64_t plane = ringed.ny * ringed.nx;
+    std::copy_n(f + nz * plane, plane, f);
+    std::copy_n(f + plane, plane, f + (nz + 1) * plane);
+  }
+}
+
 /// The weights that the sums of each point give, with their ring: the other end of a periodic axis, else zeros.
 template <class T>
 Weights<T> weights_of(const StencilFields<T>& a, const Sums<T>& sums, const Sums<T>* averaged_with = nullptr) {
@@ -81,10 +104,9 @@ Weights<T> weights_of(const StencilFields<T>& a, const Sums<T>& sums, const Sums
   const T* diagonal = a.coefficients[StencilFields<T>::kCentre];
   const Ringed ringed(grid);
   Weights<T> w{zeros<T>(Ringed::size(grid)), zeros<T>(Ringed::size(grid))};
-  const auto& [nz, ny, nx] = grid.shape;
   for_each_row(grid, [&](int64_t z, int64_t y, int64_t at) {
     T *left = w.left.data() + ringed.at(z, y, 0), *right = w.right.data() + ringed.at(z, y, 0);
-    for (int64_t i = 0; i < nx; ++i) {
+    for (int64_t i = 0; i < grid.shape[2]; ++i) {
       T s[3] = {sums[0][at + i], sums[1][at + i], sums[2][at + i]};
       if (averaged_with)
         for (int d = 0; d < 3; ++d) s[d] += (*averaged_with)[d][at + i];
@@ -93,23 +115,7 @@ Weights<T> weights_of(const StencilFields<T>& a, const Sums<T>& sums, const Sums
       right[i] = of_point.right;
     }
   });
-  for (auto* field : {&w.left, &w.right}) {
-    T* const f = field->data();
-    const auto row = [&](int64_t z, int64_t y) { return f + ringed.at(z, y, -1); };
-    if (grid.periodic[2])
-      for (int64_t z = 0; z < nz; ++z)
-        for (int64_t y = 0; y < ny; ++y) row(z, y)[0] = row(z, y)[nx], row(z, y)[nx + 1] = row(z, y)[1];
-    if (grid.periodic[1])
-      for (int64_t z = 0; z < nz; ++z) {
-        std::copy_n(row(z, ny - 1), nx + 2, row(z, -1));
-        std::copy_n(row(z, 0), nx + 2, row(z, ny));
-      }
-    if (grid.periodic[0]) {
-      const int64_t plane = ringed.ny * ringed.nx;
-      std::copy_n(f + nz * plane, plane, f);
-      std::copy_n(f + plane, plane, f + (nz + 1) * plane);
-    }
-  }
+  for (auto* field : {&w.left, &w.right}) wrap_ring(grid, ringed, field->data());
   return w;
 }
 
@@ -120,18 +126,25 @@ struct Constants {
   explicit Constants(int64_t n) : zeros(n, T(0)), ones(n, T(1)) {}
 };
 
-/// Everything that the coarse coefficients with one offset in the other axes are made of.
+/// The coarse coefficients with one offset in the other axes, and what they are made of.
 template <class T>
-class CollapseOf {
+class CoarseCoefficients {
  public:
-  CollapseOf(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer, const Constants<T>& constants,
-             int centre, T* const out[3])
-      : a_(a), axis_(axis), transfer_(transfer), constants_(constants), ringed_(a.grid), out_(out) {
-    const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
-    for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[centre + (d - 1) * step];
-    offset_ = StencilFields<T>::offset(centre);
+  CoarseCoefficients(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer,
+                     const Constants<T>& constants, int centre)
+      : a_(a),
+        axis_(axis),
+        transfer_(transfer),
+        constants_(constants),
+        ringed_(a.grid),
+        offset_(StencilFields<T>::offset(centre)) {
+    for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[place(centre, d)];
   }
   bool is_empty() const { return !fine_[0] && !fine_[1] && !fine_[2]; }
+  /// Adds those with offset -1, 0 and 1 along the axis to a coarse operator, for points() to fill.
+  void add_to(StencilFields<T>& coarse, int centre) {
+    for (int d = 0; d < 3; ++d) out_[d] = coarse.add(place(centre, d));
+  }
 
   /// The coarse points from `first` on, n of them: of a row along x, or of x itself if that is the axis.
   void points(int64_t z, int64_t y, int64_t x, int64_t n, int64_t coarse, int64_t to) const {
@@ -157,38 +170,39 @@ class CollapseOf {
     };
     const T *zeros = constants_.zeros.data(), *ones = constants_.ones.data();
     const auto& [p, r] = transfer_;
-    const GalerkinProduct<T> c{coefficient(0, before),
-                               coefficient(0, middle),
-                               coefficient(0, after),
-                               fine_[1] ? coefficient(1, before) : zeros,
-                               fine_[1] ? coefficient(1, middle) : zeros,
-                               fine_[1] ? coefficient(1, after) : zeros,
-                               coefficient(2, before),
-                               coefficient(2, middle),
-                               coefficient(2, after),
-                               has_before ? weight(p.left, before, true) : ones,
-                               has_before ? weight(p.right, before, true) : zeros,
-                               has_after ? weight(p.left, after, true) : zeros,
-                               has_after ? weight(p.right, after, true) : ones,
-                               has_before ? weight(r.right, before, false) : zeros,
-                               has_after ? weight(r.left, after, false) : zeros,
-                               out_[0] + to,
-                               out_[1] + to,
-                               out_[2] + to};
+    const GalerkinProduct<T> c{.lower_before = coefficient(0, before),
+                               .lower_here = coefficient(0, middle),
+                               .lower_after = coefficient(0, after),
+                               .centre_before = fine_[1] ? coefficient(1, before) : zeros,
+                               .centre_here = fine_[1] ? coefficient(1, middle) : zeros,
+                               .centre_after = fine_[1] ? coefficient(1, after) : zeros,
+                               .upper_before = coefficient(2, before),
+                               .upper_here = coefficient(2, middle),
+                               .upper_after = coefficient(2, after),
+                               .before_left = has_before ? weight(p.left, before, true) : ones,
+                               .before_right = has_before ? weight(p.right, before, true) : zeros,
+                               .after_left = has_after ? weight(p.left, after, true) : zeros,
+                               .after_right = has_after ? weight(p.right, after, true) : ones,
+                               .restrict_before = has_before ? weight(r.right, before, false) : zeros,
+                               .restrict_after = has_after ? weight(r.left, after, false) : zeros,
+                               .left = out_[0] + to,
+                               .centre = out_[1] + to,
+                               .right = out_[2] + to};
     loops<T>().galerkin_product(c, axis_ == 2 ? 2 : 1, n);
   }
 
  private:
   bool has_sides() const { return fine_[0] || fine_[2]; }
+  int place(int centre, int d) const { return centre + (d - 1) * (axis_ == 0 ? 9 : axis_ == 1 ? 3 : 1); }
 
   const StencilFields<T>& a_;
   int axis_;
   const AxisTransfer<T>& transfer_;
   const Constants<T>& constants_;
   Ringed ringed_;
-  T* const* out_;
-  const T* fine_[3];  // with offset -1, 0, 1 along the axis
   Offset offset_;     // in the other axes
+  const T* fine_[3];  // with offset -1, 0, 1 along the axis
+  T* out_[3] = {};
 };
 
 }  // namespace
@@ -254,13 +268,11 @@ StencilFields<T> galerkin_product(const StencilFields<T>& a, int axis, const Axi
   const int64_t count = coarse_points(a.grid.shape[axis], periodic);
   coarse.grid.shape[axis] = count;
   const Constants<T> constants(a.grid.shape[2] + 2);
-  const int step = axis == 0 ? 9 : axis == 1 ? 3 : 1;
   for (int centre = 0; centre < 27; ++centre) {
     if (StencilFields<T>::offset(centre).along[axis] != 0) continue;
-    T* out[3] = {};
-    if (CollapseOf<T>(a, axis, transfer, constants, centre, out).is_empty()) continue;
-    for (int d = 0; d < 3; ++d) out[d] = coarse.add(centre + (d - 1) * step);
-    const CollapseOf<T> part(a, axis, transfer, constants, centre, out);
+    CoarseCoefficients<T> part(a, axis, transfer, constants, centre);
+    if (part.is_empty()) continue;
+    part.add_to(coarse, centre);
     for_each_row(coarse.grid, [&](int64_t z, int64_t y, int64_t to) {
       if (axis != 2) return part.points(z, y, 0, a.grid.shape[2], axis == 0 ? z : y, to);
       // The ends of a row may lack a neighbour.

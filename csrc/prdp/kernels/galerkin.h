@@ -25,7 +25,7 @@ struct AxisTransfer {
 template <class T>
 AxisTransfer<T> make_transfer(const StencilFields<T>& a, int axis, bool symmetric);
 
-/// RᵀAP along the axis.
+/// R A P along the axis.
 template <class T>
 StencilFields<T> galerkin_product(const StencilFields<T>& a, int axis, const AxisTransfer<T>& transfer);
 

@@ -5,6 +5,7 @@
 
 #include "prdp/kernels/share_samples.h"
 #include "prdp/kernels/whole_vectors.h"
+#include "prdp/solvers/sample_numbers.h"
 
 namespace prdp::batch_loops {
 
@@ -183,56 +184,41 @@ at::Tensor sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c) {
   return sum;
 }
 
-at::Tensor ratio(const Scalar& num, const Scalar& den, double negligible) {
+Scalar ratio(const Scalar& num, const Scalar& den) {
   auto quotient = at::empty_like(den);
   with_type(den, [&]<class T>(T) {
     const T *above = data<T>(num), *below = data<T>(den);
     T* to = quotient.mutable_data_ptr<T>();
-    for (int64_t s = 0; s < den.numel(); ++s)
-      to[s] = below[s] < static_cast<T>(negligible) ? T(0) : above[s] / below[s];
+    for (int64_t s = 0; s < den.numel(); ++s) to[s] = SampleNumbers<T>::ratio(above[s], below[s]);
   });
   return quotient;
 }
 
-namespace {
-
-template <class T>
-bool is_zero_beside(T den, T a2, T b2, double epsilon) {
-  const T bound = static_cast<T>(epsilon) * std::sqrt(a2) * std::sqrt(b2);
-  return std::abs(den) <= bound && std::isfinite(bound);
-}
-
-}  // namespace
-
-Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going, double epsilon) {
+Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& active) {
   auto where = at::empty_like(den);
   with_type(den, [&]<class T>(T) {
-    const T *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2), *goes = data<T>(going);
+    const T *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2), *going = data<T>(active);
     T* to = where.mutable_data_ptr<T>();
     for (int64_t s = 0; s < den.numel(); ++s)
-      to[s] = goes[s] != T(0) && is_zero_beside(below[s], left2[s], right2[s], epsilon) ? T(1) : T(0);
+      to[s] = SampleNumbers<T>::breaks_down(below[s], left2[s], right2[s], going[s]);
   });
   return where;
 }
 
-Step guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
-                      double negligible) {
-  Step step{at::empty_like(num), {}};
-  const auto note = [&](int64_t sample) {
-    if (!step.vanishes.defined()) step.vanishes = at::zeros_like(num, num.options().dtype(at::kBool));
-    step.vanishes.mutable_data_ptr<bool>()[sample] = true;
-  };
+Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
+  Quotient quotient{at::empty_like(num), {}};
   with_type(num, [&]<class T>(T) {
     const T *above = data<T>(num), *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2);
-    T* to = step.length.mutable_data_ptr<T>();
+    T* to = quotient.value.mutable_data_ptr<T>();
     for (int64_t s = 0; s < num.numel(); ++s) {
-      const bool nothing_left = above[s] < static_cast<T>(negligible);
-      const bool breaks = !nothing_left && is_zero_beside(below[s], left2[s], right2[s], epsilon);
-      to[s] = nothing_left || breaks ? T(0) : above[s] / below[s];
-      if (breaks) note(s);
+      bool breaks = false;
+      to[s] = SampleNumbers<T>::guarded_quotient(above[s], below[s], left2[s], right2[s], breaks);
+      if (!breaks) continue;
+      if (!quotient.breaks.defined()) quotient.breaks = at::zeros_like(num, num.options().dtype(at::kBool));
+      quotient.breaks.mutable_data_ptr<bool>()[s] = true;
     }
   });
-  return step;
+  return quotient;
 }
 
 }  // namespace prdp::batch_loops

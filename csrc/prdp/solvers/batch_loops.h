@@ -40,14 +40,13 @@ Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64
 bool any(const Scalar& where);
 /// a + b² c
 Scalar sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c);
-/// As TensorSpace's: num / den, or 0; the latter says of which samples it breaks down.
-Scalar ratio(const Scalar& num, const Scalar& den, double negligible);
-struct Step {
-  Scalar length;
-  at::Tensor vanishes;  // undefined: nowhere
+/// The rules of SampleNumbers, for each sample.
+Scalar ratio(const Scalar& num, const Scalar& den);
+Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& active);
+struct Quotient {
+  Scalar value;
+  at::Tensor breaks;  // the samples that break down; undefined: none
 };
-Step guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2, double epsilon,
-                      double negligible);
-Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going, double epsilon);
+Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
 
 }  // namespace prdp::batch_loops

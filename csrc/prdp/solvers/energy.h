@@ -2,7 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/solvers/sample_state.h"
+#include "prdp/solvers/verdicts.h"
 
 /// Whether an iterate whose residual is above ‖b‖ is what a method for definite operators is made for.
 namespace prdp::detail {

@@ -6,7 +6,7 @@
 
 #include "prdp/solvers/energy.h"
 #include "prdp/solvers/space.h"
-#include "prdp/solvers/stopping.h"
+#include "prdp/solvers/observe.h"
 
 // Functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
 #ifndef PRDP_ONCE
@@ -25,7 +25,7 @@ template <class States>
 int64_t stride(const States& states, bool track) {
   int64_t n = std::numeric_limits<int64_t>::max();
   for (const auto& s : states)
-    if (s.active) n = std::min(n, (track ? std::min(s.cap, s.look) : s.cap) - s.iterations);
+    if (s.active) n = std::min(n, (track ? std::min(s.cap, s.next_look) : s.cap) - s.iterations);
   return n;
 }
 

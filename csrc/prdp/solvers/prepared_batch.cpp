@@ -6,7 +6,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/sample_state.h"
+#include "prdp/solvers/verdicts.h"
 
 namespace prdp {
 

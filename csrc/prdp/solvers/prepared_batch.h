@@ -29,7 +29,7 @@ struct ScaledRhs {
 ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part = {});
 
 bool takes_start(Method method, const at::Tensor& x0);
-/// As SampleSpace::start_from; b is scaled and within the range of A. A constant: but autograd stays on, as an
+/// As start_from() (solve_sample.h); b is scaled and within the range of A. A constant: but autograd stays on, as an
 /// operator keeps what it computes first, for later products as well.
 TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0);
 /// max |b| of each sample, (batch,).

@@ -18,20 +18,23 @@ class SampleNumbers {
 
   /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
   /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
-  Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+  static Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2, bool& breaks) {
     if (num < kNegligible) return 0;
     if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
     if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
-    if (is_zero_beside(den, a2, b2)) {
-      broken_ = true;
-      return 0;
-    }
-    return num / den;
+    breaks = is_zero_beside(den, a2, b2);
+    return breaks ? T(0) : num / den;
   }
-  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar going) {
-    return going != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
+  Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+    bool breaks = false;
+    const Scalar quotient = guarded_quotient(num, den, a2, b2, breaks);
+    broken_ = broken_ || breaks;
+    return quotient;
   }
-  Scalar ratio(Scalar num, Scalar den) const { return den < kNegligible ? T(0) : num / den; }
+  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar active) {
+    return active != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
+  }
+  static Scalar ratio(Scalar num, Scalar den) { return den < kNegligible ? T(0) : num / den; }
   void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
   static Scalar is_rounding(Scalar a, Scalar b2, Scalar c2, double factor) {
     return std::abs(a) < std::sqrt(b2) * std::sqrt(c2) * static_cast<T>(factor);

@@ -1,14 +1,11 @@
 #pragma once
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <limits>
 
 #include "prdp/solvers/status.h"
 
-/// What may happen to a sample: its state while it is iterated, and each rule that gives it a status, in the CPU loops,
-/// in tensors and in kernels of GPUs. What takes products to tell is in stopping.h and energy.h. A `Flow` refuses
-/// samples before it solves (steppers/flow/limits.cpp).
+/// A sample while it is iterated, and what comes of it. The rules are in verdicts.h.
 namespace prdp {
 
 /// What becomes of the iterate that a sample ends with.
@@ -22,21 +19,21 @@ enum class Verdict {
 
 /// What the loop knows of one sample.
 struct SampleState {
-  int64_t cap = 0;     // iterations allowed
-  double b2 = 0.0;     // ‖b‖²
-  bool active = true;  // still iterating; a frozen sample's u no longer changes
-  bool candidate = false; // its residual has just come below rtol, to be confirmed
+  int64_t cap = 0;         // iterations allowed
+  double b2 = 0.0;         // ‖b‖²
+  bool active = true;      // still iterating; a frozen sample's u no longer changes
+  bool candidate = false;  // its residual has just come below rtol, to be confirmed
   bool concluded = false;  // residual2 is the true one of the returned u, and status is final
   SolveStatus status = SolveStatus::kMaxIter;
   int64_t iterations = 0;
   int64_t applications = 0;
   double residual2 = 0.0;
-  int64_t looked = 0;   // iterations when the residual was last looked at; when it is to be next
-  int64_t look = 0;
-  double checked2 = 0.0; // the residual then
-  int64_t best = 0;  // iterations after which the residual was smallest
+  int64_t looked_at = 0;  // iterations when the residual was last looked at
+  double checked2 = 0.0;  // the residual then
+  int64_t next_look = 0;  // iterations when it is to be looked at next
+  int64_t best = 0;       // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
-  int64_t still = 0;   // cycles since the residual last fell, for methods whose residual never grows
+  int64_t still = 0;  // cycles since the residual last fell, for methods whose residual never grows
   double last_progress2 = std::numeric_limits<double>::infinity();  // the residual then
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
@@ -61,128 +58,12 @@ struct SampleState {
     active = cap > 0;
     concluded = candidate = false;
     status = SolveStatus::kMaxIter;
-    iterations = still = look = 0;
+    iterations = still = next_look = 0;
     floor2 = 0.0;
     last_progress2 = std::numeric_limits<double>::infinity();
     rejected2 = std::numeric_limits<double>::infinity();
   }
 };
-
-// ---- while it is iterated
-
-inline constexpr double kDivergenceBound = 1e13;
-
-/// Whether a residual asks to be confirmed by the true one.
-inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
-
-/// Statuses that follow from a true residual. `rtol` = 0 asks for an exact zero.
-inline void judge(SampleState& s, double rtol) {
-  if (!std::isfinite(s.residual2)) return s.stop(SolveStatus::kOverflow);
-  if (s.residual2 > kDivergenceBound * kDivergenceBound * s.b2) return s.stop(SolveStatus::kDiverged);
-  if (is_within(s.residual2, rtol, s.b2)) s.stop(SolveStatus::kConverged);
-}
-
-/// The true residual no longer follows the method's own: a second false claim, after the method has
-/// gone on from the true residual of the first, has not even halved it. Just above rtol that is noise.
-inline bool parted_ways(const SampleState& s, double rtol) {
-  return s.residual2 > 0.25 * s.rejected2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
-}
-
-/// A method of least residuals that no longer moves: a breakdown where its space is exhausted, and
-/// stagnation where several cycles in a row have not taken a thousandth off the residual.
-inline void judge_progress(SampleState& s, bool exhausted) {
-  constexpr double progress2 = 0.998;
-  constexpr int64_t patience = 10;
-  if (s.residual2 < progress2 * s.last_progress2) {
-    s.last_progress2 = s.residual2;
-    s.still = 0;
-    return;
-  }
-  if (exhausted) {
-    s.take_back_iteration();
-    return s.stop(SolveStatus::kBreakdown);
-  }
-  if (++s.still >= patience) s.stop(SolveStatus::kStagnated);
-}
-
-/// Sets when the residual is to be looked at next. Where it is log-convex it falls no faster from here
-/// on than it did since the last look, and cannot come below rtol before that; twice rtol leaves room
-/// for rounding.
-inline void plan_next_look(SampleState& s, bool log_convex, double rtol) {
-  constexpr double longest = 64.0;
-  double stride = 1.0;
-  if (log_convex && rtol > 0.0 && s.iterations > 0 && s.residual2 > 4.0 * rtol * rtol * s.b2) {
-    const double fall = std::log(s.residual2 / s.checked2) / static_cast<double>(s.iterations - s.looked);
-    const double to_go = std::log(4.0 * rtol * rtol * s.b2 / s.residual2);
-    stride = fall < 0.0 ? std::min(std::ceil(to_go / fall), longest) : longest;
-  }
-  s.looked = s.iterations;
-  s.checked2 = s.residual2;
-  s.look = s.iterations + static_cast<int64_t>(stride);
-}
-
-// ---- the verdict on its last iterate
-
-/// The iterates have run away: the last one is of no use.
-inline bool ran_away(const SampleState& s) {
-  return s.status == SolveStatus::kOverflow || s.status == SolveStatus::kDiverged;
-}
-
-/// It had come to the rounding of b and went on, and has lost that again.
-inline bool left_rounding_of_b(const SampleState& s) {
-  return s.best2 > 0.0 && s.best2 <= s.rounding2 && s.residual2 > 4.0 * s.rounding2;
-}
-
-/// The residual is above ‖b‖: zero would be a better answer.
-inline bool is_above_b(const SampleState& s, double epsilon) { return s.residual2 > (1.0 + 256.0 * epsilon) * s.b2; }
-
-// ---- the limits of the dtype
-
-/// Share of b in the null space that is still rounding, or of no account beside rtol.
-template <class T>
-T consistency_bound(double rtol) {
-  return static_cast<T>(std::max(rtol, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon())));
-}
-
-/// The norm of what rounding to the least numbers of the dtype can leave in a vector of so many unknowns that was
-/// multiplied by `scale`: one of them in each, as twice a half.
-template <class T>
-double rounding_of_least_numbers(double scale, int64_t unknowns) {
-  return static_cast<double>(std::numeric_limits<T>::denorm_min()) * scale * std::sqrt(static_cast<double>(unknowns));
-}
-
-/// Whether of a start nothing but rounding is left once its part in the null space is taken off; by the squares of the
-/// norms then and before.
-template <class Number>
-auto leaves_rounding(const Number& left2, const Number& whole2, double epsilon) {
-  return left2 <= whole2 * (64.0 * epsilon * (64.0 * epsilon));
-}
-/// Whether what a start takes off b, by the squares of the norms before and then, is more than the rounding of its
-/// product, ε ‖A‖ ‖x‖: a start that A maps to zero, or nearly so, is large and worse than none.
-template <class Number>
-auto outdoes_rounding(const Number& b2, const Number& left2, const Number& rounding) {
-  using std::sqrt;
-  return sqrt(b2) - sqrt(left2) > 4.0 * rounding;
-}
-
-/// What A cannot reach of b, as nobody named its null space, is no failure where the rounding of b may be the cause.
-inline void excuse_rounding_of_b(SampleState& s) {
-  const bool failed = s.status == SolveStatus::kDiverged || s.status == SolveStatus::kBreakdown;
-  if (!failed || !(s.residual2 <= s.rounding2)) return;
-  s.status = SolveStatus::kStagnated;
-  s.floor2 = s.residual2;
-}
-
-/// Where u, of this largest entry, consists of the smallest numbers of its dtype, its residual is their rounding.
-template <class T>
-void note_underflow(SampleState& s, double largest) {
-  const double lost = largest == 0.0 ? 1.0 : std::numeric_limits<T>::denorm_min() / largest;
-  if (s.residual2 >= lost * lost * s.b2) return;
-  s.residual2 = s.floor2 = lost * lost * s.b2;
-  if (static_cast<int64_t>(s.status) > 0) s.status = SolveStatus::kStagnated;
-}
-
-// ---- its end
 
 /// What comes of a sample.
 struct SampleOutcome {
@@ -191,26 +72,5 @@ struct SampleOutcome {
   double residual = 0.0, floor = 0.0;  // relative to ‖b‖
   bool is_zero = false;                // u is zero in place of an iterate, and yet to be written
 };
-
-/// Of a sample that gets no iteration, or whose iterates are of no use: u = 0.
-inline SampleOutcome zero_instead(SolveStatus status, int64_t applications = 0) {
-  const bool is_nonfinite = status == SolveStatus::kNonfiniteInput || status == SolveStatus::kNonfiniteOperator;
-  const double residual = is_nonfinite                        ? std::numeric_limits<double>::infinity()
-                          : status == SolveStatus::kConverged ? 0.0
-                                                              : 1.0;
-  return {status, 0, applications, residual, status == SolveStatus::kStagnated ? residual : 0.0, true};
-}
-
-/// Of a sample whose iterations are over. `consistent`: b lies in the range of A; `largest` number of u, which is not
-/// finite if it leaves the range of T; `is_nonzero()`: whether u had digits before it was scaled back.
-template <class T, class IsNonzero>
-SampleOutcome outcome_of(SampleState& s, bool guarded, bool consistent, double largest, const IsNonzero& is_nonzero) {
-  if (guarded) excuse_rounding_of_b(s);
-  if (!consistent && !is_failure(s.status)) s.status = SolveStatus::kInconsistent;
-  if (guarded && !std::isfinite(largest)) return zero_instead(SolveStatus::kOverflow, s.applications);
-  if (largest < std::numeric_limits<T>::min() && is_nonzero()) note_underflow<T>(s, largest);
-  const double floor = is_failure(s.status) ? 0.0 : std::sqrt(s.floor2 / s.b2);
-  return {s.status, s.iterations, s.applications, std::sqrt(s.residual2 / s.b2), floor};
-}
 
 }  // namespace prdp

@@ -1,6 +1,7 @@
 #include <ATen/core/grad_mode.h>
 
 #include <cstdlib>
+#include <functional>
 
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
@@ -14,7 +15,7 @@ namespace prdp {
 namespace {
 
 /// The states before the first iteration: those of samples that are settled are not active. One copy.
-void prepare(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2) {
+void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, const at::Tensor& b2) {
   const auto& applied = batch.start.applied;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b2.scalar_type()); };
   const auto host = at::stack({number(batch.status), number(b2),
@@ -44,23 +45,21 @@ void keep_top_of_heap() {
   }();
 }
 
-/// What comes of each sample: `largest` number of u, and of u `before` it was scaled back.
+/// What comes of each sample: `largest` number of u, and `largest_scaled` of u before it was scaled back.
 std::vector<SampleOutcome> outcomes_of(std::vector<SampleState>& states, const PreparedBatch& batch, bool guarded,
-                                       const at::Tensor& before, const at::Tensor& largest) {
-  const auto host =
-      at::stack({batch.status.to(largest.scalar_type()), batch.inconsistent.to(largest.scalar_type()), before, largest})
-          .to(at::kCPU, at::kDouble);
+                                       const at::Tensor& largest_scaled, const at::Tensor& largest) {
+  const auto host = at::stack({batch.status.to(largest.scalar_type()), batch.inconsistent.to(largest.scalar_type()),
+                               largest_scaled, largest})
+                        .to(at::kCPU, at::kDouble);
   const auto rows = host.accessor<double, 2>();
-  const auto concluded = rows[0], inconsistent = rows[1], digits = rows[2], most = rows[3];
-  const bool is_float = largest.scalar_type() == at::kFloat;
+  const auto status_before = rows[0], inconsistent = rows[1], scaled = rows[2], whole = rows[3];
+  const auto outcome = largest.scalar_type() == at::kFloat ? outcome_of<float, std::function<bool()>>
+                                                           : outcome_of<double, std::function<bool()>>;
   std::vector<SampleOutcome> outcomes(states.size());
   for (size_t i = 0; i < states.size(); ++i) {
-    const auto beforehand = static_cast<SolveStatus>(static_cast<int64_t>(concluded[i]));
-    const auto is_nonzero = [&] { return digits[i] > 0.0; };
-    const bool consistent = inconsistent[i] == 0.0;
-    outcomes[i] = beforehand != SolveStatus::kMaxIter ? zero_instead(beforehand)
-                  : is_float ? outcome_of<float>(states[i], guarded, consistent, most[i], is_nonzero)
-                             : outcome_of<double>(states[i], guarded, consistent, most[i], is_nonzero);
+    const auto before = static_cast<SolveStatus>(static_cast<int64_t>(status_before[i]));
+    if (before != SolveStatus::kMaxIter) outcomes[i] = zero_instead(before);
+    else outcomes[i] = outcome(states[i], guarded, inconsistent[i] == 0.0, whole[i], [&] { return scaled[i] > 0.0; });
     if (std::isnan(outcomes[i].residual)) outcomes[i].residual = std::numeric_limits<double>::infinity();
   }
   return outcomes;
@@ -80,20 +79,20 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, batch.rhs, states);
-  prepare(states, batch, space.b2());
+  fill_states(states, batch, space.b2());
   if (batch.start.x.defined()) space.start_from(batch.start.x, batch.start.r);
 
   const auto run = [&](auto method) {
     iterate(space, method, states, solver.rtol, request.guarded);
     return a.project_solution(space.solution(method.x));
   };
-  const bool in_batches = solver.method == Method::kGmres && space.is_far();
-  auto u =
-      in_batches ? run(TensorGmres(space, solver.restart)) : with_method(solver.method, solver.restart, space, run);
-  const auto before = largest_magnitude(u) * batch.takes_part;
+  const bool by_tensor_gmres = solver.method == Method::kGmres && space.is_far();
+  auto u = by_tensor_gmres ? run(TensorGmres(space, solver.restart))
+                           : with_method(solver.method, solver.restart, space, run);
+  const auto largest_scaled = largest_magnitude(u) * batch.takes_part;
   u = at::where(per_sample(batch.takes_part, b), u / batch.scale, at::zeros_like(b));
   const auto largest = largest_magnitude(u);
-  const auto outcomes = outcomes_of(states, batch, request.guarded, before, largest);
+  const auto outcomes = outcomes_of(states, batch, request.guarded, largest_scaled, largest);
   const bool overflows = std::any_of(outcomes.begin(), outcomes.end(),
                                      [](const SampleOutcome& o) { return o.status == SolveStatus::kOverflow; });
   if (request.guarded && overflows) u = at::where(per_sample(largest.isfinite(), b), u, at::zeros_like(u));

@@ -1,5 +1,6 @@
 #include "prdp/solvers/tensor_space.h"
 
+#include <limits>
 #include <utility>
 
 #include "prdp/operators/tensors.h"
@@ -79,34 +80,39 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   d = laid_out(at::where(every, solution, at::zeros_like(solution)));
 }
 
+at::Tensor TensorSpace::is_zero_beside(const Scalar& den, const Scalar& a2, const Scalar& b2) const {
+  return den.detach().abs().le(limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt());
+}
+
 TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2,
                                                   const Scalar& b2) {
   if (in_loops_) {
-    const auto [length, vanishes] = batch_loops::guarded_quotient(num, den, a2, b2, limits_of(b_).epsilon, negligible_);
-    if (vanishes.defined()) note_broken(vanishes);
-    return length;
+    const auto [value, breaks] = batch_loops::guarded_quotient(num, den, a2, b2);
+    if (breaks.defined()) note_broken(breaks);
+    return value;
   }
-  // As SampleSpace::guarded_quotient; the inner where keeps 0/0 out of the derivative.
+  // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
+  const auto below = den.detach(), is_known = b2.detach().isfinite();
   const auto nothing_left = num.detach() < negligible_;
-  const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
-  const auto vanishes =
-      den.detach().abs().le(bound).logical_and(bound.isfinite()).logical_and(nothing_left.logical_not());
-  note_broken(vanishes);
-  const auto none = nothing_left.logical_or(vanishes);
-  const auto safe = at::where(none, at::ones_like(den), den);
-  return at::where(none, at::zeros_like(num), num / safe);
+  const auto is_long = a2.detach().isfinite().logical_not().logical_and(below.isfinite()).logical_and(below.ne(0));
+  const auto breaks =
+      is_zero_beside(below, a2, b2).logical_and(is_known).logical_and(nothing_left.logical_or(is_long).logical_not());
+  note_broken(breaks);
+  const auto none = nothing_left.logical_or(breaks);
+  const auto quotient = num / at::where(none, at::ones_like(den), den);
+  return at::where(none, at::zeros_like(num),
+                   at::where(is_known, quotient, at::full_like(num, std::numeric_limits<double>::quiet_NaN())));
 }
 
 TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2,
-                                             const Scalar& going) const {
-  if (in_loops_) return batch_loops::breaks_down(den, a2, b2, going, limits_of(b_).epsilon);
-  const auto bound = limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
-  const auto vanishes = den.detach().abs().le(bound).logical_and(bound.isfinite());
-  return vanishes.logical_and(going.detach().ne(0)).to(b_.scalar_type());
+                                             const Scalar& active) const {
+  if (in_loops_) return batch_loops::breaks_down(den, a2, b2, active);
+  const auto is_known = a2.detach().isfinite().logical_and(b2.detach().isfinite());
+  return is_zero_beside(den, a2, b2).logical_and(is_known).logical_and(active.detach().ne(0)).to(b_.scalar_type());
 }
 
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {
-  if (in_loops_) return batch_loops::ratio(num, den, negligible_);
+  if (in_loops_) return batch_loops::ratio(num, den);
   const auto none = den.detach() < negligible_;
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }

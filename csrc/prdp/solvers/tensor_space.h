@@ -64,10 +64,6 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     if (in_loops_) return batch_loops::xpby(x, beta, y, active_);
     y = keep_frozen(at::addcmul(x, beta, y), y);
   }
-  void xmby(const Vector& x, const Scalar& beta, Vector& y) {
-    if (in_loops_) return batch_loops::xpby(x, -beta, y, active_);
-    y = keep_frozen(at::addcmul(x, beta, y, -1), y);
-  }
   Scalar dot(const Vector& a, const Vector& b) const { return in_loops_ ? batch_loops::dot(a, b) : dot_in_order(a, b); }
   Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r) {
     if (in_loops_ && !system_.a.needs_projection())
@@ -84,9 +80,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     out = made * system_.scale_of_a;
   }
   std::array<Scalar, 2> apply_with_dots(const Vector& v, Vector& out) {
-    if (in_loops_) return apply_along(v, v, out);
-    apply(v, out);
-    return {dot(v, out), dot(out, out)};
+    return in_loops_ ? apply_along(v, v, out) : SpaceDefaults::apply_with_dots(v, out);
   }
   std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out) {
     if (in_loops_) return batch_loops::scale_with_dots(system_.scale_of_a, unscaled_product(v), w, out);
@@ -137,7 +131,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   void solve_directly(const Vector& r, Vector& d);
 
   Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
-  Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const;
+  Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& active) const;
   Scalar ratio(const Scalar& num, const Scalar& den);
   void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
     note_broken(a.detach().gt(0).logical_or(r2.detach().lt(negligible_)).logical_not());
@@ -149,7 +143,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     return value * (is_not_zero(a) * is_not_zero(b));
   }
 
-  /// As SampleSpace's. While autograd records, numbers that are to be constants are detached.
+  /// While autograd records, numbers that are to be constants are detached.
   int derivatives() const { return recording_ ? 2 : 0; }
   Scalar constant(const Scalar& value) const { return value.detach(); }
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) const {
@@ -240,6 +234,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     const auto now = active_mask_.defined() ? rows.logical_and(active_mask_) : rows;
     broken_ = broken_.defined() ? broken_.logical_or(now) : now;
   }
+  at::Tensor is_zero_beside(const Scalar& den, const Scalar& a2, const Scalar& b2) const;
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;

@@ -2,7 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/solvers/sample_state.h"
+#include "prdp/solvers/verdicts.h"
 
 /// How the loop around the methods (iterate.h) looks at residuals, and stops the samples that are done.
 namespace prdp::detail {
