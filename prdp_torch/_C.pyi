@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_options', 'check_solver', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -26,7 +26,9 @@ class SolveOptions:
     """
     The options of a solve but for max_iter and the log.
     """
-    def __init__(self, arg0: str, arg1: typing.SupportsFloat | typing.SupportsIndex, arg2: typing.SupportsInt | typing.SupportsIndex, arg3: str, arg4: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], arg5: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], arg6: collections.abc.Sequence[torch.Tensor], arg7: bool, arg8: str, arg9: typing.SupportsInt | typing.SupportsIndex | None, arg10: typing.SupportsFloat | typing.SupportsIndex | None, arg11: str, arg12: typing.SupportsInt | typing.SupportsIndex, arg13: bool) -> None:
+    def __init__(self, names: collections.abc.Sequence[str], counts: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], numbers: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], preconditioner: collections.abc.Sequence[torch.Tensor]) -> None:
+        ...
+    def check(self, who: str) -> None:
         ...
 class Equation:
     """
@@ -115,10 +117,6 @@ def bytes_of_factorisations() -> int:
     The memory of those that are kept for later solves.
     """
 def check_operator(kind: str, shape: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], parameters: collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], tensors: collections.abc.Sequence[torch.Tensor]) -> None:
-    ...
-def check_options(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex, preconditioner: str, backward: str, adjoint_max_iter: typing.SupportsInt | typing.SupportsIndex | None, adjoint_rtol: typing.SupportsFloat | typing.SupportsIndex | None, on_failure: str, checkpoint_every: typing.SupportsInt | typing.SupportsIndex, start: str = 'zero') -> None:
-    ...
-def check_solver(who: str, method: str, max_iter: typing.SupportsInt | typing.SupportsIndex, rtol: typing.SupportsFloat | typing.SupportsIndex, restart: typing.SupportsInt | typing.SupportsIndex, preconditioner: str) -> None:
     ...
 def check_start(start: str) -> None:
     ...

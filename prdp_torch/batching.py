@@ -21,7 +21,16 @@ class _Map(Protocol):
 
 
 def _linear_solve(
-    info: _Map, in_dims: Sequence[Any], b: Tensor, tensors: list[Tensor], kind: str, shape: list[int], *rest: Any
+    info: _Map,
+    in_dims: Sequence[Any],
+    b: Tensor,
+    tensors: list[Tensor],
+    kind: str,
+    shape: list[int],
+    parameters: list[float],
+    transposed: bool,
+    x0: Tensor | None,
+    *options: Any,
 ) -> tuple[Any, Any]:
     size, op = info.batch_size, torch.ops.prdp.linear_solve
 
@@ -33,10 +42,9 @@ def _linear_solve(
     in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
     folded = _fold(in_front, mapped, kind, len(shape), size, samples)
     if folded is None:
-        return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, *rest))
-    if isinstance(rest[-1], torch.Tensor):  # x0, the last argument where there is one
-        rest = *rest[:-1], in_batch(rest[-1], in_dims[-1])
-    results = op(in_batch(b, in_dims[0]), folded, kind, shape, *rest)
+        return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, parameters, transposed, x0, *options))
+    start = None if x0 is None else in_batch(x0, in_dims[6])
+    results = op(in_batch(b, in_dims[0]), folded, kind, shape, parameters, transposed, start, *options)
     return [t.unflatten(0, (size, samples)) for t in results], [0] * len(results)
 
 

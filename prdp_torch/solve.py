@@ -12,8 +12,7 @@ from prdp_torch.solvers import (
     Kept,
     Solver,
     check_options,
-    checkpoint_number,
-    flat_preconditioner,
+    packed_options,
     solve_options,
     tensors_of,
 )
@@ -213,31 +212,18 @@ def linear_solve(
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     rhs = b.unsqueeze(0) if lone_vector else b
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
-    settings = backward, adjoint_max_iter, adjoint_rtol, on_failure
-    every = checkpoint_number(checkpoint_every)
+    settings = backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every
     if log is not None:
         preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
-        options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings, every, False)
+        options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings)
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
     if found is None:
+        parts = solver.method, solver.max_iter, solver.rtol, solver.restart, solver.preconditioner
+        packed = packed_options(*parts, *settings, adjoint_log=0 if log is None else log.number)
         solution: Solution = torch.ops.prdp.linear_solve(
-            rhs,
-            A.tensors,
-            A.kind,
-            A.shape,
-            A.parameters,
-            False,
-            solver.method,
-            solver.max_iter,
-            solver.rtol,
-            solver.restart,
-            *flat_preconditioner(solver.preconditioner),
-            *settings,
-            0 if log is None else log.number,
-            every,
-            start,
+            rhs, A.tensors, A.kind, A.shape, A.parameters, False, start, *packed
         )
         found = solution
     way = "" if compiling else _C.way_of_last_solve()

@@ -17,7 +17,7 @@ from prdp_torch.operators import Operator
 from prdp_torch.types import CheckpointEvery
 
 Preconditioner: TypeAlias = 'Literal["diagonal", "multigrid"] | Operator | Multigrid | None'
-FlatPreconditioner: TypeAlias = tuple[str, list[int], list[float], list[Tensor], bool]
+PackedOptions: TypeAlias = tuple[list[str], list[int], list[float], list[Tensor]]
 Made = TypeVar("Made")
 
 
@@ -52,8 +52,7 @@ class Solver:
         if not torch.compiler.is_compiling():
             self.max_iter = _check.whole(who, "max_iter", self.max_iter)
             self.rtol = _check.real(who, "rtol", self.rtol)
-            kind = flat_preconditioner(self.preconditioner)[0]
-            _C.check_solver(who, self.method, self.max_iter, self.rtol, self.restart, kind)
+            check_solver(who, self.method, self.max_iter, self.rtol, self.restart, self.preconditioner)
 
 
 PRECONDITIONERS = ("diagonal", "multigrid")
@@ -70,13 +69,49 @@ def check_preconditioner(who: str, preconditioner: object) -> None:
         )
 
 
-def flat_preconditioner(preconditioner: Preconditioner) -> FlatPreconditioner:
-    """A preconditioner for the compiled library: kind, shape, parameters, tensors, and whether it is transposed."""
+def packed_options(
+    method: str,
+    max_iter: int,
+    rtol: float,
+    restart: int,
+    preconditioner: Preconditioner,
+    backward: str = "implicit",
+    adjoint_max_iter: int | None = None,
+    adjoint_rtol: float | None = None,
+    on_failure: str = "raise",
+    checkpoint_every: CheckpointEvery = None,
+    start: str = "zero",
+    adjoint_log: int = 0,
+) -> PackedOptions:
+    """All options of a solve in the four lists that the ops take: csrc/prdp/autograd/packed_options.h unpacks them."""
+    shape: list[int] = []
+    parameters: list[float] = []
+    tensors: list[Tensor] = []
     if isinstance(preconditioner, Operator):
-        return preconditioner.kind, preconditioner.shape, preconditioner.parameters, preconditioner.tensors, False
-    if isinstance(preconditioner, Multigrid):
-        return "multigrid", [preconditioner.smoothing], [], [], False
-    return preconditioner or "", [], [], [], False
+        kind, shape = preconditioner.kind, preconditioner.shape
+        parameters, tensors = preconditioner.parameters, preconditioner.tensors
+    elif isinstance(preconditioner, Multigrid):
+        kind, shape = "multigrid", [preconditioner.smoothing]
+    else:
+        kind = preconditioner or ""
+    every = checkpoint_every or 0
+    counts = [
+        max_iter,
+        restart,
+        adjoint_log,
+        _C.CHECKPOINT_SQRT if every == "sqrt" else every,
+        int(adjoint_max_iter is not None),
+        adjoint_max_iter or 0,
+        0,  # M as it is, not its transpose
+        *shape,
+    ]
+    numbers = [rtol, float(adjoint_rtol is not None), adjoint_rtol or 0.0, *parameters]
+    return [method, backward, on_failure, start, kind], counts, numbers, tensors
+
+
+def check_solver(who: str, *solver: Any) -> None:
+    """Raise ValueError, in the name of `who`, unless the parts of a solver fit together."""
+    _C.SolveOptions(*packed_options(*solver)).check(who)
 
 
 @dataclass
@@ -231,11 +266,11 @@ class Kept(Generic[Made]):
 
 
 def solve_options(
-    method: str, rtol: float, restart: int, preconditioner: Preconditioner, _: object, backward: str, *others: Any
+    method: str, rtol: float, restart: int, preconditioner: Preconditioner, _: object, *others: Any
 ) -> _C.SolveOptions:
-    """The options as the compiled library takes them past the dispatcher. The one that is left out tells when the
-    tensors of the preconditioner are new."""
-    return _C.SolveOptions(method, rtol, restart, *flat_preconditioner(preconditioner), backward, *others)
+    """The options but for max_iter as the compiled library takes them past the dispatcher. The one that is left out
+    tells when the tensors of the preconditioner are new."""
+    return _C.SolveOptions(*packed_options(method, 0, rtol, restart, preconditioner, *others))
 
 
 def tensors_of(preconditioner: Preconditioner) -> tuple[int, ...]:
@@ -243,13 +278,6 @@ def tensors_of(preconditioner: Preconditioner) -> tuple[int, ...]:
     if isinstance(preconditioner, Multigrid):
         return (preconditioner.smoothing,)
     return tuple(map(id, preconditioner.tensors)) if isinstance(preconditioner, Operator) else ()
-
-
-def checkpoint_number(checkpoint_every: CheckpointEvery) -> int:
-    """`checkpoint_every` as the compiled library takes it."""
-    if checkpoint_every is None:
-        return 0
-    return _C.CHECKPOINT_SQRT if checkpoint_every == "sqrt" else checkpoint_every
 
 
 def check_options(
@@ -301,17 +329,17 @@ def check_settings(
         raise TypeError(f"{who}: checkpoint_every must be a whole number, 'sqrt' or None, got {checkpoint_every!r}")
     if checkpoint_every not in (None, "sqrt") and _check.whole(who, "checkpoint_every", checkpoint_every) < 1:
         raise ValueError(f"{who}: checkpoint_every must be >= 1, 'sqrt' or None, got {checkpoint_every}")
-    _C.check_options(
+    check_solver(
         who,
         method,
         _check.whole(who, "max_iter", max_iter),
         _check.real(who, "rtol", rtol),
         _check.whole(who, "restart", restart),
-        flat_preconditioner(preconditioner)[0],
+        preconditioner,
         _check.string(who, "backward", backward),
         _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
         _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
         _check.string(who, "on_failure", on_failure),
-        checkpoint_number(checkpoint_every),
+        checkpoint_every,
         _check.string(who, "start", start),
     )

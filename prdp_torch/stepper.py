@@ -18,12 +18,13 @@ from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
     GMRES,
     Kept,
+    PackedOptions,
     Preconditioner,
     Solver,
     check_options,
     check_settings,
-    checkpoint_number,
-    flat_preconditioner,
+    check_solver,
+    packed_options,
     solve_options,
     tensors_of,
 )
@@ -248,24 +249,26 @@ class Stepper(torch_private.HearsOfMoves):
             if found is not None:
                 return found
         solution: Solution = torch.ops.prdp.linear_solve(
-            b, a.tensors, a.kind, a.shape, a.parameters, False, *self._options(log.number), x0
+            b, a.tensors, a.kind, a.shape, a.parameters, False, x0, *self._packed_options(log)
         )
         return solution
 
     def _options_kept(self) -> _C.SolveOptions:
         """The options as the compiled library takes them past the dispatcher."""
         solver = self.method, self._rtol, self.restart, self.preconditioner, tensors_of(self.preconditioner)
-        every = checkpoint_number(self.checkpoint_every)
-        return self._kept_options.of(*solver, *self._settings(), every, self.start == "state")
+        return self._kept_options.of(*solver, *self._settings())
 
-    def _options(self, log_number: int) -> tuple[object, ...]:
+    def _packed_options(self, log: AdjointLog) -> PackedOptions:
+        """The options as the ops of torch take them."""
         compiling = torch.compiler.is_dynamo_compiling()
         k = torch_private.number_as_graph_input(self, "_max_iter") if compiling else self._max_iter
-        solver = self.method, k, self._rtol, self.restart, *flat_preconditioner(self.preconditioner)
-        return *solver, *self._settings(), log_number, checkpoint_number(self.checkpoint_every)
+        return packed_options(
+            self.method, k, self._rtol, self.restart, self.preconditioner, *self._settings(), adjoint_log=log.number
+        )
 
-    def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure]:
-        return self.backward, self.adjoint_max_iter, self._adjoint_rtol, self.on_failure
+    def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure, CheckpointEvery, Start]:
+        others = self.on_failure, self.checkpoint_every, self.start
+        return self.backward, self.adjoint_max_iter, self._adjoint_rtol, *others
 
     @property
     def max_iter(self) -> int:
@@ -275,7 +278,7 @@ class Stepper(torch_private.HearsOfMoves):
     def max_iter(self, k: int) -> None:
         who = type(self).__name__
         k = _check.whole(who, "max_iter", k)
-        _C.check_solver(who, self.method, k, self.rtol, self.restart, flat_preconditioner(self.preconditioner)[0])
+        check_solver(who, self.method, k, self.rtol, self.restart, self.preconditioner)
         self._max_iter = k
 
     @property
@@ -286,7 +289,7 @@ class Stepper(torch_private.HearsOfMoves):
     def rtol(self, rtol: float) -> None:
         who = type(self).__name__
         rtol = _check.real(who, "rtol", rtol)
-        _C.check_solver(who, "gmres", 1, rtol, 1, "")
+        check_solver(who, "gmres", 1, rtol, 1, None)
         self._rtol = rtol
 
     @property

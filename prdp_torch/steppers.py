@@ -121,7 +121,7 @@ class EquationStepper(HoldsTensors, Stepper):
             log = self._adjoint_log.number
             found = _C.step(u, self._tensors(), self._equation_kept(), self._options_kept(), self._max_iter, log)
         if found is None:
-            solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._step_options())
+            solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._packed_options(self._adjoint_log))
             found = solution
         self._keep(found[1:], self._adjoint_log)
         return found[0]
@@ -137,7 +137,8 @@ class EquationStepper(HoldsTensors, Stepper):
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
-        found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *self._step_options())
+        packed = self._packed_options(self._adjoint_log)
+        found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *packed)
         self._keep(found[1:], self._adjoint_log)
         return found[0]
 
@@ -148,9 +149,6 @@ class EquationStepper(HoldsTensors, Stepper):
     def _equation_kept(self) -> _C.Equation:
         e = self.equation
         return self._kept_equation.of(e.kind, tuple(e.shape), tuple(e.parameters), e.picard_steps)
-
-    def _step_options(self) -> tuple[object, ...]:
-        return *self._options(self._adjoint_log.number), self.start == "state"
 
     def _tensors(self) -> list[Tensor]:
         """What the operator is made of beside the state: nu as it is now."""

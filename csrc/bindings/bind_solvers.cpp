@@ -26,9 +26,6 @@ OperatorSpec spec(std::string kind, std::vector<int64_t> shape, std::vector<doub
   return {std::move(kind), std::move(shape), std::move(parameters), std::move(tensors)};
 }
 
-/// One that is not an operator.
-Preconditioner preconditioner_of_kind(std::string kind) { return OperatorSpec{std::move(kind), {}, {}, {}}; }
-
 /// A log that is closed with it, by no code of Python: an interruption cannot come between.
 struct KeptLog {
   AdjointLog log = open_adjoint_log();
@@ -152,35 +149,6 @@ void bind_solvers(py::module_& m) {
         END_HANDLE_TH_ERRORS_PYBIND
       },
       py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
-  m.def(
-      "check_solver",
-      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
-         std::string preconditioner) {
-        Solver{method_from_name(method), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))}
-            .check(who.c_str());
-      },
-      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
-      py::arg("preconditioner"));
-  m.def(
-      "check_options",
-      [](std::string who, std::string method, int64_t max_iter, double rtol, int64_t restart,
-         std::string preconditioner, std::string backward, std::optional<int64_t> adjoint_max_iter,
-         std::optional<double> adjoint_rtol, std::string on_failure, int64_t checkpoint_every, std::string start) {
-        SolveOptions{
-            {method_from_name(method), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))},
-            backward_from_name(backward),
-            adjoint_max_iter,
-            adjoint_rtol,
-            on_failure_from_name(on_failure),
-            /*adjoint_log=*/0,
-            checkpoint_every,
-            start_from_name(start)}
-            .check(who.c_str());
-      },
-      py::arg("who"), py::arg("method"), py::arg("max_iter"), py::arg("rtol"), py::arg("restart"),
-      py::arg("preconditioner"), py::arg("backward"), py::arg("adjoint_max_iter"), py::arg("adjoint_rtol"),
-      py::arg("on_failure"), py::arg("checkpoint_every"), py::arg("start") = "zero");
-
   m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
   py::class_<KeptLog>(m, "AdjointLog").def(py::init<>()).def_property_readonly("number", [](const KeptLog& kept) {
     return *kept.log;
@@ -242,7 +210,7 @@ void bind_solvers(py::module_& m) {
           const py::gil_scoped_release no_gil;
           return solve_with_tensors(
               *make_operator(a), b,
-              {{method_from_name(solver), max_iter, rtol, restart, preconditioner_of_kind(std::move(preconditioner))},
+              {{method_from_name(solver), max_iter, rtol, restart, OperatorSpec{std::move(preconditioner), {}, {}, {}}},
                {},
                true,
                x0.value_or(at::Tensor())});

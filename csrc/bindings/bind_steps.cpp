@@ -2,13 +2,13 @@
 #include <torch/csrc/autograd/python_variable.h>
 
 #include "bindings.h"
-#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/steppers/equation.h"
 #include "prdp/steppers/memory_check.h"
 
-/// The ops step and linear_solve without the arguments that they are flattened into: a call of an op with twenty of
-/// them costs more than a small solve. None where somebody watches; then the op is to be called.
+/// The ops step and linear_solve past torch's dispatcher, which costs more than a small solve. None where somebody
+/// watches; then the op is to be called.
 namespace py = pybind11;
 using namespace prdp;
 
@@ -26,6 +26,13 @@ std::vector<at::Tensor> unwrapped(const std::vector<py::object>& tensors) {
   std::vector<at::Tensor> found;
   for (const auto& t : tensors) found.push_back(THPVariable_Unpack(t.ptr()));
   return found;
+}
+
+/// The options as ops take them, packed into lists.
+SolveOptions unpack_lists(const std::vector<std::string>& names, const std::vector<int64_t>& counts,
+                          const std::vector<double>& numbers, const std::vector<at::Tensor>& preconditioner) {
+  return unpack(c10::List<std::string>(names), std::vector<c10::SymInt>(counts.begin(), counts.end()), numbers,
+                preconditioner);
 }
 
 SolveOptions with(SolveOptions options, int64_t max_iter, int64_t adjoint_log) {
@@ -71,14 +78,10 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
 
 void bind_steps(py::module_& m) {
   py::class_<SolveOptions>(m, "SolveOptions", "The options of a solve but for max_iter and the log.")
-      .def(py::init([](const std::string& method, double rtol, int64_t restart, const std::string& preconditioner,
-                       const std::vector<int64_t>& shape, const std::vector<double>& parameters,
-                       const std::vector<at::Tensor>& tensors, bool transposed, const std::string& backward,
-                       std::optional<int64_t> adjoint_max_iter, std::optional<double> adjoint_rtol,
-                       const std::string& on_failure, int64_t checkpoint_every, bool from_state) {
-        return unflatten(method, 0, rtol, restart, preconditioner, shape, parameters, tensors, transposed, backward,
-                         adjoint_max_iter, adjoint_rtol, on_failure, /*adjoint_log=*/0, checkpoint_every, from_state);
-      }));
+      .def(py::init(&unpack_lists), py::arg("names"), py::arg("counts"), py::arg("numbers"), py::arg("preconditioner"))
+      .def(
+          "check", [](const SolveOptions& options, const std::string& who) { options.check(who.c_str()); },
+          py::arg("who"));
   py::class_<Equation>(m, "Equation", "An equation but for its tensors.")
       .def(py::init(
           [](std::string kind, std::vector<int64_t> shape, std::vector<double> parameters, int64_t picard_steps) {

@@ -12,7 +12,6 @@ from prdp_torch.experiments import _C, scenes
 DATA = Path(__file__).parents[1] / "data"
 ITERATIVE = [prdp.Jacobi, prdp.SteepestDescent, prdp.CG, prdp.BiCGStab, prdp.MINRES, prdp.GMRES]
 SOLVERS = [*ITERATIVE, prdp.Direct]
-NO_PRECONDITIONER = ("", [], [], [], False)  # as the ops take it
 modes = pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 TINY = (
     ("shape = [48, 48]", "shape = [8, 8]"),

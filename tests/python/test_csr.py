@@ -5,9 +5,10 @@ import sys
 
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, statuses
+from helpers import statuses
 
 import prdp_torch as prdp
+from prdp_torch.solvers import packed_options
 
 pytestmark = pytest.mark.filterwarnings("ignore:Sparse")
 
@@ -15,6 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Sparse")
 FUZZ = """
 import random, sys, warnings
 import torch, prdp_torch as prdp
+from prdp_torch.solvers import packed_options
 warnings.simplefilter("ignore")
 seed, count, n = int(sys.argv[1]), int(sys.argv[2]), 6
 draw = random.Random(seed)
@@ -62,8 +64,8 @@ for i in range(count):
     through_op = draw.random() < 0.5
     try:
         if through_op:  # past Python's checks
-            torch.ops.prdp.linear_solve(b, parts, "csr", [], [], draw.random() < 0.5, solver.method, 3, 1e-5, 3,
-                                        "", [], [], [], False, backward, None, None, "return", 0)
+            options = packed_options(solver.method, 3, 1e-5, 3, None, backward, on_failure="return")
+            torch.ops.prdp.linear_solve(b, parts, "csr", [], [], draw.random() < 0.5, None, *options)
         else:
             size = (2, n, n) if batched else (n, n)
             matrix = torch.sparse_csr_tensor(*parts, size=size, check_invariants=False)
@@ -95,9 +97,8 @@ def csr(crow, col, values, index=torch.int64):
 
 def solve(parts, solver="direct", b=None):
     b = torch.ones(1, 2, dtype=torch.float64) if b is None else b
-    return torch.ops.prdp.linear_solve(
-        b, parts, "csr", [], [], False, solver, 3, 1e-5, 3, *NO_PRECONDITIONER, "implicit", None, None, "return", 0
-    )
+    options = packed_options(solver, 3, 1e-5, 3, None, on_failure="return")
+    return torch.ops.prdp.linear_solve(b, parts, "csr", [], [], False, None, *options)
 
 
 @pytest.mark.parametrize(

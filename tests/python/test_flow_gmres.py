@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field, golden, statuses
+from helpers import field, golden, statuses
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
+from prdp_torch.solvers import packed_options
 
 BURGERS, FLOW = golden("burgers1d"), golden("ns10")
 BURGERS_U = torch.tensor(BURGERS["u"]).view(3, 1, 256)
@@ -87,10 +88,10 @@ def test_the_cpu_loops_equal_the_plain_tensors(dtype, transposed):
         ("navier_stokes", [7, 17], field((7, 17), channels=2, dtype=dtype), consistent((7, 17), seed=1, dtype=dtype)),
     )
     for kind, shape, winds, b in cases:
-        arguments = ([winds, nu], kind, shape, [0.1], transposed, "gmres", 3, 0.0, 4)
-        options = (*NO_PRECONDITIONER, "none", None, None, "raise", 0)
-        u, iterations, _, _, applications, _ = torch.ops.prdp.linear_solve(b, *arguments, *options)
-        v, report = _C.solve_with_tensors(b, *arguments)
+        system, solver = ([winds, nu], kind, shape, [0.1], transposed), ("gmres", 3, 0.0, 4)
+        options = packed_options(*solver, None, "none")
+        u, iterations, _, _, applications, _ = torch.ops.prdp.linear_solve(b, *system, None, *options)
+        v, report = _C.solve_with_tensors(b, *system, *solver)
         np.testing.assert_allclose(u, v, rtol=0, atol=200 * torch.finfo(dtype).eps * v.abs().max())
         assert iterations.tolist() == report[0].tolist() and applications.tolist() == report[3].tolist()
 

@@ -7,10 +7,11 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, dense_laplacian, field, statuses
+from helpers import dense_laplacian, field, statuses
 
 import prdp_torch as prdp
 from prdp_torch import fields, operators
+from prdp_torch.solvers import packed_options
 
 SHAPE, LENGTH = (5, 7), (2.0, 0.5)
 
@@ -99,8 +100,8 @@ def test_the_loops_and_plain_tensors_agree_on_a_stretched_domain():
                 b, a.tensors, a.kind, a.shape, a.parameters, transposed, "gmres", 3, 0.0, 5
             )
             found, *_ = torch.ops.prdp.linear_solve(
-                b, a.tensors, a.kind, a.shape, a.parameters, transposed, "gmres", 3, 0.0, 5,
-                *NO_PRECONDITIONER, "none", None, None, "return", 0,
+                b, a.tensors, a.kind, a.shape, a.parameters, transposed, None,
+                *packed_options("gmres", 3, 0.0, 5, None, "none", on_failure="return"),
             )  # fmt: skip
             torch.testing.assert_close(found, oracle, rtol=1e-9, atol=1e-11)
 

@@ -5,25 +5,26 @@ import pickle
 
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, SOLVERS, field
+from helpers import SOLVERS, field
 from torch.library import opcheck
 from torch.utils.checkpoint import checkpoint
 
 import prdp_torch as prdp
-from prdp_torch import operators
+from prdp_torch import _C, operators
+from prdp_torch.solvers import packed_options
 
 
-def arguments(backward="implicit", solver="jacobi", requires_grad=True):
+def arguments(backward="implicit", solver="jacobi", requires_grad=True, on_failure="raise"):
     b = field((5,)).requires_grad_(requires_grad)
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=requires_grad)
-    return b, nu, (solver, 4, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0)
+    return b, nu, packed_options(solver, 4, 1e-5, 3, None, backward, on_failure=on_failure)
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unrolled", "none"])
 @pytest.mark.parametrize("solver", ["jacobi", "steepest_descent", "cg", "gmres", "direct"])
 def test_linear_solve_passes_opcheck(backward, solver):
     b, nu, options = arguments(backward, solver)
-    result = opcheck(torch.ops.prdp.linear_solve.default, (b, [nu], "heat", [5], [1.0], False, *options))
+    result = opcheck(torch.ops.prdp.linear_solve.default, (b, [nu], "heat", [5], [1.0], False, None, *options))
     assert set(result.values()) == {"SUCCESS"}
 
 
@@ -34,12 +35,12 @@ of_several_ops = pytest.mark.filterwarnings("ignore:The .grad attribute of a Ten
 @of_several_ops
 @pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 def test_solves_and_steps_of_flows_pass_opcheck(backward):
-    _, nu, options = arguments(backward, "direct")
-    options = (*options[:-2], "return", 0)  # a random pressure has a mean and is inconsistent
+    # A random pressure has a mean and is inconsistent.
+    _, nu, options = arguments(backward, "direct", on_failure="return")
     for kind, channels, shape in (("burgers", 1, [5]), ("burgers", 2, [3, 4]), ("navier_stokes", 3, [3, 4])):
         u, b = field(shape, channels=channels).requires_grad_(), field(shape, seed=1, channels=channels)
         for op, args in (
-            (torch.ops.prdp.linear_solve, (b, [u, nu], kind, shape, [0.1], False, *options)),
+            (torch.ops.prdp.linear_solve, (b, [u, nu], kind, shape, [0.1], False, None, *options)),
             (torch.ops.prdp.step, (u, [nu], kind, shape, [0.1], 2, *options)),
             (torch.ops.prdp.apply, (b, [u, nu], kind, shape, [0.1], True)),
             (torch.ops.prdp.rhs, (u, kind, shape, [0.1])),
@@ -53,7 +54,7 @@ def test_matrices_and_the_other_ops_pass_opcheck():
     m = torch.eye(5, dtype=torch.float64, requires_grad=True)
     rhs = torch.ones(2, 5, dtype=torch.float64, requires_grad=True)
     calls = [
-        (torch.ops.prdp.linear_solve, (rhs, [m], "dense", [], [], False, *options)),
+        (torch.ops.prdp.linear_solve, (rhs, [m], "dense", [], [], False, None, *options)),
         (torch.ops.prdp.step, (b, [nu], "heat", [5], [1.0], 1, *options)),
         (torch.ops.prdp.step, (b, [], "poisson", [5], [], 1, *options)),
         (torch.ops.prdp.apply, (b, [nu], "heat", [5], [1.0], False)),
@@ -61,8 +62,8 @@ def test_matrices_and_the_other_ops_pass_opcheck():
         (
             torch.ops.prdp.unrolled_vjp,
             (b.detach(), b.detach(), torch.tensor([4, 4]), torch.tensor([-1, -1]),
-             torch.full((2,), 0.1, dtype=torch.float64), [1, 1], [nu.detach()], "heat", [5], [1.0], False, "cg",
-             4, 1e-5, 3, *NO_PRECONDITIONER, "unrolled", None, None, "raise", 0),
+             torch.full((2,), 0.1, dtype=torch.float64), [1, 1], [nu.detach()], "heat", [5], [1.0], False, None,
+             *packed_options("cg", 4, 1e-5, 3, None, "unrolled")),
         ),
     ]  # fmt: skip
     for op, args in calls:
@@ -174,3 +175,33 @@ def test_reports_of_two_solves_stay_apart():
     assert first.adjoint is None and second.adjoint.iterations.tolist() == [5, 5]
     u.sum().backward()
     assert first.adjoint.iterations.tolist() == [3, 3]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda names, *rest: (names[:4], *rest), "5 names, 7 counts and 3 numbers"),
+        (lambda names, counts, *rest: (names, counts[:6], *rest), "got 5, 6 and 3"),
+        (lambda names, counts, numbers, m: (names, counts, numbers[:1], m), "got 5, 7 and 1"),
+        (lambda names, *rest: ([*names[:3], "now", names[4]], *rest), "start: unknown name 'now'"),
+    ],
+)  # fmt: skip
+def test_options_that_are_not_packed_as_they_should_be_are_refused(change, message):
+    b, nu, options = arguments()
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        torch.ops.prdp.linear_solve(b, [nu], "heat", [5], [1.0], False, None, *change(*options))
+
+
+def test_every_option_arrives_where_it_is_packed():
+    """What a setting out of range is refused for tells which setting it was taken for."""
+    settings = {"max_iter": 4, "rtol": 1e-5, "restart": 3, "preconditioner": None, "backward": "unrolled"}
+    for name, value in (
+        ("max_iter", -1), ("rtol", -2.0), ("restart", -3), ("adjoint_max_iter", -4), ("adjoint_rtol", -5.0),
+        ("checkpoint_every", -6),
+    ):  # fmt: skip
+        packed = packed_options("gmres", **{**settings, name: value})
+        with pytest.raises(ValueError, match=rf"{name} must be .*got {value:g}"):
+            _C.SolveOptions(*packed).check("op")
+    for name, value in (("backward", "b"), ("on_failure", "f"), ("start", "s")):
+        with pytest.raises(ValueError, match=f"{name}: unknown name '{value}'"):
+            _C.SolveOptions(*packed_options("gmres", **{**settings, name: value}))

@@ -5,12 +5,13 @@ import re
 import pytest
 import torch
 import torch._dynamo.testing
-from helpers import NO_PRECONDITIONER, field, modes, statuses
+from helpers import field, modes, statuses
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
 
 import prdp_torch as prdp
 from prdp_torch import fields
+from prdp_torch.solvers import packed_options
 
 # name: (stepper, grid, channels, physics beside nu)
 STEPPERS = {
@@ -226,7 +227,7 @@ def test_refused_samples_carry_no_gradient():
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @modes
 def test_the_ops_pass_opcheck(backward):
-    options = ("gmres", 3, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "return", 0)
+    options = packed_options("gmres", 3, 1e-5, 3, None, backward, on_failure="return")
     nu = torch.tensor(1e-2, dtype=torch.float64, requires_grad=True)
     said = torch.full((2, 4), 3), torch.full((2, 4), -1), torch.full((2, 4), 0.1, dtype=torch.float64)
     for kind, shape, channels in (("heat", [5], 1), ("burgers", [3, 4], 2), ("navier_stokes", [3, 4], 3)):

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field, modes, random
+from helpers import field, modes, random
 from torch.library import opcheck
 
 import prdp_torch as prdp
 from prdp_torch import operators
+from prdp_torch.solvers import packed_options
 
 # ---- steppers and rollouts
 
@@ -94,13 +95,13 @@ def test_starting_from_the_state_saves_products_on_trajectories(name, solver):
 def test_the_ops_pass_opcheck(backward):
     b, x0 = field((5,)).requires_grad_(), field((5,), seed=1)
     nu = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
-    options = ("cg", 3, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0, 0)
+    options = packed_options("cg", 3, 1e-5, 3, None, backward, start="state")
     equation = ([nu], "heat", [5], [0.1], 2)
     for op, arguments in (
-        (torch.ops.prdp.linear_solve, (b, [nu], "heat", [5], [1.0], False, *options, x0)),
-        (torch.ops.prdp.step, (b, *equation, *options, True)),
-        (torch.ops.prdp.rollout_solves, (b, *equation, 4, *options, True)),
-        (torch.ops.prdp.rollout, (b, *equation, 2, *options, True)),
+        (torch.ops.prdp.linear_solve, (b, [nu], "heat", [5], [1.0], False, x0, *options)),
+        (torch.ops.prdp.step, (b, *equation, *options)),
+        (torch.ops.prdp.rollout_solves, (b, *equation, 4, *options)),
+        (torch.ops.prdp.rollout, (b, *equation, 2, *options)),
     ):
         assert set(opcheck(op.default, arguments).values()) == {"SUCCESS"}
 

@@ -5,11 +5,12 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field, statuses
+from helpers import field, statuses
 from stencils import FAR_2D, NEAREST, NINE, cases, dense, few, random_coefficients
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
+from prdp_torch.solvers import packed_options
 
 
 def symmetric_coefficients(shape, seed=3, batch=2):
@@ -42,10 +43,10 @@ def test_products_equal_those_of_the_matrix(shape, offsets, boundary, batch, cha
 def loops_and_tensors(c, offsets, boundary, b, solver, transposed):
     """The solution by the CPU loops, of A or by way of the adjoint solve of Aᵀ, and that by plain tensors."""
     a = operators.Stencil(c, offsets, boundary)
-    spec = (a.tensors, a.kind, a.shape, a.parameters, transposed, solver.method, solver.max_iter, solver.rtol)
-    rest = (solver.restart, *NO_PRECONDITIONER, "none", None, None, "return", 0)
-    loops = torch.ops.prdp.linear_solve(b, *spec, *rest)
-    u, info = _C.solve_with_tensors(b, *spec, solver.restart)
+    spec = (a.tensors, a.kind, a.shape, a.parameters, transposed)
+    limits = (solver.method, solver.max_iter, solver.rtol, solver.restart)
+    loops = torch.ops.prdp.linear_solve(b, *spec, None, *packed_options(*limits, None, "none", on_failure="return"))
+    u, info = _C.solve_with_tensors(b, *spec, *limits)
     return loops, (u, *info)
 
 

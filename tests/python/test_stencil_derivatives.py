@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field
+from helpers import field
 from stencils import CASES, FAR_2D, FEW, NEAREST, dense, few, random_coefficients
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
 
 import prdp_torch as prdp
 from prdp_torch import operators
+from prdp_torch.solvers import packed_options
 
 
 def solution(c, b, offsets, boundary, solver, backward):
@@ -111,8 +112,8 @@ def test_opcheck(shape, offsets, boundary):
     a = operators.Stencil(c, offsets, boundary)
     for backward in ("implicit", "unrolled"):
         for solver in ("jacobi", "direct"):
-            options = (solver, 3, 1e-5, 3, *NO_PRECONDITIONER, backward, None, None, "raise", 0)
-            call = (b, a.tensors, a.kind, a.shape, a.parameters, False, *options)
+            options = packed_options(solver, 3, 1e-5, 3, None, backward)
+            call = (b, a.tensors, a.kind, a.shape, a.parameters, False, None, *options)
             assert set(opcheck(torch.ops.prdp.linear_solve.default, call).values()) == {"SUCCESS"}
     call = (b, a.tensors, a.kind, a.shape, a.parameters, True)
     assert set(opcheck(torch.ops.prdp.apply.default, call).values()) == {"SUCCESS"}

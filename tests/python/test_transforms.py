@@ -2,13 +2,14 @@
 
 import pytest
 import torch
-from helpers import NO_PRECONDITIONER, field, random, spd_matrices
+from helpers import field, random, spd_matrices
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 from torch.utils._pytree import tree_leaves
 from transforms import SECOND, SECOND_NAMES, close
 
 import prdp_torch as prdp
 from prdp_torch import operators
+from prdp_torch.solvers import packed_options
 
 # torch's own forward mode warns when it is first used.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script")
@@ -26,19 +27,8 @@ def csr_solve(solver, backward="implicit"):
 
     def solve(a, b):
         tensors = [crow, col, a[row, column]]
-        options = (
-            solver.method,
-            solver.max_iter,
-            solver.rtol,
-            solver.restart,
-            *NO_PRECONDITIONER,
-            backward,
-            None,
-            None,
-            "raise",
-            0,
-        )
-        return torch.ops.prdp.linear_solve(b[None], tensors, "csr", [], [], False, *options)[0][0]
+        options = packed_options(solver.method, solver.max_iter, solver.rtol, solver.restart, None, backward)
+        return torch.ops.prdp.linear_solve(b[None], tensors, "csr", [], [], False, None, *options)[0][0]
 
     return solve
 

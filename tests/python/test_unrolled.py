@@ -9,7 +9,7 @@ from torch.library import opcheck
 
 import prdp_torch as prdp
 from prdp_torch import operators
-from prdp_torch.solvers import flat_preconditioner
+from prdp_torch.solvers import packed_options
 
 pytestmark = pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
 
@@ -238,20 +238,9 @@ def test_the_op_behind_it_passes_opcheck():
     # One to be taken back, one that is solved: its derivative is a solve.
     said = torch.tensor([4, 3]), torch.tensor([-1, 1]), torch.tensor([0.1, 0.0], dtype=torch.float64)
     for make in METHODS.values():
-        options = (
-            make(4).method,
-            4,
-            1e-5,
-            3,
-            *flat_preconditioner(make(4).preconditioner),
-            "unrolled",
-            None,
-            None,
-            "raise",
-            0,
-            2,
-        )
-        args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, *options)
+        solver = make(4).method, 4, 1e-5, 3, make(4).preconditioner
+        options = packed_options(*solver, "unrolled", checkpoint_every=2)
+        args = (b, b, *said, [1, 1], [nu], "heat", [5], [1.0], False, None, *options)
         assert set(opcheck(torch.ops.prdp.unrolled_vjp.default, args).values()) == {"SUCCESS"}
 
 

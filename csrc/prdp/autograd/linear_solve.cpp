@@ -5,7 +5,7 @@
 #include <torch/library.h>
 
 #include "prdp/autograd/adjoint_log.h"
-#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
 #include "prdp/operators/kinds.h"
@@ -20,9 +20,7 @@ namespace {
 
 constexpr const char* kSchema =
     "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
-    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
-    ") -> "
-    "(Tensor u, " PRDP_REPORT_SCHEMA ")";
+    "transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA ") -> (Tensor u, " PRDP_REPORT_SCHEMA ")";
 
 /// The arguments of the op but b.
 struct Call {
@@ -31,22 +29,21 @@ struct Call {
   at::Tensor x0;
 };
 
-using Signature = WithOptionsAndX0<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                                at::ArrayRef<double>, bool)>;
+using Signature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
+                                           at::ArrayRef<double>, bool, const OptionalTensor&)>;
 
 SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::linear_solve", "").typed<Signature>();
-  return call_with_x0(op, o, x0, b, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-                      at::ArrayRef<double>(a.parameters), a.transposed);
+  return call_with_options(op, o, b, a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(x0));
 }
 
 /// The op's arguments as structures; raises for names that do not exist.
 template <class... Options>
-Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-            bool transposed, Options... options) {
-  auto [solve, x0] = unflatten_with_x0(std::move(options)...);
-  return {
-      {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed}, std::move(solve), std::move(x0)};
+Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                 bool transposed, const OptionalTensor& x0, const Options&... options) {
+  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
+          unpack(options...),
+          x0.value_or(at::Tensor())};
 }
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
@@ -78,15 +75,15 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 }
 
 template <class... Args>
-SolveOutputs solve_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options, x0] = unpack(std::move(args)...);
+SolveOutputs solve_kernel(const at::Tensor& b, const Args&... args) {
+  const auto [a, options, x0] = unpack_call(args...);
   return outputs_of(linear_solve_kernel(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
-SolveOutputs fake_kernel(const at::Tensor& b, Args... args) {
-  const auto [a, options, x0] = unpack(std::move(args)...);
+SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
+  const auto [a, options, x0] = unpack_call(args...);
   checked_operator(a, b, options, x0);
   return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), fake_info(b, {b.sym_size(0)})});
 }
@@ -140,10 +137,10 @@ template <class>
 struct Kernels;
 template <class... Args>
 struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
-  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel<Args...>(b, args...); }
-  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel<Args...>(b, args...); }
+  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel(b, args...); }
+  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
-    const auto [a, options, x0] = unpack(args...);
+    const auto [a, options, x0] = unpack_call(args...);
     return solve_and_record(b, a, options, x0);
   }
 };

@@ -4,8 +4,8 @@
 #include <torch/csrc/autograd/functions/utils.h>
 #include <torch/library.h>
 
-#include "prdp/autograd/flat_options.h"
 #include "prdp/autograd/node_pointer.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/operators/plain_tensors.h"
 
@@ -15,24 +15,24 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] needed, "
-    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA
+    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA
     ") -> Tensor";
-using Signature = WithOptionsAndX0<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                                              const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
-                                              at::IntArrayRef, at::ArrayRef<double>, bool)>;
+using Signature = WithOptions<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                         const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
+                                         at::IntArrayRef, at::ArrayRef<double>, bool, const OptionalTensor&)>;
 
 /// The product with the cotangent is linear in it; the transpose of that is the product with the tangents.
 template <class... Options>
 at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Tensor& iterations,
                       const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed,
                       at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                      at::ArrayRef<double> parameters, bool transposed, Options... flat) {
+                      at::ArrayRef<double> parameters, bool transposed, const OptionalTensor& x0, Options... packed) {
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
-  auto [options, x0] = unflatten_with_x0(std::move(flat)...);
+  auto options = unpack(packed...);
   options.adjoint_log = 0;
   return with_autograd([&] {
     const auto leaf = [](const at::Tensor& t, bool wanted) { return t.detach().requires_grad_(wanted); };
-    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual, x0.defined() ? x0.detach() : x0};
+    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual, x0 ? x0->detach() : at::Tensor()};
     for (size_t i = 0; i < tensors.size(); ++i) a.tensors.push_back(leaf(tensors[i], needed[i + 1]));
     const auto cotangent = at::ones_like(b).requires_grad_();  // any: the map is linear
     const auto found = unrolled_vjp_recorded(cotangent, solved, a, options, needed);
@@ -54,7 +54,7 @@ at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Te
 template <class... Options>
 at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                        at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool,
-                       Options...) {
+                       const OptionalTensor&, Options...) {
   return at::empty_symint(b.sym_sizes(), b.options());
 }
 
@@ -90,9 +90,8 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
 at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
                         const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
-  return call_with_x0(op, options, solved.x0, tangents, solved.b, solved.iterations, solved.status, solved.residual,
-                      needed, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-                      at::ArrayRef<double>(a.parameters), a.transposed);
+  return call_with_options(op, options, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
+                           a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(solved.x0));
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

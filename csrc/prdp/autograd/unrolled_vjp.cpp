@@ -6,7 +6,7 @@
 
 #include <limits>
 
-#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/unrolled_samples.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -18,11 +18,11 @@ namespace {
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
     "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
-    "transposed, " PRDP_OPTIONS_SCHEMA PRDP_X0_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
+    "transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-using Signature = WithOptionsAndX0<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                                           const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
-                                           at::IntArrayRef, at::ArrayRef<double>, bool)>;
+using Signature = WithOptions<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                      const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
+                                      at::IntArrayRef, at::ArrayRef<double>, bool, const OptionalTensor&)>;
 
 /// The iterations, run again and taken back.
 UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -67,16 +67,17 @@ template <class... Options>
 Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::Tensor& iterations,
                    const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, at::TensorList tensors,
                    c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed,
-                   Options... flat) {
+                   const OptionalTensor& x0, Options... packed) {
   const at::NoGradGuard no_grad;
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
   make_operator(a)->check_parameters();
-  const auto [options, x0] = unflatten_with_x0(std::move(flat)...);
+  const auto options = unpack(packed...);
   auto with_b = needed.vec();  // b̄ tells whether the derivative is one of the solution
   if (!traits(options.solver.method).is_polynomial) with_b[0] = 1;
-  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, with_b,
-                                    run_iterations_back, linear_solve_kernel);
+  const auto found =
+      vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0.value_or(at::Tensor())}, a, options,
+                     with_b, run_iterations_back, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);
@@ -89,7 +90,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
 template <class... Options>
 Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                     at::IntArrayRef needed, at::TensorList tensors, c10::string_view, at::IntArrayRef,
-                    at::ArrayRef<double>, bool, Options...) {
+                    at::ArrayRef<double>, bool, const OptionalTensor&, Options...) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -104,9 +105,8 @@ SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const O
                       const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
   const auto [gradients, iterations, residual, status, applications, floor] =
-      call_with_x0(op, options, solved.x0, cotangent, solved.b, solved.iterations, solved.status, solved.residual,
-                   needed, at::TensorList(a.tensors), c10::string_view(a.kind), at::IntArrayRef(a.shape),
-                   at::ArrayRef<double>(a.parameters), a.transposed);
+      call_with_options(op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
+                        a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(solved.x0));
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
   SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications, floor}};
   for (size_t i = 0, next = 0; i < needed.size(); ++i)

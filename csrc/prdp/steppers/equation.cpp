@@ -6,7 +6,7 @@
 #include <algorithm>
 
 #include "prdp/autograd/detach_failed.h"
-#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/stepper.h"
@@ -73,9 +73,9 @@ namespace {
 
 template <class... Options>
 SolveOutputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                         at::ArrayRef<double> parameters, int64_t picard_steps, Options... options) {
+                         at::ArrayRef<double> parameters, int64_t picard_steps, Options... packed) {
   const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
-  return outputs_of(step(equation, u, unflatten(std::move(options)...)));
+  return outputs_of(step(equation, u, unpack(packed...)));
 }
 using StepSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
                                                at::ArrayRef<double>, int64_t)>;
@@ -94,7 +94,7 @@ void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArr
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(
       "step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
-      "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor u_next, " PRDP_REPORT_SCHEMA ")",
+      "picard_steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor u_next, " PRDP_REPORT_SCHEMA ")",
       static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
   m.def(

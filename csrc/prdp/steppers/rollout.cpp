@@ -7,7 +7,7 @@
 
 #include <limits>
 
-#include "prdp/autograd/flat_options.h"
+#include "prdp/autograd/packed_options.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
@@ -31,17 +31,14 @@ using torch::autograd::variable_list;
 // right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
 constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-    "SymInt solves, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA
-    ") -> "
-    "(Tensor solutions, " PRDP_REPORT_SCHEMA ")";
+    "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> (Tensor solutions, " PRDP_REPORT_SCHEMA ")";
 constexpr const char* kVjpSchema =
     "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
     "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
-    "picard_steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> Tensor[]";
+    "picard_steps, " PRDP_OPTIONS_SCHEMA ") -> Tensor[]";
 
 using SolvesSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
                                                  at::ArrayRef<double>, int64_t, c10::SymInt)>;
-using OptionalTensor = std::optional<at::Tensor>;
 using VjpSignature = WithOptions<std::vector<at::Tensor>(
     const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
     at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
@@ -49,8 +46,7 @@ using VjpSignature = WithOptions<std::vector<at::Tensor>(
 SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_solves", "").typed<SolvesSignature>();
-  return call_with_options(op, o, u, at::TensorList(e.tensors), c10::string_view(e.kind), at::IntArrayRef(e.shape),
-                           at::ArrayRef<double>(e.parameters), e.picard_steps, solves);
+  return call_with_options(op, o, u, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps, solves);
 }
 
 /// The arguments of an op but u; the forward pass hands them on to the backward pass.
@@ -67,12 +63,12 @@ Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArray
 }
 
 template <class... Options>
-Call unpack(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-            int64_t picard_steps, c10::SymInt solves, Options... flat) {
+Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
+                 int64_t picard_steps, c10::SymInt solves, const Options&... packed) {
   Call call;
   call.equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   call.solves = std::move(solves);
-  call.options = unflatten(std::move(flat)...);
+  call.options = unpack(packed...);
   return call;
 }
 
@@ -89,7 +85,7 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
 /// Below autograd.
 template <class... Args>
 SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack(std::move(args)...);
+  const auto call = unpack_call(std::move(args)...);
   const auto& equation = call.equation;
   const auto& options = call.options;
   check(equation, u, call.solves, options);
@@ -104,7 +100,7 @@ SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
 
 template <class... Args>
 SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
-  const auto call = unpack(std::move(args)...);
+  const auto call = unpack_call(std::move(args)...);
   check(call.equation, u, call.solves, call.options);
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, call.solves + 1);
@@ -116,13 +112,12 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
                                    const OptionalTensor& iterations, const OptionalTensor& status,
                                    const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors,
                                    c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-                                   int64_t picard_steps, Options... flat) {
+                                   int64_t picard_steps, Options... packed) {
   const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
                         status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
-  const auto found =
-      vjp_of_solves(cotangent, kept, equation, unflatten(std::move(flat)...), needed, linear_solve_kernel);
+  const auto found = vjp_of_solves(cotangent, kept, equation, unpack(packed...), needed, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < found.size(); ++i) {
     if (!needed[i]) continue;
@@ -195,13 +190,11 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
     if (at::GradMode::is_enabled() || has_tangent(cotangent))
       return vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve);
-    const auto optional = [](const at::Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
     static const auto op =
         c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_vjp", "").typed<VjpSignature>();
-    const auto found = call_with_options(
-        op, options, cotangent, optional(kept.solutions), optional(kept.iterations), optional(kept.status),
-        optional(kept.residual), needed, at::TensorList(equation.tensors), c10::string_view(equation.kind),
-        at::IntArrayRef(equation.shape), at::ArrayRef<double>(equation.parameters), equation.picard_steps);
+    const auto found = call_with_options(op, options, cotangent, or_none(kept.solutions), or_none(kept.iterations),
+                                         or_none(kept.status), or_none(kept.residual), needed, equation.tensors,
+                                         equation.kind, equation.shape, equation.parameters, equation.picard_steps);
     variable_list gradients(needed.size());
     for (size_t i = 0, next = 0; i < needed.size(); ++i)
       if (needed[i]) gradients[i] = found[next++];
@@ -211,7 +204,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
 
 template <class... Args>
 SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
-  auto call = c10::make_intrusive<Call>(unpack(std::move(args)...));
+  auto call = c10::make_intrusive<Call>(unpack_call(std::move(args)...));
   const auto tensors = call->equation.tensors;
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
@@ -235,7 +228,7 @@ SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, 
 
 template <class... Args>
 SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack(std::move(args)...);  // its solves are steps here
+  const auto call = unpack_call(std::move(args)...);  // its solves are steps here
   return outputs_of(rollout(call.equation, u, call.solves, call.options));
 }
 
@@ -265,7 +258,7 @@ TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
   m.def(
       "rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-      "SymInt steps, " PRDP_OPTIONS_SCHEMA PRDP_FROM_STATE_SCHEMA ") -> (Tensor states, " PRDP_REPORT_SCHEMA ")",
+      "SymInt steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor states, " PRDP_REPORT_SCHEMA ")",
       static_cast<SolvesSignature*>(rollout_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
