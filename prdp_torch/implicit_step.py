@@ -83,6 +83,7 @@ class ConstantOperator(torch_private.HearsOfMoves):
     def __init__(self, operator: operators.Operator) -> None:
         super().__init__()
         self._operator = copy.copy(operator)
+        operator.explain_freed_graphs()
         for name, tensor in zip(operator.names, operator.tensors, strict=True):
             if name is None or name in self._buffers:
                 continue
