@@ -62,6 +62,19 @@ def graph_is_freed(t: Tensor) -> bool:
     return False
 
 
+def leaves_of(t: Tensor) -> list[Tensor]:
+    """The tensors whose gradients a backward pass from t computes. Nothing public tells."""
+    nodes, seen, leaves = [t.grad_fn], set(), []
+    for node in nodes:  # which grows
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if isinstance(leaf := getattr(node, "variable", None), Tensor):
+            leaves.append(leaf)
+        nodes += [before for before, _ in node.next_functions]
+    return leaves
+
+
 class HearsOfMoves(torch.nn.Module):
     """A module that is told when `to`, `half` and the like have given it new tensors: they all call `_apply`, and
     modules have no public hook for that."""
