@@ -21,12 +21,14 @@ from prdp_torch.solver_trials import (
     measure_with_start,
     now,
     preconditioner_of,
+    seconds_of_parts,
 )
 from prdp_torch.solvers import GMRES, Direct, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 
 WORTH_REFINING = 0.1  # of an update
+WORTH_TELLING = 0.1  # of the seconds of a solve
 WORTH_A_START = 0.1  # of the products of a solve
 NOISE = 0.1  # of the seconds of a solve
 MOST_ERROR = 0.1  # of u at the loosest tolerance: what a network is off by when a controller asks for that one
@@ -50,7 +52,8 @@ class Advice:
             for i, solve in enumerate(row.solves):
                 costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
             error = "" if row.error is None else _power(row.error) if row.error else "0"
-            lines.append((row.name, _power(row.rtol), *costs, error, row.status))
+            status = "time limit" if row.may_go_on else row.status
+            lines.append((row.name, _power(row.rtol), *costs, error, status))
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         align = (str.ljust,) * 2 + (str.rjust,) * 5 + (str.ljust,)
         lines.insert(1, tuple("─" * width for width in widths))
@@ -73,6 +76,10 @@ class Update:
     forwards: int = 1
     adjoints: int = 1
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def whole(self) -> str:
+        return "an update" if self.network or self.forwards > 1 else "a step"
 
     def physics(self, row: Row) -> float:
         adjoint = 0.0 if row.adjoint is None else row.adjoint.seconds
@@ -108,8 +115,7 @@ def advise(
     Args:
         step: a `Stepper`, such as `Heat`, `Flow` or `ImplicitStep`. Its own budget is not used.
         sample: states (batch, channel, *shape) to step from, as many as a batch of the training has.
-        seconds: the limit for each solver. A solver that does not reach a tolerance in time is marked
-            MAX_ITER.
+        seconds: the limit for each solver. The table says where it came before the tolerance.
         dtypes: those to try beside that of the sample, such as (torch.float64,). None tries the other one of float32
             and float64 for the built-in steps, and none for a step of your own: its functions may hold tensors that
             `step.to(dtype)` does not reach. Its batch is never changed.
@@ -215,11 +221,27 @@ def advise_on(
             "The error of u may be far smaller; a smaller residual needs float64."
         )
     if (best is None or at_rounding) and not other_dtypes and not is_built_in(step):
-        notes.append("Only the dtype of the sample was tried, as the step is your own; dtypes=... tries others.")
+        notes.append(
+            "Only the dtype of the sample was tried, as functions of the step may hold tensors of it; dtypes=... tries "
+            "others."
+        )
+    if best is not None and not is_built_in(step):
+        notes += _beside_solves(seconds_of_parts(step, sample), best)
     if best is not None and not isinstance(best.solver, Direct) and not isinstance(step, Flow):
         notes.append(_start_gain(best, measure_with_start(step, sample, best)))
     words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
     return Advice(rows + others, notes, words)
+
+
+def _beside_solves(parts: float, best: Row) -> list[str]:
+    """A sentence on what every row counts, though no solver changes it."""
+    whole = sum(solve.seconds for solve in best.solves)
+    if parts < WORTH_TELLING * whole:
+        return []
+    return [
+        f"To make A(u) and b(u), and their gradients, takes {milliseconds(parts)} of the {milliseconds(whole)} of "
+        f"{best.name}: the step's operator and rhs, which every row counts and no solver changes."
+    ]
 
 
 def _start_gain(zero: Row, state: Row) -> str:
@@ -245,14 +267,14 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     cost = (
         f"physics is {update.share(physics)}"
         if update.network
-        else f"a step takes {milliseconds(physics)} with its adjoint"
+        else f"{update.whole} takes {milliseconds(physics)} with its adjoint"
     )
     if chosen.name == best.name:
         fastest = "the fastest" if best is update.fastest(rows, best.rtol) else "as fast as any"
         why = f"it is {fastest} to {finest}, and {cost}"
     else:
         why = f"it is the fastest to {loosest}. With {best.name}, the fastest to {finest}, {cost}"
-    most = f"{_percent(saving)} of {'an update' if update.network else 'a step'}, as {cheapest} takes"
+    most = f"{_percent(saving)} of {update.whole}, as {cheapest} takes"
     return f"{choice}: {why}. {_limit(saving, f'{most} {milliseconds(least)}', best)}"
 
 

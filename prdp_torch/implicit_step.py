@@ -3,12 +3,13 @@
 import copy
 from collections.abc import Callable
 from operator import is_
-from typing import Unpack
+from typing import Any, Self, Unpack
 
 import torch
 from torch import Tensor
 
 from prdp_torch import operators, torch_private
+from prdp_torch.closures import warn_of_shared
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solvers import Solver
 from prdp_torch.stepper import Stepper
@@ -27,7 +28,9 @@ class ImplicitStep(Stepper):
     Gradients reach u and every tensor that A(u) and b(u) are made of. If `operator` or `rhs` is an `nn.Module`, it
     becomes a submodule, so its Parameters are trained, moved and saved with the stepper. The same holds for the
     tensors of a constant operator, under the names of its arguments, such as `operator_at.kappa`; those of a
-    `Function` are tensors_0, tensors_1 and so on. It does not hold for variables that a plain function captures.
+    `Function` are tensors_0, tensors_1 and so on. It does not hold for variables that a plain function captures:
+    `copy.deepcopy` does not copy them, and warns where it copies a module that they belong to. In a module of your own,
+    give methods, `ImplicitStep(self.operator, self.rhs)`, which copies make their own.
 
     Raises:
         TypeError, ValueError: A(u), b(u) and u do not fit each other. This is checked before any work.
@@ -67,6 +70,12 @@ class ImplicitStep(Stepper):
         self.operator_at = operator
         self.rhs_at = rhs
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        warn_of_shared(type(self).__name__, (self.operator_at, self.rhs_at), memo)
+        other = memo[id(self)] = type(self).__new__(type(self))
+        vars(other).update(copy.deepcopy(vars(self), memo))
+        return other
+
     def operator(self, u: Tensor) -> operators.Operator | Tensor:
         """A(u) as an operator."""
         return self.operator_at(u)
@@ -83,6 +92,7 @@ class ConstantOperator(torch_private.HearsOfMoves):
     def __init__(self, operator: operators.Operator) -> None:
         super().__init__()
         self._operator = copy.copy(operator)
+        operator.explain_freed_graphs()
         for name, tensor in zip(operator.names, operator.tensors, strict=True):
             if name is None or name in self._buffers:
                 continue

@@ -214,6 +214,9 @@ def linear_solve(
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
     settings = backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every
     if log is not None:
+        if vars(A).setdefault("_solves", 0) == 1:
+            A.explain_freed_graphs()  # who makes a new one for each update has no need of it
+        vars(A)["_solves"] += 1
         preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
         options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings)
         found = _C.linear_solve(

@@ -11,7 +11,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, operators
+from prdp_torch import _C, operators, torch_private
 from prdp_torch.flow import Flow
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, SolveInfo, SolveStatus
@@ -82,7 +82,7 @@ class Row:
 
     @property
     def status(self) -> str:
-        """The word solved, or the worse of the two statuses."""
+        """The word solved, or the worse of the two statuses; of what the time limit cut off that is often MAX_ITER."""
         return "solved" if self.solved else min((solve.status for solve in self.solves), key=SolveStatus.__getitem__)
 
     @property
@@ -253,7 +253,6 @@ def _measure_one(trial: Trial, solver: Solver, seconds: float) -> list[Row]:
 def run(trial: Trial, solver: Solver, max_runs: int = 1, deadline: float = float("inf")) -> Row:
     """The row of a step and its adjoint as they are set; no run starts after the deadline but the first."""
     step, u = trial.step, trial.sample.clone().requires_grad_()
-    inputs = [u, *(p for p in step.parameters() if p.requires_grad)]
     forward: list[float] = []
     adjoint: list[float] = []
     while not forward or (len(forward) < max_runs and time.perf_counter() < deadline):
@@ -263,7 +262,8 @@ def run(trial: Trial, solver: Solver, max_runs: int = 1, deadline: float = float
         between = now(u)
         forward.append(between - started)
         if u_next.requires_grad:
-            torch.autograd.grad(u_next, inputs, trial.cotangent, allow_unused=True)
+            # An operator may be made of what it is kept with, such as a field: its graph stays.
+            torch.autograd.grad(u_next, torch_private.leaves_of(u_next), trial.cotangent, retain_graph=True)
             adjoint.append(now(u) - between)
     assert step.info is not None
     backward = _solve(step.adjoint_info, adjoint) if adjoint and step.adjoint_info is not None else None
@@ -341,6 +341,22 @@ def _symmetric(trial: Trial) -> bool:
         a = _operator(trial.step, trial.sample)
         product, transposed = a.apply(v), a.apply_transpose(v)
     return float((product - transposed).abs().max()) <= _rounding(product)
+
+
+def seconds_of_parts(step: Stepper, sample: Tensor) -> float:
+    """What a step takes beside its solves, forward and backward: to make A(u) and b(u), such as by a network."""
+    times = []
+    for _ in range(1 + RUNS):
+        u = sample.clone().requires_grad_()
+        started = now(u)
+        with torch.enable_grad():
+            made = [step.rhs(u), *_operator(step, u).tensors]
+        made = [t for t in made if t.grad_fn is not None]
+        if made:
+            leaves = {leaf for t in made for leaf in torch_private.leaves_of(t)}
+            torch.autograd.grad(made, list(leaves), [torch.ones_like(t) for t in made], retain_graph=True)
+        times.append(now(u) - started)
+    return median(times[1:])
 
 
 def random_cotangent(step: Stepper, sample: Tensor) -> Tensor:

@@ -44,6 +44,37 @@ def number_as_graph_input(module: torch.nn.Module, name: str) -> int:
     return number
 
 
+def graph_is_freed(t: Tensor) -> bool:
+    """Whether a backward pass has freed the graph that t is a result of, so that the nearest node that keeps tensors
+    has lost them. Nothing public tells. Nodes show them as `_saved_...`, and raise where they are gone."""
+    nodes = [t.grad_fn]
+    for node in nodes:  # which grows
+        if node is None:
+            continue
+        for name in (name for name in dir(node) if name.startswith("_saved_") or name == "saved_tensors"):
+            try:
+                saved = getattr(node, name)
+            except RuntimeError:
+                return True
+            if isinstance(saved[0] if isinstance(saved, tuple) and saved else saved, Tensor):
+                return False
+        nodes += [before for before, _ in node.next_functions if before not in nodes]
+    return False
+
+
+def leaves_of(t: Tensor) -> list[Tensor]:
+    """The tensors whose gradients a backward pass from t computes. Nothing public tells."""
+    nodes, seen, leaves = [t.grad_fn], set(), []
+    for node in nodes:  # which grows
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if isinstance(leaf := getattr(node, "variable", None), Tensor):
+            leaves.append(leaf)
+        nodes += [before for before, _ in node.next_functions]
+    return leaves
+
+
 class HearsOfMoves(torch.nn.Module):
     """A module that is told when `to`, `half` and the like have given it new tensors: they all call `_apply`, and
     modules have no public hook for that."""

@@ -86,6 +86,19 @@ def make_darcy_step(scene: _C.Scene, **options: Any) -> ImplicitStep:
     return ImplicitStep(operator, sources, **options)
 
 
+def take_reference(scene: _C.Scene, stepper: ImplicitStep) -> Tensor:
+    """Give the step of the scene the field that is to be found, whose solves are those at the end of a training. Return
+    the states that it steps from: of a Darcy flow, the pressures of the field that the training starts from."""
+    problem = _C.make_field_problem(scene, 0)
+    equation = cast(Diffusion | Darcy, stepper.operator_at)
+    sample = problem.start
+    if isinstance(equation, Darcy):
+        equation.take(problem.theta.exp())
+        sample = equation.follow(scene, stepper, problem.start).squeeze(1)
+    equation.take(problem.reference.clone().requires_grad_())
+    return sample.detach()
+
+
 def misfit(scene: _C.Scene, stepper: ImplicitStep, problem: _C.FieldProblem, theta: Tensor) -> Tensor:
     """The mean over the states of (‖u - u_observed‖ / ‖u_observed‖)² over all snapshots."""
     equation = cast(Diffusion | Darcy, stepper.operator_at)

@@ -3,24 +3,30 @@
 import torch
 
 from prdp_torch.advice import Advice, Update, advise_on, checked_limit, milliseconds, network_seconds
-from prdp_torch.experiments import _C, datasets
+from prdp_torch.experiments import _C, datasets, field_task
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_solver, make_stepper
+from prdp_torch.implicit_step import ImplicitStep
 from prdp_torch.solver_trials import RUNS, run, trial_of
 
 
 def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
     """Advise on a scene from `prdp_torch.experiments.scenes.load`, as `advise` does on a step.
 
-    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network."""
-    if scene.task == "field":
-        raise ValueError(
-            f"advise: the equation of '{scene.name}' changes in every update, as its field does; make the step with a "
-            "field of yours and call prdp_torch.advise on it"
-        )
+    It uses a batch of the scene's initial states, and times a forward and backward pass of its untrained network. The
+    step of a scene that finds a field has the field that is to be found."""
     _C.find_device(str(scene.device))
     seconds, step, update = checked_limit(seconds), make_stepper(scene), Update()
-    if scene.task == "parameters":
+    if scene.task == "field":
+        assert isinstance(step, ImplicitStep)
+        steps = 1 if scene.physics.equation == "darcy" else scene.field.steps
+        sample, update = field_task.take_reference(scene, step), Update(0.0, steps, steps)
+        update.notes.append("The field is the one that is to be found.")
+        if steps > 1:
+            update.notes.append(
+                f"An update makes {steps} steps with one A, whose factors or grids count {steps} times."
+            )
+    elif scene.task == "parameters":
         problem = _C.make_parameter_problem(scene)
         sample = (problem.start @ problem.modes)[None, None]
     else:
@@ -45,4 +51,5 @@ def advise_scene(scene: _C.Scene, seconds: float = 5.0) -> Advice:
             f"The network is the larger part, {milliseconds(update.network)}; in bfloat16 autocast it takes "
             f"{milliseconds(low)}, {low / update.network:.2g} times that."
         )
-    return advise_on(step, sample, seconds, update, [other])
+    # The tensors of a field's step are made by the task.
+    return advise_on(step, sample, seconds, update, [] if scene.task == "field" else [other])

@@ -3,6 +3,7 @@
 import functools
 import inspect
 import math
+import weakref
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Self
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, _check
+from prdp_torch import _C, _check, torch_private
 from prdp_torch.types import NullSpace, Number
 
 # What the compiled library reads.
@@ -68,6 +69,13 @@ class Operator:
         other.tensors = list(tensors)
         return other
 
+    def explain_freed_graphs(self) -> None:
+        """From now on, say in a second backward pass that reaches results of operations among the tensors why there is
+        none: torch's own error names neither them nor what to do."""
+        for name, t in zip(self.names, self.tensors, strict=True):
+            if t.requires_grad and not t.is_leaf and not torch_private.transforms_are_active():
+                t.register_hook(functools.partial(_refuse_freed, f"{type(self).__name__}: {name}", weakref.ref(t)))
+
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v has the shape of a right-hand side."""
         product: Tensor = torch.ops.prdp.apply(v, self.tensors, self.kind, self.shape, self.parameters, False)
@@ -106,6 +114,16 @@ class Operator:
                 f"{type(self).__name__}: dense() of {n} unknowns would take {needed / 1e9:.3g} GB, and this machine "
                 f"has {there / 1e9:.3g} GB; apply() needs no matrix"
             )
+
+
+def _refuse_freed(what: str, made: weakref.ref[Tensor], _: Tensor) -> None:
+    """A hook of a tensor."""
+    t = made()
+    if t is not None and torch_private.graph_is_freed(t):
+        raise RuntimeError(
+            f"{what} is a result of operations, whose graph an earlier backward pass has freed. Make the operator anew "
+            "for each update; ImplicitStep takes a function of u that does so. Or call backward(retain_graph=True)"
+        )
 
 
 def real_tensor(who: str, name: str, value: Number) -> Tensor:

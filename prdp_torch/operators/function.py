@@ -1,5 +1,6 @@
 """Products given by Python functions."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, batching
+from prdp_torch.closures import warn_of_shared
 from prdp_torch.operators.base import Operator, null_spaces_of
 from prdp_torch.types import NullSpace
 
@@ -68,6 +70,12 @@ class Function(Operator):
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
         super().__init__([self._products.number], [], given, null_spaces)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Function":
+        warn_of_shared("Function", self._made_of[:3], memo)
+        made, arguments = self.__reduce__()
+        function: Function = made(*copy.deepcopy(arguments, memo))
+        return function
 
     def __reduce__(self) -> tuple[Any, ...]:
         matvec, transpose, diagonal, symmetric = self._made_of

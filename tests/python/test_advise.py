@@ -7,11 +7,12 @@ import sys
 
 import pytest
 import torch
-from helpers import field
+from helpers import field, small_darcy, small_field
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators, solver_trials
 from prdp_torch import advice as module
+from prdp_torch.advice import network_seconds
 from prdp_torch.experiments import scene_advice, scenes
 from prdp_torch.solver_trials import Row, Solve, measure_with_start, random_cotangent
 
@@ -147,7 +148,7 @@ def test_a_solver_that_takes_too_long_is_marked_and_bounded():
     """On 3000 points Jacobi needs tens of millions of iterations."""
     advice = advise(prdp.Poisson((3000,), prdp.CG(1)), field((3000,), batch=1), seconds=0.2)
     (jacobi,) = rows(advice, "Jacobi", torch.float64).values()
-    assert jacobi.rtol == 1e-2 and jacobi.status == "MAX_ITER" and "MAX_ITER" in str(advice)
+    assert jacobi.rtol == 1e-2 and jacobi.status == "MAX_ITER" and re.search(r"Jacobi .* time limit\n", str(advice))
     assert sum(solve.seconds for solve in jacobi.solves) < 2.0  # on a busy machine the forward solve takes it all
     assert rows(advice, "Direct", torch.float64)[1e-5].solved and "Direct" in advice.recommendation
 
@@ -280,6 +281,44 @@ def test_a_scene_says_what_share_its_physics_has():
     share, physics, whole = map(float, re.search(r"(\d+)% of an update: (\S+) ms of (\S+) ms", own).groups())
     assert math.isclose(share, 100 * physics / whole, abs_tol=1.0) and "jacobi, K = 25, implicit" in own
     assert "physics is" in advice.recommendation and "Refinement" in advice.recommendation
+
+
+@pytest.mark.parametrize("small, steps", [(small_field, 6), (small_darcy, 1)])
+def test_a_scene_that_finds_a_field_is_advised_on(tmp_path, small, steps):
+    advice = scene_advice.advise_scene(scenes.load(small(tmp_path)), seconds=0.2)
+    assert "The field is the one that is to be found." in advice.notes
+    assert any(f"makes {steps} steps with one A" in note for note in advice.notes) == (steps > 1)
+    solved = [row for row in advice.rows if row.solved]
+    assert {"CG", "Direct"} <= {row.name for row in solved}
+    assert all(row.adjoint is not None and row.adjoint.products > 0 for row in solved)  # for the field alone, in Darcy
+    assert re.match("(Use|Refine) .* (an update|a step) takes", advice.recommendation)
+
+
+@pytest.mark.parametrize("channels", [1, 64])
+def test_a_network_within_the_step_is_named(channels):
+    torch.manual_seed(0)
+    wide = torch.nn.Sequential(
+        torch.nn.Conv1d(1, channels, 15, padding=7), torch.nn.ReLU(), torch.nn.Conv1d(channels, 1, 15, padding=7)
+    ).double()
+    heat = prdp.operators.Heat((200,), 1e-3, 1e-3)
+    network = wide if channels > 1 else None
+    step = prdp.ImplicitStep(heat, network and (lambda u: u + 1e-3 * network(u)), prdp.CG(1))
+    advice = advise(step, field((200,), batch=8), seconds=0.1)
+    told = [note for note in advice.notes if note.startswith("To make A(u) and b(u), and their gradients, takes")]
+    assert len(told) == (channels > 1)
+    if told:  # what the network takes by itself, of which the solves are a small part
+        parts, whole = map(float, re.search(r"takes (\S+) ms of the (\S+) ms", told[0]).groups())
+        alone = 1e3 * network_seconds(wide, field((200,), batch=8), 1.0)
+        assert 0.2 * alone < parts and 0.5 * parts < whole
+
+
+def test_what_the_functions_of_a_step_close_over_gets_its_gradient():
+    """Nothing in the step's `parameters()` asks for an adjoint solve."""
+    kappa, b = torch.nn.Parameter(torch.ones(1, 16)), torch.ones(1, 1, 16)
+    step = prdp.ImplicitStep(lambda u: prdp.operators.Diffusion(kappa.exp()), lambda u: b, prdp.CG(1))
+    found = [row for row in advise(step, torch.zeros(1, 1, 16), seconds=0.1).rows if row.solved]
+    assert found and all(row.adjoint is not None and row.adjoint.products > 0 for row in found)
+    assert kappa.grad is None
 
 
 def test_the_command_ends_with_a_recommendation(tmp_path):

@@ -275,3 +275,31 @@ def test_nu_set_later_is_kept_as_what_it_is():
     with pytest.raises(TypeError, match="Heat: nu must be a real number, got 'large'"):
         heat.nu = "large"
     assert heat.nu is nu
+
+
+RESULTS = {
+    "exp": lambda t: operators.Diffusion(t.exp(), shift=1.0),
+    "through what keeps nothing": lambda t: operators.Diffusion(t.exp().reshape(1, 6) + 1, shift=1.0),
+    "Function": lambda t: operators.Function(lambda v, k: k * v, tensors=t.exp()[:, None]),
+}
+
+
+@pytest.mark.parametrize("of_step", [True, False])
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_second_backward_pass_through_results_of_operations_says_what_to_do(name, of_step):
+    theta, u = torch.nn.Parameter(torch.zeros(1, 6)), torch.ones(2, 1, 6)
+
+    def solves():
+        a = RESULTS[name](theta)
+        step = prdp.ImplicitStep(a, solver=prdp.CG(9)) if of_step else None
+        return step or (lambda b: prdp.linear_solve(a, b, prdp.CG(9))[0])
+
+    again, kept = solves(), solves()
+    again(u).sum().backward()
+    for _ in range(2):  # and in each that follows
+        with pytest.raises(
+            RuntimeError, match=r"(Diffusion: kappa|Function: tensors_0) is a result of .* anew for each"
+        ):
+            again(u).sum().backward()
+    for _ in range(3):  # which is allowed
+        kept(u).sum().backward(retain_graph=True)
