@@ -1,6 +1,8 @@
 """Controllers: they choose K or the tolerance of the solves after each training interval."""
 
 import math
+import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypedDict, Unpack
 
@@ -71,11 +73,16 @@ class ToleranceRecord(NamedTuple):
     """As of a `Record`."""
 
 
+PATIENCE = 5
+"""A `warning` that lasts so many intervals without a refinement is said aloud."""
+
+
 class _Attached(_Compiled):
     """What controllers share: they hand K and tolerances on to the steppers, and ask them how the solves went."""
 
     steppers: list[Refinable]
     process_group: "ProcessGroup | None"
+    _warned_for: int
 
     if TYPE_CHECKING:  # each compiled controller has its own
 
@@ -87,6 +94,7 @@ class _Attached(_Compiled):
         if process_group is not None and data_parallel.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
+        self._warned_for = 0
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
@@ -115,7 +123,16 @@ class _Attached(_Compiled):
             converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
         refined = self._step(*self._of_all_processes(metric, bool(converged), error))
         self._push()
+        self._speak(refined)
         return refined
+
+    def _speak(self, refined: bool) -> None:
+        """Say once what `warning` says, if a few intervals have not ended it."""
+        warning = self.warning
+        self._warned_for = 0 if warning is None or refined else self._warned_for + 1
+        if self._warned_for == PATIENCE:
+            self._warned_for = -sys.maxsize
+            warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=4)
 
     def _of_all_processes(
         self, metric: float, converged: bool, error: float | None
@@ -240,7 +257,8 @@ class PRDPController(_C.PRDPController, _Attached):
     K is not raised while every solve of the steppers meets its tolerance. It is raised if the metric grows, as on a
     plateau.
 
-    Every controller has a `warning`. It is None, or a sentence about one of these:
+    Every controller has a `warning`. It is None, or a sentence about one of these. It becomes a `UserWarning`, once, if
+    it lasts five intervals without a refinement:
 
     - The solves stop so far from the solution that their error dominates what is trained.
     - Most of the last solves took no iteration, so that steps pass their start on.
@@ -307,9 +325,6 @@ class ToleranceController(_C.ToleranceController, _Attached):
             with the error, and a descent needs no better gradient late than early.
         maximum: K >= 1. It is only a limit, which the solves should not reach.
         process_group: as for `PRDPController`. The error is averaged over the processes.
-
-    Under `torch.compile` a step compiles again for each new rtol. After `torch._dynamo.config.recompile_limit` (8)
-    of them it runs uncompiled. Raise that limit, or do not compile the step.
 
     Raises:
         ValueError, TypeError: a setting or an error is out of range or of a wrong type.

@@ -5,6 +5,7 @@ All start from zero unless they are given a start, and stop, sample by sample, a
 Arguments out of range raise ValueError.
 """
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
@@ -55,6 +56,12 @@ class Solver:
             check_solver(who, self.method, self.max_iter, self.rtol, self.restart, self.preconditioner)
 
 
+def bits_of(number: float) -> int:
+    """The integer with the bits of a number in float64; of a tolerance, it is not negative."""
+    bits: int = struct.unpack("<q", struct.pack("<d", number))[0]
+    return bits
+
+
 PRECONDITIONERS = ("diagonal", "multigrid")
 
 
@@ -82,8 +89,11 @@ def packed_options(
     checkpoint_every: CheckpointEvery = None,
     start: str = "zero",
     adjoint_log: int = 0,
+    rtol_bits: int = -1,
+    adjoint_rtol_bits: int = -1,
 ) -> PackedOptions:
-    """All options of a solve in the four lists that the ops take: csrc/prdp/autograd/packed_options.h unpacks them."""
+    """All options of a solve in the four lists that the ops take: csrc/prdp/autograd/packed_options.h unpacks them.
+    With `rtol_bits`, the `bits_of` a tolerance take its place."""
     shape: list[int] = []
     parameters: list[float] = []
     tensors: list[Tensor] = []
@@ -103,6 +113,8 @@ def packed_options(
         int(adjoint_max_iter is not None),
         adjoint_max_iter or 0,
         0,  # M as it is, not its transpose
+        rtol_bits,
+        adjoint_rtol_bits,
         *shape,
     ]
     numbers = [rtol, float(adjoint_rtol is not None), adjoint_rtol or 0.0, *parameters]

@@ -21,6 +21,7 @@ from prdp_torch.solvers import (
     PackedOptions,
     Preconditioner,
     Solver,
+    bits_of,
     check_options,
     check_settings,
     check_solver,
@@ -74,8 +75,7 @@ class Stepper(torch_private.HearsOfMoves):
     Attributes:
         max_iter: K, the maximum number of iterations. You or a controller may set it at any time. Under
             `torch.compile` this does not compile again, except for the second value.
-        rtol, adjoint_rtol: the tolerances. They may be set at any time as well, but under `torch.compile`
-            each new value compiles again, up to `torch._dynamo.config.recompile_limit` times.
+        rtol, adjoint_rtol: the tolerances. The same holds for them.
         start: as above. It may be set at any time.
         restart, preconditioner and the options above: they may be set at any time, and are checked then.
         info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised
@@ -127,6 +127,7 @@ class Stepper(torch_private.HearsOfMoves):
         self.backward = backward
         self.adjoint_max_iter = adjoint_max_iter
         self._adjoint_rtol = adjoint_rtol
+        self._keep_bits()
         self.on_failure = on_failure
         self.checkpoint_every = checkpoint_every
         self.start = start
@@ -260,11 +261,22 @@ class Stepper(torch_private.HearsOfMoves):
 
     def _packed_options(self, log: AdjointLog) -> PackedOptions:
         """The options as the ops of torch take them."""
-        compiling = torch.compiler.is_dynamo_compiling()
-        k = torch_private.number_as_graph_input(self, "_max_iter") if compiling else self._max_iter
+        number = log.number
+        if not torch.compiler.is_dynamo_compiling():
+            solver = self.method, self._max_iter, self._rtol, self.restart, self.preconditioner
+            return packed_options(*solver, *self._settings(), adjoint_log=number)
+        k = torch_private.number_as_graph_input(self, "_max_iter")
+        rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
+        of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")
+        others = self.adjoint_max_iter, None, self.on_failure, self.checkpoint_every, self.start
         return packed_options(
-            self.method, k, self._rtol, self.restart, self.preconditioner, *self._settings(), adjoint_log=log.number
+            self.method, k, 0.0, self.restart, self.preconditioner, self.backward, *others, number, rtol, of_adjoint
         )
+
+    def _keep_bits(self) -> None:
+        """The tolerances as compiled graphs take them."""
+        self._rtol_bits = bits_of(self._rtol)
+        self._adjoint_rtol_bits = bits_of(self._rtol if self._adjoint_rtol is None else self._adjoint_rtol)
 
     def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure, CheckpointEvery, Start]:
         others = self.on_failure, self.checkpoint_every, self.start
@@ -291,6 +303,7 @@ class Stepper(torch_private.HearsOfMoves):
         rtol = _check.real(who, "rtol", rtol)
         check_solver(who, "gmres", 1, rtol, 1, None)
         self._rtol = rtol
+        self._keep_bits()
 
     @property
     def adjoint_rtol(self) -> float | None:
@@ -300,6 +313,7 @@ class Stepper(torch_private.HearsOfMoves):
     def adjoint_rtol(self, rtol: float | None) -> None:
         check_options(type(self).__name__, GMRES(1), "implicit", None, rtol, "raise", None)
         self._adjoint_rtol = rtol
+        self._keep_bits()
 
     @property
     def start(self) -> Start:

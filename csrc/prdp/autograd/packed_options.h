@@ -1,4 +1,5 @@
 #pragma once
+#include <bit>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -40,7 +41,9 @@ struct PackedOptions {
                o.checkpoint_every,
                static_cast<int64_t>(o.adjoint_max_iter.has_value()),
                o.adjoint_max_iter.value_or(0),
-               static_cast<int64_t>(o.solver.preconditioner.spec().transposed)},
+               static_cast<int64_t>(o.solver.preconditioner.spec().transposed),
+               o.traced_rtol,
+               o.traced_adjoint_rtol},
         numbers{o.solver.rtol, static_cast<double>(o.adjoint_rtol.has_value()), o.adjoint_rtol.value_or(0.0)},
         preconditioner(o.solver.preconditioner.spec().tensors) {
     const auto& m = o.solver.preconditioner.spec();
@@ -54,10 +57,22 @@ struct PackedOptions {
   const std::vector<at::Tensor>& preconditioner;
 };
 
+namespace detail {
+
+/// A tolerance may come as the integer of its bits instead, of which -1 is none: compiled graphs take an integer as it
+/// is, and would have to be compiled again for each float.
+template <class Number>
+void take_bits(const c10::SymInt& bits, Number& tolerance, c10::SymInt& traced) {
+  if (bits.is_symbolic()) traced = bits;
+  else if (bits.expect_int() >= 0) tolerance = std::bit_cast<double>(bits.expect_int());
+}
+
+}  // namespace detail
+
 /// Raises ValueError for names that do not exist, and for lists that are too short.
 inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArrayRef counts,
                            at::ArrayRef<double> numbers, at::TensorList preconditioner) {
-  constexpr size_t kNames = 5, kCounts = 7, kNumbers = 3;
+  constexpr size_t kNames = 5, kCounts = 9, kNumbers = 3;
   TORCH_CHECK_VALUE(names.size() == kNames && counts.size() >= kCounts && numbers.size() >= kNumbers,
                     "the options of a solve are ", kNames, " names, ", kCounts, " counts and ", kNumbers,
                     " numbers, got ", names.size(), ", ", counts.size(), " and ", numbers.size());
@@ -68,6 +83,8 @@ inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArray
                  backward_from_name(names.get(1))};
   if (counts[4].expect_int() != 0) o.adjoint_max_iter = counts[5];
   if (numbers[1] != 0.0) o.adjoint_rtol = numbers[2];
+  detail::take_bits(counts[7], o.solver.rtol, o.traced_rtol);
+  detail::take_bits(counts[8], o.adjoint_rtol, o.traced_adjoint_rtol);
   o.on_failure = on_failure_from_name(names.get(2));
   o.adjoint_log = counts[2].expect_int();
   o.checkpoint_every = counts[3].expect_int();

@@ -60,6 +60,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   auto o = options;
   o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
   o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
+  if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
   o.solver.preconditioner = o.solver.preconditioner.transposed();
   auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
   if (o.on_failure == OnFailure::kZeroGrad) lambda = without_lost(lambda, info.status, o.on_failure);

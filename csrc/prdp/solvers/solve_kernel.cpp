@@ -59,8 +59,8 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
        << divides_by_diagonal(solver) << ", " << bytes_of_arrays(solver.method, restart, number) << ", " << restart
        << ", ";
   if (has_cycles)
-    text << "Cycles<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
-  else text << "NoCycles";
+    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
+  else text << "NoCycleSetting";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
        << "using Arguments = SolveArguments<S::T>;\n"
        << "extern \"C\" __global__ void __launch_bounds__(S::kThreads) prdp_kernel(const Arguments arguments) {\n"

@@ -199,6 +199,8 @@ struct SolveOptions {
   /// With n > 0, unrolled mode stores every n-th iterate and recomputes the others; 0 stores all.
   int64_t checkpoint_every = 0;
   Start start = Start::kZero;  // only for steps and rollouts; linear_solve() has the argument x0
+  /// Only while a graph is being traced: the tolerances, if they are symbolic, each as the integer of its bits.
+  c10::SymInt traced_rtol{-1}, traced_adjoint_rtol{-1};
 
   /// Raises ValueError, in the name of `who`, for a setting out of range.
   void check(const char* who) const;

@@ -17,7 +17,7 @@ template <class S, class A>
 struct Cycle;
 
 /// Constants of a kernel without cycles, and with them.
-struct NoCycles {
+struct NoCycleSetting {
   static constexpr bool kAny = false;
   static constexpr int kVectors = 0, kInBlock = 0;
   static constexpr int64_t kBeyond = 0;
@@ -25,7 +25,7 @@ struct NoCycles {
   using Of = NoCycle<typename S::T>;
 };
 template <int dimensions, int vectors, int in_block, int64_t beyond>
-struct Cycles {
+struct CycleSetting {
   static constexpr bool kAny = true;
   static constexpr int kDim = dimensions;
   static constexpr int kVectors = vectors;    // of a sample, that the preconditioner keeps
@@ -106,30 +106,30 @@ struct Cycle {
     const T* r;
     Vectors vectors;  // of the grid where it is
     T* t;
-    int64_t used = 0;  // by the grids above, and by this one
+    Vectors finest{};
 
     const CoarseGrid& grid(int level) const { return of.grids().grid[level]; }
+    int64_t entries(int level) const { return int64_t{fields()} * points(grid(level)); }
     const T* right_hand_side(int level) const { return level == 0 ? r : vectors.b; }
+    bool transposed() const { return of.hierarchy.transposed != 0; }
 
-    /// Takes memory for the vectors of a coarse grid, or finds it again.
-    void enter(int level) {
-      const int64_t n = int64_t{fields()} * points(grid(level));
-      T* const first = memory(used, 3 * n);
-      vectors = {first, first + n, first + 2 * n};
-      used += 3 * n;
-    }
-    T* memory(int64_t place, int64_t n) const {
-      return place + n <= S::Cycles::kInBlock ? of.in_block + place : of.beyond + place;
+    /// The vectors of a coarse grid, which lie behind those of the grids above it.
+    Vectors vectors_of(int level) const {
+      int64_t place = 0;
+      for (int above = 1; above < level; ++above) place += 3 * entries(above);
+      const int64_t n = entries(level);
+      T* const first = (place + 3 * n <= S::Cycles::kInBlock ? of.in_block : of.beyond) + place;
+      return {first, first + n, first + 2 * n};
     }
 
     void go_down(int level) {
       const CoarseGrid& here = grid(level);
       smooth(level, /*from_zero=*/true);
-      relax(level, T(0), T(0));
+      take_residual(level);
       const T* from = vectors.y;
       T* const other = vectors.y;
       if (level == 0) finest = vectors;
-      enter(level + 1);
+      vectors = vectors_of(level + 1);
       for (int axis = 0; axis < 3; ++axis) {
         if (!(here.axes >> axis & 1)) continue;
         T* const to = here.axes >> (axis + 1) == 0 ? vectors.b : from == other ? t : other;
@@ -140,14 +140,9 @@ struct Cycle {
     }
     /// From the solution of the coarser grid to that of this one, which it returns.
     const T* go_up(int level, const T* coarse) {
-      used -= int64_t{3} * fields() * points(grid(level + 1));
-      if (level == 0) {
-        vectors = finest;
-      } else {
-        used -= int64_t{3} * fields() * points(grid(level));
-        enter(level);
-        if (of.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
-      }
+      vectors = level == 0 ? finest : vectors_of(level);
+      // Each smoothing step but the first had swapped them on the way down.
+      if (level > 0 && of.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
       const CoarseGrid& here = grid(level);
       for (int axis = 2; axis >= 0; --axis) {
         if (!(here.axes >> axis & 1)) continue;
@@ -164,7 +159,7 @@ struct Cycle {
       const T* const b = right_hand_side(level);
       const T* const inverse = of.numbers(of.grids().inverse);
       const int n = points(grid(level));
-      const bool by_columns = of.hierarchy.transposed != 0;
+      const bool by_columns = transposed();
       T* const x = vectors.x;
       team.meet();
       const auto given = shared(b);
@@ -203,14 +198,16 @@ struct Cycle {
       using Stencil = GridStencil<T, A, S::Cycles::kDim>;
       return of.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * points(grid(level));
     }
-    /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x.
+    /// y = b - A x
+    void take_residual(int level) { relax(level, T(0), T(0)); }
+    /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x: products are most of what there is to compile, so
+    /// there is one text of both.
     void relax(int level, T p, T q) {
       if (level == 0) return relax(Finest{a, diagonals(0)}, r, A::kUnknowns, p, q);
       const CoarseGrid& here = grid(level);
       const int n = points(here);
-      const Coarse coarse{{of.numbers(here.coefficients), {here.shape[0], here.shape[1], here.shape[2]}},
-                          n,
-                          of.hierarchy.transposed != 0};
+      const Coarse coarse{
+          {of.numbers(here.coefficients), {here.shape[0], here.shape[1], here.shape[2]}}, n, transposed()};
       relax(coarse, vectors.b, fields() * n, p, q);
     }
     template <class Level>
@@ -236,14 +233,15 @@ struct Cycle {
         if (of.axes >> d & 1) shape[d] = static_cast<int>(kernels::coarse_points(shape[d], A::periodic(d)));
       return {shape, axis, A::periodic(axis)};
     }
-    /// Those of interpolation, or of restriction.
-    const T* weights(const CoarseGrid& here, int axis, const CoarsenedAxis& line, bool of_restriction) const {
-      const bool second = of_restriction && !of.grids().is_symmetric;
+    enum class Weights { kInterpolation, kRestriction };
+    /// Of a symmetric operator they are the same.
+    const T* weights(const CoarseGrid& here, int axis, const CoarsenedAxis& line, Weights which) const {
+      const bool second = which == Weights::kRestriction && !of.grids().is_symmetric;
       return of.numbers(here.weights[axis]) + (second ? 2 * line.weights() : 0);
     }
     PRDP_ONCE void restrict(const CoarseGrid& here, int axis, const T* fine, T* coarse) {
       const CoarsenedAxis line = line_of(here, axis);
-      const T* const left = weights(here, axis, line, of.hierarchy.transposed == 0);
+      const T* const left = weights(here, axis, line, transposed() ? Weights::kInterpolation : Weights::kRestriction);
       const T* const right = left + line.weights();
       const auto given = shared(fine);
       team.for_each(fields() * line.coarse_entries(),
@@ -251,7 +249,7 @@ struct Cycle {
     }
     PRDP_ONCE void interpolate(const CoarseGrid& here, int axis, const T* coarse, T* fine, bool adds) {
       const CoarsenedAxis line = line_of(here, axis);
-      const T* const left = weights(here, axis, line, of.hierarchy.transposed != 0);
+      const T* const left = weights(here, axis, line, transposed() ? Weights::kRestriction : Weights::kInterpolation);
       const T* const right = left + line.weights();
       const auto given = shared(coarse);
       team.for_each(fields() * line.outer * line.n * line.inner, [&](int i) {
@@ -259,8 +257,6 @@ struct Cycle {
         fine[i] = adds ? fine[i] + value : value;
       });
     }
-
-    Vectors finest{};
   };
 };
 
