@@ -230,10 +230,10 @@ def test_solutions_and_gradients_are_those_of_the_cpu(solver, case, backward):
 
 
 @pytest.mark.parametrize("backward", ["implicit", "unrolled"])
-def test_multigrid_makes_its_grids_with_few_looks(backward):
+def test_a_cycle_of_multigrid_is_one_look(backward):
     solver = prdp.CG(20, 1e-10, preconditioner="multigrid")
     copies = compare(lambda b, c: prdp.linear_solve(CASES["stencil"](b, c), b, solver, backward=backward)[0])
-    assert copies <= 23  # 76 when each coefficient was asked for
+    assert copies <= 30  # with those of CG itself
 
 
 def compare(make):

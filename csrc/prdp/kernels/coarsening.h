@@ -4,8 +4,7 @@
 #include <cstdint>
 #include <limits>
 
-/// The rules of multigrid that its loops (multigrid.h), its kernels (gpu/device/hierarchy.h) and its tensors
-/// (solvers/tensor_cycles.h) share.
+/// The rules of multigrid that its loops (multigrid.h) and its kernels on a GPU (gpu/device/hierarchy.h) share.
 namespace prdp::kernels {
 
 /// The number of coarse points of an axis.

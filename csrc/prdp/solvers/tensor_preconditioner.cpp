@@ -8,7 +8,6 @@
 
 #include "prdp/kernels/kernel.h"
 #include "prdp/kernels/preconditioner.h"
-#include "prdp/solvers/tensor_cycles.h"
 
 namespace prdp {
 
@@ -17,7 +16,7 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-/// V-cycles of every sample of a batch.
+/// V-cycles of every sample of a batch, on the CPU.
 class Cycles : public torch::CustomClassHolder {
  public:
   virtual at::Tensor apply(const at::Tensor& v, bool transposed) = 0;
@@ -111,19 +110,9 @@ TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preco
     return [inverse](const at::Tensor& v) { return in_its_name([&] { return inverse->apply(v); }); };
   }
   if (!preconditioner.is_multigrid()) return {};
-  const auto like = b.detach();
-  if (like.is_cpu())
-    return [cycles = make_cycles(a, preconditioner.smoothing(), like)](const at::Tensor& v) {
-      return ApplyCycles::apply(v, cycles, /*transposed=*/false);
-    };
-  TORCH_CHECK_NOT_IMPLEMENTED(a.has_coarse_grids(),
-                              "linear_solve: this operator has a multigrid preconditioner on the CPU ",
-                              "and in the kernels of a GPU, got vectors on ", b.device(),
-                              " without a kernel; take "
-                              "GMRES without it");
-  const bool transposed = preconditioner.spec().transposed;
-  const auto cycles = TensorCycles::find_or_make(a, transposed, preconditioner.smoothing(), like);
-  return [cycles, transposed](const at::Tensor& v) { return cycles->apply(v, transposed); };
+  return [cycles = make_cycles(a, preconditioner.smoothing(), b.detach())](const at::Tensor& v) {
+    return ApplyCycles::apply(v.to(at::kCPU), cycles, /*transposed=*/false).to(v.device());
+  };
 }
 
 }  // namespace prdp
