@@ -4,12 +4,13 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, Unpack
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, data_parallel
+from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
 from prdp_torch.solve import SolveInfo
 from prdp_torch.types import Number, Refinable, Steppers
 
@@ -19,58 +20,6 @@ if TYPE_CHECKING:
     _Compiled = _C.Controller
 else:
     _Compiled = object  # the controllers have the compiled one as their first base
-
-
-class Record(NamedTuple):
-    """One call of `step` of a `PRDPController`."""
-
-    metric: float
-    smoothed: float
-    """Exponentially weighted mean L̃ of the metrics so far."""
-    max_iter: int
-    """K before the decision."""
-    refined: bool
-    error: float | None = None
-    """The relative error that `step` was given."""
-    residual: float | None = None
-    """‖b - A u‖ / ‖b‖ where the attached solves ended, the mean over the samples."""
-
-
-class PRDPSettings(TypedDict, total=False):
-    """The settings of a `PRDPController`."""
-
-    tau_step: float
-    tau_stop: float
-    delta: int
-    window: int
-    initial: int
-    increment: int
-    maximum: int | None
-    growth: float
-    adjoint_ratio: float | None
-
-
-class ToleranceSettings(TypedDict, total=False):
-    """The settings of a `ToleranceController`."""
-
-    ratio: float
-    adjoint_ratio: float
-    floor: float
-    adjoint_floor: float
-    maximum: int
-
-
-class ToleranceRecord(NamedTuple):
-    """One call of `step` of a `ToleranceController`."""
-
-    error: float
-    smallest: float
-    """The smallest error so far."""
-    rtol: float
-    """Before the decision."""
-    tightened: bool
-    residual: float | None = None
-    """As of a `Record`."""
 
 
 PATIENCE = 5

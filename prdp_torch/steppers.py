@@ -188,6 +188,19 @@ class TimeStepper(EquationStepper):
 class LinearisedStepper(TimeStepper):
     """The base of those that are linearised about the state."""
 
+    def __init__(
+        self,
+        shape: Shape,
+        nu: Number,
+        dt: float,
+        solver: Solver,
+        backward: Backward = "implicit",
+        picard_steps: int = 1,
+        length: Length = 1.0,
+        **options: Unpack[StepOptions],
+    ) -> None:
+        super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
+
     @property
     def picard_steps(self) -> int:
         return self.equation.picard_steps
@@ -296,19 +309,6 @@ class Burgers(LinearisedStepper):
 
     kind = "burgers"
 
-    def __init__(
-        self,
-        shape: Shape,
-        nu: Number,
-        dt: float,
-        solver: Solver,
-        backward: Backward = "implicit",
-        picard_steps: int = 1,
-        length: Length = 1.0,
-        **options: Unpack[StepOptions],
-    ) -> None:
-        super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
-
     def operator(self, u: Tensor) -> operators.Burgers:
         """A(u) as an operator: the winds are u."""
         return operators.Burgers(u, self.nu, self.equation.parameters[0], self.length)
@@ -335,19 +335,6 @@ class NavierStokes(LinearisedStepper):
     """
 
     kind = "navier_stokes"
-
-    def __init__(
-        self,
-        shape: Shape,
-        nu: Number,
-        dt: float,
-        solver: Solver,
-        backward: Backward = "implicit",
-        picard_steps: int = 1,
-        length: Length = 1.0,
-        **options: Unpack[StepOptions],
-    ) -> None:
-        super().__init__(shape, solver, backward, length, (nu, dt), picard_steps, **options)
 
     def operator(self, u: Tensor) -> operators.NavierStokes:
         """A(u) as an operator: the winds are the velocity of u."""

@@ -107,19 +107,7 @@ void check_signals() {
   if (PyErr_CheckSignals() != 0) throw py::error_already_set();
 }
 
-}  // namespace
-
-void bind_solvers(py::module_& m) {
-  set_warning_sink(warn_in_python);
-  main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
-  interruption::set_check(check_signals);
-  m.attr("DEFAULT_RTOL") = kDefaultRtol;
-  m.attr("DEFAULT_RESTART") = kDefaultRestart;
-  m.attr("CHECKPOINT_SQRT") = kCheckpointSqrt;
-  py::dict statuses;
-  for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
-  m.attr("SOLVE_STATUSES") = statuses;
-
+void bind_operators(py::module_& m) {
   py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts",
                                                                       py::custom_type_setup(collect_products))
       .def(py::init([](py::function apply, std::optional<py::function> apply_transpose,
@@ -149,31 +137,6 @@ void bind_solvers(py::module_& m) {
         END_HANDLE_TH_ERRORS_PYBIND
       },
       py::arg("kind"), py::arg("shape"), py::arg("parameters"), py::arg("tensors"));
-  m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
-  py::class_<KeptLog>(m, "AdjointLog").def(py::init<>()).def_property_readonly("number", [](const KeptLog& kept) {
-    return *kept.log;
-  });
-  m.def(
-      "read_adjoint_log",
-      [](int64_t log) -> std::optional<py::tuple> {
-        const auto info = adjoint_log::read(log);
-        if (!info) return std::nullopt;
-        return as_tuple(*info);
-      },
-      py::arg("log"));
-
-  m.def(
-      "join_adjoint_logs",
-      [](const std::vector<int64_t>& logs) -> std::optional<py::tuple> {
-        const auto info = join_adjoint_logs(logs);
-        if (!info) return std::nullopt;
-        return as_tuple(*info);
-      },
-      py::arg("logs"));
-  py::class_<StepOfRollout>(m, "StepOfRollout")
-      .def(py::init<int64_t, int64_t>(), py::arg("step"), py::arg("steps"))
-      .def("__enter__", &StepOfRollout::enter)
-      .def("__exit__", [](StepOfRollout& self, const py::args&) { self.exit(); });
   m.def(
       "product_rule",
       [](const at::Tensor& lambda, const at::Tensor& v, std::vector<at::Tensor> tensors, std::string kind,
@@ -193,6 +156,50 @@ void bind_solvers(py::module_& m) {
       "Whether `Direct` solves with A, axis by axis, without a factorisation of the whole.",
       py::call_guard<py::gil_scoped_release>(), py::arg("b"), py::arg("tensors"), py::arg("kind"), py::arg("shape"),
       py::arg("parameters"));
+}
+
+void bind_reports(py::module_& m) {
+  py::class_<KeptLog>(m, "AdjointLog").def(py::init<>()).def_property_readonly("number", [](const KeptLog& kept) {
+    return *kept.log;
+  });
+  m.def(
+      "read_adjoint_log",
+      [](int64_t log) -> std::optional<py::tuple> {
+        const auto info = adjoint_log::read(log);
+        if (!info) return std::nullopt;
+        return as_tuple(*info);
+      },
+      py::arg("log"));
+  m.def(
+      "join_adjoint_logs",
+      [](const std::vector<int64_t>& logs) -> std::optional<py::tuple> {
+        const auto info = join_adjoint_logs(logs);
+        if (!info) return std::nullopt;
+        return as_tuple(*info);
+      },
+      py::arg("logs"));
+  py::class_<StepOfRollout>(m, "StepOfRollout")
+      .def(py::init<int64_t, int64_t>(), py::arg("step"), py::arg("steps"))
+      .def("__enter__", &StepOfRollout::enter)
+      .def("__exit__", [](StepOfRollout& self, const py::args&) { self.exit(); });
+}
+
+}  // namespace
+
+void bind_solvers(py::module_& m) {
+  set_warning_sink(warn_in_python);
+  main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
+  interruption::set_check(check_signals);
+  m.attr("DEFAULT_RTOL") = kDefaultRtol;
+  m.attr("DEFAULT_RESTART") = kDefaultRestart;
+  m.attr("CHECKPOINT_SQRT") = kCheckpointSqrt;
+  py::dict statuses;
+  for (const auto& s : solve_statuses()) statuses[s.name] = static_cast<int64_t>(s.status);
+  m.attr("SOLVE_STATUSES") = statuses;
+  bind_operators(m);
+  bind_reports(m);
+
+  m.def("check_start", [](const std::string& start) { start_from_name(start); }, py::arg("start"));
   m.def("way_of_last_solve", &way_of_last_solve,
         "How this thread's last solve was computed: kernel, loops or tensors.");
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");

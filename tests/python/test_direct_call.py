@@ -94,6 +94,26 @@ def test_both_ways_give_the_same_bits(make, backward, start):
     assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(straight, through_the_op, strict=True))
 
 
+@pytest.mark.parametrize("make", [heat, poisson, flow])
+@pytest.mark.parametrize("backward", ["implicit", "unrolled", "none"])
+def test_a_rollout_gives_the_same_bits_through_the_dispatcher(make, backward):
+    def results(mode):
+        step = make(backward=backward)
+        u = state(make).requires_grad_()
+        with mode:
+            after = step.rollout(u, 3)
+            if backward != "none":
+                after.square().sum().backward()
+        gradients = [u.grad, *(p.grad for p in step.parameters()), *step.adjoint_info[:4]] if backward != "none" else []
+        return [after, *step.info[:4], *gradients]
+
+    seen = Seen()
+    straight, through_the_op = results(torch.enable_grad()), results(seen)
+    assert torch.ops.prdp.rollout_solves in seen.ops
+    assert backward == "none" or torch.ops.prdp.rollout_vjp in seen.ops
+    assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(straight, through_the_op, strict=True))
+
+
 @every_stepper
 def test_the_dispatcher_is_left_out(make, monkeypatch):
     def refused(*arguments):

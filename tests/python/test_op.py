@@ -205,3 +205,11 @@ def test_every_option_arrives_where_it_is_packed():
     for name, value in (("backward", "b"), ("on_failure", "f"), ("start", "s")):
         with pytest.raises(ValueError, match=f"{name}: unknown name '{value}'"):
             _C.SolveOptions(*packed_options("gmres", **{**settings, name: value}))
+
+
+def test_a_nu_that_is_negated_by_a_bit_is_read_right():
+    nu = torch.tensor(1 - 1e-2j, dtype=torch.complex128).conj().imag
+    assert nu.is_neg() and nu == 1e-2
+    for make in (operators.Heat, lambda shape, nu, dt: operators.Burgers(field(shape, seed=1), nu, dt)):
+        found, expected = (prdp.linear_solve(make((5,), n, 0.1), field((5,)), prdp.Direct())[0] for n in (nu, 1e-2))
+        assert torch.equal(found, expected)

@@ -229,8 +229,15 @@ def test_solutions_and_gradients_are_those_of_the_cpu(solver, case, backward):
     compare(lambda b, c: prdp.linear_solve(CASES[case](b, c), b, SOLVERS[solver], backward=backward)[0])
 
 
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_cycle_of_multigrid_is_one_look(backward):
+    solver = prdp.CG(20, 1e-10, preconditioner="multigrid")
+    copies = compare(lambda b, c: prdp.linear_solve(CASES["stencil"](b, c), b, solver, backward=backward)[0])
+    assert copies <= 30  # with those of CG itself
+
+
 def compare(make):
-    """u and its gradients on the CPU and on the stand-in."""
+    """u and its gradients on the CPU and on the stand-in; returns how often the forward pass waited."""
     inputs = [noise(3, 1, *SHAPE), five_points(4.3)]
 
     def run(b, c):
@@ -241,12 +248,15 @@ def compare(make):
     device = StandIn()
     with device:
         there = [device.send(t).requires_grad_() for t in inputs]
+        make(*there)
+        copies = device.copies_to_host
         v, found = run(*there)
     torch.testing.assert_close(device.fetch(v), u, rtol=1e-8, atol=1e-10)
     for mine, other in zip(found, gradients, strict=True):
         assert (mine is None) == (other is None)
         if other is not None:
             torch.testing.assert_close(device.fetch(mine), other, rtol=1e-7, atol=1e-9)
+    return copies
 
 
 @pytest.mark.parametrize("name", ["heat", "burgers"])

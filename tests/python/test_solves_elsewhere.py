@@ -114,8 +114,87 @@ def test_a_constant_that_a_cannot_reach_is_found_there():
     assert names[1] != "INCONSISTENT"
 
 
-@pytest.mark.parametrize("solver", [prdp.Multigrid(2), prdp.CG(2, preconditioner="multigrid")])
-def test_multigrid_is_refused_where_it_has_no_kernel(solver):
-    with pytest.raises(NotImplementedError, match="multigrid runs on the CPU and in the kernels of a GPU, got vectors"):
-        make, c = OPERATORS["stencil"]
-        Run(make, c, noise(4, 1, *SHAPE), solver)
+@pytest.mark.parametrize("solver", [prdp.Multigrid, lambda k, rtol: prdp.CG(k, rtol, preconditioner="multigrid")])
+def test_cycles_run_on_the_host_whose_grids_are_kept(solver):
+    """The adjoint solve finds those of the solve. A cycle is one copy to the host, and one back."""
+    _C.clear_factorisations()
+    make, c = OPERATORS["stencil"]
+    b = noise(4, 1, *SHAPE)
+    looks = []
+    for k, scale, new in ((2, 1.0, 1), (5, 1.0, 0), (5, 1.5, 1)):
+        before = _C.count_factorisations()
+        run = Run(make, scale * c, b, solver(k, 0.0), on_failure="return")
+        assert _C.count_factorisations() == before + new
+        looks.append(run.forward)
+        u, info = prdp.linear_solve(make(scale * c), b, solver(k, 0.0), on_failure="return")
+        torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
+        assert torch.equal(run.device.fetch(run.info.status), info.status)
+    assert looks[1] == looks[2] and looks[1] - looks[0] <= 6
+
+
+@pytest.mark.parametrize("name", ["burgers", "navier_stokes"])
+def test_cycles_know_the_winds_of_the_device(name):
+    winds, b = 0.3 * noise(2, 2, 8, 10), noise(2, 2 if name == "burgers" else 3, 8, 10)
+    solver = prdp.BiCGStab(60, 1e-11, preconditioner="multigrid")
+    if name == "navier_stokes":
+        solver = prdp.GMRES(max_iter=20, rtol=1e-11, restart=20, preconditioner="multigrid")
+        winds = torch.cat([winds, winds[:, :1]], 1)
+        b[:, 2] -= b[:, 2].mean((-2, -1), keepdim=True)
+
+    def make(u):
+        return (operators.Burgers if name == "burgers" else operators.NavierStokes)(u, 0.05, 0.1)
+
+    run = Run(make, winds, b, solver, on_failure="return")
+    assert (run.device.fetch(run.info.status) > 0).all()
+    leaves = [winds.clone().requires_grad_(), b.clone().requires_grad_()]
+    u, _ = prdp.linear_solve(make(leaves[0]), leaves[1], prdp.Direct())
+    torch.testing.assert_close(run.u, u, rtol=1e-7, atol=1e-9)
+    for mine, other in zip(run.gradients, torch.autograd.grad(u.square().sum(), leaves), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(6, 5, 9), (8, 7, 6), (11, 10), (5, 12), (13,), (10,)])
+def test_cycles_are_those_of_the_loops(shape):
+    """Every neighbour, each with a coefficient of its own; even and odd rings."""
+    offsets = list(itertools.product((0, -1, 1), repeat=len(shape)))
+    generator = torch.Generator().manual_seed(sum(shape))
+    c = -1 - 0.5 * torch.rand(2, len(offsets), *shape, generator=generator, dtype=F64)
+    c[:, 0] = 1.3 * c[:, 1:].abs().sum(1)
+    b = noise(2, 1, *shape)
+    run = Run(lambda c: operators.Stencil(c, offsets, "periodic"), c, b, prdp.Multigrid(2, 0.0), on_failure="return")
+    a = operators.Stencil(c, offsets, "periodic")
+    u, info = prdp.linear_solve(a, b, prdp.Multigrid(2, 0.0), on_failure="return")
+    assert (info.residual < 0.5).all()
+    torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_grids_are_made_again_where_a_single_coefficient_has_changed(dtype):
+    """In place, without a word to autograd, and by little more than rounding."""
+    _C.clear_factorisations()
+    c = five_points(4.3).to(dtype).expand(1, 5, *SHAPE).contiguous()
+    b = noise(2, 1, *SHAPE).to(dtype)
+    device = StandIn()
+    with device:
+        there, rhs = device.send(c), device.send(b)
+        for factor in (1.0, 1 + 100 * torch.finfo(dtype).eps, 3.0):
+            there.numbers[0, 0, 2, 3] *= factor
+            before = _C.count_factorisations()
+            u, _ = prdp.linear_solve(operators.Stencil(there, OFFSETS, "periodic"), rhs, prdp.Multigrid(3, 0.0),
+                                     on_failure="return")  # fmt: skip
+            assert _C.count_factorisations() == before + 1
+    expected = prdp.linear_solve(operators.Stencil(there.numbers, OFFSETS, "periodic"), b, prdp.Multigrid(3, 0.0),
+                                 on_failure="return")[0]  # fmt: skip
+    torch.testing.assert_close(device.fetch(u), expected, rtol=1e-4, atol=1e-5 if dtype == F32 else 1e-11)
+
+
+def test_operations_of_an_iteration_with_a_cycle():
+    coefficients = torch.tensor([4.3, -1, -1, -1, -1], dtype=F64).view(1, 5, 1, 1).expand(1, 5, 64, 64).contiguous()
+
+    def launched(k):
+        with StandIn() as device:
+            a = operators.Stencil(device.send(coefficients), OFFSETS, "periodic")
+            prdp.linear_solve(a, device.send(noise(1, 1, 64, 64)), prdp.Multigrid(k, 0.0), on_failure="return")
+            return device.launched()
+
+    assert launched(2) - launched(1) <= 40

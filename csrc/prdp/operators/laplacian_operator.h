@@ -73,7 +73,7 @@ class HeatOperator final : public LaplacianOperator {
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
 
  private:
-  Coefficients coefficients() const override { return {1.0, -step_.nu.item<double>() * step_.dt}; }
+  Coefficients coefficients() const override { return {1.0, -step_.nu_value() * step_.dt}; }
   Factors factors() const override { return {1.0, -step_.dt, step_.nu}; }
   at::Tensor symbol(const at::Tensor& x) const override { return 1.0 - (step_.nu * step_.dt) * x; }
 

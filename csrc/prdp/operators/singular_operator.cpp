@@ -248,7 +248,7 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
   const auto regular = a_->kernels(b, transposed);
   if (!regular) return nullptr;
   const auto rows_of = [&](const Basis& basis) {
-    const auto q = orthonormal(basis, b.detach()).to(at::kDouble).contiguous();
+    const auto q = orthonormal(basis, b.detach()).to(at::kCPU, at::kDouble).contiguous();
     std::vector<std::vector<double>> rows;
     for (int64_t k = 0; k < q.size(0); ++k)
       rows.emplace_back(q[k].const_data_ptr<double>(), q[k].const_data_ptr<double>() + q.size(1));

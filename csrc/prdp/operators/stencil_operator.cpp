@@ -311,7 +311,7 @@ bool StencilOperator::has_coarse_grids() const {
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tensor& b, bool transposed) const {
   const auto offsets = transposed ? turned(offsets_) : offsets_;
   const auto of_samples =
-      [transposed, channels = b.size(1), c = coefficients_.detach().contiguous(),
+      [transposed, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
        pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                          transposed};

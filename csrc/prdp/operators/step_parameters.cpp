@@ -25,8 +25,17 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
 void StepParameters::check_values(bool kernel_checks) const {
   if (kernel_checks && !nu.is_cpu()) return;
   if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
-  const double value = nu.item<double>();
+  const double value = nu_value();
   TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ", value);
+}
+
+double StepParameters::nu_value() const {
+  // Read where it lies: item() takes as long as a tenth of a small step.
+  if (nu.is_cpu() && nu.has_storage() && !nu.is_neg()) {
+    if (nu.scalar_type() == at::kDouble) return *nu.const_data_ptr<double>();
+    if (nu.scalar_type() == at::kFloat) return *nu.const_data_ptr<float>();
+  }
+  return nu.item<double>();
 }
 
 }  // namespace prdp

@@ -14,6 +14,8 @@ struct StepParameters {
   StepParameters(const char* owner, const OperatorSpec& spec, size_t tensors, const char* expected);
   /// Raises ValueError unless nu is finite and >= 0. Operator::check_parameters() has `kernel_checks`.
   void check_values(bool kernel_checks) const;
+  /// nu as a number of the host.
+  double nu_value() const;
 
   const char* owner;
   double dt;

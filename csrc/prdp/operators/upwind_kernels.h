@@ -15,7 +15,7 @@ std::shared_ptr<const kernels::Kernels> UpwindOperator::upwind_kernels(const at:
     length[2 - dim + d] = grid_.length(static_cast<int64_t>(d));
     extent[2 - dim + d] = grid_.shape()[d];
   }
-  const auto of_samples = [=, winds = winds_.detach().contiguous(), nu = step_.nu.item<double>(),
+  const auto of_samples = [=, winds = winds_.detach().to(at::kCPU).contiguous(), nu = step_.nu_value(),
                            dt = step_.dt]<class T>(T) -> kernels::KernelBatch<T> {
     const bool shared = winds.size(0) == 1;
     const int64_t stride = shared ? 0 : winds.stride(0);

@@ -33,6 +33,7 @@ class CyclesOnGpu final : public Cycles {
   gpu::Product product_, transpose_;
 };
 
+/// On the CPU; vectors of other devices are copied there and back.
 template <class T>
 class CyclesOnLoops final : public Cycles {
  public:
@@ -50,7 +51,7 @@ class CyclesOnLoops final : public Cycles {
   }
 
   at::Tensor apply(const at::Tensor& v, bool transposed) override {
-    const auto from = v.contiguous();
+    const auto from = v.to(at::kCPU).contiguous();
     const auto out = at::full_like(from, std::numeric_limits<double>::quiet_NaN());
     const int64_t unknowns = from.numel() / std::max<int64_t>(from.size(0), 1);
     for (int64_t s = 0; s < from.size(0); ++s) {
@@ -64,7 +65,7 @@ class CyclesOnLoops final : public Cycles {
       else sample.inverse->apply(r, z);
       layout.store(z, sample.a->factor(), out.mutable_data_ptr<T>() + s * unknowns);
     }
-    return out;
+    return out.to(v.device());
   }
 
  private:
@@ -96,9 +97,6 @@ class ApplyCycles : public torch::autograd::Function<ApplyCycles> {
 c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, const Preconditioner& m, const at::Tensor& b) {
   if (auto product = gpu::make_cycle(a, /*transposed=*/false, m, b))
     return c10::make_intrusive<CyclesOnGpu>(std::move(product), gpu::make_cycle(a, /*transposed=*/true, m, b));
-  TORCH_CHECK_NOT_IMPLEMENTED(b.is_cpu(),
-                              "linear_solve: multigrid runs on the CPU and in the kernels of a GPU, got vectors on ",
-                              b.device(), " without a kernel for this; take another preconditioner, or the CPU");
   auto kernels = a.kernels(b, false), transpose = a.kernels(b, true);
   if (b.scalar_type() == at::kFloat)
     return c10::make_intrusive<CyclesOnLoops<float>>(std::move(kernels), std::move(transpose), m.smoothing(),

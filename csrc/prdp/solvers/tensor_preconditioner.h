@@ -12,9 +12,9 @@ namespace prdp {
 /// constant.
 using TensorPreconditioner = std::function<at::Tensor(const at::Tensor& v)>;
 
-/// That of the preconditioner of `a` for vectors like b: an operator of the user's own, or V-cycles, on the CPU by its
-/// loops; empty for none and for the diagonal. Raises ValueError or TypeError unless it takes vectors as b, and
-/// NotImplementedError for the block preconditioner of Navier-Stokes on other devices.
+/// That of the preconditioner of `a` for vectors like b: an operator of the user's own, or V-cycles by the loops of the
+/// CPU, which vectors on another device are copied to; empty for none and for the diagonal. Raises ValueError or
+/// TypeError unless it takes vectors as b.
 TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b);
 
 }  // namespace prdp

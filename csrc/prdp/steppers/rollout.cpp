@@ -82,20 +82,23 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
   check_devices(a, u);
 }
 
-/// Below autograd.
-template <class... Args>
-SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);
-  const auto& equation = call.equation;
-  const auto& options = call.options;
-  check(equation, u, call.solves, options);
-  const int64_t solves = call.solves.expect_int(), picard = equation.picard_steps, unknowns = u.numel();
+SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+                       const SolveOptions& options) {
+  check(equation, u, solves, options);
+  const int64_t picard = equation.picard_steps, unknowns = u.numel();
   at::Tensor b;
-  return outputs_of(solve_by_solve(u, solves, picard, [&](const at::Tensor& last, int64_t s) {
+  return outputs_of(solve_by_solve(u, solves.expect_int(), picard, [&](const at::Tensor& last, int64_t s) {
     interruption::Watch::local().spend(unknowns);
     if (s % picard == 0) b = equation_rhs(equation, last);
     return linear_solve_kernel(equation_operator(equation, last), b, options, start_of_step(options, last));
   }));
+}
+
+/// Below autograd.
+template <class... Args>
+SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
+  const auto call = unpack_call(std::move(args)...);
+  return solve_all(call.equation, u, call.solves, call.options);
 }
 
 template <class... Args>
@@ -107,25 +110,31 @@ SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
   return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.solves})});
 }
 
+/// The gradients that are needed.
+std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
+                                       const SolveOptions& options, at::IntArrayRef needed) {
+  const at::NoGradGuard no_grad;
+  const auto found = vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve_kernel);
+  std::vector<at::Tensor> gradients;
+  for (size_t i = 0; i < found.size(); ++i) {
+    if (!needed[i]) continue;
+    gradients.push_back(!found[i].defined() ? at::zeros_like(equation.tensors[i - 1])
+                        : i == 0            ? found[i].contiguous()
+                                            : found[i]);
+  }
+  return gradients;
+}
+
 template <class... Options>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
                                    const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors,
                                    c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
                                    int64_t picard_steps, Options... packed) {
-  const at::NoGradGuard no_grad;
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
                         status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
-  const auto found = vjp_of_solves(cotangent, kept, equation, unpack(packed...), needed, linear_solve_kernel);
-  std::vector<at::Tensor> gradients;
-  for (size_t i = 0; i < found.size(); ++i) {
-    if (!needed[i]) continue;
-    gradients.push_back(!found[i].defined() ? at::zeros_like(tensors[i - 1])
-                        : i == 0            ? found[i].contiguous()
-                                            : found[i]);
-  }
-  return gradients;
+  return solve_all_back(cotangent, kept, equation, unpack(packed...), needed);
 }
 
 template <class... Options>
@@ -142,13 +151,31 @@ std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTens
   return gradients;
 }
 
+std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& e,
+                                         const SolveOptions& o, at::IntArrayRef needed) {
+  static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_vjp", "").typed<VjpSignature>();
+  return call_with_options(op, o, cotangent, or_none(kept.solutions), or_none(kept.iterations), or_none(kept.status),
+                           or_none(kept.residual), needed, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps);
+}
+
+/// Whether all tensors of a call are plain. Then it need not cross the dispatcher, which takes longer than a small
+/// solve.
+bool is_plain_call(const Equation& e, const at::Tensor& v, const SolveOptions& o) {
+  return is_plain(v) && all_plain(e.tensors) && all_plain(o.solver.preconditioner.spec().tensors);
+}
+
+/// The op below autograd.
+SolveOutputs call_below(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
+  const at::AutoDispatchBelowADInplaceOrView below;
+  return is_plain_call(e, u, o) ? solve_all(e, u, solves, o) : call_solves(e, u, solves, o);
+}
+
 class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
  public:
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
-    const at::AutoDispatchBelowADInplaceOrView below;
     const auto& options = call->options;
-    auto outputs = call_solves(call->equation, u, call->solves, options);
+    auto outputs = call_below(call->equation, u, call->solves, options);
     const auto& [solutions, iterations, residual, status, applications, floor] = outputs;
     ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
     ctx->set_materialize_grads(false);
@@ -190,11 +217,8 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
     // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
     if (at::GradMode::is_enabled() || has_tangent(cotangent))
       return vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve);
-    static const auto op =
-        c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_vjp", "").typed<VjpSignature>();
-    const auto found = call_with_options(op, options, cotangent, or_none(kept.solutions), or_none(kept.iterations),
-                                         or_none(kept.status), or_none(kept.residual), needed, equation.tensors,
-                                         equation.kind, equation.shape, equation.parameters, equation.picard_steps);
+    const auto back = is_plain_call(equation, cotangent, options) ? solve_all_back : call_solves_back;
+    const auto found = back(cotangent, kept, equation, options, needed);
     variable_list gradients(needed.size());
     for (size_t i = 0, next = 0; i < needed.size(); ++i)
       if (needed[i]) gradients[i] = found[next++];
@@ -202,21 +226,28 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
   }
 };
 
-template <class... Args>
-SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
-  auto call = c10::make_intrusive<Call>(unpack_call(std::move(args)...));
+/// The op's autograd kernel.
+SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+                              const SolveOptions& options) {
+  auto call = c10::make_intrusive<Call>();
+  call->equation = equation;
+  call->solves = solves;
+  call->options = options;
   const auto tensors = call->equation.tensors;
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
   call->products = products_of(call->options.solver.preconditioner.spec());
   const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
                               (u.requires_grad() || any_requires_grad(tensors));
-  if (!differentiable) {
-    const at::AutoDispatchBelowADInplaceOrView below;
-    return call_solves(call->equation, u, call->solves, call->options);
-  }
+  if (!differentiable) return call_below(call->equation, u, call->solves, call->options);
   const auto out = RolloutSolves::apply(u, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4], out[5]};
+}
+
+template <class... Args>
+SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
+  const auto call = unpack_call(std::move(args)...);
+  return solve_and_record(call.equation, u, call.solves, call.options);
 }
 
 /// The same step by step.
@@ -243,7 +274,8 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   TORCH_CHECK_VALUE(
       steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  auto [solutions, info] = result_of(call_solves(equation, u, steps * picard, options));
+  const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? solve_and_record : call_solves;
+  auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
   if (picard == 1) return {solutions, info};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
   const auto last = [&](const at::Tensor& t) { return of_steps(t).select(-1, picard - 1); };

@@ -1,24 +1,14 @@
 #include "prdp/steppers/rollout_vjp.h"
 
-#include <algorithm>
-
-#include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/stepper.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
 namespace {
-
-/// (batch,) of each solve → (batch, solves).
-at::Tensor side_by_side(const std::vector<at::Tensor>& of_solves, const at::Tensor& u, at::ScalarType dtype) {
-  if (of_solves.empty()) return at::empty({u.size(0), 0}, u.options().dtype(dtype));
-  return at::stack(of_solves, 1);
-}
 
 at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
   return of_solves.defined() ? of_solves.select(1, s) : of_solves;
@@ -26,40 +16,36 @@ at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
 
 }  // namespace
 
-void Reports::push(const SolveInfo& info) {
-  iterations_.push_back(info.iterations);
-  residual_.push_back(info.residual);
-  status_.push_back(info.status);
-  applications_.push_back(info.operator_applications);
-  floor_.push_back(info.floor);
-}
-
-void Reports::reverse() {
-  for (auto* list : {&iterations_, &residual_, &status_, &applications_, &floor_})
-    std::reverse(list->begin(), list->end());
-}
-
-SolveInfo Reports::joined(const at::Tensor& u) const {
-  return {side_by_side(iterations_, u, at::kLong), side_by_side(residual_, u, u.scalar_type()),
-          side_by_side(status_, u, at::kLong), side_by_side(applications_, u, at::kLong),
-          side_by_side(floor_, u, u.scalar_type())};
+SolveInfo side_by_side(std::vector<SolveInfo> infos, const at::Tensor& u) {
+  if (infos.empty()) {
+    const auto counts = [&] { return at::empty({u.size(0), 0}, u.options().dtype(at::kLong)); };
+    const auto numbers = [&] { return at::empty({u.size(0), 0}, u.options()); };
+    return {counts(), numbers(), counts(), counts(), numbers()};
+  }
+  SolveInfo all;
+  const auto solves = static_cast<int64_t>(infos.size());
+  const auto joined = all.parts();
+  for (size_t part = 0; part < joined.size(); ++part) {
+    std::vector<at::Tensor> of_solves;
+    for (auto& info : infos) of_solves.push_back(*info.parts()[part]);
+    const auto batch = of_solves[0].sym_size(0);
+    *joined[part] = at::cat(of_solves).view_symint({solves, batch}).t().contiguous();  // stack() takes longer
+  }
+  return all;
 }
 
 std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
                                       const SolveOptions& options, at::IntArrayRef needed,
                                       decltype(linear_solve)& adjoint_solve) {
-  const int64_t solves = cotangent.size(1) - 1, picard = equation.picard_steps;
+  const int64_t picard = equation.picard_steps;
   const auto& kind = equation_kind(equation.kind);
   const bool rhs_is_state = !kind.rhs;
   auto each = options;
   each.adjoint_log = 0;
   auto bars = cotangent.unbind(1);
   std::vector<at::Tensor> of_tensors(equation.tensors.size());
-  Reports reports;
   at::Tensor rhs_bar;
-  for (int64_t s = solves - 1; s >= 0; --s) {
-    const FailuresOfStep here(s / picard + 1, solves / picard);
-    interruption::Watch::local().spend(cotangent.numel() / cotangent.size(1));
+  solve_by_solve_back(cotangent, picard, options.adjoint_log, [&](int64_t s) {
     const int64_t first = s - s % picard;
     if (options.on_failure == OnFailure::kZeroGrad && s == first + picard - 1)  // whichever solve of the step failed
       bars[s + 1] = without_lost(bars[s + 1], kept.status.slice(1, first, s + 1).amin(1), options.on_failure);
@@ -77,7 +63,6 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     wanted[0] = needed[0] || first > 0;
     if (kind.linearised) wanted.insert(wanted.begin() + 1, needed[0] || s > 0);
     const auto [gradients, info] = solve_vjp(bars[s + 1], solved, a, each, wanted, adjoint_solve);
-    reports.push(info);
     add_to(rhs_is_state ? bars[first] : rhs_bar, gradients[0]);
     if (kind.linearised) add_to(bars[s], gradients[1]);
     if (s == first && rhs_bar.defined()) {
@@ -86,9 +71,8 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
     }
     const size_t others = gradients.size() - of_tensors.size();
     for (size_t i = 0; i < of_tensors.size(); ++i) add_to(of_tensors[i], gradients[others + i]);
-  }
-  reports.reverse();
-  if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, reports.joined(cotangent));
+    return info;
+  });
   std::vector<at::Tensor> found{needed[0] ? bars[0] : at::Tensor()};
   found.insert(found.end(), of_tensors.begin(), of_tensors.end());
   return found;

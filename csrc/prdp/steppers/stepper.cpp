@@ -23,9 +23,9 @@ std::optional<SolveInfo> join_adjoint_logs(at::IntArrayRef logs) {
   const SolveInfo none{at::zeros_like(any->iterations), at::zeros_like(any->residual),
                        at::full_like(any->status, static_cast<int64_t>(SolveStatus::kConverged)),
                        at::zeros_like(any->operator_applications), at::zeros_like(any->floor)};
-  Reports reports;
-  for (const auto& info : found) reports.push(info.value_or(none));
-  return reports.joined(any->residual);
+  std::vector<SolveInfo> infos;
+  for (const auto& info : found) infos.push_back(info.value_or(none));
+  return side_by_side(std::move(infos), any->residual);
 }
 
 StepperBase::StepperBase(std::string who, SolveOptions options)

@@ -9,7 +9,10 @@
 namespace py = pybind11;
 using namespace prdp;
 
-void bind_scenes(py::module_& m) {
+namespace {
+
+/// The tables of a scene file.
+void bind_tables(py::module_& m) {
   py::class_<Scene::Physics>(m, "Physics")
       .def_readonly("equation", &Scene::Physics::equation)
       .def_readonly("shape", &Scene::Physics::shape)
@@ -58,7 +61,12 @@ void bind_scenes(py::module_& m) {
       .def_readonly("schedule", &Scene::Compare::schedule)
       .def_readonly("rtol", &Scene::Compare::rtol)
       .def_readonly("target", &Scene::Compare::target);
+}
 
+}  // namespace
+
+void bind_scenes(py::module_& m) {
+  bind_tables(m);
   py::class_<Scene>(m, "Scene")
       .def_readonly("name", &Scene::name)
       .def_readonly("path", &Scene::path)

@@ -56,7 +56,7 @@ SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps
   sizes.insert(sizes.begin() + 1, steps + 1);
   auto states = at::empty(sizes, u.options());
   states.select(1, 0).copy_(u);
-  Reports reports;
+  std::vector<SolveInfo> infos;
   auto state = u;
   for (int64_t s = 0; s < steps; ++s) {
     const FailuresOfStep here(s + 1, steps);
@@ -64,9 +64,9 @@ SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps
     auto step = flow_step(equation, state, options);
     state = step.u;
     states.select(1, s + 1).copy_(state);
-    reports.push(step.info);
+    infos.push_back(std::move(step.info));
   }
-  return {states, reports.joined(u)};
+  return {states, side_by_side(std::move(infos), u)};
 }
 
 class FlowSteps : public torch::autograd::Function<FlowSteps> {
@@ -127,10 +127,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                                                   const Call& call, at::IntArrayRef needed) {
     std::vector<at::Tensor> sums(needed.size());
     auto bar = cotangent.select(1, call.steps);
-    Reports reports;
-    for (int64_t s = call.steps - 1; s >= 0; --s) {
-      const FailuresOfStep here(s + 1, call.steps);
-      interruption::Watch::local().spend(bar.numel());
+    const int64_t log = at::GradMode::is_enabled() ? 0 : call.options.adjoint_log;
+    solve_by_solve_back(cotangent, 1, log, [&](int64_t s) {
       const auto status_of_step = status.defined() ? status.select(1, s) : status;
       std::vector<int64_t> wanted = needed.vec();
       wanted[0] = needed[0] || s > 0;
@@ -140,11 +138,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
       bar = cotangent.select(1, s);
       add_to(bar, found[0]);
       for (size_t i = 1; i < sums.size(); ++i) add_to(sums[i], found[i]);
-      if (info.status.defined()) reports.push(info);
-    }
-    reports.reverse();
-    if (call.options.adjoint_log != 0 && !at::GradMode::is_enabled())
-      adjoint_log::write(call.options.adjoint_log, reports.joined(cotangent));
+      return info;
+    });
     if (needed[0]) sums[0] = bar;
     return sums;
   }
