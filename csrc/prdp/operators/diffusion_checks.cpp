@@ -122,26 +122,53 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
                       t.device(), " but the vector is on ", b.device());
 }
 
-void DiffusionOperator::check_parameters(bool kernel_checks) const {
+void DiffusionOperator::check_parameters(Checks checks) const {
   for (const auto& [name, t] : tensors())
     if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
   for (const auto& h : robin_) {
-    if (kernel_checks && (h.dim() > 0 || !h.is_cpu())) continue;
+    if (checks != Checks::kAll && (h.dim() > 0 || (checks == Checks::kHost && !h.is_cpu()))) continue;
     const double least = h.min().item<double>();
     TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
-  if (kernel_checks) return;
+  if (checks == Checks::kHost) return;
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
   const auto* least_and_most = ends.const_data_ptr<double>();
   if (least_and_most[0] > 0.0) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
   const auto wrong = kappa_.le(0);
-  if (!wrong.any().item<bool>()) return;
+  if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
   TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
                     kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
                     " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(2));
+}
+
+std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64_t sample) const {
+  for (const auto& [name, t] : tensors()) {
+    if (t.dim() == 0) continue;
+    const bool is_kappa = t.is_same(kappa_), is_shift = t.is_same(shift_);
+    const auto numbers = t.select(0, t.size(0) == 1 ? 0 : sample).select(0, 0);
+    auto wrong = nonfinite(numbers);
+    if (!is_shift) wrong = wrong.logical_or(is_kappa ? numbers.le(0) : numbers.lt(0));
+    if (!wrong.any().item<bool>()) continue;
+    return Refused{is_kappa ? "kappa must be > 0" : "h of a Robin side must be >= 0",
+                   numbers.masked_select(wrong)[0].item<double>(), first_true(wrong)};
+  }
+  return std::nullopt;
+}
+
+std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
+  const auto found = first_refused(sample);
+  return found ? found->index : std::vector<int64_t>{};
+}
+
+std::string DiffusionOperator::refusal(int64_t sample) const {
+  const auto found = first_refused(sample);
+  if (!found || !std::isfinite(found->value)) return {};
+  std::ostringstream text;
+  text << found->must << ", got " << found->value;
+  return text.str();
 }
 
 void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double largest_kappa) const {

@@ -2,6 +2,8 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+
 #include "prdp/gpu/operator_view.h"
 #include "prdp/operators/products_by_kernel.h"
 #include "prdp/operators/stencil_operator.h"
@@ -47,6 +49,10 @@ bool launch_products(gpu::DiffusionProducts<T> of, const at::Tensor& lambda, con
   return gpu::each_point(out.device(), product_body<T>("DiffusionProducts"), of, out.numel());
 }
 
+at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
+  return t.masked_fill(allowed.logical_not(), std::numeric_limits<double>::quiet_NaN());
+}
+
 /// Summed over the samples where these share one.
 at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
   if (tensor.dim() == 0) return total(sum);
@@ -71,7 +77,9 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
     const auto cells = end == 0 ? first(kappa_, d) : last(kappa_, d);
     if (sides_[axis][end] == Side::kZero) return 2.0 * scale * cells;
     if (sides_[axis][end] != Side::kRobin) return at::zeros_like(cells);
-    const auto within = 2.0 * per_cell2(axis) * cells, beyond = per_cell(axis) * robin(axis, end);
+    const auto& h = robin(axis, end);
+    const auto within = 2.0 * per_cell2(axis) * cells,
+               beyond = per_cell(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
     return factor * (within * (beyond / (within + beyond)));  // in series
   };
   const auto around = is_closed(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
@@ -168,7 +176,8 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
 }
 
 at::Tensor DiffusionOperator::coefficients() const {
-  auto diagonal = shift_ + 0.0 * kappa_;  // NaN where kappa is not finite, which a harmonic mean would lose
+  // NaN where kappa is not allowed, or not finite, which a harmonic mean would lose.
+  auto diagonal = or_nan(shift_ + 0.0 * kappa_, kappa_.gt(0));
   std::vector<at::Tensor> all{at::Tensor()};
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (const auto& coupling : faces(axis, -1.0)) {
@@ -190,15 +199,6 @@ at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()
 
 at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b) const {
   return StencilOperator(as_stencil()).solve_directly(b);
-}
-
-std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
-  for (const auto& [name, t] : tensors()) {
-    if (t.dim() == 0) continue;
-    const auto of_sample = nonfinite(t.select(0, t.size(0) == 1 ? 0 : sample).select(0, 0));
-    if (of_sample.any().item<bool>()) return first_true(of_sample);
-  }
-  return {};
 }
 
 std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) const {

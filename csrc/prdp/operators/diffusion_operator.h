@@ -34,7 +34,8 @@ class DiffusionOperator final : public Operator {
 
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless kappa > 0 and h >= 0.
-  void check_parameters(bool kernel_checks) const override;
+  void check_parameters(Checks checks) const override;
+  std::string refusal(int64_t sample) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
   at::Tensor diagonal() const override { return coefficients().narrow(1, 0, 1); }
@@ -68,6 +69,13 @@ class DiffusionOperator final : public Operator {
   double held_by(double shift, double least_shift, double kappa) const;
   double per_cell(int64_t axis) const;   // 1/h
   double per_cell2(int64_t axis) const;  // 1/h²
+  /// The first number of a sample that is not finite or not allowed.
+  struct Refused {
+    const char* must;  // "kappa must be > 0"
+    double value;
+    std::vector<int64_t> index;
+  };
+  std::optional<Refused> first_refused(int64_t sample) const;
   void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
   const at::Tensor& robin(int64_t axis, size_t end) const;
   std::vector<std::pair<const char*, at::Tensor>> tensors() const;

@@ -204,6 +204,8 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
                               : "the right-hand side is NaN or Inf there; look at the state that it is made of";
         return "the start is NaN or Inf there; take another one, or none";
       case SolveStatus::kNonfiniteOperator:
+        if (const auto refused = a.refusal(sample); !refused.empty())
+          return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       case SolveStatus::kStagnated: return stagnated(role.solver, b);
       default: return "it did not reach its tolerance; raise max_iter or rtol";

@@ -110,7 +110,8 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   const auto is_of_a = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
   };
-  if (std::any_of(failed.begin(), failed.end(), is_of_a)) a.check_parameters();  // a kernel may have found it
+  if (std::any_of(failed.begin(), failed.end(), is_of_a))  // a kernel may have found it
+    a.check_parameters(on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared);
 
   constexpr size_t named = 4;
   std::ostringstream text;
