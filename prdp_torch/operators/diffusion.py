@@ -31,17 +31,19 @@ class Diffusion(Operator):
 
     Args:
         kappa: (batch, *shape), or (1, *shape) for all samples alike, κ > 0 in the centres of the cells; shape has 1 to
-            3 axes. Gets a gradient, which is formed from fluxes: in float32 it keeps digits that the gradient of a
-            `Stencil`'s coefficients loses.
-        shift: a number, or a tensor like kappa, which gets a gradient. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by
-            implicit Euler, with b = u/dt. In float32, A holds shift and sides to ε max κ Σ 2/dx², beside which they
-            must not be small: a warning says so. Take float64 for large jumps of κ on fine grids.
+            3 axes. With per_axis (batch or 1, axes, *shape). Gets a gradient, which is formed from fluxes: in float32
+            it keeps digits that the gradient of a `Stencil`'s coefficients loses.
+        shift: a number, or a tensor (batch or 1, *shape), which gets a gradient. With 1/dt, A is a step of
+            ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32, A holds shift and sides to ε max κ Σ 2/dx²,
+            beside which they must not be small: a warning says so. Take float64 for large jumps of κ on fine grids.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
             ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
             one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor
             (batch or 1, *side) where side is shape without the axis, and gets a gradient.
         length: the side of the box, one number or one for each axis in the order of `shape`.
         faces: how κ on a face is made of its two cells: "harmonic", which is exact for layers, or "arithmetic".
+        per_axis: whether κ differs between the axes, as in layered ground: A u = shift·u - Σ_d ∂(κ_d ∂u/∂x_d)/∂x_d.
+            kappa[:, d] then is κ along the axis d of shape.
 
     Raises:
         ValueError, TypeError: the arguments do not fit together. This is checked before any work.
@@ -52,6 +54,7 @@ class Diffusion(Operator):
     """
 
     kind = "diffusion"
+    per_axis: bool
     boundary: list[tuple[str, ...]]
     length: tuple[float, ...]
 
@@ -62,21 +65,26 @@ class Diffusion(Operator):
         boundary: Sides = "zero",
         length: Length = 1.0,
         faces: Literal["harmonic", "arithmetic"] = "harmonic",
+        per_axis: bool = False,
     ) -> None:
-        dim = _check.dense("Diffusion", "kappa", kappa).dim() - 1
-        if not 1 <= dim <= 3:
+        dim = _check.dense("Diffusion", "kappa", kappa).dim() - (2 if per_axis else 1)
+        if not 1 <= dim <= 3 or (per_axis and kappa.shape[1] != dim):
             raise ValueError(
-                "Diffusion: kappa must have shape (batch or 1, *shape) with 1 to 3 axes in shape, got "
-                f"{tuple(kappa.shape)}"
+                f"Diffusion: kappa must have shape (batch or 1, {'axes, ' if per_axis else ''}*shape) with 1 to 3 axes "
+                f"in shape, got {tuple(kappa.shape)}"
             )
+        self.per_axis, shape = per_axis, kappa.shape[-dim:]
+        if per_axis:
+            self.kind = "diffusion_per_axis"
         if faces not in ("harmonic", "arithmetic"):
             raise ValueError(f"Diffusion: faces must be 'harmonic' or 'arithmetic', got {faces!r}")
         sides = _sides(boundary, dim)
         self.boundary = [tuple(_kind(side) for side in pair) for pair in sides]
         self.length = tuple(_check.lengths("Diffusion", length, dim)) or (1.0,) * dim
-        if isinstance(shift, Tensor) and shift.dim() not in (0, kappa.dim()):
+        if isinstance(shift, Tensor) and shift.dim() not in (0, 1 + dim):
+            like = (len(kappa), *shape)
             raise ValueError(
-                f"Diffusion: shift must be a number or have the shape of kappa, {tuple(kappa.shape)}, got "
+                f"Diffusion: shift must be a number or have the shape of {'a field of ' * per_axis}kappa, {like}, got "
                 f"{tuple(shift.shape)}"
             )
         given: dict[str, Number] = {"kappa": kappa, "shift": shift}
@@ -89,7 +97,7 @@ class Diffusion(Operator):
         codes = [float(KINDS.index(side)) for pair in self.boundary for side in pair]
         parameters = [*codes, *self.length, float(faces == "arithmetic")]
         null_spaces = () if is_held else (kappa.new_empty(0).detach(),) * 2
-        super().__init__(list(kappa.shape[1:]), parameters, given, null_spaces)
+        super().__init__(list(shape), parameters, given, null_spaces)
 
     @property
     def kappa(self) -> Tensor:
@@ -110,13 +118,13 @@ class Diffusion(Operator):
         """
         values, fluxes = self._of_sides("values", values, TAKE_VALUES), self._of_sides("fluxes", fluxes, ("flux",))
         kappa, robin = full_precision(self.kappa), iter(self.tensors[2:])
-        b = torch.zeros_like(kappa)
+        b = torch.zeros_like(kappa[:, 0] if self.per_axis else kappa)
         for axis, sides in enumerate(self.boundary):
             width = self.length[axis] / self.shape[axis]
             for end, side in enumerate(sides):
                 if side == "periodic":
                     continue
-                at_side = kappa.select(axis + 1, -end)
+                at_side = (kappa[:, axis] if self.per_axis else kappa).select(axis + 1, -end)
                 conductance = torch.ones_like(at_side) if side == "flux" else 2 * at_side
                 if side == "robin":  # in series with that of the side
                     h = width * full_precision(next(robin))

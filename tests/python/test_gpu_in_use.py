@@ -131,7 +131,7 @@ def test_a_kernel_refuses_numbers_that_are_not_allowed(name):
         return operators.Diffusion(kappa, 1.0, boundary=("zero", (("robin", h), "flux")))
 
     with pytest.raises(ValueError, match=name) as expected:
-        make(kappa, h)
+        prdp.linear_solve(make(kappa, h), b, solver)
     with Fibers():
         a = make(kappa, h)
         with pytest.raises(ValueError) as found:

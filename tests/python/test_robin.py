@@ -169,7 +169,7 @@ def test_vmap_over_h_is_a_loop():
 ])  # fmt: skip
 def test_mistakes_are_named(boundary, words):
     with pytest.raises(ValueError, match=words):
-        Diffusion(torch.ones(1, 4, 5), boundary=boundary)
+        prdp.linear_solve(Diffusion(torch.ones(1, 4, 5), boundary=boundary), torch.ones(1, 1, 4, 5), prdp.CG(3))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])

@@ -20,16 +20,18 @@ double mean_of_least_sample(const at::Tensor& t) {
 }  // namespace
 
 OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const std::vector<std::array<Side, 2>>& sides,
-                       const std::vector<double>& lengths, FaceMean faces, const std::vector<at::Tensor>& robin) {
-  TORCH_CHECK_VALUE(kappa.dim() >= 2 && kappa.dim() <= 4,
-                    "Diffusion: kappa must have shape (batch or 1, *shape) with 1 to 3 axes in shape, got ",
-                    kappa.sizes());
-  const auto dim = static_cast<size_t>(kappa.dim() - 1);
+                       const std::vector<double>& lengths, FaceMean faces, const std::vector<at::Tensor>& robin,
+                       bool per_axis) {
+  const int64_t axes = kappa.dim() - 1 - static_cast<int64_t>(per_axis);
+  TORCH_CHECK_VALUE(axes >= 1 && axes <= 3, "Diffusion: kappa must have shape (batch or 1, ", per_axis ? "axes, " : "",
+                    "*shape) with 1 to 3 axes in shape, got ", kappa.sizes());
+  const auto dim = static_cast<size_t>(axes);
   TORCH_CHECK_VALUE(sides.size() == 1 || sides.size() == dim, "Diffusion: boundary must be one for all axes or ", dim,
                     ", one for each, got ", sides.size());
   TORCH_CHECK_VALUE(lengths.size() == 1 || lengths.size() == dim, "Diffusion: length must be one number or ", dim,
                     ", one for each axis, got ", lengths.size());
-  OperatorSpec spec{"diffusion", kappa.sizes().slice(1).vec(), {}, {kappa, shift}};
+  OperatorSpec spec{
+      per_axis ? "diffusion_per_axis" : "diffusion", kappa.sizes().slice(kappa.dim() - axes).vec(), {}, {kappa, shift}};
   spec.tensors.insert(spec.tensors.end(), robin.begin(), robin.end());
   for (size_t d = 0; d < dim; ++d)
     for (const auto side : sides[sides.size() == 1 ? 0 : d]) spec.parameters.push_back(static_cast<double>(side));
@@ -43,18 +45,23 @@ OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift, const s
   return with_null_space(std::move(spec), at::empty({0}, kappa.options()));
 }
 
-DiffusionOperator::DiffusionOperator(const OperatorSpec& spec) : shape_(spec.shape) {
+DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
+    : shape_(spec.shape), per_axis_(spec.kind.ends_with("_per_axis")) {
   TORCH_CHECK_VALUE(spec.tensors.size() >= 2, "Diffusion: takes the tensors kappa, shift, and h of each Robin side");
   const auto &kappa = spec.tensors[0], &shift = spec.tensors[1];
-  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa.dim() == dim() + 1 &&
-                        kappa.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_)),
-                    "Diffusion: kappa must have shape (batch or 1, *shape), got ", kappa.sym_sizes());
+  auto of_sample = shape_;
+  if (per_axis_) of_sample.insert(of_sample.begin(), dim());
+  TORCH_CHECK_VALUE(dim() >= 1 && dim() <= 3 && kappa.dim() == 1 + static_cast<int64_t>(of_sample.size()) &&
+                        kappa.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(of_sample)),
+                    "Diffusion: kappa must have shape (batch or 1, ", per_axis_ ? "axes, " : "", "*shape), got ",
+                    kappa.sym_sizes());
   TORCH_CHECK_TYPE(kappa.scalar_type() == at::kFloat || kappa.scalar_type() == at::kDouble,
                    "Diffusion: kappa must be float32 or float64, got ", kappa.scalar_type());
   TORCH_CHECK_VALUE(
-      shift.dim() == 0 || (shift.dim() == kappa.dim() && shift.sym_sizes().slice(1) == kappa.sym_sizes().slice(1)),
+      shift.dim() == 0 || (shift.dim() == dim() + 1 &&
+                           shift.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_))),
       "Diffusion: shift must be a number or have the shape of kappa, got ", shift.sym_sizes());
-  kappa_ = kappa.unsqueeze(1);
+  kappa_ = per_axis_ ? kappa : kappa.unsqueeze(1);
   shift_ = shift.to(kappa.scalar_type());
   if (shift.dim() > 0) shift_ = shift_.unsqueeze(1);
   const auto axes = static_cast<size_t>(dim());
@@ -110,8 +117,9 @@ std::vector<std::pair<const char*, at::Tensor>> DiffusionOperator::tensors() con
 
 void DiffusionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(b.dim() == dim() + 2 && b.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2) && b.sym_size(1) != 0,
-                    "Diffusion: expected kappa (batch or 1, *shape) and b (batch, channel, *shape), got kappa ",
-                    kappa_.squeeze(1).sym_sizes(), " and b ", b.sym_sizes());
+                    "Diffusion: expected kappa (batch or 1, ", per_axis_ ? "axes, " : "",
+                    "*shape) and b (batch, channel, *shape), got kappa ",
+                    (per_axis_ ? kappa_ : kappa_.squeeze(1)).sym_sizes(), " and b ", b.sym_sizes());
   for (const auto& [name, t] : tensors())
     TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
                       " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));
@@ -122,32 +130,61 @@ void DiffusionOperator::check_vector(const at::Tensor& b) const {
                       t.device(), " but the vector is on ", b.device());
 }
 
-void DiffusionOperator::check_parameters(bool kernel_checks) const {
+void DiffusionOperator::check_parameters(Checks checks) const {
   for (const auto& [name, t] : tensors())
     if (at::isTensorSubclassLike(t) || t.is_meta() || t.numel() == 0) return;  // no numbers, or none yet
   for (const auto& h : robin_) {
-    if (kernel_checks && (h.dim() > 0 || !h.is_cpu())) continue;
+    if (checks != Checks::kAll && (h.dim() > 0 || (checks == Checks::kHost && !h.is_cpu()))) continue;
     const double least = h.min().item<double>();
     TORCH_CHECK_VALUE(!(least < 0.0) && (h.dim() > 0 || std::isfinite(least)),
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
-  if (kernel_checks) return;
+  if (checks == Checks::kHost) return;
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
   const auto* least_and_most = ends.const_data_ptr<double>();
   if (least_and_most[0] > 0.0) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
   const auto wrong = kappa_.le(0);
-  if (!wrong.any().item<bool>()) return;
+  if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
   TORCH_CHECK_VALUE(false, "Diffusion: kappa must be > 0, got ",
                     kappa_.flatten()[wrong.flatten().to(at::kByte).argmax().item<int64_t>()].item<double>(),
-                    " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(2));
+                    " in sample ", index[0], " at index ", at::IntArrayRef(index).slice(per_axis_ ? 1 : 2));
+}
+
+std::optional<DiffusionOperator::Refused> DiffusionOperator::first_refused(int64_t sample) const {
+  for (const auto& [name, t] : tensors()) {
+    if (t.dim() == 0) continue;
+    const bool is_kappa = t.is_same(kappa_), is_shift = t.is_same(shift_);
+    auto numbers = t.select(0, t.size(0) == 1 ? 0 : sample);
+    if (!(is_kappa && per_axis_)) numbers = numbers.select(0, 0);
+    auto wrong = nonfinite(numbers);
+    if (!is_shift) wrong = wrong.logical_or(is_kappa ? numbers.le(0) : numbers.lt(0));
+    if (!wrong.any().item<bool>()) continue;
+    return Refused{is_kappa ? "kappa must be > 0" : "h of a Robin side must be >= 0",
+                   numbers.masked_select(wrong)[0].item<double>(), first_true(wrong)};
+  }
+  return std::nullopt;
+}
+
+std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
+  const auto found = first_refused(sample);
+  return found ? found->index : std::vector<int64_t>{};
+}
+
+std::string DiffusionOperator::refusal(int64_t sample) const {
+  const auto found = first_refused(sample);
+  if (!found || !std::isfinite(found->value)) return {};
+  std::ostringstream text;
+  text << found->must << ", got " << found->value;
+  return text.str();
 }
 
 void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double largest_kappa) const {
   if (kappa_.scalar_type() != at::kFloat || !kappa_.is_cpu() || !shift_.is_cpu()) return;
   double diagonal = 0.0;
-  for (int64_t axis = 0; axis < dim(); ++axis) diagonal += 2.0 * largest_kappa * per_cell2(axis);
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    diagonal += 2.0 * (per_axis_ ? kappa_along(axis).max().item<double>() : largest_kappa) * per_cell2(axis);
   const double rounding = 10.0 * epsilon_of(kappa_) * diagonal;
   const double least_shift = shift_.min().item<double>();
   if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa))

@@ -2,6 +2,8 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+
 #include "prdp/gpu/operator_view.h"
 #include "prdp/operators/products_by_kernel.h"
 #include "prdp/operators/stencil_operator.h"
@@ -47,6 +49,10 @@ bool launch_products(gpu::DiffusionProducts<T> of, const at::Tensor& lambda, con
   return gpu::each_point(out.device(), product_body<T>("DiffusionProducts"), of, out.numel());
 }
 
+at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
+  return t.masked_fill(allowed.logical_not(), std::numeric_limits<double>::quiet_NaN());
+}
+
 /// Summed over the samples where these share one.
 at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
   if (tensor.dim() == 0) return total(sum);
@@ -62,16 +68,19 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
   const int64_t d = 2 + axis;
   const double scale = factor * per_cell2(axis);
   const bool harmonic = mean_ == FaceMean::kHarmonic;
-  const auto averaged = harmonic ? kappa_.reciprocal() : kappa_;
+  const auto kappa = kappa_along(axis);
+  const auto averaged = harmonic ? kappa.reciprocal() : kappa;
   const auto mean = [&](const at::Tensor& a, const at::Tensor& b) {
     return harmonic ? (a + b).reciprocal() * (2.0 * scale) : (a + b) * (0.5 * scale);
   };
   const auto inner = mean(above(averaged, d), below(averaged, d));
   const auto outer = [&](size_t end) -> at::Tensor {
-    const auto cells = end == 0 ? first(kappa_, d) : last(kappa_, d);
+    const auto cells = end == 0 ? first(kappa, d) : last(kappa, d);
     if (sides_[axis][end] == Side::kZero) return 2.0 * scale * cells;
     if (sides_[axis][end] != Side::kRobin) return at::zeros_like(cells);
-    const auto within = 2.0 * per_cell2(axis) * cells, beyond = per_cell(axis) * robin(axis, end);
+    const auto& h = robin(axis, end);
+    const auto within = 2.0 * per_cell2(axis) * cells,
+               beyond = per_cell(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
     return factor * (within * (beyond / (within + beyond)));  // in series
   };
   const auto around = is_closed(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
@@ -94,7 +103,7 @@ at::Tensor DiffusionOperator::apply(const at::Tensor& v) const {
 }
 
 at::Tensor DiffusionOperator::kappa_bar_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (!robin_.empty() || !has_product_kernel(lambda, u)) return {};
+  if (per_axis_ || !robin_.empty() || !has_product_kernel(lambda, u)) return {};
   const auto fill = [&](auto of) {
     for (int64_t d = 0; d < 3; ++d) of.n[d] = 1;
     for (int64_t d = 0; d < dim(); ++d) {
@@ -123,10 +132,11 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
   };
   if (const auto by_kernel = kappa_bar_by_kernel(lambda, u); by_kernel.defined())
     return {by_kernel.squeeze(1), shift_bar()};
-  at::Tensor kappa_bar;
-  std::vector<at::Tensor> robin_bar;
+  std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const int64_t d = 2 + axis;
+    auto& kappa_bar = kappa_bars[per_axis_ ? axis : 0];
+    const auto kappa = kappa_along(axis);
     const double scale = per_cell2(axis);
     // ∂ mean(a, b)/∂a; 0 in a sample whose κ is not finite, which was refused, so that its λ of 0 gives 0.
     const auto derivative = [&](const at::Tensor& a, const at::Tensor& b) {
@@ -136,7 +146,7 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
       return scale * (du * dl).sum(1, /*keepdim=*/true);
     };
     const auto inner = couple(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
-    const auto lower = below(kappa_, d), upper = above(kappa_, d);
+    const auto lower = below(kappa, d), upper = above(kappa, d);
     // Fields that are zero but at the low, or the high end of the axis.
     const auto at_first = [&](const at::Tensor& t) { return padded(t, d, 0, shape_[axis] - t.size(d)); };
     const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
@@ -144,8 +154,8 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
     add_to(kappa_bar, at_first(inner * derivative(lower, upper)));
     if (is_closed(axis)) {
       const auto around = couple(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
-      add_to(kappa_bar, at_first(around * derivative(first(kappa_, d), last(kappa_, d))));
-      add_to(kappa_bar, at_last(around * derivative(last(kappa_, d), first(kappa_, d))));
+      add_to(kappa_bar, at_first(around * derivative(first(kappa, d), last(kappa, d))));
+      add_to(kappa_bar, at_last(around * derivative(last(kappa, d), first(kappa, d))));
     }
     for (size_t end = 0; end < 2; ++end) {
       const auto at_side = [&](const at::Tensor& t) { return end == 0 ? first(t, d) : last(t, d); };
@@ -153,7 +163,7 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
       if (sides_[axis][end] == Side::kZero) add_to(kappa_bar, at_end(2.0 * couple(at_side(u), at_side(lambda))));
       if (sides_[axis][end] != Side::kRobin) continue;
       // Of within·beyond/(within + beyond), with within = 2κ/h² and beyond = h of the side over the width of a cell.
-      const auto within = 2.0 * scale * at_side(kappa_), beyond = per_cell(axis) * robin(axis, end);
+      const auto within = 2.0 * scale * at_side(kappa), beyond = per_cell(axis) * robin(axis, end);
       const auto of_within = (beyond / (within + beyond)).square().nan_to_num(0.0);
       const auto of_beyond = (within / (within + beyond)).square().nan_to_num(0.0);
       const auto product = couple(at_side(u), at_side(lambda));
@@ -162,13 +172,19 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
       robin_bar.push_back(h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1));
     }
   }
-  std::vector<at::Tensor> all{like(kappa_, kappa_bar).squeeze(1), shift_bar()};
+  const auto of_kappa = [&] {
+    return per_axis_ ? like(kappa_, at::cat(kappa_bars, 1)) : like(kappa_, kappa_bars[0]).squeeze(1);
+  };
+  std::vector<at::Tensor> all{of_kappa(), shift_bar()};
   all.insert(all.end(), robin_bar.begin(), robin_bar.end());
   return all;
 }
 
 at::Tensor DiffusionOperator::coefficients() const {
-  auto diagonal = shift_ + 0.0 * kappa_;  // NaN where kappa is not finite, which a harmonic mean would lose
+  // NaN where kappa is not allowed, or not finite, which a harmonic mean would lose.
+  const auto allowed = kappa_.gt(0);
+  auto diagonal = per_axis_ ? or_nan(shift_ + 0.0 * kappa_.sum(1, /*keepdim=*/true), allowed.all(1, /*keepdim=*/true))
+                            : or_nan(shift_ + 0.0 * kappa_, allowed);
   std::vector<at::Tensor> all{at::Tensor()};
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (const auto& coupling : faces(axis, -1.0)) {
@@ -190,15 +206,6 @@ at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()
 
 at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b) const {
   return StencilOperator(as_stencil()).solve_directly(b);
-}
-
-std::vector<int64_t> DiffusionOperator::first_nonfinite(int64_t sample) const {
-  for (const auto& [name, t] : tensors()) {
-    if (t.dim() == 0) continue;
-    const auto of_sample = nonfinite(t.select(0, t.size(0) == 1 ? 0 : sample).select(0, 0));
-    if (of_sample.any().item<bool>()) return first_true(of_sample);
-  }
-  return {};
 }
 
 std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) const {
@@ -224,6 +231,7 @@ std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Ten
 }
 
 std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {
+  if (per_axis_) return StencilOperator(as_stencil()).gpu_view(b, /*transposed=*/false);
   static_assert(static_cast<int>(Side::kZero) == 0 && static_cast<int>(Side::kPeriodic) == 2 &&
                 static_cast<int>(Side::kRobin) == 3);
   std::string sides;
@@ -257,7 +265,10 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
 
 std::optional<kernels::FactorKey> DiffusionOperator::key(bool /*transposed*/) const {
   kernels::FactorKeyMaker key;
-  key.add(int64_t{-1}).add(static_cast<int64_t>(mean_)).add(shape_.data(), dim()).add(lengths_.data(), dim());
+  key.add(int64_t{per_axis_ ? -2 : -1})
+      .add(static_cast<int64_t>(mean_))
+      .add(shape_.data(), dim())
+      .add(lengths_.data(), dim());
   for (const auto& sides : sides_)
     for (const auto side : sides) key.add(static_cast<int64_t>(side));
   for (const auto& [name, t] : tensors()) {

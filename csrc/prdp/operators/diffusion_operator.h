@@ -15,26 +15,28 @@ enum class FaceMean { kHarmonic, kArithmetic };
 /// A u = shift·u - ∇·(κ ∇u) on the cells of a box in finite volumes, the same for every channel of u (batch, channel,
 /// *shape), for linear_solve. It is symmetric; where nothing holds u, it knows that it is singular.
 ///
-/// kappa: (batch or 1, *shape) with 1 to 3 axes in shape, the values in the centres of the cells, > 0. shift: a
-/// 0-dimensional tensor or one like kappa. Both get gradients, which for kappa are formed from differences of u and not
-/// from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each axis, or one
-/// pair for all. lengths: of the box, for each axis or one for all. robin: h >= 0 of each such side in their order, 0-
-/// dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises ValueError if
-/// these do not fit together.
+/// kappa: (batch or 1, *shape) with 1 to 3 axes in shape, the values in the centres of the cells, > 0; with `per_axis`
+/// (batch or 1, axes, *shape), where ∂(κ_d ∂u/∂x_d)/∂x_d has the κ of its own axis, in the order of shape. shift: a
+/// 0-dimensional tensor or (batch or 1, *shape). Both get gradients, which for kappa are formed from differences of u
+/// and not from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each
+/// axis, or one pair for all. lengths: of the box, for each axis or one for all. robin: h >= 0 of each such side in
+/// their order, 0- dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises
+/// ValueError if these do not fit together.
 OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
                        const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
                        const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic,
-                       const std::vector<at::Tensor>& robin = {});
+                       const std::vector<at::Tensor>& robin = {}, bool per_axis = false);
 
-/// The operator of kind "diffusion". Parameters: the two sides of each axis, the lengths, the mean on faces. Tensors:
-/// kappa, shift, and h of each Robin side.
+/// The operator of kind "diffusion", or "diffusion_per_axis". Parameters: the two sides of each axis, the lengths, the
+/// mean on faces. Tensors: kappa, shift, and h of each Robin side.
 class DiffusionOperator final : public Operator {
  public:
   explicit DiffusionOperator(const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless kappa > 0 and h >= 0.
-  void check_parameters(bool kernel_checks) const override;
+  void check_parameters(Checks checks) const override;
+  std::string refusal(int64_t sample) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
   at::Tensor diagonal() const override { return coefficients().narrow(1, 0, 1); }
@@ -66,8 +68,16 @@ class DiffusionOperator final : public Operator {
   /// About the least eigenvalue of A where κ is the same everywhere: what holds u in the mean, in series with the way
   /// there through the cells.
   double held_by(double shift, double least_shift, double kappa) const;
+  at::Tensor kappa_along(int64_t axis) const { return per_axis_ ? kappa_.narrow(1, axis, 1) : kappa_; }
   double per_cell(int64_t axis) const;   // 1/h
   double per_cell2(int64_t axis) const;  // 1/h²
+  /// The first number of a sample that is not finite or not allowed.
+  struct Refused {
+    const char* must;  // "kappa must be > 0"
+    double value;
+    std::vector<int64_t> index;
+  };
+  std::optional<Refused> first_refused(int64_t sample) const;
   void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
   const at::Tensor& robin(int64_t axis, size_t end) const;
   std::vector<std::pair<const char*, at::Tensor>> tensors() const;
@@ -81,7 +91,8 @@ class DiffusionOperator final : public Operator {
   std::vector<std::array<Side, 2>> sides_;
   std::vector<double> lengths_;
   FaceMean mean_;
-  // With an axis of one channel, and one of extent 1 where a side has none; or 0-dimensional.
+  bool per_axis_;
+  // With an axis of one channel, or of those of κ, and one of extent 1 where a side has none; or 0-dimensional.
   at::Tensor kappa_, shift_;
   std::vector<at::Tensor> robin_;  // h of each Robin side, in their order
 };

@@ -27,6 +27,8 @@ const std::vector<OperatorKind> kKinds{
     {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, false, /*has_pressure=*/true},
     {"diffusion", "Diffusion", make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide},
      /*takes_null_spaces=*/true},
+    {"diffusion_per_axis", "Diffusion", make<DiffusionOperator>, Axes{kLikeState, kLikeField, kLikeSide},
+     /*takes_null_spaces=*/true},
     {"stencil", "Stencil", make<StencilOperator>, Axes{kLikeState}, true},
     {"dense", "Matrix", make<DenseOperator>, Axes{3}, true},
     {"csr", "Matrix", make<CsrOperator>, Axes{2, 2, 2}, true},

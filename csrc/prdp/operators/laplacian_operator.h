@@ -67,7 +67,7 @@ class PoissonOperator final : public LaplacianOperator {
 class HeatOperator final : public LaplacianOperator {
  public:
   explicit HeatOperator(const OperatorSpec& spec);
-  void check_parameters(bool kernel_checks) const override { step_.check_values(kernel_checks); }
+  void check_parameters(Checks checks) const override { step_.check_values(checks); }
   at::Tensor apply(const at::Tensor& v) const override;
   std::unique_ptr<Operator> select(const at::Tensor&) const override { return std::make_unique<HeatOperator>(*this); }
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;

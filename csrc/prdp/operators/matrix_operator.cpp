@@ -143,7 +143,7 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
   col_ = for_values(col);
 }
 
-void CsrOperator::check_parameters(bool /*kernel_checks*/) const {
+void CsrOperator::check_parameters(Checks /*checks*/) const {
   // Tensors that stand for others while a graph is traced have no numbers yet: the kernel checks them.
   if (at::isTensorSubclassLike(crow_) || at::isTensorSubclassLike(col_) || crow_.is_meta()) return;
   const auto crow = crow_.to(at::kCPU).contiguous(), col = col_.to(at::kCPU).contiguous();

@@ -35,7 +35,7 @@ class CsrOperator final : public Operator {
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless each crow rises from 0 to nnz and each column lies in [0, n). Torch does not
   /// check this when a sparse tensor is made, and loops and kernels read and write where the indices say.
-  void check_parameters(bool kernel_checks) const override;
+  void check_parameters(Checks checks) const override;
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;

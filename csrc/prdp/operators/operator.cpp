@@ -53,7 +53,8 @@ class Transposed final : public Operator {
  public:
   explicit Transposed(std::unique_ptr<Operator> a) : a_(std::move(a)) {}
   void check_vector(const at::Tensor& b) const override { a_->check_vector(b); }
-  void check_parameters(bool kernel_checks) const override { a_->check_parameters(kernel_checks); }
+  void check_parameters(Checks checks) const override { a_->check_parameters(checks); }
+  std::string refusal(int64_t sample) const override { return a_->refusal(sample); }
   void check_null_spaces(const at::Tensor& b) const override { a_->check_null_spaces(b); }
   at::Tensor apply(const at::Tensor& v) const override { return a_->apply_transpose(v); }
   at::Tensor apply_transpose(const at::Tensor& v) const override { return a_->apply(v); }

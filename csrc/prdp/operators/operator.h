@@ -25,6 +25,14 @@ namespace gpu {
 struct OperatorView;
 }
 
+/// Which numbers Operator::check_parameters() looks at. The others are left to the solve, where what is not allowed
+/// counts as not finite.
+enum class Checks {
+  kAll,
+  kShared,  // not what a sample has for itself: it fails alone
+  kHost,    // not what lies on a GPU, so that the host need not wait for it
+};
+
 /// A linear operator A(g) on batches of vectors: (batch, channel, *shape) on grids, (batch, n) for matrices. It is
 /// immutable.
 class Operator {
@@ -33,10 +41,8 @@ class Operator {
 
   /// Raises ValueError or TypeError unless b is a right-hand side of this operator.
   virtual void check_vector(const at::Tensor& b) const = 0;
-  /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu. With `kernel_checks`, numbers
-  /// on a GPU are left to the kernel of the solve, so that the host need not wait for them: there, what is not allowed
-  /// counts as not finite.
-  virtual void check_parameters(bool /*kernel_checks*/ = false) const {}
+  /// Raises ValueError if the value of a parameter is not allowed, such as a negative nu.
+  virtual void check_parameters(Checks /*checks*/ = Checks::kAll) const {}
 
   /// Raises ValueError if what somebody named as a null space is none, for vectors like b.
   virtual void check_null_spaces(const at::Tensor& /*b*/) const {}
@@ -69,8 +75,8 @@ class Operator {
   virtual bool knows_jacobi_radius() const { return false; }
   /// Which samples of b have an A that holds a NaN or Inf: (batch,), or one for all.
   virtual at::Tensor nonfinite_samples(const at::Tensor& /*b*/) const { return norm().isfinite().logical_not(); }
-  /// The index of the first NaN or Inf in the tensors of A: (i, j) in a matrix, (channel, *grid) in winds. Empty where
-  /// an index would say nothing.
+  /// The index of the first NaN or Inf in the tensors of A, or of what counts as one: (i, j) in a matrix, (channel,
+  /// *grid) in winds. Empty where an index would say nothing.
   virtual std::vector<int64_t> first_nonfinite(int64_t /*sample*/) const { return {}; }
   /// The operator for the samples `index` (int64) alone, differentiable in the same tensors; null if that is not
   /// possible.
@@ -89,6 +95,8 @@ class Operator {
   /// Tells a kernel that all samples share from those of other operators; nothing if they do not share it, or if to
   /// make it takes no longer than to read its numbers.
   virtual std::optional<kernels::FactorKey> key(bool transposed) const;
+  /// What is not allowed of the numbers of a sample, though it is finite: "kappa must be > 0, got -1". Else empty.
+  virtual std::string refusal(int64_t /*sample*/) const { return {}; }
 
   /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.
   at::Tensor dense(const at::TensorOptions& options) const;

@@ -23,7 +23,8 @@ class SingularOperator final : public Operator {
   SingularOperator(std::unique_ptr<Operator> a, const OperatorSpec& spec);
 
   void check_vector(const at::Tensor& b) const override;
-  void check_parameters(bool kernel_checks) const override { a_->check_parameters(kernel_checks); }
+  void check_parameters(Checks checks) const override { a_->check_parameters(checks); }
+  std::string refusal(int64_t sample) const override { return a_->refusal(sample); }
   /// Raises ValueError if A does not map the right, or Aᵀ the left basis to zero. Of the operator that this thread
   /// checked last, it is known.
   void check_null_spaces(const at::Tensor& b) const override;

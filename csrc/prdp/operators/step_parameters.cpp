@@ -22,8 +22,8 @@ StepParameters::StepParameters(const char* who, const OperatorSpec& spec, size_t
   TORCH_CHECK_TYPE(at::isFloatingType(nu.scalar_type()), owner, ": nu must be a real number, got ", nu.scalar_type());
 }
 
-void StepParameters::check_values(bool kernel_checks) const {
-  if (kernel_checks && !nu.is_cpu()) return;
+void StepParameters::check_values(Checks checks) const {
+  if (checks == Checks::kHost && !nu.is_cpu()) return;
   if (at::isTensorSubclassLike(nu)) return;  // no number yet; the solve checks it once there is one
   const double value = nu_value();
   TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ", value);

@@ -12,8 +12,8 @@ struct StepParameters {
   /// tensors as `expected` ("one tensor, nu") says, the last 0-dimensional; TypeError unless that is
   /// real. `owner` names the caller.
   StepParameters(const char* owner, const OperatorSpec& spec, size_t tensors, const char* expected);
-  /// Raises ValueError unless nu is finite and >= 0. Operator::check_parameters() has `kernel_checks`.
-  void check_values(bool kernel_checks) const;
+  /// Raises ValueError unless nu is finite and >= 0.
+  void check_values(Checks checks) const;
   /// nu as a number of the host.
   double nu_value() const;
 

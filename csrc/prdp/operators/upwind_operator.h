@@ -13,7 +13,7 @@ namespace prdp {
 class UpwindOperator : public Operator {
  public:
   void check_vector(const at::Tensor& b) const override;
-  void check_parameters(bool kernel_checks) const override { step_.check_values(kernel_checks); }
+  void check_parameters(Checks checks) const override { step_.check_values(checks); }
   std::vector<int64_t> vector_shape() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
 

@@ -143,6 +143,17 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
          "take a b without that part, or add a multiple of the identity to A";
 }
 
+/// Why the residual fell no further, far above what was asked for.
+std::string stagnated(const Solver& solver, const at::Tensor& b) {
+  const bool single = b.scalar_type() == at::kFloat;
+  if (traits(solver.method).counts == Counts::kCycles)
+    return "its cycles take nothing more off the residual; take a larger restart, a preconditioner or Direct" +
+           std::string(single ? ", or float64" : "");
+  return "the residual falls no further in " + std::string(single ? "float32" : "float64") + ", and u may be wrong; " +
+         (single ? "solve it in float64 once to see, and if it is, stay there, or " : "") +
+         "take another preconditioner or Direct, or scale A and b so that their rows are of one size";
+}
+
 std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const bool has_zero = a.diagonal().expand_as(b).select(0, sample).eq(0).any().item<bool>();
   const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
@@ -179,7 +190,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         forgets_constants(role, a, b, sample))
       return "A maps the constant to zero, so it is singular; give nullspace=\"constant\"";
-    if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown)
+    if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {
       case SolveStatus::kDiverged: return diverged(role.solver, a, b, sample);
@@ -193,7 +204,10 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
                               : "the right-hand side is NaN or Inf there; look at the state that it is made of";
         return "the start is NaN or Inf there; take another one, or none";
       case SolveStatus::kNonfiniteOperator:
+        if (const auto refused = a.refusal(sample); !refused.empty())
+          return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
+      case SolveStatus::kStagnated: return stagnated(role.solver, b);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

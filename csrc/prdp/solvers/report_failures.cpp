@@ -1,4 +1,8 @@
+#include <c10/util/Exception.h>
+
 #include <algorithm>
+#include <mutex>
+#include <set>
 #include <sstream>
 #include <utility>
 
@@ -43,6 +47,43 @@ std::string whereabouts(const Operator& a, const at::Tensor& b, const at::Tensor
   return text.str();
 }
 
+/// "step 3 of 10: "; nothing outside of a rollout.
+std::string of_step() {
+  return step_now > 0 ? "step " + std::to_string(step_now) + " of " + std::to_string(steps_in_all) + ": " : "";
+}
+
+/// Whether this is the first time that somebody says so.
+bool is_news(const std::string& what) {
+  static std::mutex mutex;
+  static std::set<std::string> said;
+  const std::lock_guard lock(mutex);
+  return said.insert(what).second || c10::WarningUtils::get_warnAlways();
+}
+
+/// Warns of samples whose residual stopped far above what was asked for. That is no failure: the residual may be all
+/// that rounding leaves of a u that is good enough, but nobody else would say that it may not be.
+void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                        const std::vector<int64_t>& stagnated) {
+  if (stagnated.empty()) return;
+  constexpr double far = 10.0, wrong = 0.01;
+  // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
+  const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
+  const auto* residual = residuals.const_data_ptr<double>();
+  const double bound = std::max(far * role.solver.rtol, wrong);
+  const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
+  const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
+  if (!(residual[worst] > bound)) return;
+  const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
+  const std::string who = role.adjoint ? "adjoint solve" : "linear_solve";
+  if (!is_news(who + std::string(name(role.solver.method)) + role.a.kind)) return;
+  std::ostringstream text;
+  text << of_step() << who << ": " << many << " of " << b.size(0)
+       << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst << " at relative residual "
+       << residual[worst] << " after " << info.iterations[worst].item<int64_t>() << " iterations, "
+       << diagnosis(role, a, b, SolveStatus::kStagnated, worst) << ". This is said once";
+  warning_sink()(text.str());
+}
+
 }  // namespace
 
 FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
@@ -59,14 +100,18 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();
-  std::vector<int64_t> failed;
-  for (int64_t i = 0; i < batch; ++i)
-    if (is_failure(static_cast<SolveStatus>(status[i]))) failed.push_back(i);
-  if (failed.empty()) return;
+  std::vector<int64_t> failed, stagnated;
+  for (int64_t i = 0; i < batch; ++i) {
+    const auto what = static_cast<SolveStatus>(status[i]);
+    if (is_failure(what)) failed.push_back(i);
+    if (what == SolveStatus::kStagnated) stagnated.push_back(i);
+  }
+  if (failed.empty()) return warn_of_stagnation(role, a, b, info, stagnated);
   const auto is_of_a = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
   };
-  if (std::any_of(failed.begin(), failed.end(), is_of_a)) a.check_parameters();  // a kernel may have found it
+  if (std::any_of(failed.begin(), failed.end(), is_of_a))  // a kernel may have found it
+    a.check_parameters(on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared);
 
   constexpr size_t named = 4;
   std::ostringstream text;
@@ -87,8 +132,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 
 void raise_or_warn(const std::string& text, OnFailure on_failure) {
   std::ostringstream whole;
-  if (step_now > 0) whole << "step " << step_now << " of " << steps_in_all << ": ";
-  whole << text;
+  whole << of_step() << text;
   if (on_failure == OnFailure::kRaise)
     whole
         << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "

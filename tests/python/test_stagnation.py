@@ -1,0 +1,128 @@
+"""What a solve says that stagnates: nothing near rounding, and once where it stands far above what was asked for."""
+
+import subprocess
+import sys
+import warnings
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch.operators import Diffusion, Function, Poisson
+
+F64 = torch.float64
+
+
+@contextmanager
+def told():
+    """The warnings, each as often as it is due."""
+    torch.set_warn_always(True)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            words = []
+            yield words
+            words += [str(w.message) for w in caught if "STAGNATED" in str(w.message)]
+    finally:
+        torch.set_warn_always(False)
+
+
+def rough(samples, n=48, contrast=4.0):
+    """κ that jumps by thousands from cell to cell."""
+    noise = torch.randn(samples, n, n, generator=torch.Generator().manual_seed(0))
+    return (contrast * noise).exp()
+
+
+def rotation(**options):
+    """A cyclic shift: GMRES(1) finds nothing in it that lowers the residual."""
+    return Function(lambda v: v.roll(1, -1), lambda v: v.roll(-1, -1), **options)
+
+
+def names(info):
+    return {prdp.SolveStatus(int(s)).name for s in info.status}
+
+
+@pytest.mark.filterwarnings("ignore:Diffusion. in float32")
+@pytest.mark.parametrize("on_failure", ["raise", "warn", "return", "zero_grad"])
+def test_a_residual_far_above_rtol_in_float32_is_told_with_the_remedy(on_failure):
+    kappa, b = rough(2), torch.ones(2, 1, 48, 48)
+    solver = prdp.CG(5000, rtol=1e-6, preconditioner="diagonal")
+    with told() as words:
+        _, info = prdp.linear_solve(Diffusion(kappa, boundary=["zero", "flux"]), b, solver, on_failure=on_failure)
+    assert names(info) == {"STAGNATED"} and (info.residual > 0.01).all() and not info.solved.any()
+    if on_failure in ("return", "zero_grad"):
+        assert not words
+        return
+    (text,) = words
+    worst = int(info.residual.argmax())
+    assert text.startswith("linear_solve: 2 of 2 samples STAGNATED far above rtol = 1e-06: ")
+    assert f"sample {worst} at relative residual {info.residual[worst]:.6g} after {info.iterations[worst]} iter" in text
+    assert 'CG with preconditioner="diagonal" on Diffusion' in text and "float64" in text
+    with told() as words:  # the remedy
+        _, info = prdp.linear_solve(
+            Diffusion(kappa.double(), boundary=["zero", "flux"]), b.double(), solver, on_failure=on_failure
+        )
+    assert info.solved.all() and not words
+
+
+def test_cycles_that_take_nothing_off_are_told():
+    b = torch.eye(8, dtype=F64)[:1]
+    with told() as words:
+        _, info = prdp.linear_solve(rotation(), b, prdp.GMRES(50, restart=1))
+    assert names(info) == {"STAGNATED"} and info.residual == 1.0
+    assert len(words) == 1 and "its cycles take nothing more off the residual; take a larger restart" in words[0]
+    with told() as words:
+        _, info = prdp.linear_solve(rotation(), b, prdp.GMRES(50, restart=8))
+    assert info.solved.all() and not words
+
+
+def test_what_is_told_may_be_wrong_altogether():
+    """Nothing but the warning tells: float32 against LAPACK in float64, with a condition number of a million."""
+    generator = torch.Generator().manual_seed(0)
+    q, _ = torch.linalg.qr(torch.randn(40, 40, dtype=F64, generator=generator))
+    a, b = q @ torch.diag(torch.logspace(0, -6, 40, dtype=F64)) @ q.T, torch.randn(1, 40, dtype=F64, generator=generator)
+    with told() as words:
+        u, info = prdp.linear_solve(a.float(), b.float(), prdp.GMRES(300, restart=10, rtol=1e-6))
+    exact = torch.linalg.solve(a, b[0])
+    assert names(info) == {"STAGNATED"} and (u - exact).norm() > 0.5 * exact.norm()
+    assert len(words) == 1 and "Direct, or float64. This is said once" in words[0]
+
+
+def test_an_adjoint_solve_is_told_by_its_own_name():
+    b = torch.zeros(1, 8, dtype=F64, requires_grad=True)  # solved at once
+    with told() as words:
+        u, info = prdp.linear_solve(rotation(), b, prdp.GMRES(50, restart=1))
+        (u * torch.eye(8, dtype=F64)[:1]).sum().backward()
+    assert names(info) == {"CONVERGED"} and names(info.adjoint) == {"STAGNATED"}
+    assert len(words) == 1 and words[0].startswith("adjoint solve: 1 of 1 samples STAGNATED far above rtol")
+
+
+@pytest.mark.parametrize("case", ["rounding", "near rounding", "as loose as was asked", "max_iter"])
+def test_no_false_alarm(case):
+    torch.manual_seed(0)
+    a, b, solver = Poisson((256, 256)), torch.ones(1, 1, 256, 256), prdp.CG(900, preconditioner="multigrid")
+    expected = {"STAGNATED"}
+    if case == "near rounding":  # above a hundredth of what float32 reaches here, and far above rtol
+        a, b, solver = Poisson((100,)), torch.ones(1, 1, 100), prdp.CG(900, rtol=1e-7)
+    if case == "as loose as was asked":
+        a, b, solver = rotation(), torch.eye(8)[:1] + 1e-3 * torch.randn(1, 8), prdp.GMRES(50, restart=1, rtol=0.2)
+    if case == "max_iter":  # as PRDP lets solves end
+        solver, expected = prdp.CG(2), {"MAX_ITER"}
+    with told() as words:
+        _, info = prdp.linear_solve(a, b, solver)
+    assert names(info) == expected and not words
+
+
+SAID_ONCE = """
+import torch, prdp_torch as prdp
+a = prdp.operators.Function(lambda v: v.roll(1, -1), lambda v: v.roll(-1, -1))
+for restart in (1, 1, 2):
+    prdp.linear_solve(a, torch.eye(8)[:1], prdp.GMRES(50, restart=restart))
+step = prdp.ImplicitStep(a, solver=prdp.MINRES(50))
+"""
+
+
+def test_it_is_said_once():
+    done = subprocess.run([sys.executable, "-W", "always", "-c", SAID_ONCE], capture_output=True, text=True, check=True)
+    assert done.stderr.count("STAGNATED far above") == 1 and "This is said once" in done.stderr
