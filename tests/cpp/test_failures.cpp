@@ -54,7 +54,7 @@ TEST(Failures, NameOperatorSampleAndRemedy) {
   expect_said(a, at::ones_like(flow), prdp::Jacobi{5},
               {"ZERO_DIAGONAL in row (2, 0, 0)", "Jacobi on NavierStokes: the pressure rows have a zero diagonal"});
   expect_said(a, at::ones_like(flow), prdp::GMRES{.max_iter = 5},
-              {"INCONSISTENT", "57.7 % of b are a mean of its pressure channel"});
+              {"INCONSISTENT", "57.7 % of b is the mean of its pressure channel"});
   const prdp::OperatorSpec heat{"heat", {4}, {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}};
   expect_said(heat, at::full({1, 1, 4}, infinity, at::kDouble), prdp::Jacobi{5},
               {"NONFINITE_INPUT at index (0, 0)", "Jacobi on Heat: the right-hand side is NaN or Inf there"});

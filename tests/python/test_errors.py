@@ -59,7 +59,7 @@ def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
         lambda: prdp.linear_solve(function, torch.zeros(1, 5), prdp.CG(1)),
     ):
         for graph in (torch.no_grad, torch.enable_grad):
-            with graph(), pytest.raises(ValueError, match="a tensor of it is on meta but the vector is on cpu; it has"):
+            with graph(), pytest.raises(ValueError, match="one of its tensors is on meta, the vector on cpu; it has"):
                 call()
 
 

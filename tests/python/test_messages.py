@@ -63,7 +63,7 @@ TABLE = [
     ("ZERO_DIAGONAL", SWAP, E1, prdp.Jacobi(9), r"in row \(0\), Jacobi on Matrix: it divides by .*; take GMRES"),
     ("ZERO_DIAGONAL", ZERO, GRID, prdp.Jacobi(9), r"in row \(0, 0\), Jacobi on Stencil: it divides by .*; take GMRES"),
     *[("INCONSISTENT", FLOW, flow_state(2.0), solver,
-       rf"{name} on NavierStokes: [\d.]+ % of b are a mean of its pressure channel, which no flow can have")
+       rf"{name} on NavierStokes: [\d.]+ % of b is the mean of its pressure channel, which no flow can have")
       for name, solver in (("SteepestDescent", prdp.SteepestDescent(9)),
                            (r"GMRES\(10\)", prdp.GMRES(9)), ("Direct", prdp.Direct()),
                            (r'GMRES\(10\) with preconditioner="multigrid"',
@@ -113,7 +113,7 @@ def test_a_loss_of_the_mean_pressure_is_named():
     u, _ = prdp.linear_solve(FLOW, flow_state().requires_grad_(), prdp.GMRES(30, restart=8))
     with pytest.raises(
         torch.linalg.LinAlgError,
-        match=r"INCONSISTENT .*GMRES\(8\) on NavierStokes: 100 % of the cotangent are a mean of its pressure, "
+        match=r"INCONSISTENT .*GMRES\(8\) on NavierStokes: 100 % of the cotangent is the mean of its pressure, "
         "which the step leaves free; take the mean off the pressure that the loss is made of",
     ):
         u[:, 2].mean().backward()

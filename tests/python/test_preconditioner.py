@@ -337,7 +337,7 @@ def test_a_preconditioner_without_values_is_refused(solver):
     scale = torch.ones(8, device="meta")
     inverse = operators.Function(lambda v, t: v * t, tensors=(scale,), symmetric=True)
     with pytest.raises(
-        ValueError, match="Function: a tensor of it is on meta but the vector is on cpu; it has no values"
+        ValueError, match="Function: one of its tensors is on meta, the vector on cpu; it has no values"
     ):
         prdp.linear_solve(operators.Heat((8,), 1e-3, 0.1), torch.ones(2, 1, 8), solver(5, preconditioner=inverse))
 

@@ -59,8 +59,8 @@ void check_devices(const OperatorSpec& a, const at::Tensor& b) {
   for (const auto& t : a.tensors) {
     const bool beside = t.device() == b.device() || (t.dim() == 0 && t.is_cpu()) || t.sym_numel() == 0 ||
                         (is_function(a) && t.is_meta() == b.is_meta());
-    TORCH_CHECK_VALUE(beside, operator_kind(a.kind).title, ": a tensor of it is on ", t.device(),
-                      " but the vector is on ", b.device(),
+    TORCH_CHECK_VALUE(beside, operator_kind(a.kind).title, ": one of its tensors is on ", t.device(),
+                      ", the vector on ", b.device(),
                       t.is_meta() ? "; it has no values: give it some, as with to_empty and load_state_dict" : "");
   }
 }

@@ -176,9 +176,9 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
     return share + "b lies in the null space of A; take a b without that part";
   if (role.adjoint)
     return share +
-           "the cotangent are a mean of its pressure, which the step leaves free; take the mean off the "
+           "the cotangent is the mean of its pressure, which the step leaves free; take the mean off the "
            "pressure that the loss is made of";
-  return share + "b are a mean of its pressure channel, which no flow can have; take it off";
+  return share + "b is the mean of its pressure channel, which no flow can have; take it off";
 }
 
 }  // namespace

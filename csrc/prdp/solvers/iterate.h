@@ -5,8 +5,8 @@
 #include <limits>
 
 #include "prdp/solvers/energy.h"
-#include "prdp/solvers/space.h"
 #include "prdp/solvers/observe.h"
+#include "prdp/solvers/space.h"
 
 // Functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
 #ifndef PRDP_ONCE
@@ -170,9 +170,9 @@ void replay(Space& space, Method& method, typename Space::States& states, double
 
 }  // namespace detail
 
-/// Solves every sample that `states` holds active, from zero or the space's start; the result is method.x, but for
-/// that start. A sample that overflows or diverges, or ends worse than zero without an excuse, is run again for as many
-/// iterations as gave its smallest residual, unless the iterations are wanted as they come.
+/// Solves every sample that `states` holds active, from zero or the space's start. The result is method.x, to which the
+/// caller adds the start. With `guarded`, a sample that overflows or diverges, or ends worse than zero without an
+/// excuse, is run again for as many iterations as gave its smallest residual.
 template <LoopSpace Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   const bool track = rtol > 0.0;

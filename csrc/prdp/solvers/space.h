@@ -92,9 +92,11 @@ concept NumberOperations =
       { s.is_rounding(a, a2, b2, factor) } -> std::same_as<typename S::Scalar>;
       /// a where b and `active` are not zero, else 0.
       { s.unless_zero(a, b, active) } -> std::same_as<typename S::Scalar>;
-      /// 1 where a is not zero, else 0; the other way round; and 1 where a > b, else 0.
+      /// 1 where a is not zero, else 0.
       { s.is_not_zero(a) } -> std::same_as<typename S::Scalar>;
+      /// 1 where a is zero, else 0.
       { s.is_zero(a) } -> std::same_as<typename S::Scalar>;
+      /// 1 where a > b, else 0.
       { s.is_larger(a, b) } -> std::same_as<typename S::Scalar>;
       /// y = x, and b = a, where `where` is not zero.
       s.restore(where, x, y);

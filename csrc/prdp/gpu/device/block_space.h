@@ -336,8 +336,8 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   auto largest_over_rows(const F& f) {
     return largest_of(team_, A::kUnknowns, f);
   }
-  /// store(i, (A v)_i) for this thread's cells. Before v is changed, a sum or another product must come: slower threads
-  /// still read it. The methods are like that; one that is not gives other bits in tests/python/test_gpu_kernels.py.
+  /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
+  /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.
   template <class Store>
   void product(const T* v, const Store& store) {
     ++state_->applications;

@@ -14,8 +14,8 @@ struct Projected {
   at::Tensor u, potential;
 };
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info);
-/// The same of u + added, if there is any, which is zero on the faces that are not free; and φ + potential, if it is
-/// defined.
+/// The projection of u + added, where `added` is zero on the faces that are not free; `potential` is added to φ. Both
+/// may be absent.
 Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
                   const SolveOptions& options, CombinedInfo& info);
 /// The cotangent of u from that of the projected one, the same projection, and from that of φ, if it is defined: by one

@@ -87,7 +87,7 @@ std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<a
   return all;
 }
 
-/// The same by differentiating the step as it is written; for derivatives of derivatives.
+/// The gradients of a step by recording it and differentiating what was recorded; for derivatives of derivatives.
 std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                      SolveOptions options, at::IntArrayRef needed) {
   options.adjoint_log = 0;
@@ -100,9 +100,9 @@ std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Ten
 
 /// The gradients of u and the tensors of the equation from the cotangents of the velocity with its boundary values, of
 /// its change, and of ν in the diffusion.
-std::vector<at::Tensor> explicit_vjp_recorded(const FlowEquation& equation, const at::Tensor& u,
-                                              const at::Tensor& refused, const at::Tensor& velocity_bar,
-                                              const DiffuseVjp& back, at::IntArrayRef needed) {
+std::vector<at::Tensor> explicit_vjp_by_autograd(const FlowEquation& equation, const at::Tensor& u,
+                                                 const at::Tensor& refused, const at::Tensor& velocity_bar,
+                                                 const DiffuseVjp& back, at::IntArrayRef needed) {
   const at::AutoGradMode record(true);
   std::vector<at::Tensor> inputs{u.detach().requires_grad_()};
   const auto given = equation.tensors();
@@ -126,9 +126,10 @@ std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::T
   return all;
 }
 
-/// The same by loops.
-std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& refused,
-                                     const at::Tensor& velocity_bar, const DiffuseVjp& back, at::IntArrayRef needed) {
+/// explicit_vjp_by_autograd() by the loops of the CPU.
+std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, const at::Tensor& u,
+                                              const at::Tensor& refused, const at::Tensor& velocity_bar,
+                                              const DiffuseVjp& back, at::IntArrayRef needed) {
   const auto e = equation.for_state(u);
   const auto velocity = cleared(with_boundary_values(e, u), refused);
   auto found = tendency_vjp(e, velocity, back.change[0] * e.dt);
@@ -183,10 +184,11 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   if (beginning.of_kernels) {
     auto found = flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, needed);
     if (found) return as_given(equation, *std::move(found), back.nu, needed);
-    return explicit_vjp_recorded(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
+    return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
   const auto by_loops = flow_has_loops(u);
-  return (by_loops ? explicit_vjp : explicit_vjp_recorded)(equation, u, refused, velocity_bar.u, back, needed);
+  return (by_loops ? explicit_vjp_by_loops : explicit_vjp_by_autograd)(equation, u, refused, velocity_bar.u, back,
+                                                                       needed);
 }
 
 }  // namespace prdp
