@@ -114,6 +114,68 @@ TEST(StencilKernel, EqualsItsMatrixInThreeDimensions) {
   expect_stencils(3, {{1, 1, 1}, {2, 1, 3}, {3, 2, 4}, {2, 3, 17}}, kFarInSpace);
 }
 
+/// Whether the neighbour of a point is there.
+bool is_there(const StencilGrid& grid, int64_t point, const Offset& offset) {
+  const auto& [nz, ny, nx] = grid.shape;
+  const int64_t at[3] = {point / nx / ny, point / nx % ny, point % nx};
+  for (int d = 0; d < 3; ++d)
+    if (neighbour(at[d], offset.along[d], grid.shape[d], grid.periodic[d]) < 0) return false;
+  return true;
+}
+
+/// Points that are coupled to their neighbours a million times as strongly as they are held.
+template <class T>
+void expect_held(const StencilGrid& grid, bool is_number) {
+  SCOPED_TRACE(testing::Message() << grid.shape[0] << " x " << grid.shape[1] << " x " << grid.shape[2] << ", periodic "
+                                  << grid.periodic[0] << grid.periodic[1] << grid.periodic[2] << ", " << sizeof(T)
+                                  << " bytes, held by a number: " << is_number);
+  const int64_t n = grid.shape[0] * grid.shape[1] * grid.shape[2], channels = 2;
+  const auto offsets = StencilSparsity::nearest_neighbours(grid.dim);
+  auto held = random_values<T>(is_number ? 1 : n, 10), c = random_values<T>(n * std::ssize(offsets), 9);
+  for (auto& h : held) h = T(1e-6) * (1 + std::abs(h));
+  std::vector<double> exact(c.size());
+  for (int64_t i = 0; i < n; ++i) {
+    exact[i] = static_cast<double>(held[is_number ? 0 : i]);
+    for (int64_t k = 1; k < std::ssize(offsets); ++k) {
+      c[k * n + i] = is_there(grid, i, offsets[k]) ? -std::abs(c[k * n + i]) : T(0);
+      exact[k * n + i] = static_cast<double>(c[k * n + i]);
+      exact[i] -= exact[k * n + i];
+    }
+    c[i] = static_cast<T>(exact[i]);
+  }
+  const auto made =
+      GivenStencil<T>{c.data(), 0, std::make_shared<StencilSparsity>(grid, offsets), false, {held.data(), 0, is_number}}
+          .make(0, channels);
+  const Matrix block = dense_stencil(grid, offsets, exact);
+  Matrix a = Matrix::Zero(channels * n, channels * n);
+  for (int64_t i = 0; i < channels; ++i) a.block(i * n, i * n, n, n) = block;
+  expect_matrix(*made, a);
+  expect_jacobi_sweep(*made, a);
+  const auto lu = a.partialPivLu();  // in double, so that it says nothing of factors in double
+  if (sizeof(T) == 4) expect_solution(*made, [&](const Vector& r) -> Vector { return lu.solve(r); });
+
+  Harness<T> harness(*made);
+  const auto of_ones = harness.apply(std::vector<T>(channels * n, T(1)));
+  for (int64_t i = 0; i < channels * n; ++i) EXPECT_EQ(of_ones[i], held[is_number ? 0 : i % n]);
+  Vector rows = Vector::Zero(n);
+  for_each_entry(*made, [&](int64_t i, int64_t, double value) { rows[i] += value; });
+  for (int64_t i = 0; i < n; ++i) EXPECT_NEAR(rows[i], held[is_number ? 0 : i], 1e-14);
+}
+
+TEST(StencilKernel, KeepsWhatHoldsItsPointsBesideAnyCoupling) {
+  const std::vector<std::pair<int64_t, std::array<int64_t, 3>>> grids{{1, {1, 1, 2}},  {1, {1, 1, 3}}, {1, {1, 1, 16}},
+                                                                      {1, {1, 1, 33}}, {2, {1, 2, 2}}, {2, {1, 3, 5}},
+                                                                      {2, {1, 5, 17}}, {3, {2, 2, 3}}, {3, {3, 2, 17}}};
+  for (const auto& [dim, n] : grids)
+    for (int boundary = 0; boundary < 1 << dim; ++boundary)
+      for (const bool is_number : {true, false}) {
+        const StencilGrid grid{
+            dim, {n[0], n[1], n[2]}, {(boundary & 4) != 0, (boundary & 2) != 0, (boundary & 1) != 0}};
+        expect_held<float>(grid, is_number);
+        expect_held<double>(grid, is_number);
+      }
+}
+
 TEST(StencilSparsity, OffsetsThatLeadToOneNeighbourAreOne) {
   const std::vector<Offset> five{{{0, 0, -2}}, {{0, 0, -1}}, {{0, 0, 0}}, {{0, 0, 1}}, {{0, 0, 2}}};
   const auto places = [&](int64_t n, bool periodic) {

@@ -366,7 +366,6 @@ def test_the_limit_is_a_positive_number(seconds):
         prdp.advise(prdp.Heat((8,), 1e-3, 1.0, prdp.CG(1)), torch.ones(2, 1, 8), seconds)
 
 
-@pytest.mark.filterwarnings("ignore:Diffusion. in float32")
 def test_an_adjoint_at_its_rounding_does_not_end_the_trials_of_the_forward_solve():
     """Here the adjoint solve is STAGNATED after four cycles, while a forward solve is MAX_ITER and needs more."""
     generator = torch.Generator().manual_seed(0)

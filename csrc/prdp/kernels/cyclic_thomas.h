@@ -21,13 +21,13 @@ class CyclicThomas {
     double corner = 0;
     std::vector<double> pivot(n_), border(n_);
     // Where n is 2 or 3, entries coincide and add up.
-    a.for_each_entry([&](int64_t i, int64_t j, T value) {
+    a.for_each_entry([&](int64_t i, int64_t j, double value) {
       double& entry = i == last   ? (j == last ? corner : border[j])
                       : j == last ? column_[i]
                       : j < i     ? lower_[i]
                       : j > i     ? upper_[i]
                                   : pivot[i];
-      entry += static_cast<double>(value);
+      entry += value;
     });
     is_dominant_ = is_dominant(pivot, border, corner, 8.0 * std::numeric_limits<T>::epsilon());
     if (!is_dominant_) return;

@@ -59,6 +59,14 @@ PackedStencil<T> assemble_rows(std::shared_ptr<const StencilSparsity> pattern,
   return a;
 }
 
+/// What the points are held by, see PackedStencil::hold(): (batch, nz, ny, nx), or one number for all of them.
+template <class T>
+struct Hold {
+  const T* values = nullptr;  // null: nothing is said of that
+  int64_t sample_stride = 0;  // 0: all samples share them
+  bool is_number = false;
+};
+
 /// The stencils with `coefficients` (batch, k, nz, ny, nx) for the offsets that `pattern` was given, or their
 /// transposes: the stencils of the opposite offsets, of which `pattern` is then to be.
 template <class T>
@@ -67,9 +75,11 @@ struct GivenStencil {
   int64_t sample_stride;  // 0: all samples share them
   std::shared_ptr<const StencilSparsity> pattern;
   bool transposed;
+  Hold<T> hold = {};
 
-  /// Whether each given offset leads to a neighbour of its own.
+  /// Whether apply() may be used: each given offset leads to a neighbour of its own, and products are of values.
   bool is_one_to_one() const {
+    if (hold.values) return false;
     auto places = pattern->places;
     std::sort(places.begin(), places.end());
     return places.front() >= 0 && std::adjacent_find(places.begin(), places.end()) == places.end();
@@ -110,8 +120,11 @@ struct GivenStencil {
     for (int64_t k = 0; k < given; ++k) fields.push_back(from + k * points);
     const T factor = scale_of_operator(magnitude);
     auto rows = std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, factor, transposed));
-    const auto key = [given_stencil = *this, from, count = given * points] {
-      return given_stencil.of_matrix().add_field(from, count).key();
+    const T* const held = hold.values ? hold.values + s * hold.sample_stride : nullptr;
+    if (held) rows->hold(held, hold.is_number, factor);
+    const auto key = [given_stencil = *this, from, held, count = given * points, points] {
+      auto made = given_stencil.of_matrix().add_field(from, count);
+      return held ? made.add_field(held, given_stencil.hold.is_number ? 1 : points).key() : made.key();
     };
     const auto raw = [given_stencil = *this, fields, factor, points] {
       return given_stencil.raw(fields, factor, points);

@@ -178,7 +178,7 @@ bool Hierarchy<T>::invert_coarsest(const StencilFields<T>& a, int64_t nullity) {
   const auto rows = rows_of(a, false);
   const int64_t n = a.points();
   MatrixXd m = MatrixXd::Zero(n, n);
-  rows->for_each_entry([&](int64_t i, int64_t j, T value) { m(i, j) += static_cast<double>(value); });
+  rows->for_each_entry([&](int64_t i, int64_t j, double value) { m(i, j) += value; });
   const double tiny = 10.0 * static_cast<double>(n) * static_cast<double>(std::numeric_limits<T>::epsilon());
   const MatrixXd inverse = invert(m, nullity, tiny);
   coarsest_inverse_.resize(n * n);

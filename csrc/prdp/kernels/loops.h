@@ -30,11 +30,17 @@ struct ConstantStencil {
 /// and its first value at the last kLanes; null where nothing does. Beyond the first and the last row, and
 /// plane, comes the one from the other end, with coefficients of zero where the axis is not periodic.
 /// The padding holds zeros but for the centre's, which may be divided by.
+///
+/// With `held`, products are made of differences: A v is held∘v and, for each neighbour, its coefficient times how far
+/// it is from the point itself. The centre, which is the sum of them all, is then for divisions alone. `held` has a row
+/// for each row of the grid, `held_step` apart.
 template <class T>
 struct NeighbourStencil {
   int64_t nz, ny, nx, row;
   const T* coefficients;
   const T* ends;
+  const T* held = nullptr;
+  int64_t held_step = 0;
 };
 
 /// The same with neighbours at any offsets, the first being the point itself. What leaves a row has its

@@ -42,7 +42,7 @@ class NavierStokes final : public Kernel<T> {
   void for_each_entry(const Body& body) const {
     const int64_t n = ny() * nx();
     for (int64_t c = 0; c < 2; ++c)
-      velocity_[c]->for_each_entry([&](int64_t i, int64_t j, T a) { body(c * n + i, c * n + j, a); });
+      velocity_[c]->for_each_entry([&](int64_t i, int64_t j, double a) { body(c * n + i, c * n + j, a); });
     // Backward differences of the pressure; D = -Gᵀ.
     const auto gradient = [&](int64_t u, int64_t p, T value) {
       body(u, 2 * n + p, value);

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <memory>
 
 #include "prdp/kernels/stencil_sparsity.h"
@@ -52,6 +53,32 @@ class PackedStencil {
     });
   }
 
+  /// Of nearest neighbours: from here on the diagonal is, but for rounding, these values and what the neighbours of a
+  /// point are coupled by, and products are made of differences. The rounding of a diagonal would hold v by more, or by
+  /// less, than the values say. One for all points, or one for each.
+  void hold(const T* values, bool is_number, T factor) {
+    held_step_ = is_number ? 0 : row_;
+    held_ = zeros<T>(is_number ? row_ : rows() * row_);
+    for (int64_t r = 0; r < (is_number ? 1 : rows()); ++r)
+      for (int64_t i = 0; i < nx_; ++i) held_[r * row_ + i] = factor * values[is_number ? 0 : r * nx_ + i];
+  }
+  /// Whether every point is held by the same, or nothing was said of that.
+  bool is_held_evenly() const {
+    if (held_step_ == 0) return true;
+    const double first = static_cast<double>(held_[0]), slack = 16.0 * std::numeric_limits<T>::epsilon();
+    for (int64_t r = 0; r < rows(); ++r)
+      for (int64_t i = 0; i < nx_; ++i)
+        if (!(std::abs(held_[r * row_ + i] - first) <= slack * std::abs(first))) return false;
+    return true;
+  }
+  /// The entry of the matrix on its diagonal at point i of row r.
+  double diagonal(int64_t r, int64_t i) const {
+    if (held_.empty()) return static_cast<double>(coefficient(r, 0)[i]);
+    double sum = static_cast<double>(held_[r * held_step_ + i]);
+    for (int64_t k = 1; k < count_; ++k) sum -= static_cast<double>(value(r, k, i));
+    return sum;
+  }
+
   /// On these rows: out = A v; dots += {v·out, ‖out‖²} unless it is null.
   void apply(Lines lines, const T* v, T* out, T* dots) const {
     const auto& loops = kernels::loops<T>();
@@ -78,10 +105,17 @@ class PackedStencil {
   /// The same for the loops of operators that hold several stencils of nearest neighbours.
   NeighbourStencil<T> neighbours() const {
     const auto& n = grid().shape;
-    return {n[0], n[1], nx_, row_, coefficients_, coupled_ ? coupled(0) : nullptr};
+    return {n[0],
+            n[1],
+            nx_,
+            row_,
+            coefficients_,
+            coupled_ ? coupled(0) : nullptr,
+            held_.empty() ? nullptr : held_.data(),
+            held_step_};
   }
 
-  int64_t bytes() const { return static_cast<int64_t>(memory_.size() * sizeof(T)); }
+  int64_t bytes() const { return static_cast<int64_t>((memory_.size() + held_.size()) * sizeof(T)); }
   /// max_i Σ_j |A_ij|
   double norm() const {
     std::vector<T> sums(nx_);
@@ -109,7 +143,7 @@ class PackedStencil {
       for (int64_t k = 0; k < count_; ++k)
         for (int64_t i = 0; i < nx_; ++i) body(r, k, i, value(r, k, i));
   }
-  /// Calls body(row, column, value) for the entries of the matrix; where nearest neighbours coincide they
+  /// Calls body(row, column, value in double) for the entries of the matrix; where nearest neighbours coincide they
   /// come one by one.
   template <class Body>
   void for_each_entry(const Body& body) const {
@@ -122,10 +156,11 @@ class PackedStencil {
         if (z < 0 || y < 0) continue;
         const int64_t begin = std::max<int64_t>(-o[2], 0), end = std::min(nx, nx - o[2]);
         const int64_t at = r * nx, there = (z * ny + y) * nx;
-        for (int64_t i = begin; i < end; ++i) body(at + i, there + i + o[2], coefficient(r, k)[i]);
+        const auto entry = [&](int64_t i) { return k == 0 ? diagonal(r, i) : static_cast<double>(value(r, k, i)); };
+        for (int64_t i = begin; i < end; ++i) body(at + i, there + i + o[2], entry(i));
         if (!periodic[2]) continue;
-        for (int64_t i = 0; i < begin; ++i) body(at + i, there + i + o[2] + nx, wrapped(r, k, i));
-        for (int64_t i = end; i < nx; ++i) body(at + i, there + i + o[2] - nx, wrapped(r, k, i));
+        for (int64_t i = 0; i < begin; ++i) body(at + i, there + i + o[2] + nx, entry(i));
+        for (int64_t i = end; i < nx; ++i) body(at + i, there + i + o[2] - nx, entry(i));
       }
   }
 
@@ -168,6 +203,8 @@ class PackedStencil {
   int64_t nx_, row_, count_;
   int64_t coupled_;  // values for what leaves a row
   Field<T> memory_;
+  Field<T> held_;  // see hold()
+  int64_t held_step_ = 0;
   T* coefficients_;  // aligned, within memory_, with those values behind them
 };
 

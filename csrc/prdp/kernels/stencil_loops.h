@@ -41,12 +41,13 @@ struct Line {
   Register<T> right() const { return lanes_from<T, 1>(here, after); }
 };
 
-/// Row j of plane z of a field with what lies around it; its coefficients in A.
-template <int Dim, class T>
+/// Row j of plane z of a field with what lies around it; its coefficients in A, whose products may be made of
+/// differences.
+template <int Dim, class T, bool Differences = false>
 struct NeighbourRow {
   const NeighbourStencil<T>& a;
   int64_t row, last;  // its padded length; where its last register starts
-  const T *w, *ends, *below, *above, *back, *front;
+  const T *w, *own, *ends, *below, *above, *back, *front;  // own: what the point itself is multiplied by
   Line<T> line;
 
   NeighbourRow(const NeighbourStencil<T>& stencil, int64_t z, int64_t j, const T* field)
@@ -54,6 +55,7 @@ struct NeighbourRow {
         row(a.row),
         last((a.nx - 1) / kWidth<T> * kWidth<T>),
         w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
+        own(Differences ? a.held + (z * a.ny + j) * a.held_step : w),
         ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
         below(field + (z * a.ny + round(j - 1, a.ny)) * row),
         above(field + (z * a.ny + round(j + 1, a.ny)) * row),
@@ -64,39 +66,50 @@ struct NeighbourRow {
   /// A v at register i, but for the ends.
   Register<T> product(int64_t i) {
     line.step_to(i);
-    Register<T> sum = load(w + i) * line.here;
-    sum += load(w + row + i) * line.left();
-    sum += load(w + 2 * row + i) * line.right();
+    Register<T> sum = load(own + i) * line.here;
+    sum += load(w + row + i) * from_here(line.left());
+    sum += load(w + 2 * row + i) * from_here(line.right());
     if constexpr (Dim > 1) {
-      sum += load(w + 3 * row + i) * load(below + i);
-      sum += load(w + 4 * row + i) * load(above + i);
+      sum += load(w + 3 * row + i) * from_here(load(below + i));
+      sum += load(w + 4 * row + i) * from_here(load(above + i));
     }
     if constexpr (Dim > 2) {
-      sum += load(w + 5 * row + i) * load(back + i);
-      sum += load(w + 6 * row + i) * load(front + i);
+      sum += load(w + 5 * row + i) * from_here(load(back + i));
+      sum += load(w + 6 * row + i) * from_here(load(front + i));
     }
     return sum;
   }
   Register<T> with_ends(int64_t i, Register<T> sum) const {
     if (!ends) return sum;
-    if (i == 0) sum += load(ends) * line.v[a.nx - 1];
-    if (i == last) sum += load(ends + kLanes<T> + last % kLanes<T>) * line.v[0];
+    if (i == 0) sum += load(ends) * from_here(line.v[a.nx - 1]);
+    if (i == last) sum += load(ends + kLanes<T> + last % kLanes<T>) * from_here(line.v[0]);
     return sum;
+  }
+  /// Of a neighbour, a register or one value, what its coefficient multiplies.
+  template <class V>
+  auto from_here(const V& there) const {
+    if constexpr (Differences) return there - line.here;
+    else return there;
   }
 };
 
 /// Calls body.finish(i, v, A v, diagonal) for every register i of a field v.
-template <int Dim, class T, class Body>
-void for_each_register(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& shared) {
+template <int Dim, bool Differences, class T, class Body>
+void go_along_rows(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& shared) {
   Body body = shared;  // a copy, which no store can change for all the compiler knows
   for (int64_t line = lines.begin; line < lines.end; ++line) {
-    NeighbourRow<Dim, T> u(a, line / a.ny, line % a.ny, v);
+    NeighbourRow<Dim, T, Differences> u(a, line / a.ny, line % a.ny, v);
     for (int64_t i = 0, at = line * a.row; i < a.row; i += kWidth<T>) {
       const Register<T> sum = u.product(i);
       body.finish(at + i, u.line.here, u.with_ends(i, sum), u.w + i);
     }
   }
   shared = body;
+}
+template <int Dim, class T, class Body>
+void for_each_register(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& body) {
+  if (a.held) go_along_rows<Dim, true>(a, lines, v, body);
+  else go_along_rows<Dim, false>(a, lines, v, body);
 }
 
 template <class T, class Body>

@@ -1,7 +1,6 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include <cmath>
-#include <sstream>
 
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/singular_operator.h"
@@ -180,35 +179,28 @@ std::string DiffusionOperator::refusal(int64_t sample) const {
   return text.str();
 }
 
+bool DiffusionOperator::takes_differences() const {
+  if (kappa_.scalar_type() != at::kFloat) return false;
+  for (const auto& [low, high] : sides_)
+    for (const auto side : {low, high})
+      if (side == Side::kZero || side == Side::kRobin) return false;
+  return true;
+}
+
 void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double largest_kappa) const {
-  if (kappa_.scalar_type() != at::kFloat || !kappa_.is_cpu() || !shift_.is_cpu()) return;
+  if (kappa_.scalar_type() != at::kFloat || takes_differences() || !kappa_.is_cpu() || !shift_.is_cpu()) return;
   double diagonal = 0.0;
   for (int64_t axis = 0; axis < dim(); ++axis)
     diagonal += 2.0 * (per_axis_ ? kappa_along(axis).max().item<double>() : largest_kappa) * per_cell2(axis);
   const double rounding = 10.0 * epsilon_of(kappa_) * diagonal;
   const double least_shift = shift_.min().item<double>();
-  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa))
-    return warn_of_drift(least_shift, epsilon_of(kappa_) * diagonal);
+  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa)) return;
   const double shift = mean_of_least_sample(shift_);
   const double held = held_by(shift, least_shift, std::exp(kappa_.log().mean().item<double>()));
   if (!(held > 0.0) || rounding <= held) return;
-  std::ostringstream what;
-  if (held == shift) what << "a shift of " << shift;
-  else what << "what holds u, a shift and sides that act as one of about " << held << ',';
-  TORCH_WARN_ONCE("Diffusion: in float32, ", what.str(), " is lost in the rounding of a diagonal of up to ", diagonal,
-                  ", so that u may be off by per cents and its mean is not conserved; take float64");
-}
-
-void DiffusionOperator::warn_of_drift(double shift, double rounding) const {
-  constexpr double most = 1e-4;  // half a per cent in fifty steps
-  for (const auto& [low, high] : sides_)
-    for (const auto side : {low, high})
-      if (side == Side::kZero || side == Side::kRobin) return;
-  const double drift = rounding / (2.0 * shift);
-  if (!(shift > 0.0) || !(drift > most) || !std::isfinite(drift)) return;
-  TORCH_WARN_ONCE("Diffusion: in float32 the mean of u, which nothing but the shift holds, may drift by up to ", drift,
-                  " of itself in each solve, as a shift of ", shift,
-                  " is small beside the diagonal; take float64, or more than one step to the same time");
+  TORCH_WARN_ONCE("Diffusion: in float32, what holds u, a shift and sides that act as one of about ", held,
+                  ", is lost in the rounding of a diagonal of up to ", diagonal,
+                  ", so that u may be off by per cents; take float64");
 }
 
 double DiffusionOperator::held_by(double shift, double least_shift, double kappa) const {

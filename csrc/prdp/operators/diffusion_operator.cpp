@@ -205,7 +205,11 @@ OperatorSpec DiffusionOperator::as_stencil() const {
 at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()).norm(); }
 
 at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b) const {
-  return StencilOperator(as_stencil()).solve_directly(b);
+  if (!takes_differences() || !b.is_cpu()) return StencilOperator(as_stencil()).solve_directly(b);
+  auto wide = *this;  // a diagonal in float32 would lose what the loops keep
+  wide.kappa_ = kappa_.to(at::kDouble);
+  wide.shift_ = shift_.to(at::kDouble);
+  return StencilOperator(wide.as_stencil()).solve_directly(b.to(at::kDouble)).to(b.scalar_type());
 }
 
 std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) const {
@@ -227,7 +231,8 @@ std::vector<int64_t> DiffusionOperator::vector_shape() const {
 
 std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
   const at::NoGradGuard no_grad;
-  return StencilOperator(as_stencil()).kernels(b, /*transposed=*/false);
+  const StencilOperator stencil(as_stencil());
+  return takes_differences() ? stencil.kernels_by_differences(b, shift_) : stencil.kernels(b, /*transposed=*/false);
 }
 
 std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b, bool /*transposed*/) const {

@@ -61,10 +61,11 @@ class DiffusionOperator final : public Operator {
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
   bool is_closed(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
-  /// Warns where float32 rounds the diagonal by as much as what holds u.
+  /// Whether the loops make products of differences: in float32, nothing but the shift holds u, so that the rounding of
+  /// a diagonal would change the mean of u in every solve.
+  bool takes_differences() const;
+  /// Warns where float32 rounds the diagonal by as much as what holds u, if that is part of the diagonal.
   void warn_if_rounding_holds(double least_kappa, double largest_kappa) const;
-  /// Warns where the rounding of the diagonal adds up in the means of a rollout, in a box that nothing enters.
-  void warn_of_drift(double shift, double rounding) const;
   /// About the least eigenvalue of A where κ is the same everywhere: what holds u in the mean, in series with the way
   /// there through the cells.
   double held_by(double shift, double least_shift, double kappa) const;

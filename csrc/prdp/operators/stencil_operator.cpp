@@ -309,13 +309,29 @@ bool StencilOperator::has_coarse_grids() const {
 }
 
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tensor& b, bool transposed) const {
+  return kernels_of(b, transposed, at::Tensor());
+}
+
+std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_by_differences(const at::Tensor& b,
+                                                                                const at::Tensor& held) const {
+  return kernels_of(b, /*transposed=*/false, held.detach().to(at::kCPU).contiguous());
+}
+
+std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Tensor& b, bool transposed,
+                                                                    const at::Tensor& held) const {
   const auto offsets = transposed ? turned(offsets_) : offsets_;
   const auto of_samples =
-      [transposed, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
+      [transposed, held, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
        pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
-    const kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
-                                         transposed};
-    kernels::KernelBatch<T> batch{c.size(0) == 1, [c, given, channels](int64_t s) { return given.make(s, channels); }};
+    kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
+                                   transposed};
+    if (held.defined()) {
+      const bool is_number = held.dim() == 0;
+      const int64_t stride = is_number || held.size(0) == 1 ? 0 : held.stride(0);
+      given.hold = {held.template const_data_ptr<T>(), stride, is_number};
+    }
+    kernels::KernelBatch<T> batch{c.size(0) == 1,
+                                  [c, held, given, channels](int64_t s) { return given.make(s, channels); }};
     if (given.is_one_to_one())
       batch.product = [c, given, channels](int64_t s, const T* v, T* out) { given.apply(s, channels, v, out); };
     return batch;

@@ -42,12 +42,18 @@ class StencilOperator final : public Operator {
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
+  /// The kernels of a stencil of nearest neighbours whose diagonal is, but for rounding, `held` less the other
+  /// coefficients of a point: their products are held·v and differences of neighbours. held: 0-dimensional or (batch or
+  /// 1, 1, *shape). The coefficients hold as many samples.
+  std::shared_ptr<const kernels::Kernels> kernels_by_differences(const at::Tensor& b, const at::Tensor& held) const;
   OperatorSpec spec() const;
   /// Of A, or of Aᵀ, the diagonal and what couples a point to those before and behind it along each axis, (batch or 1,
   /// 1 + 2 dim, *shape), zero where there is none; undefined if A couples points that are no neighbours.
   at::Tensor nearest_coefficients(bool transposed) const;
 
  private:
+  std::shared_ptr<const kernels::Kernels> kernels_of(const at::Tensor& b, bool transposed,
+                                                     const at::Tensor& held) const;
   int64_t dim() const { return grid_.dim; }
   int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
   int64_t extent(int64_t axis) const { return grid_.shape[3 - dim() + axis]; }
