@@ -5,25 +5,29 @@
 #include <limits>
 #include <utility>
 
-#include "prdp/gpu/device/cycle.h"
+#include "prdp/gpu/device/block_vectors.h"
 #include "prdp/gpu/device/saddle_point.h"
-#include "prdp/gpu/device/setting.h"
-#include "prdp/gpu/device/team.h"
-#include "prdp/gpu/device/views.h"
 #include "prdp/kernels/scales.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
 #include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 
-/// One sample as a space for iterate(), on a GPU: a team of threads owns it. A number is the same in every thread; a
-/// vector lies in the memory of the block, or of the device, and every operation is a loop over a thread's share of it.
 namespace prdp::gpu {
 
+/// One sample as a space for iterate(), on a GPU: a team of threads owns it, and a number is the same in every thread.
 template <class S>
-class BlockSpace : public SampleNumbers<typename S::T> {
+class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, public SpaceDefaults<BlockSpace<S>> {
+  using Vectors = BlockVectors<S>;
   using Numbers = SampleNumbers<typename S::T>;
   using Numbers::broken_;
+  using Vectors::beyond_;
+  using Vectors::beyond_of;
+  using Vectors::into;
+  using Vectors::largest_over_rows;
+  using Vectors::memory_of;
+  using Vectors::place;
+  using Vectors::team_;
 
  public:
   using T = typename S::T;
@@ -31,14 +35,18 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   using Vector = T*;
   using Scalar = T;
   using States = std::array<SampleState, 1>;
-  using TeamOfSample = Team<S::kBlocks, S::kThreads>;
+  using typename Vectors::TeamOfSample;
+  using Vectors::add;
+  using Vectors::copy;
+  using Vectors::dot;
+  using Vectors::each;
+  using Vectors::scratch;
+  using Vectors::xpby_with_square;
 
   /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
   BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, int64_t sample, T* in_block, T* beyond)
-      : team_(team),
+      : Vectors(team, in_block + S::Cycles::kInBlock, beyond),
         a_(a),
-        in_block_(in_block + S::Cycles::kInBlock),
-        beyond_(beyond),
         cycle_{of.hierarchy, sample, in_block, beyond + beyond_of(S::kRestart)},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
@@ -49,15 +57,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     state_ = &state;
     broken_ = started_ = false;
   }
-  /// y = factor · x, where one of the two is no vector of the space.
-  PRDP_ONCE void load(const T* x, T factor, Vector y) {
-    each([&](int i) { return factor * x[i]; }, into(y));
-  }
-  T store(const T* x, T factor, T* u) {
-    load(x, factor, u);
-    return largest_magnitude(u);
-  }
-  T largest_given(const T* x) { return largest_magnitude(x); }
   void take_b() { b2_ = dot(b(), b()); }
   /// A as it will be used; false where it is not finite.
   PRDP_ONCE bool prepare_operator() {
@@ -69,13 +68,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   T factor() const { return factor_; }
   PRDP_ONCE bool has_zero_diagonal() {
     return largest_over_rows([&](int i) { return T(a_.diagonal(i) == T(0)); }) != 0;
-  }
-  PRDP_ONCE T largest_magnitude(const T* x) {
-    return largest_over_rows([&](int i) { return std::abs(x[i]); });
-  }
-  /// x = factor x
-  PRDP_ONCE void scale(T factor, Vector x) {
-    each([&](int i) { return factor * x[i]; }, into(x));
   }
   /// Onto what products with A may contain, and onto the solutions of least norm. Returns the norm of what is taken
   /// off.
@@ -98,45 +90,10 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     if (started_) add(start(), x);
   }
   bool started() const { return started_; }
-  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
-    each([&](int i) { return y[i] + alpha * x[i]; }, into(y));
-  }
 
   // ---- what space.h asks for
-  Vector vector() { return memory_of(used_++); }
-  Vector scratch() { return memory_of(1); }
   Vector b() { return memory_of(0); }
   Scalar b2() const { return b2_; }
-  static constexpr int64_t unknowns() { return A::kUnknowns; }
-  template <class X>
-  Slice<X> array(int64_t n) const {
-    auto* first = reinterpret_cast<X*>(numbers_ + used_numbers_);
-    used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
-    return {first, n};
-  }
-
-  PRDP_ONCE void fill_zero(Vector v) {
-    each([](int) { return T(0); }, into(v));
-  }
-  PRDP_ONCE void copy(const T* from, Vector to) {
-    each([&](int i) { return from[i]; }, into(to));
-  }
-  void advance(Vector& x, Vector& next) { std::swap(x, next); }
-  PRDP_ONCE void add(const T* d, Vector x) {
-    each([&](int i) { return x[i] + d[i]; }, into(x));
-  }
-  PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
-    each([&](int i) { return x[i] + beta * y[i]; }, into(y));
-  }
-  void xmby(const T* x, Scalar beta, Vector y) { xpby(x, -beta, y); }
-  PRDP_ONCE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
-    return square_of([&](int i) { return x[i] + beta * y[i]; }, y);
-  }
-  PRDP_ONCE Scalar dot(const T* v, const T* w) {
-    T s = 0;
-    each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
-    return team_.sum(s);
-  }
   PRDP_ONCE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
     T s = 0;
     each([&](int i) { return Pair{x[i] + alpha * p[i], r[i] - alpha * q[i]}; },
@@ -168,10 +125,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     team_.sum(s);
     return {s[0], s[1]};
   }
-  std::array<Scalar, 2> apply_along(const T* v, const T* w, Vector out) {
-    const auto found = apply_with_dots(v, out);
-    return {v == w ? found[0] : dot(w, out), found[1]};
-  }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   PRDP_ONCE Scalar residual(const T* x, Vector r) {
     const T* const of = started_ ? whole_b() : b();
@@ -190,7 +143,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     const T* u = solution(x);
     return dot(u, u);
   }
-
   Scalar terms2(const T* x) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
@@ -219,7 +171,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
          });
     return team_.sum(s);
   }
-  void correct(const T* v, Vector out) { precondition(v, out); }
   /// Whether there is a preconditioner of the kind that is asked for.
   bool has_preconditioner() const { return cycle_.exists(); }
 
@@ -240,37 +191,6 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   Scalar radius2() const { return static_cast<T>(a_.radius() * a_.radius()); }
   static constexpr bool sweeps_contract() { return A::kKnowsRadius; }
 
-  PRDP_ONCE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
-    for (int64_t j = 0; j < count; j += kMostAtOnce) {
-      T s[kMostAtOnce] = {};
-      const int some = static_cast<int>(count - j < kMostAtOnce ? count - j : kMostAtOnce);
-      const T* of[kMostAtOnce];
-      PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) of[k] = v[j + (k < some ? k : 0)];
-      each([&](int i) { return factor * w[i]; },
-           [&](int i, T value) { PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) s[k] += of[k][i] * value; });
-      team_.sum(s);
-      for (int k = 0; k < some; ++k) h[j + k] = s[k];
-    }
-  }
-  PRDP_ONCE Scalar subtract_combination(const Scalar* h, const Slice<Vector>& v, int64_t count, Scalar factor,
-                                        Vector w) {
-    return square_of(
-        [&](int i) {
-          T sum = factor * w[i];
-          for (int64_t j = 0; j < count; ++j) sum -= h[j] * v[j][i];
-          return sum;
-        },
-        w);
-  }
-  PRDP_ONCE void add_combination(const Scalar* y, const Slice<Vector>& v, int64_t count, Vector x) {
-    each(
-        [&](int i) {
-          T sum = x[i];
-          for (int64_t j = 0; j < count; ++j) sum += y[j] * v[j][i];
-          return sum;
-        },
-        into(x));
-  }
   /// Seldom: one thread computes it.
   PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
                       Scalar* y) const {
@@ -300,42 +220,10 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void reset() { broken_ = false; }
 
-  /// f(i), and then store(i, f(i)), for this thread's cells.
-  template <class F, class Store>
-  void each(const F& f, const Store& store) const {
-    team_.each(A::kUnknowns, f, store);
-  }
-
  private:
   struct Pair {
     T first, second;
   };
-  static auto into(Vector v) {
-    return [v](int i, T value) { v[i] = value; };
-  }
-  Vector place(int i) {
-    if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
-    return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
-  }
-  /// The first vectors are those of cycles.
-  Vector memory_of(int i) { return place(i + S::Cycles::kVectors); }
-  /// Numbers beyond the block: vectors, and what damping needs.
-  static constexpr int64_t beyond_of(int restart) {
-    return static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns + numbers_beyond(restart);
-  }
-  template <class F>
-  T square_of(const F& f, Vector out) {
-    T s = 0;
-    each(f, [&](int i, T value) {
-      out[i] = value;
-      s += value * value;
-    });
-    return team_.sum(s);
-  }
-  template <class F>
-  auto largest_over_rows(const F& f) {
-    return largest_of(team_, A::kUnknowns, f);
-  }
   /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
   /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.
   template <class Store>
@@ -381,19 +269,14 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     return scratch();
   }
 
-  TeamOfSample& team_;
   A a_;
-  T *in_block_, *beyond_;
   typename S::Cycles::template Of<S> cycle_;
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>&null_space_, &left_null_space_;
   bool leaks_;
-  int used_ = kOwnVectors;
   T factor_ = 1, b2_ = 0;
   double norm_ = 0;
   bool started_ = false;
-  alignas(8) mutable char numbers_[S::kNumbers > 0 ? S::kNumbers : 1];
-  mutable int64_t used_numbers_ = 0;
 };
 
 }  // namespace prdp::gpu

@@ -1,0 +1,153 @@
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <utility>
+
+#include "prdp/gpu/device/cycle.h"
+#include "prdp/gpu/device/setting.h"
+#include "prdp/gpu/device/team.h"
+#include "prdp/gpu/device/views.h"
+#include "prdp/solvers/iterate.h"
+
+namespace prdp::gpu {
+
+/// The vectors of a sample that a team of threads owns, and what is done with them without A. They lie in the memory of
+/// the block, or of the device; every operation is a loop over a thread's share, and a sum is the same in every thread.
+template <class S>
+class BlockVectors {
+ public:
+  using T = typename S::T;
+  using A = typename S::A;
+  using Vector = T*;
+  using Scalar = T;
+  using TeamOfSample = Team<S::kBlocks, S::kThreads>;
+
+  BlockVectors(TeamOfSample& team, T* in_block, T* beyond) : team_(team), in_block_(in_block), beyond_(beyond) {}
+
+  Vector vector() { return memory_of(used_++); }
+  Vector scratch() { return memory_of(1); }
+  static constexpr int64_t unknowns() { return A::kUnknowns; }
+  template <class X>
+  Slice<X> array(int64_t n) const {
+    auto* first = reinterpret_cast<X*>(numbers_ + used_numbers_);
+    used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
+    return {first, n};
+  }
+
+  PRDP_ONCE void fill_zero(Vector v) {
+    each([](int) { return T(0); }, into(v));
+  }
+  PRDP_ONCE void copy(const T* from, Vector to) {
+    each([&](int i) { return from[i]; }, into(to));
+  }
+  void advance(Vector& x, Vector& next) { std::swap(x, next); }
+  PRDP_ONCE void add(const T* d, Vector x) {
+    each([&](int i) { return x[i] + d[i]; }, into(x));
+  }
+  PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
+    each([&](int i) { return x[i] + beta * y[i]; }, into(y));
+  }
+  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
+    each([&](int i) { return y[i] + alpha * x[i]; }, into(y));
+  }
+  /// x = factor x
+  PRDP_ONCE void scale(T factor, Vector x) {
+    each([&](int i) { return factor * x[i]; }, into(x));
+  }
+  /// y = factor · x, where one of the two is no vector of the space.
+  PRDP_ONCE void load(const T* x, T factor, Vector y) {
+    each([&](int i) { return factor * x[i]; }, into(y));
+  }
+  T store(const T* x, T factor, T* u) {
+    load(x, factor, u);
+    return largest_magnitude(u);
+  }
+  T largest_given(const T* x) { return largest_magnitude(x); }
+  PRDP_ONCE T largest_magnitude(const T* x) {
+    return largest_over_rows([&](int i) { return std::abs(x[i]); });
+  }
+
+  PRDP_ONCE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
+    return square_of([&](int i) { return x[i] + beta * y[i]; }, y);
+  }
+  PRDP_ONCE Scalar dot(const T* v, const T* w) {
+    T s = 0;
+    each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
+    return team_.sum(s);
+  }
+  PRDP_ONCE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
+    for (int64_t j = 0; j < count; j += kMostAtOnce) {
+      T s[kMostAtOnce] = {};
+      const int some = static_cast<int>(count - j < kMostAtOnce ? count - j : kMostAtOnce);
+      const T* of[kMostAtOnce];
+      PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) of[k] = v[j + (k < some ? k : 0)];
+      each([&](int i) { return factor * w[i]; },
+           [&](int i, T value) { PRDP_UNROLL for (int k = 0; k < kMostAtOnce; ++k) s[k] += of[k][i] * value; });
+      team_.sum(s);
+      for (int k = 0; k < some; ++k) h[j + k] = s[k];
+    }
+  }
+  PRDP_ONCE Scalar subtract_combination(const Scalar* h, const Slice<Vector>& v, int64_t count, Scalar factor,
+                                        Vector w) {
+    return square_of(
+        [&](int i) {
+          T sum = factor * w[i];
+          for (int64_t j = 0; j < count; ++j) sum -= h[j] * v[j][i];
+          return sum;
+        },
+        w);
+  }
+  PRDP_ONCE void add_combination(const Scalar* y, const Slice<Vector>& v, int64_t count, Vector x) {
+    each(
+        [&](int i) {
+          T sum = x[i];
+          for (int64_t j = 0; j < count; ++j) sum += y[j] * v[j][i];
+          return sum;
+        },
+        into(x));
+  }
+
+  /// f(i), and then store(i, f(i)), for this thread's cells.
+  template <class F, class Store>
+  void each(const F& f, const Store& store) const {
+    team_.each(A::kUnknowns, f, store);
+  }
+
+ protected:
+  static auto into(Vector v) {
+    return [v](int i, T value) { v[i] = value; };
+  }
+  Vector place(int i) {
+    if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
+    return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
+  }
+  /// The first vectors are those of cycles.
+  Vector memory_of(int i) { return place(i + S::Cycles::kVectors); }
+  /// Numbers beyond the block: vectors, and what damping needs.
+  static constexpr int64_t beyond_of(int restart) {
+    return static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns + numbers_beyond(restart);
+  }
+  template <class F>
+  T square_of(const F& f, Vector out) {
+    T s = 0;
+    each(f, [&](int i, T value) {
+      out[i] = value;
+      s += value * value;
+    });
+    return team_.sum(s);
+  }
+  template <class F>
+  auto largest_over_rows(const F& f) {
+    return largest_of(team_, A::kUnknowns, f);
+  }
+
+  TeamOfSample& team_;
+  T *in_block_, *beyond_;
+
+ private:
+  int used_ = kOwnVectors;
+  alignas(8) mutable char numbers_[S::kNumbers > 0 ? S::kNumbers : 1];
+  mutable int64_t used_numbers_ = 0;
+};
+
+}  // namespace prdp::gpu
