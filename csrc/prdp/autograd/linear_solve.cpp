@@ -162,15 +162,13 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
                                 const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
-  const bool kernel_checks = gpu::takes(b, options.solver);
-  a->check_parameters(kernel_checks);
+  a->check_parameters(/*kernel_checks=*/gpu::takes(b, options.solver));
   if (!spec.transposed) a->check_null_spaces(b);  // an adjoint solve follows one
   const auto& s = options.solver;
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
   const bool may_wait = waits_for_report(options);
   auto result = solve(*a, rhs, {s, {}, true, x0, may_wait});
-  if (kernel_checks && std::string_view(way_of_last_solve()) != "kernel") a->check_parameters();
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
