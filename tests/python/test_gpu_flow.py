@@ -226,6 +226,25 @@ def test_a_step_is_at_most_eight_launches_beside_its_solves(name):
     assert len(of_torch) <= 4 and len(of_torch_back) <= 18, (of_torch, of_torch_back)  # those of the solves among them
 
 
+@pytest.mark.parametrize("name", ["explicit, upwind", "viscous", "implicit box"])
+def test_the_gradient_of_a_force_is_one_launch_more(name):
+    shape, _, tensors = CASES[name]
+    force = tensors["force"].to(F64).requires_grad_()
+    u = (0.5 * noise(2, len(shape), *shape, seed=1)).requires_grad_()
+    step = flow(name, given={"force": force}, on_failure="return")
+    found = []
+    with Fibers() as fibers:
+        for leaves in ([u], [u], [u, force]):
+            state = step(u)
+            before = fibers.launches()
+            with torch.autograd.profiler.profile() as profiler:
+                torch.autograd.grad(state, leaves, torch.ones_like(state))
+            names = [event.name for event in profiler.function_events if event.name.startswith("aten::")]
+            found.append((fibers.launches() - before, sum(n not in FREE for n in names)))
+    _, (launches, of_torch), (with_force, of_torch_with_force) = found
+    assert with_force == launches + 1 and of_torch_with_force <= of_torch + 2, found
+
+
 # Operations that compute nothing: memory, views, and reading a number of the host.
 FREE = {
     f"aten::{name}"

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 from fibers import ROOT, SHUFFLED, Fibers
-from test_gpu_kernels import noise
+from test_gpu_kernels import noise, sparse
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -106,18 +106,81 @@ def test_caps_of_their_own_and_long_bases():
     torch.testing.assert_close(a.apply(u), b, rtol=1e-8, atol=1e-8)
 
 
-def test_a_step_with_its_own_kappa_is_one_launch_alone():
-    """A κ that is new in each step: no operation of torch but views and memory, so no look of the host either."""
-    b, solver = noise(3, 1, *SHAPE), prdp.CG(max_iter=50, rtol=1e-8)
-    memory = {"empty", "as_strided", "detach", "detach_", "unsqueeze", "to", "lift_fresh"}
+PATTERN = sparse(1, F64)[0].to_sparse_csr()
+OF_A_STEP = {  # an operator with numbers that are new in each step, and the shape of b
+    "diffusion": (lambda seed: operators.Diffusion(1 + noise(3, *SHAPE, seed=seed).square(), 1.0), (3, 1, *SHAPE)),
+    "sparse": (lambda seed: csr(PATTERN.values() * (1 + 0.01 * seed)), (3, 9)),
+    "sparse matrices": (lambda seed: csr(PATTERN.values() * noise(3, 1, seed=seed).exp()), (3, 9)),
+}
+
+
+def csr(values, crow=None, col=None):
+    crow, col = PATTERN.crow_indices() if crow is None else crow, PATTERN.col_indices() if col is None else col
+    return operators.Matrix.csr(crow, col, values, 9)
+
+
+@pytest.mark.parametrize("name", OF_A_STEP)
+def test_a_step_with_its_own_numbers_is_one_launch_alone(name):
+    """No operation of torch but views and memory, so no look of the host either."""
+    make, shape = OF_A_STEP[name]
+    b, solver = noise(*shape), prdp.BiCGStab(max_iter=50, rtol=1e-8)
+    memory = {
+        "empty",
+        "as_strided",
+        "detach",
+        "detach_",
+        "unsqueeze",
+        "to",
+        "lift_fresh",
+        "view",
+        "expand",
+        "narrow",
+        "slice",
+    }
     of_host = {"item", "_local_scalar_dense"}  # the shift, a number
     with Fibers():
         for seed in (0, 1):  # the first result of the kernel is compared
-            kappa = 1 + noise(3, *SHAPE, seed=seed).square()
+            a = make(seed)
             with torch.autograd.profiler.profile() as profiler:
-                prdp.linear_solve(operators.Diffusion(kappa, 1.0), b, solver, on_failure="return")
+                prdp.linear_solve(a, b, solver, on_failure="return")
     names = {e.name.removeprefix("aten::") for e in profiler.function_events if e.name.startswith("aten::")}
     assert names <= memory | of_host, names
+
+
+PLACES = {  # what is wrong with a pattern of 23 values
+    "a column": (None, 5, 9),
+    "a negative column": (None, 22, -1),
+    "the first row": (0, None, 1),
+    "the last row": (9, None, 22),
+    "rows that fall": (4, None, 2),
+    "beyond the values": (4, None, 2**40),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_kernel_refuses_a_pattern_that_is_none(name):
+    """Without a look of the host: nothing is read where there is nothing; in the words of the CPU."""
+    row, entry, wrong = PLACES[name]
+    crow, col = (t.expand(3, -1).clone() for t in (PATTERN.crow_indices(), PATTERN.col_indices()))
+    (crow[1] if entry is None else col[1])[row if entry is None else entry] = wrong
+    values, b = PATTERN.values().expand(3, -1).clone(), noise(3, 9)
+    leaf, solver = values.clone().requires_grad_(), prdp.BiCGStab(max_iter=100, rtol=1e-12)
+    with pytest.raises(ValueError, match="of a CSR matrix") as expected:
+        csr(values, crow, col)
+    with Fibers():
+        u, info = prdp.linear_solve(csr(leaf, crow, col), b, solver, on_failure="return")
+        gradient = torch.autograd.grad(u.square().sum(), leaf)[0]
+        for a in (csr(values, crow, col), csr(values[1], crow[1], col[1])):
+            with pytest.raises(ValueError) as found:
+                prdp.linear_solve(a, b, solver)
+            assert str(found.value) == str(expected.value)
+    assert [prdp.SolveStatus(int(s)).name for s in info.status] == ["CONVERGED", "NONFINITE_OPERATOR", "CONVERGED"]
+    right = values.clone().requires_grad_()
+    exact = prdp.linear_solve(csr(right), b, solver)[0]
+    torch.testing.assert_close(u[::2], exact[::2], rtol=1e-9, atol=1e-11)
+    of_right = torch.autograd.grad(exact.square().sum(), right)[0]
+    torch.testing.assert_close(gradient[::2], of_right[::2], rtol=1e-8, atol=1e-10)
+    assert not u[1].any() and not gradient[1].any()
 
 
 @pytest.mark.parametrize("name", ["kappa", "h of a Robin side"])

@@ -5,7 +5,6 @@
 #include <limits>
 
 #include "prdp/gpu/operator_view.h"
-#include "prdp/operators/products_by_kernel.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
@@ -38,15 +37,6 @@ at::Tensor joined(const at::Tensor& a, const at::Tensor& b, int64_t axis) {
     return t.expand(sizes);
   };
   return at::cat({grown(a), grown(b)}, axis);
-}
-
-template <class T>
-bool launch_products(gpu::DiffusionProducts<T> of, const at::Tensor& lambda, const at::Tensor& u,
-                     const at::Tensor& kappa, const at::Tensor& out) {
-  of.pair = pair_of<T>(lambda, u, out.size(0));
-  of.kappa = kappa.const_data_ptr<T>();
-  of.out = out.mutable_data_ptr<T>();
-  return gpu::each_point(out.device(), product_body<T>("DiffusionProducts"), of, out.numel());
 }
 
 at::Tensor or_nan(const at::Tensor& t, const at::Tensor& allowed) {
@@ -102,36 +92,9 @@ at::Tensor DiffusionOperator::apply(const at::Tensor& v) const {
   return sum;
 }
 
-at::Tensor DiffusionOperator::kappa_bar_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (per_axis_ || !robin_.empty() || !has_product_kernel(lambda, u)) return {};
-  const auto fill = [&](auto of) {
-    for (int64_t d = 0; d < 3; ++d) of.n[d] = 1;
-    for (int64_t d = 0; d < dim(); ++d) {
-      const int64_t axis = d + 3 - dim();
-      of.n[axis] = static_cast<int>(shape_[d]);
-      of.periodic[axis] = is_closed(d);
-      for (size_t end = 0; end < 2; ++end)
-        of.zero[2 * axis + static_cast<int64_t>(end)] = sides_[d][end] == Side::kZero;
-      of.per_cell[axis] = per_cell(d);
-    }
-    of.harmonic = mean_ == FaceMean::kHarmonic;
-    return of;
-  };
-  const auto kappa = kappa_.detach().contiguous(), out = at::empty_like(kappa);
-  const auto l = lambda.contiguous(), v = u.contiguous();
-  const bool launched = out.scalar_type() == at::kFloat
-                            ? launch_products(fill(gpu::DiffusionProducts<float>{}), l, v, kappa, out)
-                            : launch_products(fill(gpu::DiffusionProducts<double>{}), l, v, kappa, out);
-  return launched ? out : at::Tensor();
-}
-
 std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  const auto shift_bar = [&] {
-    const auto bar = like(shift_, (lambda * u).sum(1, /*keepdim=*/true));
-    return shift_.dim() == 0 ? bar : bar.squeeze(1);
-  };
-  if (const auto by_kernel = kappa_bar_by_kernel(lambda, u); by_kernel.defined())
-    return {by_kernel.squeeze(1), shift_bar()};
+  if (auto by_kernel = products_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
+  const auto shift_bar = like(shift_, (lambda * u).sum(1, /*keepdim=*/true));
   std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const int64_t d = 2 + axis;
@@ -172,10 +135,8 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
       robin_bar.push_back(h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1));
     }
   }
-  const auto of_kappa = [&] {
-    return per_axis_ ? like(kappa_, at::cat(kappa_bars, 1)) : like(kappa_, kappa_bars[0]).squeeze(1);
-  };
-  std::vector<at::Tensor> all{of_kappa(), shift_bar()};
+  const auto kappa_bar = per_axis_ ? like(kappa_, at::cat(kappa_bars, 1)) : like(kappa_, kappa_bars[0]).squeeze(1);
+  std::vector<at::Tensor> all{kappa_bar, shift_.dim() == 0 ? shift_bar : shift_bar.squeeze(1)};
   all.insert(all.end(), robin_bar.begin(), robin_bar.end());
   return all;
 }

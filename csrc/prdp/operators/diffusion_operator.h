@@ -56,8 +56,10 @@ class DiffusionOperator final : public Operator {
   OperatorSpec as_stencil() const;
 
  private:
-  /// The cotangent of κ, with a channel, in one launch on a GPU; undefined where there is no kernel.
-  at::Tensor kappa_bar_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
+  /// The product rule in one launch on a GPU; nothing where there is no kernel.
+  std::vector<at::Tensor> products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
+  template <class T>
+  std::vector<at::Tensor> products_of(const at::Tensor& lambda, const at::Tensor& u) const;
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
   bool is_closed(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }

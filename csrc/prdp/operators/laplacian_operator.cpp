@@ -10,6 +10,8 @@
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/products_by_kernel.h"
+#include "prdp/operators/shared_sums.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_axes.h"
 
@@ -119,8 +121,34 @@ HeatOperator::HeatOperator(const OperatorSpec& spec)
 
 at::Tensor HeatOperator::apply(const at::Tensor& v) const { return v - (step_.nu * step_.dt) * laplacian(v, grid_); }
 
+namespace {
+
+/// ⟨λ, L u⟩ in one launch; undefined where there is no kernel.
+template <class T>
+at::Tensor product_with_laplacian(const at::Tensor& lambda, const at::Tensor& u, const Grid& grid,
+                                  const at::Tensor& nu) {
+  SharedSums sums(lambda);
+  gpu::LaplacianProducts<T> of{pair_of<T>(lambda, u, /*sets=*/1), {1, 1, 1}, {}, sums.add(nu), nullptr};
+  of.out = sums.memory(0);
+  for (int64_t d = 0; d < grid.dim(); ++d) {
+    const int64_t axis = d + 3 - grid.dim();
+    of.n[axis] = static_cast<int>(grid.shape()[d]);
+    of.per_cell2[axis] = 1.0 / (grid.dx(d) * grid.dx(d));
+  }
+  return gpu::each_point(u.device(), product_body<T>("LaplacianProducts"), of, sums.count()) ? sums.result(0)
+                                                                                             : at::Tensor();
+}
+
+}  // namespace
+
 std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, u - ν Δt L u⟩/∂ν = -Δt ⟨λ, L u⟩
+  if (has_product_kernel(lambda, u)) {
+    const auto by_kernel =
+        u.scalar_type() == at::kFloat ? product_with_laplacian<float> : product_with_laplacian<double>;
+    const auto product = by_kernel(lambda.contiguous(), u.contiguous(), grid_, step_.nu);
+    if (product.defined()) return {(product * -step_.dt).to(step_.nu.options())};
+  }
   const bool by_loops = !at::GradMode::is_enabled() && is_plain(u) && is_plain(lambda) && !has_tangent(u);
   const auto lu = by_loops ? apply_on_loops(PoissonOperator(grid_), u, /*transposed=*/false) : laplacian(u, grid_);
   const auto derivative = total(lambda * lu) * -step_.dt;

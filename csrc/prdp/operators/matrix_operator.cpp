@@ -5,6 +5,7 @@
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/products_by_kernel.h"
 
 namespace prdp {
 
@@ -143,7 +144,8 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
   col_ = for_values(col);
 }
 
-void CsrOperator::check_parameters(Checks /*checks*/) const {
+void CsrOperator::check_parameters(Checks checks) const {
+  if (checks == Checks::kHost) return;
   // Tensors that stand for others while a graph is traced have no numbers yet: the kernel checks them.
   if (at::isTensorSubclassLike(crow_) || at::isTensorSubclassLike(col_) || crow_.is_meta()) return;
   const auto crow = crow_.to(at::kCPU).contiguous(), col = col_.to(at::kCPU).contiguous();
@@ -202,7 +204,39 @@ at::Tensor CsrOperator::to_dense() const {
 at::Tensor CsrOperator::solve_directly(const at::Tensor& b) const { return solve_matrix(to_dense(), b); }
 at::Tensor CsrOperator::solve_transpose_directly(const at::Tensor& b) const { return solve_matrix(to_dense().mT(), b); }
 
+namespace {
+
+/// Contiguous; one row for all where they share it.
+at::Tensor shared_or_own(const at::Tensor& t) {
+  return (t.dim() == 2 && t.stride(0) == 0 ? t.narrow(0, 0, 1) : t).contiguous();
+}
+/// The step from the row of one matrix to that of the next.
+int64_t step(const at::Tensor& t) { return t.dim() == 2 && t.size(0) > 1 ? t.stride(0) : 0; }
+
+/// The cotangent of the values in one launch; undefined where there is no kernel.
+template <class T>
+at::Tensor products_by_kernel(const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& crow,
+                              const at::Tensor& col, const at::Tensor& values) {
+  const auto out = at::empty(values.sizes(), values.options());
+  const int64_t sets = values.dim() == 2 ? values.size(0) : 1;
+  const gpu::CsrProducts<T> of{pair_of<T>(lambda.unsqueeze(1), u.unsqueeze(1), sets),
+                               static_cast<int>(values.size(-1)),
+                               crow.const_data_ptr<int64_t>(),
+                               col.const_data_ptr<int64_t>(),
+                               step(crow),
+                               step(col),
+                               out.mutable_data_ptr<T>()};
+  return gpu::each_point(out.device(), product_body<T>("CsrProducts"), of, out.numel()) ? out : at::Tensor();
+}
+
+}  // namespace
+
 std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (has_product_kernel(lambda, u) && values_.numel() > 0) {
+    const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
+    const auto all = by_kernel(lambda.contiguous(), u.contiguous(), shared_or_own(crow_), shared_or_own(col_), values_);
+    if (all.defined()) return {at::Tensor(), at::Tensor(), all};
+  }
   // ∂⟨λ, A u⟩/∂A_ij = λ_i u_j at the stored entries, summed over the samples that share A
   const auto col = col_.expand({u.size(0), -1});
   const auto row = rows().expand({u.size(0), -1});
@@ -246,8 +280,9 @@ std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b
 }
 
 std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool transposed) const {
-  auto crow = crow_.contiguous(), col = col_.contiguous(), values = values_.detach().contiguous();
+  auto crow = shared_or_own(crow_), col = shared_or_own(col_), values = values_.detach().contiguous();
   if (transposed) {  // columns as rows
+    col = col_.contiguous();
     const auto order = col.argsort(/*stable=*/true, /*dim=*/-1, /*descending=*/false);
     const auto along = [&](const at::Tensor& t) { return t.gather(-1, order); };
     auto bounds = at::arange(n() + 1, crow.options());
@@ -257,8 +292,8 @@ std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool
     values = along(values);
   }
   gpu::OperatorView view{"Csr<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n()) + ">"};
-  const auto matrices = values.dim() == 2 ? values.size(0) : 1;
-  for (const auto& t : {crow, col, values}) view.tensors.push_back(t.view({matrices, -1}));
+  view.numbers = {static_cast<double>(values.size(-1))};
+  for (const auto& t : {crow, col, values}) view.tensors.push_back(t.view({t.dim() == 2 ? t.size(0) : 1, t.size(-1)}));
   return view;
 }
 

@@ -2,6 +2,8 @@
 #include <ATen/ATen.h>
 #include <ATen/core/grad_mode.h>
 
+#include <limits>
+
 #include "prdp/gpu/device/products.h"
 #include "prdp/gpu/launch.h"
 #include "prdp/gpu/operator_view.h"
@@ -12,7 +14,7 @@ namespace prdp {
 
 inline bool has_product_kernel(const at::Tensor& lambda, const at::Tensor& u) {
   return gpu::runtime_of(lambda.device()) && !at::GradMode::is_enabled() && is_plain(lambda) && is_plain(u) &&
-         lambda.numel() > 0;
+         lambda.numel() > 0 && lambda.numel() <= std::numeric_limits<int>::max() / 2;  // kernels count by int
 }
 
 /// λ and u, contiguous, (batch, channels, *shape), for fields of so many sets: one for each sample, or one.
@@ -24,8 +26,8 @@ gpu::PairOfVectors<T> pair_of(const at::Tensor& lambda, const at::Tensor& u, int
 }
 
 template <class T>
-gpu::Body product_body(const char* name) {
-  return {std::string(name) + (std::is_same_v<T, float> ? "<float>" : "<double>"), "prdp/gpu/device/products.h"};
+gpu::Body product_body(const char* name, const char* header = "prdp/gpu/device/products.h") {
+  return {std::string(name) + (std::is_same_v<T, float> ? "<float>" : "<double>"), header};
 }
 
 }  // namespace prdp

@@ -15,17 +15,22 @@ at::Tensor on_device(const Eigen::MatrixXd& matrix, const at::TensorOptions& opt
 }  // namespace
 
 at::Tensor along_axes(const at::Tensor& v, at::TensorList matrices, bool transposed) {
-  const int64_t samples = v.size(0), first = v.dim() - static_cast<int64_t>(matrices.size());
-  auto w = v.to(matrices[0].scalar_type());
-  for (int64_t axis = v.dim() - 1; axis >= first; --axis) {
+  const auto sizes = v.sizes();
+  const int64_t last = v.dim() - 1, first = v.dim() - static_cast<int64_t>(matrices.size());
+  auto w = v.to(matrices[0].scalar_type()).contiguous();
+  for (int64_t axis = last; axis >= first; --axis) {
     const auto& matrix = matrices[axis - first];
-    // A product for each sample: that of all rows at once would add up in an order that depends on how many there are.
-    const auto moved = w.movedim(axis, -1);
-    const auto rows = moved.reshape({samples, -1, matrix.size(0)});
-    const auto of_each = (transposed ? matrix : matrix.mT()).unsqueeze(0).expand({samples, -1, -1});
-    w = at::bmm(rows, of_each).view(moved.sizes()).movedim(-1, axis);
+    const auto from_left = transposed ? matrix.transpose(0, 1) : matrix;
+    const auto each = [](const at::Tensor& m, int64_t count) { return m.unsqueeze(0).expand({count, -1, -1}); };
+    // A product for each sample or less: that of all would add up in an order that depends on how many there are.
+    if (axis == last) {
+      w = at::bmm(w.view({sizes[0], -1, sizes[axis]}), each(from_left.transpose(0, 1), sizes[0]));
+    } else {
+      const int64_t before = c10::multiply_integers(sizes.slice(0, axis));
+      w = at::bmm(each(from_left, before), w.view({before, sizes[axis], -1}));
+    }
   }
-  return w;
+  return w.view(sizes);
 }
 
 at::Tensor InnerBox::of(at::Tensor t) const {

@@ -13,11 +13,6 @@ namespace {
 constexpr const char* kHeader = "prdp/gpu/device/upwind_products.h";
 
 template <class T>
-gpu::Body body(const char* name) {
-  return {product_body<T>(name).type, kHeader};
-}
-
-template <class T>
 gpu::PeriodicGrid<T> device_grid(const Grid& grid) {
   gpu::PeriodicGrid<T> made{{1, 1}, {T(0), T(0)}};
   for (int64_t axis = 0; axis < grid.dim(); ++axis) {
@@ -44,7 +39,8 @@ std::optional<UpwindProducts> products(const Grid& grid, const at::Tensor& winds
                                      static_cast<int>(grid.dim()),
                                      static_cast<int>(channels),
                                      sums.mutable_data_ptr<double>()};
-  if (!gpu::each_sample(out.device(), body<T>("ViscosityProducts"), of, channels * of.pair.points, batch))
+  if (!gpu::each_sample(out.device(), product_body<T>("ViscosityProducts", kHeader), of, channels * of.pair.points,
+                        batch))
     return std::nullopt;
   return UpwindProducts{out, total(sums)};
 }
@@ -61,7 +57,7 @@ std::optional<UpwindProducts> burgers_products(const Grid& grid, const at::Tenso
         [&](const auto& pair, const auto& on_device, const T* given, const at::Tensor& out) {
           const gpu::BurgersProducts<T> of{
               pair, on_device, static_cast<T>(beta), static_cast<int>(grid.dim()), given, out.mutable_data_ptr<T>()};
-          return gpu::each_point(out.device(), body<T>("BurgersProducts"), of, out.numel());
+          return gpu::each_point(out.device(), product_body<T>("BurgersProducts", kHeader), of, out.numel());
         });
   });
 }
@@ -75,7 +71,8 @@ std::optional<UpwindProducts> navier_stokes_products(const Grid& grid, const at:
                        [&](const auto& pair, const auto& on_device, const T* given, const at::Tensor& out) {
                          const gpu::NavierStokesProducts<T> of{pair, on_device, static_cast<int>(out.size(1)), given,
                                                                out.mutable_data_ptr<T>()};
-                         return gpu::each_point(out.device(), body<T>("NavierStokesProducts"), of, out.numel());
+                         return gpu::each_point(out.device(), product_body<T>("NavierStokesProducts", kHeader), of,
+                                                out.numel());
                        });
   });
 }

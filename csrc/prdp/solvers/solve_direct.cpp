@@ -2,6 +2,9 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <cmath>
+#include <numeric>
+
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
@@ -17,21 +20,53 @@ bool is_for(const at::Tensor& b, const SolveRequest& request) {
          solver.max_iter.maybe_as_int().value_or(0) >= 1 && request.guarded && !request.caps;
 }
 
-}  // namespace
+SolveResult result_of(const at::Tensor& u, const at::Tensor& zero, const at::Tensor& residual) {
+  const auto once = zero.logical_not().to(at::kLong), none = at::zeros(zero.sizes(), u.scalar_type());
+  const auto converged = at::full(zero.sizes(), static_cast<int64_t>(SolveStatus::kConverged), at::kLong);
+  return {u.contiguous(), {once, at::where(zero, 0.0, residual).to(u.scalar_type()), converged, once.clone(), none}};
+}
 
-std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
-  if (!is_for(b, request)) return std::nullopt;
-  const at::NoGradGuard no_grad;
+/// max |t| of each sample, in one operation.
+at::Tensor largest_of(const at::Tensor& t) {
+  std::vector<int64_t> axes(t.dim() - 1);
+  std::iota(axes.begin(), axes.end(), 1);
+  return at::linalg_vector_norm(t, INFINITY, axes);
+}
+at::Tensor square_of(const at::Tensor& t) { return dot_in_order(t, t).view({-1}); }
+
+/// Nothing if a sample is out of the ordinary or not solved. b is not scaled, which by powers of two changes no bit
+/// where no number leaves the range of the dtype.
+std::optional<SolveResult> solve_ordinary(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  constexpr double least = 1e-10, most = 1e10;  // of the largest entry of b
+  const auto rhs = a.project(b), x = a.solve_directly(rhs), u = a.project_solution(x);
+  std::vector<at::Tensor> told{largest_of(b), square_of(rhs), square_of(a.project(rhs - a.apply(x))), largest_of(u)};
+  if (a.needs_projection()) told.insert(told.end(), {square_of(b), square_of(b - rhs)});
+  const auto host = at::stack(told).to(at::kCPU, at::kDouble);
+  const auto largest = host[0], b2 = host[1], r2 = host[2], largest_of_u = host[3];
+  const double rtol = request.solver.rtol;
+  auto solved = largest.ge(least) & largest.le(most) & r2.le(b2 * (rtol * rtol)) & largest_of_u.isfinite() &
+                largest_of_u.ge(limits_of(b).least_normal);
+  if (a.needs_projection()) {
+    const double bound =
+        b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
+    const auto whole = host[4].sqrt();
+    solved = solved & host[5].sqrt().le(bound * whole) & b2.sqrt().gt(epsilon_of(b) * whole);
+  }
+  const auto zero = largest.eq(0) & largest_of_u.eq(0);
+  if (!(solved | zero).all().item<bool>()) return std::nullopt;
+  return result_of(u, zero, (r2 / b2).sqrt());
+}
+
+/// The same for any b. Nothing if a sample is not solved.
+std::optional<SolveResult> solve_scaled(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto batch = prepare_batch(a, b, request);
   const auto x = a.solve_directly(batch.rhs);
   const auto r = a.project(batch.rhs - a.apply(x));
   auto u = a.project_solution(x) / batch.scale;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b.scalar_type()); };
-  const auto host =
-      at::stack({number(batch.status), number(batch.inconsistent), number(dot_in_order(batch.rhs, batch.rhs)),
-                 number(dot_in_order(r, r)), number(largest_magnitude(u))})
-          .to(at::kCPU, at::kDouble);
-  const int64_t samples = b.size(0);
+  const auto host = at::stack({number(batch.status), number(batch.inconsistent), square_of(batch.rhs), square_of(r),
+                               number(largest_magnitude(u))})
+                        .to(at::kCPU, at::kDouble);
   const auto status = host[0].to(at::kLong), inconsistent = host[1], b2 = host[2], r2 = host[3], largest = host[4];
   const auto solved = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
                           .logical_and(inconsistent.eq(0))
@@ -41,10 +76,16 @@ std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Ten
   const auto zero = status.eq(static_cast<int64_t>(SolveStatus::kConverged));
   if (!solved.logical_or(zero).all().item<bool>()) return std::nullopt;
   if (zero.any().item<bool>()) u = at::where(per_sample(batch.takes_part, b), u, at::zeros_like(u));
-  const auto once = solved.to(at::kLong), none = at::zeros({samples}, b.scalar_type());
-  const auto residual = at::where(zero, 0.0, (r2 / b2).sqrt()).to(b.scalar_type());
-  const auto converged = at::full({samples}, static_cast<int64_t>(SolveStatus::kConverged), at::kLong);
-  return SolveResult{u.contiguous(), {once, residual, converged, once.clone(), none}};
+  return result_of(u, zero, (r2 / b2).sqrt());
+}
+
+}  // namespace
+
+std::optional<SolveResult> solve_direct_at_once(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  if (!is_for(b, request)) return std::nullopt;
+  const at::NoGradGuard no_grad;
+  if (auto ordinary = solve_ordinary(a, b, request)) return ordinary;
+  return solve_scaled(a, b, request);
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/gpu/device/flow.h"
+#include "prdp/gpu/device/shared_sum.h"
 
 /// The reverse of the explicit part: each cotangent gathers from the points that read its value.
 namespace prdp::gpu {
@@ -120,6 +121,19 @@ struct FlowEndBars {
     T sum = 2 * state.reverse.with_ghosts(s, c, p.moved(axis, high ? last : -1), fold);
     if (inlet) sum += inlet.at(s, c, p) * state.of_velocity(s, c, p);
     out.at(s, c, p) = sum;
+  }
+};
+
+/// The cotangent of the force, on the free faces, summed over what shares it.
+template <class T>
+struct FlowForceBars {
+  FlowReverse<T> reverse;
+  SharedSum shared;
+  double* out;
+
+  void operator()(int i) const {
+    out[i] = shared.sum(
+        i, [&](const int (&at)[SharedSum::kAxes]) { return reverse.given(at[0], at[1], {{at[2], at[3], at[4]}}); });
   }
 };
 

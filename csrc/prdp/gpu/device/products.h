@@ -2,6 +2,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "prdp/gpu/device/shared_sum.h"
+
 /// ∂⟨λ, A(g) u⟩/∂g for the fields that operators are made of: each entry sums over the channels, and over the samples
 /// that share it, in their order.
 namespace prdp::gpu {
@@ -51,43 +53,53 @@ struct StencilProducts {
   }
 };
 
-/// Of κ of shift·u - ∇·(κ ∇u), (batch or 1, *shape), and of a shift of the same shape.
+/// Of a number that the Laplacian of a box is multiplied by, as in views.h: Σ λ L u.
 template <class T>
-struct DiffusionProducts {
+struct LaplacianProducts {
   PairOfVectors<T> pair;
   int n[3];
-  bool periodic[3], zero[6];  // whether u is zero at the low and the high side of an axis
-  double per_cell[3];
-  bool harmonic;
-  const T* kappa;  // (batch or 1, *shape), as many as `out`
+  double per_cell2[3];
+  SharedSum shared;
+  double* out;
+
+  void operator()(int i) const {
+    out[i] = shared.sum(i, [&](const int (&at)[SharedSum::kAxes]) {
+      const int strides[3] = {n[2] * n[1], n[2], 1};
+      const int64_t here =
+          (static_cast<int64_t>(at[0]) * n[0] + at[2]) * strides[0] + static_cast<int64_t>(at[3]) * n[2] + at[4];
+      T sum = 0;
+      for (int a = 0; a < 3; ++a) {
+        const T low = at[2 + a] > 0 ? pair.u[here - strides[a]] : T(0);
+        const T high = at[2 + a] + 1 < n[a] ? pair.u[here + strides[a]] : T(0);
+        sum += static_cast<T>(per_cell2[a]) * ((low - pair.u[here]) + (high - pair.u[here]));
+      }
+      return pair.lambda[here] * sum;
+    });
+  }
+};
+
+/// Of the values of matrices by compressed rows, (batch or 1, stored). λ and u have one channel of as many points as a
+/// matrix has rows. 0 where the pattern is none: such a matrix was refused.
+template <class T>
+struct CsrProducts {
+  PairOfVectors<T> pair;
+  int stored;
+  const int64_t *crow, *col;
+  int64_t crow_step, col_step;  // between matrices; 0: they share it
   T* out;
 
   void operator()(int i) const {
-    const int point = i % pair.points, s = i / pair.points;
-    const int at[3] = {point / (n[2] * n[1]), point / n[2] % n[1], point % n[2]};
-    const int strides[3] = {n[2] * n[1], n[2], 1};
-    const T* const mine = kappa + static_cast<int64_t>(s) * pair.points;
-    T sum = 0;
-    for (int side = 0; side < 6; ++side) {
-      const int axis = side / 2, next = at[axis] + (side % 2 ? 1 : -1);
-      const T scale = static_cast<T>(per_cell[axis] * per_cell[axis]);
-      if (next >= 0 && next < n[axis]) sum += through(s, mine, point, point + (next - at[axis]) * strides[axis], scale);
-      else if (periodic[axis] && n[axis] > 1)
-        sum += through(s, mine, point, point + (next < 0 ? n[axis] - 1 : 1 - n[axis]) * strides[axis], scale);
-      else if (zero[side])
-        sum += 2 * scale * pair.sum(s, [&](T& all, const T* l, const T* v) { all += v[point] * l[point]; });
+    const int s = i / stored, k = i % stored, n = pair.points;
+    const int64_t* const ends = crow + s * crow_step + 1;
+    int row = 0, beyond = n;  // the first row that ends after k
+    while (row < beyond) {
+      const int middle = row + (beyond - row) / 2;
+      if (ends[middle] > k) beyond = middle;
+      else row = middle + 1;
     }
-    out[i] = sum;
-  }
-
- private:
-  T through(int s, const T* of_sample, int here, int there, T scale) const {
-    const T coupled = scale * pair.sum(s, [&](T& sum, const T* l, const T* v) {
-      sum += (v[there] - v[here]) * (l[there] - l[here]);
-    });
-    if (!harmonic) return coupled * T(0.5);
-    const T part = of_sample[there] / (of_sample[here] + of_sample[there]);
-    return coupled * (part == part ? 2 * part * part : T(0));  // 0 where κ is not finite: the sample was refused
+    const int64_t column = col[s * col_step + k];
+    const bool inside = row < n && column >= 0 && column < n;
+    out[i] = inside ? pair.sum(s, [&](T& sum, const T* l, const T* v) { sum += l[row] * v[column]; }) : T(0);
   }
 };
 

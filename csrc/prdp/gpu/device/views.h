@@ -244,7 +244,7 @@ class Dense : public Rows<Dense<T, n, kTransposed>, T> {
   const T* matrix_;
 };
 
-/// Tensors: the ends of the rows, n + 1 from 0 on; columns; values.
+/// Tensors: the ends of the rows, n + 1 from 0 on; columns; values. Number: how many values are stored.
 template <class T, int n>
 class Csr : public Rows<Csr<T, n>, T> {
  public:
@@ -253,7 +253,13 @@ class Csr : public Rows<Csr<T, n>, T> {
   Csr(const OperatorArguments& a, int64_t sample)
       : crow_(static_cast<const int64_t*>(a.tensors[0]) + sample * a.sample_strides[0]),
         col_(static_cast<const int64_t*>(a.tensors[1]) + sample * a.sample_strides[1]),
-        values_(static_cast<const T*>(a.tensors[2]) + sample * a.sample_strides[2]) {}
+        values_(static_cast<const T*>(a.tensors[2]) + sample * a.sample_strides[2]),
+        stored_(static_cast<int64_t>(a.numbers[0])) {}
+
+  /// NaN where the row has no place among the stored values, or a column none in A: nothing reads such an A.
+  T largest_in_row(int i) const {
+    return is_row(i) ? Rows<Csr, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
+  }
 
   template <class F>
   void for_each_entry(int i, const F& f) const {
@@ -261,8 +267,18 @@ class Csr : public Rows<Csr<T, n>, T> {
   }
 
  private:
+  bool is_row(int i) const {
+    const int64_t begin = crow_[i], end = crow_[i + 1];
+    if (begin < 0 || end < begin || end > stored_) return false;
+    if ((i == 0 && begin != 0) || (i == n - 1 && end != stored_)) return false;
+    bool inside = true;
+    for (int64_t k = begin; k < end; ++k) inside = inside && col_[k] >= 0 && col_[k] < n;
+    return inside;
+  }
+
   const int64_t *crow_, *col_;
   const T* values_;
+  int64_t stored_;
 };
 
 }  // namespace prdp::gpu

@@ -1,6 +1,7 @@
 #include <ATen/Dispatch.h>
 
 #include "prdp/gpu/device/flow_back.h"
+#include "prdp/operators/shared_sums.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/kernel_fields.h"
@@ -73,12 +74,14 @@ at::Tensor of_end(const Reverse& r, int64_t axis, bool high, const at::Tensor& g
   return launched ? at::sum_to(out, given.sizes()) : at::Tensor();
 }
 
-/// On the free faces, and no more.
 at::Tensor of_force(const Reverse& r) {
-  const auto& free = r.box().fields(r.like().options()).free;
-  auto bar = joined(r.change_bar) * r.equation.dt;
-  if (free.defined()) bar = bar * free;
-  return at::sum_to(bar, r.equation.force.sizes());
+  SharedSums sums(r.like());
+  const auto sum = sums.add(r.equation.force);
+  const bool launched = AT_DISPATCH_FLOATING_TYPES(r.like().scalar_type(), "flow_force_bars", [&] {
+    const gpu::FlowForceBars<scalar_t> of{r.terms<scalar_t>(), sum, sums.memory(0)};
+    return gpu::each_point(r.like().device(), body("FlowForceBars", kBack, r.like()), of, sums.count());
+  });
+  return launched ? sums.result(0) : at::Tensor();
 }
 
 }  // namespace

@@ -1,0 +1,42 @@
+#pragma once
+#include <cstdint>
+
+/// Sums over what samples, channels and points share.
+namespace prdp::gpu {
+
+/// Numbers (batch, channels, z, y, x), of which a tensor has an entry for each along the axes that are its own: those
+/// along the others add up. A sum of many is left in parts, in an order that the sizes alone tell.
+struct SharedSum {
+  static constexpr int kAxes = 5;
+  int n[kAxes];
+  bool own[kAxes];
+  int parts;  // of each sum
+  int count;  // of all: entries times parts; 0: there is no such tensor
+
+  /// The part i of all, f(at) summed over it.
+  template <class F>
+  double sum(int i, const F& f) const {
+    int at[kAxes] = {}, entry = i / parts, terms = 1;
+    for (int a = kAxes - 1; a >= 0; --a) {
+      if (own[a]) {
+        at[a] = entry % n[a];
+        entry /= n[a];
+      } else {
+        terms *= n[a];
+      }
+    }
+    double all = 0;
+    for (int k = i % parts; k < terms; k += parts) {
+      int rest = k;
+      for (int a = kAxes - 1; a >= 0; --a) {
+        if (own[a]) continue;
+        at[a] = rest % n[a];
+        rest /= n[a];
+      }
+      all += static_cast<double>(f(at));
+    }
+    return all;
+  }
+};
+
+}  // namespace prdp::gpu

@@ -1,0 +1,75 @@
+#include "prdp/gpu/device/diffusion_products.h"
+
+#include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/products_by_kernel.h"
+#include "prdp/operators/shared_sums.h"
+
+/// The product rule of a Diffusion in one launch on a GPU.
+namespace prdp {
+
+namespace {
+
+/// As the kernel counts axes.
+int64_t axis_of_kernel(int64_t axis, int64_t dim) { return axis + 3 - dim; }
+
+template <class T>
+gpu::SideField<T> side_field(const at::Tensor& h) {
+  if (h.dim() == 0 && h.is_cpu()) return {nullptr, 0, 0, h.item<T>()};
+  if (h.dim() == 0) return {h.const_data_ptr<T>(), 0, 0, T(0)};
+  return {h.const_data_ptr<T>(), h.size(0) == 1 ? 0 : h.stride(0), 1, T(0)};
+}
+
+}  // namespace
+
+template <class T>
+std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda, const at::Tensor& u) const {
+  const auto kappa = kappa_.detach().contiguous(), l = lambda.contiguous(), v = u.contiguous();
+  const auto of_kappa = at::empty_like(kappa);
+  gpu::DiffusionProducts<T> of{};
+  of.pair = pair_of<T>(l, v, kappa.size(0));
+  of.batch = static_cast<int>(l.size(0));
+  of.harmonic = mean_ == FaceMean::kHarmonic;
+  of.kappa = kappa.const_data_ptr<T>();
+  of.of_kappa = of_kappa.mutable_data_ptr<T>();
+  for (int64_t axis = 0; axis < 3; ++axis) {
+    const int64_t d = axis - axis_of_kernel(0, dim());
+    of.n[axis] = d < 0 ? 1 : static_cast<int>(shape_[d]);
+    of.per_cell[axis] = d < 0 ? 0.0 : per_cell(d);
+    for (int64_t end = 0; end < 2; ++end)
+      of.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
+  }
+  SharedSums sums(l);
+  of.sums[0] = sums.add(shift_);
+  std::vector<at::Tensor> h;
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    for (size_t end = 0; end < 2; ++end) {
+      if (sides_[axis][end] != Side::kRobin) continue;
+      const int64_t side = 2 * axis_of_kernel(axis, dim()) + static_cast<int64_t>(end);
+      h.push_back(robin(axis, end).detach().contiguous());
+      of.robin[side] = side_field<T>(h.back());
+      of.sums[1 + side] = sums.add(robin(axis, end), axis);
+    }
+  size_t next = 0;
+  for (int k = 0; k < of.kSums; ++k)
+    if (of.sums[k].count > 0) of.of_sums[k] = sums.memory(next++);
+  const int64_t count = of_kappa.numel() + sums.count();
+  if (!gpu::each_point(l.device(), product_body<T>("DiffusionProducts", "prdp/gpu/device/diffusion_products.h"), of,
+                       count))
+    return {};
+  std::vector<at::Tensor> found{of_kappa.squeeze(1)};
+  found.push_back(shift_.dim() == 0 ? sums.result(0) : sums.result(0).squeeze(1));
+  for (int64_t axis = 0; axis < dim(); ++axis)
+    for (const auto side : sides_[axis]) {
+      if (side != Side::kRobin) continue;
+      const auto bar = sums.result(found.size() - 1);
+      found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + axis).squeeze(1));
+    }
+  return found;
+}
+
+std::vector<at::Tensor> DiffusionOperator::products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (per_axis_ || !has_product_kernel(lambda, u)) return {};
+  return u.scalar_type() == at::kFloat ? products_of<float>(lambda, u) : products_of<double>(lambda, u);
+}
+
+}  // namespace prdp
