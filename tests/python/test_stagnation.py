@@ -81,7 +81,8 @@ def test_what_is_told_may_be_wrong_altogether():
     """Nothing but the warning tells: float32 against LAPACK in float64, with a condition number of a million."""
     generator = torch.Generator().manual_seed(0)
     q, _ = torch.linalg.qr(torch.randn(40, 40, dtype=F64, generator=generator))
-    a, b = q @ torch.diag(torch.logspace(0, -6, 40, dtype=F64)) @ q.T, torch.randn(1, 40, dtype=F64, generator=generator)
+    a = q @ torch.diag(torch.logspace(0, -6, 40, dtype=F64)) @ q.T
+    b = torch.randn(1, 40, dtype=F64, generator=generator)
     with told() as words:
         u, info = prdp.linear_solve(a.float(), b.float(), prdp.GMRES(300, restart=10, rtol=1e-6))
     exact = torch.linalg.solve(a, b[0])

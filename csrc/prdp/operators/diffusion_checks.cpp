@@ -142,7 +142,8 @@ void DiffusionOperator::check_parameters(Checks checks) const {
   const auto [low, high] = at::aminmax(kappa_);
   const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
   const auto* least_and_most = ends.const_data_ptr<double>();
-  if (least_and_most[0] > 0.0) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
+  known_positive_ = least_and_most[0] > 0.0;
+  if (known_positive_) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
   const auto wrong = kappa_.le(0);
   if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);

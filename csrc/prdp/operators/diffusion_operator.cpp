@@ -143,9 +143,8 @@ std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda
 
 at::Tensor DiffusionOperator::coefficients() const {
   // NaN where kappa is not allowed, or not finite, which a harmonic mean would lose.
-  const auto allowed = kappa_.gt(0);
-  auto diagonal = per_axis_ ? or_nan(shift_ + 0.0 * kappa_.sum(1, /*keepdim=*/true), allowed.all(1, /*keepdim=*/true))
-                            : or_nan(shift_ + 0.0 * kappa_, allowed);
+  auto diagonal = shift_ + 0.0 * (per_axis_ ? kappa_.sum(1, /*keepdim=*/true) : kappa_);
+  if (!known_positive_) diagonal = or_nan(diagonal, per_axis_ ? kappa_.gt(0).all(1, /*keepdim=*/true) : kappa_.gt(0));
   std::vector<at::Tensor> all{at::Tensor()};
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (const auto& coupling : faces(axis, -1.0)) {

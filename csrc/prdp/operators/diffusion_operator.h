@@ -95,6 +95,7 @@ class DiffusionOperator final : public Operator {
   std::vector<double> lengths_;
   FaceMean mean_;
   bool per_axis_;
+  mutable bool known_positive_ = false;  // κ, by check_parameters(), so that no product need look again
   // With an axis of one channel, or of those of κ, and one of extent 1 where a side has none; or 0-dimensional.
   at::Tensor kappa_, shift_;
   std::vector<at::Tensor> robin_;  // h of each Robin side, in their order
