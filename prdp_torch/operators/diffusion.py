@@ -204,7 +204,7 @@ def _sides(boundary: Any, dim: int) -> list[tuple[Any, Any]]:
     if len(pairs) != dim or any(len(pair) != 2 or not all(map(is_known, pair)) for pair in pairs):
         raise ValueError(
             "Diffusion: boundary must be 'zero', 'flux', 'periodic' or ('robin', h): one for all sides, or one, or a "
-            f"pair (low, high), for each of {dim} axes, got {boundary!r}"
+            f"pair (low, high), for each of {dim} axes, got {boundary!r} ('zero' is Dirichlet's, 'flux' Neumann's)"
         )
     if any([_kind(side) for side in pair].count("periodic") == 1 for pair in pairs):
         raise ValueError(f"Diffusion: boundary: both sides of an axis are periodic or none is, got {boundary!r}")

@@ -225,6 +225,9 @@ def test_arguments_are_checked():
         expected = r"Diffusion: expected kappa \(batch or 1, \*shape\) and b \(batch, channel, \*shape\), got kappa "
         with pytest.raises(ValueError, match=expected + got):
             prdp.linear_solve(Diffusion(wrong), torch.ones(1, 1, *b, dtype=F64), prdp.CG(3))
+    for axes, remedy in ((1, r"take kappa\[:, 0\]"), (2, "with per_axis=True, kappa has a field for each axis")):
+        with pytest.raises(ValueError, match=remedy):
+            prdp.linear_solve(Diffusion(torch.ones(3, axes, 4, 4)), torch.ones(3, 1, 4, 4), prdp.CG(3))
     bad = kappa.clone()
     bad[0, 1, 2] = torch.nan
     with pytest.raises(torch.linalg.LinAlgError, match="NONFINITE_OPERATOR"):

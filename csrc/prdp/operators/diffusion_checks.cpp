@@ -114,11 +114,18 @@ std::vector<std::pair<const char*, at::Tensor>> DiffusionOperator::tensors() con
   return all;
 }
 
+/// What may be meant by an axis too many.
+std::string DiffusionOperator::remedy_for(const at::Tensor& b) const {
+  if (per_axis_ || dim() != b.dim() - 1) return "";
+  if (shape_[0] == 1) return "; kappa has no channel axis: take kappa[:, 0]";
+  return shape_[0] == dim() - 1 ? "; with per_axis=True, kappa has a field for each axis" : "";
+}
+
 void DiffusionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(b.dim() == dim() + 2 && b.sym_sizes().slice(2) == kappa_.sym_sizes().slice(2) && b.sym_size(1) != 0,
                     "Diffusion: expected kappa (batch or 1, ", per_axis_ ? "axes, " : "",
                     "*shape) and b (batch, channel, *shape), got kappa ",
-                    (per_axis_ ? kappa_ : kappa_.squeeze(1)).sym_sizes(), " and b ", b.sym_sizes());
+                    (per_axis_ ? kappa_ : kappa_.squeeze(1)).sym_sizes(), " and b ", b.sym_sizes(), remedy_for(b));
   for (const auto& [name, t] : tensors())
     TORCH_CHECK_VALUE(t.dim() == 0 || t.sym_size(0) == 1 || t.sym_size(0) == b.sym_size(0), "Diffusion: ", name,
                       " holds ", t.sym_size(0), " samples, the vector holds ", b.sym_size(0));

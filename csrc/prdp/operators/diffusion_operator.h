@@ -1,5 +1,6 @@
 #pragma once
 #include <array>
+#include <string>
 
 #include "prdp/grid/grid.h"
 #include "prdp/operators/operator.h"
@@ -56,6 +57,7 @@ class DiffusionOperator final : public Operator {
   OperatorSpec as_stencil() const;
 
  private:
+  std::string remedy_for(const at::Tensor& b) const;
   /// The product rule in one launch on a GPU; nothing where there is no kernel.
   std::vector<at::Tensor> products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
   template <class T>
