@@ -51,7 +51,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   /// y = factor · x, where one of the two is no vector of the space.
   PRDP_ONCE void load(const T* x, T factor, Vector y) {
-    each([&](int i) { return factor * x[i]; }, into(y));
+    each<1>([&](int i) { return factor * x[i]; }, into(y));
   }
   T store(const T* x, T factor, T* u) {
     load(x, factor, u);
@@ -75,7 +75,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   /// x = factor x
   PRDP_ONCE void scale(T factor, Vector x) {
-    each([&](int i) { return factor * x[i]; }, into(x));
+    each<1>([&](int i) { return factor * x[i]; }, into(x));
   }
   /// Onto what products with A may contain, and onto the solutions of least norm. Returns the norm of what is taken
   /// off.
@@ -85,12 +85,12 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   Vector start() { return memory_of(2); }
   Vector whole_b() { return memory_of(3); }
   /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
-  void start_here(T left2) {
-    each([&](int i) { return Pair{b()[i], whole_b()[i]}; },
-         [&](int i, Pair both) {
-           whole_b()[i] = both.first;
-           b()[i] = both.second;
-         });
+  PRDP_ONCE void start_here(T left2) {
+    each<1>([&](int i) { return Pair{b()[i], whole_b()[i]}; },
+            [&](int i, Pair both) {
+              whole_b()[i] = both.first;
+              b()[i] = both.second;
+            });
     started_ = true;
     b2_ = left2;
   }
@@ -99,7 +99,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   bool started() const { return started_; }
   PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
-    each([&](int i) { return y[i] + alpha * x[i]; }, into(y));
+    each<1>([&](int i) { return y[i] + alpha * x[i]; }, into(y));
   }
 
   // ---- what space.h asks for
@@ -176,7 +176,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   PRDP_ONCE Scalar residual(const T* x, Vector r) {
     const T* const of = started_ ? whole_b() : b();
     T s = 0;
-    product(solution(x), [&](int i, T value) {
+    product<1>(solution(x), [&](int i, T value) {
       const T left = of[i] - value;
       r[i] = left;
       s += left * left;
@@ -191,12 +191,12 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     return dot(u, u);
   }
 
-  Scalar terms2(const T* x) {
+  PRDP_ONCE Scalar terms2(const T* x) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
-    each([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
+    each<1>([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
     T s = 0;
-    product(signed_u, [&](int, T value) { s += value * value; });
+    product<1>(signed_u, [&](int, T value) { s += value * value; });
     --state_->applications;  // no part of the method
     return team_.sum(s);
   }
@@ -257,7 +257,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     return square_of(
         [&](int i) {
           T sum = factor * w[i];
-          for (int64_t j = 0; j < count; ++j) sum -= h[j] * v[j][i];
+          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum -= h[j] * v[j][i];
           return sum;
         },
         w);
@@ -266,7 +266,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
     each(
         [&](int i) {
           T sum = x[i];
-          for (int64_t j = 0; j < count; ++j) sum += y[j] * v[j][i];
+          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum += y[j] * v[j][i];
           return sum;
         },
         into(x));
@@ -300,10 +300,11 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void reset() { broken_ = false; }
 
-  /// f(i), and then store(i, f(i)), for this thread's cells.
-  template <class F, class Store>
+  /// f(i), and then store(i, f(i)), for this thread's cells. Loops that run a few times in a solve take one cell at
+  /// once, which leaves less to compile.
+  template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(const F& f, const Store& store) const {
-    team_.each(A::kUnknowns, f, store);
+    team_.template each<kAtOnce>(A::kUnknowns, f, store);
   }
 
  private:
@@ -338,12 +339,12 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   /// store(i, (A v)_i) for this thread's cells. Before v is changed, a sum or another product must come: slower threads
   /// still read it. The methods are like that; one that is not gives other bits in tests/python/test_gpu_kernels.py.
-  template <class Store>
+  template <int kAtOnce = kCellsAtOnce, class Store>
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
     const Shared<S::kBlocks, T> of_all{v};
-    each([&](int i) { return a_.product(of_all, i); }, store);
+    each<kAtOnce>([&](int i) { return a_.product(of_all, i); }, store);
   }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
   template <class Tell>
@@ -377,7 +378,7 @@ class BlockSpace : public SampleNumbers<typename S::T> {
   }
   PRDP_ONCE const T* solution(const T* x) {
     if (!started_) return x;
-    each([&](int i) { return x[i] + start()[i]; }, into(scratch()));
+    each<1>([&](int i) { return x[i] + start()[i]; }, into(scratch()));
     return scratch();
   }
 

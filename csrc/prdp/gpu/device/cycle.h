@@ -122,7 +122,7 @@ struct Cycle {
       return place + n <= S::Cycles::kInBlock ? of.in_block + place : of.beyond + place;
     }
 
-    void go_down(int level) {
+    PRDP_ONCE void go_down(int level) {
       const CoarseGrid& here = grid(level);
       smooth(level, /*from_zero=*/true);
       relax(level, T(0), T(0));
@@ -139,7 +139,7 @@ struct Cycle {
       }
     }
     /// From the solution of the coarser grid to that of this one, which it returns.
-    const T* go_up(int level, const T* coarse) {
+    PRDP_ONCE const T* go_up(int level, const T* coarse) {
       used -= int64_t{3} * fields() * points(grid(level + 1));
       if (level == 0) {
         vectors = finest;
@@ -171,13 +171,13 @@ struct Cycle {
       team.for_each(fields() * n, [&](int at) {
         const int i = at % n;
         T sum = 0;
-        for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
+        PRDP_ROLLED for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
         x[at] = sum;
       });
     }
 
     /// x = M b, or from x on; y is memory.
-    void smooth(int level, bool from_zero) {
+    PRDP_ONCE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
       for (int64_t s = 0; s < of.hierarchy.smoothing; ++s) {
         const kernels::SmoothingStep step = steps.next();
@@ -204,7 +204,7 @@ struct Cycle {
       return of.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * points(grid(level));
     }
     /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x.
-    void relax(int level, T p, T q) {
+    PRDP_ONCE void relax(int level, T p, T q) {
       if (level == 0) return relax(Finest{a, diagonals(0)}, r, A::kUnknowns, p, q);
       const CoarseGrid& here = grid(level);
       const int n = points(here);
