@@ -25,6 +25,7 @@
 #define __shared__ static thread_local
 #define PRDP_UNROLL
 #define PRDP_ONCE
+#define PRDP_ROLLED
 #define PRDP_SPIN fibers::spin(since)
 #define PRDP_BLOCK_MEMORY(name) double* const name = reinterpret_cast<double*>(fibers::block->memory.data())
 // One barrier may be left out, to see that a test notices: that of a line of team.h, or of a line that calls meet().

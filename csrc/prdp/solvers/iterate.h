@@ -8,11 +8,6 @@
 #include "prdp/solvers/observe.h"
 #include "prdp/solvers/space.h"
 
-// Functions that a kernel of a GPU holds once: copied to each call, they take a minute to compile there.
-#ifndef PRDP_ONCE
-#define PRDP_ONCE
-#endif
-
 /// The one loop around every method: it counts, checks and decides, per sample. A method (jacobi.h,
 /// …) supplies one iteration; a space says what a vector is: one sample in padded memory
 /// (sample_space.h), or a batch of plain tensors (tensor_space.h). Both run these same lines.

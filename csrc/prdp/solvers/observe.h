@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/solvers/space.h"
 #include "prdp/solvers/verdicts.h"
 
 /// How the loop around the methods (iterate.h) looks at residuals, and stops the samples that are done.
@@ -44,8 +45,8 @@ bool is_idle(const SampleState& s) {
 /// says nothing, nor does a residual near it: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a
 /// product rounds: columns of A that differ much in size make ‖A‖ ‖u‖ large without.
 template <class Space, class Method, class Predicate>
-void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
-                            const Predicate& doubtful) {
+PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
+                                      const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto norm_a = space.operator_norm();
   const auto u2 = space.values_of(space.solution2(method.x));
@@ -75,7 +76,7 @@ void stop_at_rounding_floor(Space& space, const Method& method, typename Space::
 /// Takes the residuals that the method knows. Freezes what diverged, overflowed or broke down, and
 /// confirms what seems converged by the true residual: a recursive one may have drifted from it.
 template <class Space, class Method>
-void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
+PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto residual2 = space.values_of(method.residual2());
   const auto broken = space.broken();
   [[maybe_unused]] decltype(space.values_of(method.residual2())) exhausted{};

@@ -2,6 +2,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "prdp/solvers/space.h"
+
 namespace prdp {
 
 /// Numbers that solve_damped() works with.
@@ -12,15 +14,15 @@ constexpr int64_t numbers_of_solve_damped(int64_t n) { return n * (n + 2); }
 template <class T>
 void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y, T* work) {
   T *a = work, *rhs = a + n * n, *row = rhs + n;
-  for (int64_t j = 0; j < n; ++j) {
+  PRDP_ROLLED for (int64_t j = 0; j < n; ++j) {
     rhs[j] = g[j];
-    for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+    PRDP_ROLLED for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
   }
-  for (int64_t k = 0; k < n; ++k) {
-    for (int64_t j = 0; j < n; ++j) row[j] = 0;
+  PRDP_ROLLED for (int64_t k = 0; k < n; ++k) {
+    PRDP_ROLLED for (int64_t j = 0; j < n; ++j) row[j] = 0;
     row[k] = tau;
     T of_row = 0;
-    for (int64_t i = k; i < n; ++i) {
+    PRDP_ROLLED for (int64_t i = k; i < n; ++i) {
       const T length = std::hypot(a[i * n + i], row[i]);
       if (length == T(0)) continue;
       const T cos = a[i * n + i] / length, sin = row[i] / length;
@@ -29,13 +31,13 @@ void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y
         lower = cos * lower - sin * upper;
         upper = rotated;
       };
-      for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
+      PRDP_ROLLED for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
       rotate(rhs[i], of_row);
     }
   }
-  for (int64_t i = n - 1; i >= 0; --i) {
+  PRDP_ROLLED for (int64_t i = n - 1; i >= 0; --i) {
     T sum = rhs[i];
-    for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
+    PRDP_ROLLED for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
     y[i] = a[i * n + i] == T(0) ? T(0) : sum / a[i * n + i];
   }
 }

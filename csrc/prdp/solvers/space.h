@@ -4,6 +4,13 @@
 #include <cstdint>
 #include <utility>
 
+// Functions that a kernel of a GPU holds once, and loops that it does not unroll: copied, they take a minute to compile
+// there.
+#ifndef PRDP_ONCE
+#define PRDP_ONCE
+#define PRDP_ROLLED
+#endif
+
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample in padded memory (sample_space.h), or a batch of plain tensors (tensor_space.h). An operation
 /// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new method needs

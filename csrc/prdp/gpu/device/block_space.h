@@ -77,12 +77,12 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   Vector start() { return memory_of(2); }
   Vector whole_b() { return memory_of(3); }
   /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
-  void start_here(T left2) {
-    each([&](int i) { return Pair{b()[i], whole_b()[i]}; },
-         [&](int i, Pair both) {
-           whole_b()[i] = both.first;
-           b()[i] = both.second;
-         });
+  PRDP_ONCE void start_here(T left2) {
+    this->template each<1>([&](int i) { return Pair{b()[i], whole_b()[i]}; },
+                           [&](int i, Pair both) {
+                             whole_b()[i] = both.first;
+                             b()[i] = both.second;
+                           });
     started_ = true;
     b2_ = left2;
   }
@@ -129,7 +129,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   PRDP_ONCE Scalar residual(const T* x, Vector r) {
     const T* const of = started_ ? whole_b() : b();
     T s = 0;
-    product(solution(x), [&](int i, T value) {
+    product<1>(solution(x), [&](int i, T value) {
       const T left = of[i] - value;
       r[i] = left;
       s += left * left;
@@ -143,12 +143,12 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     const T* u = solution(x);
     return dot(u, u);
   }
-  Scalar terms2(const T* x) {
+  PRDP_ONCE Scalar terms2(const T* x) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
-    each([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
+    this->template each<1>([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
     T s = 0;
-    product(signed_u, [&](int, T value) { s += value * value; });
+    product<1>(signed_u, [&](int, T value) { s += value * value; });
     --state_->applications;  // no part of the method
     return team_.sum(s);
   }
@@ -226,12 +226,12 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   };
   /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
   /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.
-  template <class Store>
+  template <int kAtOnce = kCellsAtOnce, class Store>
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
     const Shared<S::kBlocks, T> of_all{v};
-    each([&](int i) { return a_.product(of_all, i); }, store);
+    this->template each<kAtOnce>([&](int i) { return a_.product(of_all, i); }, store);
   }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
   template <class Tell>
@@ -265,7 +265,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   PRDP_ONCE const T* solution(const T* x) {
     if (!started_) return x;
-    each([&](int i) { return x[i] + start()[i]; }, into(scratch()));
+    this->template each<1>([&](int i) { return x[i] + start()[i]; }, into(scratch()));
     return scratch();
   }
 

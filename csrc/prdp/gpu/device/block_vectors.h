@@ -48,15 +48,15 @@ class BlockVectors {
     each([&](int i) { return x[i] + beta * y[i]; }, into(y));
   }
   PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
-    each([&](int i) { return y[i] + alpha * x[i]; }, into(y));
+    each<1>([&](int i) { return y[i] + alpha * x[i]; }, into(y));
   }
   /// x = factor x
   PRDP_ONCE void scale(T factor, Vector x) {
-    each([&](int i) { return factor * x[i]; }, into(x));
+    each<1>([&](int i) { return factor * x[i]; }, into(x));
   }
   /// y = factor · x, where one of the two is no vector of the space.
   PRDP_ONCE void load(const T* x, T factor, Vector y) {
-    each([&](int i) { return factor * x[i]; }, into(y));
+    each<1>([&](int i) { return factor * x[i]; }, into(y));
   }
   T store(const T* x, T factor, T* u) {
     load(x, factor, u);
@@ -92,7 +92,7 @@ class BlockVectors {
     return square_of(
         [&](int i) {
           T sum = factor * w[i];
-          for (int64_t j = 0; j < count; ++j) sum -= h[j] * v[j][i];
+          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum -= h[j] * v[j][i];
           return sum;
         },
         w);
@@ -101,16 +101,17 @@ class BlockVectors {
     each(
         [&](int i) {
           T sum = x[i];
-          for (int64_t j = 0; j < count; ++j) sum += y[j] * v[j][i];
+          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum += y[j] * v[j][i];
           return sum;
         },
         into(x));
   }
 
-  /// f(i), and then store(i, f(i)), for this thread's cells.
-  template <class F, class Store>
+  /// f(i), and then store(i, f(i)), for this thread's cells. Loops that run a few times in a solve take one cell at
+  /// once, which leaves less to compile.
+  template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(const F& f, const Store& store) const {
-    team_.each(A::kUnknowns, f, store);
+    team_.template each<kAtOnce>(A::kUnknowns, f, store);
   }
 
  protected:

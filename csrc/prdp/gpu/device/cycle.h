@@ -122,7 +122,7 @@ struct Cycle {
       return {first, first + n, first + 2 * n};
     }
 
-    void go_down(int level) {
+    PRDP_ONCE void go_down(int level) {
       const CoarseGrid& here = grid(level);
       smooth(level, /*from_zero=*/true);
       take_residual(level);
@@ -139,7 +139,7 @@ struct Cycle {
       }
     }
     /// From the solution of the coarser grid to that of this one, which it returns.
-    const T* go_up(int level, const T* coarse) {
+    PRDP_ONCE const T* go_up(int level, const T* coarse) {
       vectors = level == 0 ? finest : vectors_of(level);
       // Each smoothing step but the first had swapped them on the way down.
       if (level > 0 && of.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
@@ -166,13 +166,13 @@ struct Cycle {
       team.for_each(fields() * n, [&](int at) {
         const int i = at % n;
         T sum = 0;
-        for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
+        PRDP_ROLLED for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
         x[at] = sum;
       });
     }
 
     /// x = M b, or from x on; y is memory.
-    void smooth(int level, bool from_zero) {
+    PRDP_ONCE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
       for (int64_t s = 0; s < of.hierarchy.smoothing; ++s) {
         const kernels::SmoothingStep step = steps.next();
@@ -202,7 +202,7 @@ struct Cycle {
     void take_residual(int level) { relax(level, T(0), T(0)); }
     /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x: products are most of what there is to compile, so
     /// there is one text of both.
-    void relax(int level, T p, T q) {
+    PRDP_ONCE void relax(int level, T p, T q) {
       if (level == 0) return relax(Finest{a, diagonals(0)}, r, A::kUnknowns, p, q);
       const CoarseGrid& here = grid(level);
       const int n = points(here);

@@ -13,7 +13,7 @@ T larger_or_nan(T a, T b) {
 template <class Team, class F>
 auto largest_of(Team& team, int n, const F& f) {
   decltype(f(0)) most = 0;
-  team.each(n, f, [&](int, auto value) { most = larger_or_nan(most, value); });
+  team.template each<1>(n, f, [&](int, auto value) { most = larger_or_nan(most, value); });
   return team.largest(most);
 }
 

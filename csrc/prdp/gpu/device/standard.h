@@ -6,6 +6,7 @@ using int32_t = int;
 using uint64_t = unsigned long;
 
 #define PRDP_UNROLL _Pragma("unroll")
+#define PRDP_ROLLED _Pragma("unroll 1")
 /// Functions that are not copied to where they are called: else a kernel takes a minute to compile.
 #define PRDP_ONCE __noinline__
 #define PRDP_SPIN \

@@ -40,14 +40,14 @@ class Team {
   bool leads() const { return rank_ == 0 && threadIdx.x == 0; }
 
   /// f(i), and then store(i, f(i)), for each of this thread's share of 0 … n - 1. f only reads.
-  template <class F, class Store>
+  template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(int n, const F& f, const Store& store) const {
     const Share mine = share_of(n);
-    for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end; first += kThreads * kCellsAtOnce) {
-      decltype(f(0)) value[kCellsAtOnce];
-      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
+    for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end; first += kThreads * kAtOnce) {
+      decltype(f(0)) value[kAtOnce];
+      PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
           f(first + k * kThreads);
-      PRDP_UNROLL for (int k = 0; k < kCellsAtOnce; ++k) if (first + k * kThreads < mine.end)
+      PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end)
           store(first + k * kThreads, value[k]);
     }
   }
