@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, operators
-from prdp_torch.solvers import (
-    Kept,
-    Solver,
-    check_options,
-    packed_options,
-    solve_options,
-    tensors_of,
-)
+from prdp_torch.solvers import Solver, check_options, packed_options
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Solution
 
 _STATUSES: dict[str, int] = _C.SOLVE_STATUSES
@@ -36,9 +29,6 @@ class SolveStatus(IntEnum):
     INCONSISTENT = _STATUSES["INCONSISTENT"]
     NONFINITE_INPUT = _STATUSES["NONFINITE_INPUT"]
     NONFINITE_OPERATOR = _STATUSES["NONFINITE_OPERATOR"]
-
-
-_last_options = Kept(solve_options)
 
 
 class AdjointLog:
@@ -229,18 +219,16 @@ def linear_solve(
         _check.dense("linear_solve", "b", b)
         if x0 is not None:
             _check.dense("linear_solve", "x0", x0)
-        check_options("linear_solve", solver, backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every)
-        log = AdjointLog()
     lone_vector = b.dim() == 1 and isinstance(A, operators.Matrix)
     rhs = b.unsqueeze(0) if lone_vector else b
     start = x0.unsqueeze(0) if lone_vector and x0 is not None else x0
     settings = backward, adjoint_max_iter, adjoint_rtol, on_failure, checkpoint_every
-    if log is not None:
+    if not compiling:
+        options = check_options("linear_solve", solver, *settings)
+        log = AdjointLog()
         if vars(A).setdefault("_solves", 0) == 1:
             A.explain_freed_graphs()  # who makes a new one for each update has no need of it
         vars(A)["_solves"] += 1
-        preconditioner = solver.preconditioner, tensors_of(solver.preconditioner)
-        options = _last_options.of(solver.method, solver.rtol, solver.restart, *preconditioner, *settings)
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )

@@ -121,9 +121,11 @@ def packed_options(
     return [method, backward, on_failure, start, kind], counts, numbers, tensors
 
 
-def check_solver(who: str, *solver: Any) -> None:
-    """Raise ValueError, in the name of `who`, unless the parts of a solver fit together."""
-    _C.SolveOptions(*packed_options(*solver)).check(who)
+def check_solver(who: str, *solver: Any) -> _C.SolveOptions:
+    """Raise ValueError, in the name of `who`, unless the parts of a solver fit together; return them as options."""
+    options = _C.SolveOptions(*packed_options(*solver))
+    options.check(who)
+    return options
 
 
 @dataclass
@@ -301,11 +303,11 @@ def check_options(
     on_failure: object,
     checkpoint_every: CheckpointEvery,
     start: object = "zero",
-) -> None:
-    """The arguments that every solve takes: TypeError or ValueError in the name of `who`."""
+) -> _C.SolveOptions:
+    """The arguments that every solve takes, as options: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
         raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
-    check_settings(
+    return check_settings(
         who,
         solver.method,
         solver.max_iter,
@@ -334,14 +336,14 @@ def check_settings(
     on_failure: object,
     checkpoint_every: Any,
     start: object,
-) -> None:
+) -> _C.SolveOptions:
     """The same for the parts of a solver: they and the options fit together."""
     check_preconditioner(who, preconditioner)
     if isinstance(checkpoint_every, str) and checkpoint_every != "sqrt":
         raise TypeError(f"{who}: checkpoint_every must be a whole number, 'sqrt' or None, got {checkpoint_every!r}")
     if checkpoint_every not in (None, "sqrt") and _check.whole(who, "checkpoint_every", checkpoint_every) < 1:
         raise ValueError(f"{who}: checkpoint_every must be >= 1, 'sqrt' or None, got {checkpoint_every}")
-    check_solver(
+    return check_solver(
         who,
         method,
         _check.whole(who, "max_iter", max_iter),
