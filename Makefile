@@ -19,7 +19,7 @@ export MAKEFLAGS :=
 CONFIGURE = $(BIN)/cmake -S . -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
   -DPRDP_EXPERIMENTS=ON -DPRDP_TRAINER=ON -DPRDP_TESTS=ON -DPRDP_WERROR=ON
 
-.PHONY: demo test docs kernels tidy sanitize fuzz cuda wheel bench-peers records records-gpu clean
+.PHONY: demo test docs kernels tidy sanitize fuzz cuda sanitize-cuda wheel bench-peers records records-gpu clean
 
 demo: $(STAMPS)/configure
 	@echo "prdp: building the library (from scratch some 5 minutes on two cores)"
@@ -76,11 +76,22 @@ cuda:
 	mkdir -p build-cuda
 	$(CUDA_CMAKE) -S . -B build-cuda -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(CUDA)/python -DPRDP_EXPERIMENTS=ON -DPRDP_WERROR=OFF \
 	  $(if $(HEADERS),-DCMAKE_INCLUDE_PATH=$(abspath $(HEADERS)) -DCMAKE_PREFIX_PATH=$(abspath $(HEADERS))) > build-cuda/configure.log
-	$(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target python
+	$(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target python prdp_fibers
 	! grep -q '^build prdp_train:' build-cuda/build.ninja || $(CUDA_CMAKE) --build build-cuda --parallel $$(nproc) --target prdp_train
 	$(CUDA_CMAKE) --install build-cuda --component python --prefix prdp_torch > build-cuda/install.log
-	$(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py tests/python/test_cuda_trainings.py
+	PRDP_BUILD_DIR=build-cuda $(CUDA)/python -m pytest -m cuda tests/python/test_cuda.py tests/python/test_cuda_trainings.py
+	$(if $(filter cpu,$(DEVICE)),,@$(MAKE) --no-print-directory sanitize-cuda)
 	$(CUDA)/python -m benchmarks.devices --device $(DEVICE) $(if $(filter cpu,$(DEVICE)),--quick) | tee build-cuda/devices.jsonl
+
+# A short test under each tool of compute-sanitizer, where CUDA's toolkit has it. Memory is torch's alone without its cache,
+# which would hide what is beyond a tensor.
+sanitize-cuda:
+	@command -v compute-sanitizer > /dev/null || { echo "prdp: no compute-sanitizer here, so it was not run"; exit 0; }; \
+	for tool in memcheck racecheck synccheck; do \
+	  PRDP_BUILD_DIR=build-cuda PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $$tool --error-exitcode 1 \
+	    $(CUDA)/python -m pytest -q -m cuda tests/python/test_cuda.py \
+	    -k 'test_kernels_solve_as_the_loops_of_the_cpu and (heat or diffusion) and (CG or GMRES)' || exit 1; \
+	done
 
 wheel: $(STAMPS)/configure $(STAMPS)/wheel
 	$(BIN)/python packaging/make_wheel.py dist

@@ -1,9 +1,11 @@
 // Kernels of a GPU on the CPU: compiled by the host's compiler, run by fibers.h. With it, tensors of the CPU take the
 // way that those of a GPU take, from the operator to the report.
 
+#include <c10/core/impl/DeviceGuardImplInterface.h>
 #include <dlfcn.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
 #include <filesystem>
@@ -11,7 +13,7 @@
 #include <functional>
 #include <map>
 #include <mutex>
-#include <set>
+#include <vector>
 
 #include "prdp/gpu/cuda_runtime.h"
 #include "prdp/gpu/nvrtc.h"
@@ -29,10 +31,10 @@ struct Settings {
   Limits limits{};
   int order = 0;  // of fibers::Order
   int left_out = 0;  // the line of the barrier that is left out; 0: none
-  std::string last{};  // text of a kernel
-  std::set<std::string> loops{};  // those that are loops over points or samples
+  int64_t most_blocks = 0;  // that are at work at the same time; 0: as many as there are
 };
 Settings settings;
+std::vector<KernelSource> asked_for;  // since kernels serve the CPU, each once
 std::atomic<int64_t> launches = 0;
 
 std::string read(const fs::path& file) {
@@ -60,7 +62,7 @@ void compile(const std::string& arguments, const fs::path& result) {
   if (fs::exists(result)) return;
   const auto part = result.string() + "." + std::to_string(getpid()), log = part + ".log";
   static const std::string watch = std::getenv("PRDP_FIBERS_TSAN") ? " -fsanitize=thread -g" : "";
-  const std::string command = "c++ -std=c++20 -O1 -ffp-contract=off -fPIC -pthread" + watch + " -I" +
+  const std::string command = "c++ -std=c++20 -O1 -ffp-contract=off -fno-gnu-unique -fPIC -pthread" + watch + " -I" +
                               folder().string() + " -I" + PRDP_CSRC + " " + arguments + " -o " + part + " 2> " + log;
   if (std::system(command.c_str()) != 0) throw Unavailable("the host's compiler fails: " + read(log));
   fs::remove(log);
@@ -113,8 +115,9 @@ class FiberRuntime final : public prdp::gpu::Runtime {
   Limits limits(c10::Device) override { return settings.limits; }
   std::shared_ptr<const prdp::gpu::Kernel> kernel(c10::Device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
-    settings.last = source.text;
-    if (source.text.find("run_each.h") != std::string::npos) settings.loops.insert(source.text);
+    if (std::ranges::find(asked_for, source.text, &KernelSource::text) == asked_for.end()) asked_for.push_back(source);
+    if (settings.most_blocks > 0 && source.blocks_of_team > settings.most_blocks)
+      throw Unavailable("a sample of this size needs more blocks than the device runs at the same time");
     auto& kernel = kernels_[source.text];
     if (!kernel) kernel = std::make_shared<FiberKernel>(source);
     return kernel;
@@ -125,69 +128,68 @@ class FiberRuntime final : public prdp::gpu::Runtime {
   std::map<std::string, std::shared_ptr<const prdp::gpu::Kernel>> kernels_;
 };
 
+/// What `run` raises, in words; nothing where it does not.
+template <class Run>
+const char* said_by(const Run& run) {
+  static thread_local std::string said;
+  said.clear();
+  try {
+    run();
+  } catch (const std::exception& e) {
+    said = e.what();
+  }
+  return said.c_str();
+}
+
+const c10::Device kCuda(c10::DeviceType::CUDA, 0);
+/// A torch without CUDA knows no current device of that kind.
+struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::CUDA> {
+  void* getStreamNativeHandle(const c10::Stream) const override { return nullptr; }
+};
+
 }  // namespace
 
 /// From here on, kernels serve tensors of the CPU; and no longer.
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
-                                  int left_out) {
+                                  int left_out, int64_t most_blocks) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, settings.last, settings.loops};
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, most_blocks};
+  asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }
-/// Compiles the text of the last kernel for devices of this compute capability by NVRTC. Returns what went wrong, or
-/// nothing; the length of the binary goes to `size`.
-extern "C" const char* prdp_compile_last(int capability, int64_t* size) {
-  static std::string error;
-  error.clear();
-  try {
-    *size = std::ssize(prdp::gpu::nvrtc::compile(settings.last, capability));
-  } catch (const std::exception& e) {
-    error = e.what();
-  }
-  return error.c_str();
+/// How many kernels were asked for since then.
+extern "C" int64_t prdp_fibers_kernels() { return std::ssize(asked_for); }
+extern "C" const char* prdp_text_of(int64_t kernel) { return asked_for.at(static_cast<size_t>(kernel)).text.c_str(); }
+/// Bytes that a block is launched with, beside what its text declares.
+extern "C" int64_t prdp_block_memory_of(int64_t kernel) {
+  return asked_for.at(static_cast<size_t>(kernel)).block_memory;
 }
-/// The same for all kernels that are loops; how many there are goes to `count`.
-extern "C" const char* prdp_compile_loops(int capability, int64_t* count) {
-  static std::string error;
-  error.clear();
-  *count = std::ssize(settings.loops);
-  for (const auto& text : settings.loops) try {
-      prdp::gpu::nvrtc::compile(text, capability);
-    } catch (const std::exception& e) {
-      error = e.what();
-    }
-  return error.c_str();
+/// Compiles a text for devices of this compute capability by NVRTC. Returns what went wrong, or nothing; the length of
+/// the binary goes to `size`.
+extern "C" const char* prdp_compile(const char* text, int capability, int64_t* size) {
+  return said_by([&] { *size = std::ssize(prdp::gpu::nvrtc::compile(text, capability)); });
+}
+/// What the compiler says of it.
+extern "C" const char* prdp_resources_of(const char* text, int capability) {
+  static std::string found;
+  const char* const error = said_by([&] { found = prdp::gpu::nvrtc::resources(text, capability); });
+  return *error ? error : found.c_str();
 }
 /// Why CUDA cannot be used here; nothing where it can.
 extern "C" const char* prdp_why_no_cuda() {
-  static std::string said;
-  said.clear();
-  try {
-    prdp::gpu::cuda_runtime().limits(c10::Device(c10::DeviceType::CUDA, 0));
-  } catch (const std::exception& e) {
-    said = e.what();
-  }
-  return said.c_str();
+  return said_by([] { prdp::gpu::cuda_runtime().limits(kCuda); });
+}
+/// Why CUDA makes no kernel of this text here, for a team of so many blocks.
+extern "C" const char* prdp_why_no_kernel_of_cuda(const char* text, int64_t blocks) {
+  static auto* const guard = new CudaWithoutTorch;  // outlives every thread
+  static const c10::impl::DeviceGuardImplRegistrar registered(c10::DeviceType::CUDA, guard);
+  return said_by([&] { prdp::gpu::cuda_runtime().kernel(kCuda, {text, 32, 0, blocks}); });
 }
 /// Why a sample of this size has no kernel.
 extern "C" const char* prdp_why_too_large(int64_t unknowns) {
-  static std::string said;
-  try {
+  return said_by([&] {
     prdp::gpu::solve_kernel({"A"}, false, prdp::CG{}, at::empty({1}).expand({1, unknowns}), {96 << 10, 16384, 1024});
-  } catch (const Unavailable& e) {
-    said = e.what();
-  }
-  return said.c_str();
-}
-/// What the compiler says of it.
-extern "C" const char* prdp_resources_of_last(int capability) {
-  static std::string said;
-  try {
-    said = prdp::gpu::nvrtc::resources(settings.last, capability);
-  } catch (const std::exception& e) {
-    said = e.what();
-  }
-  return said.c_str();
+  });
 }
 /// How many kernels were launched so far.
 extern "C" int64_t prdp_fibers_launches() { return launches; }

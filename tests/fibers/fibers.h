@@ -1,4 +1,5 @@
 #pragma once
+#include <link.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -6,18 +7,20 @@
 #include <chrono>
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <functional>
 #include <memory>
 #include <numeric>
 #include <random>
 #include <thread>
+#include <utility>
 #include <vector>
 
 /// The text of a GPU kernel on a CPU, without a GPU: the threads of a block are fibers of one host thread, which give
 /// way at barriers and shuffles, and the blocks are host threads. Between two barriers the fibers run in a given order:
-/// forward, backward or shuffled. What depends on the order shows in the bits; memory of a block begins as NaN; fibers
-/// that wait at different barriers are an error.
+/// forward, backward or shuffled. What depends on the order shows in the bits; memory of a block begins as NaN in each
+/// launch; fibers that wait at different barriers, or called by different lines, are an error.
 #define __device__
 #define __global__
 #define __grid_constant__
@@ -29,8 +32,8 @@
 #define PRDP_SPIN fibers::spin(since)
 #define PRDP_BLOCK_MEMORY(name) double* const name = reinterpret_cast<double*>(fibers::block->memory.data())
 // One barrier may be left out, to see that a test notices: that of a line of team.h, or of a line that calls meet().
-#define __syncthreads() (__LINE__ == fibers::left_out ? void() : fibers::meet())
-#define PRDP_LEAVES_OUT(line) (fibers::kLinesOfTeam + (line) == fibers::left_out)
+#define __syncthreads() (__LINE__ == fibers::left_out ? void() : fibers::meet(__LINE__))
+#define PRDP_LEAVES_OUT(line) fibers::leaves_out(line)
 #define __threadfence() std::atomic_thread_fence(std::memory_order_seq_cst)
 
 // Under ThreadSanitizer, fibers are threads that only barriers and shuffles put into an order. What this file keeps for
@@ -80,12 +83,14 @@ struct Fiber {
   ucontext_t context;
   std::unique_ptr<char[]> stack;
   bool done = false;
+  int caller = 0;           // the line that last called meet() of a team
   void* watched = nullptr;  // by ThreadSanitizer
 };
 /// Where fibers wait for each other.
 struct Gate {
   int64_t opened = 0;
   int waiting = 0;
+  std::pair<int, int> place{};  // of those that wait: the line of the barrier, and that of its caller
 };
 struct Block {
   std::vector<Fiber> fibers;
@@ -112,10 +117,13 @@ inline void give_way() {
   switch_to(block->watched, /*ordered=*/false);
   swapcontext(&fiber.context, &block->scheduler);
 }
-inline void wait_among(Gate& gate, int fibers) {
+inline void wait_among(Gate& gate, int fibers, int line) {
   const Unwatched here;
   block->moved = true;
   const int64_t before = gate.opened;
+  const std::pair place{line, block->fibers[block->now].caller};
+  if (gate.waiting > 0 && gate.place != place) stuck = true;
+  gate.place = place;
   if (++gate.waiting == fibers) {
     gate.waiting = 0;
     ++gate.opened;
@@ -125,12 +133,17 @@ inline void wait_among(Gate& gate, int fibers) {
   while (gate.opened == before);
   block->moved = true;
 }
-inline void wait_at(Gate& gate, int fibers) {
+inline void wait_at(Gate& gate, int fibers, int line) {
   came_to(&gate);
-  wait_among(gate, fibers);
+  wait_among(gate, fibers, line);
   left(&gate);
 }
-inline void meet() { wait_at(block->all, static_cast<int>(block->fibers.size())); }
+inline void meet(int line) { wait_at(block->all, static_cast<int>(block->fibers.size()), line); }
+inline bool leaves_out(int line) {
+  const Unwatched here;
+  block->fibers[block->now].caller = line;
+  return kLinesOfTeam + line == left_out;
+}
 /// Gives up, after a while, where a block ended that should have come.
 inline void spin(int64_t& since) {
   constexpr int64_t patience = 3000;  // ms: on a busy machine the others may be late
@@ -160,13 +173,13 @@ inline thread_local Index threadIdx, blockDim, blockIdx, gridDim;
 
 /// All lanes meet twice: when each has written, and when each has read.
 template <class T>
-T __shfl_xor_sync(unsigned, T value, int lane) {
+T __shfl_xor_sync(unsigned, T value, int lane, int line = __builtin_LINE()) {
   auto& b = *fibers::block;
   auto& warp = b.warps[threadIdx.x / fibers::kLanesOfWarp];
   b.of_lanes[threadIdx.x] = static_cast<double>(value);
-  fibers::wait_at(warp, fibers::kLanesOfWarp);
+  fibers::wait_at(warp, fibers::kLanesOfWarp, line);
   const T other = static_cast<T>(b.of_lanes[threadIdx.x ^ static_cast<unsigned>(lane)]);
-  fibers::wait_at(warp, fibers::kLanesOfWarp);
+  fibers::wait_at(warp, fibers::kLanesOfWarp, -line);
   return other;
 }
 template <class T>
@@ -177,11 +190,27 @@ inline unsigned atomicAdd(unsigned* p, unsigned v) { return __atomic_fetch_add(p
 
 namespace fibers {
 
+/// The __shared__ variables of this thread's block, which are thread_local ones of this library, become NaN.
+inline void poison_shared() {
+  const auto poison = [](dl_phdr_info* library, size_t, void* mine) {
+    auto* const begin = static_cast<char*>(library->dlpi_tls_data);
+    for (int k = 0; begin && k < library->dlpi_phnum; ++k) {
+      const auto& part = library->dlpi_phdr[k];
+      if (part.p_type != PT_TLS || mine < begin || mine >= begin + part.p_memsz) continue;
+      std::memset(begin, 0xff, part.p_memsz);
+      return 1;
+    }
+    return 0;
+  };
+  if (dl_iterate_phdr(poison, &block) == 0) std::abort();
+}
+
 /// Runs a block to its end; false where its fibers wait at different barriers.
 inline bool run_block(int index, int blocks, int threads, int64_t memory, Order order, unsigned seed,
                       std::function<void()> kernel) {
   const Unwatched here;
   Block mine;
+  poison_shared();
   block = &mine;
   mine.watched = this_fiber();
   body = &kernel;

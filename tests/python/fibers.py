@@ -4,59 +4,86 @@ text is compiled by the host's compiler, and its threads run as fibers (tests/fi
 import ctypes
 import os
 import pathlib
+from typing import NamedTuple
+
+import torch
 
 import prdp_torch  # noqa: F401  the library that the fibers are linked against
 
 ROOT = pathlib.Path(__file__).parents[2]
+BUILD = ROOT / os.environ.get("PRDP_BUILD_DIR", "build")  # which prdp_torch was built in
 ORDERS = FORWARD, BACKWARD, SHUFFLED = range(3)
 
 
-class Fibers:
-    """A device whose blocks have so much memory, and teams of one block for so many unknowns."""
+class Kernel(NamedTuple):
+    """A kernel that was asked for."""
 
-    def __init__(self, block_memory=96 << 10, cells=16384, threads=64, order=FORWARD, left_out=0):
-        self.settings = (block_memory, cells, threads, order, left_out)
+    text: str
+    block_memory: int  # bytes that a block is launched with, beside what the text declares
+
+    def compile(self, capability):
+        """By NVRTC; returns the length of the binary, and what failed."""
+        size = ctypes.c_int64()
+        error = Fibers.library().prdp_compile(self.text.encode(), capability, ctypes.byref(size))
+        return size.value, error.decode()
+
+    def resources(self, capability):
+        return Fibers.library().prdp_resources_of(self.text.encode(), capability).decode()
+
+
+class Fibers:
+    """A device whose blocks have so much memory, and teams of one block for so many unknowns; with `most_blocks`, teams
+    have no more. Memory that torch makes anew begins as NaN, which is one more operation of torch, unless `poison` is
+    False."""
+
+    def __init__(
+        self, block_memory=96 << 10, cells=16384, threads=64, order=FORWARD, left_out=0, most_blocks=0, poison=True
+    ):
+        self.settings = (block_memory, cells, threads, order, left_out, most_blocks)
+        self.poison = poison
 
     @staticmethod
     def library():
-        library = ctypes.CDLL(str(ROOT / "build" / "libprdp_fibers.so"))
-        library.prdp_compile_last.argtypes = [ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
-        library.prdp_compile_last.restype = ctypes.c_char_p
-        library.prdp_resources_of_last.restype = ctypes.c_char_p
+        library = ctypes.CDLL(str(BUILD / "libprdp_fibers.so"))
+        library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_int64]
         library.prdp_fibers_launches.restype = ctypes.c_int64
-        library.prdp_compile_loops.argtypes = [ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
-        library.prdp_compile_loops.restype = ctypes.c_char_p
-        library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2
+        library.prdp_fibers_kernels.restype = ctypes.c_int64
+        library.prdp_text_of.argtypes = library.prdp_block_memory_of.argtypes = [ctypes.c_int64]
+        library.prdp_text_of.restype = ctypes.c_char_p
+        library.prdp_block_memory_of.restype = ctypes.c_int64
+        library.prdp_compile.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
+        library.prdp_resources_of.argtypes = [ctypes.c_char_p, ctypes.c_int]
+        library.prdp_why_no_kernel_of_cuda.argtypes = [ctypes.c_char_p, ctypes.c_int64]
+        library.prdp_why_too_large.argtypes = [ctypes.c_int64]
+        for name in ("compile", "resources_of", "why_no_cuda", "why_no_kernel_of_cuda", "why_too_large"):
+            getattr(library, f"prdp_{name}").restype = ctypes.c_char_p
         return library
-
-    def compile_last(self, capability):
-        """Compile the text of the kernel that ran last by NVRTC; returns the length of the binary, and what failed."""
-        size = ctypes.c_int64()
-        error = self.library().prdp_compile_last(capability, ctypes.byref(size))
-        return size.value, error.decode()
 
     def launches(self):
         """How many kernels were launched so far."""
         return self.library().prdp_fibers_launches()
 
-    def compile_loops(self, capability):
-        """Compile every kernel that is a loop and has run; returns how many, and what failed."""
-        count = ctypes.c_int64()
-        error = self.library().prdp_compile_loops(capability, ctypes.byref(count))
-        return count.value, error.decode()
-
-    def resources_of_last(self, capability):
-        return self.library().prdp_resources_of_last(capability).decode()
+    def kernels(self):
+        """Those that were asked for since fibers were last entered, each once."""
+        library = self.library()
+        return [
+            Kernel(library.prdp_text_of(n).decode(), library.prdp_block_memory_of(n))
+            for n in range(library.prdp_fibers_kernels())
+        ]
 
     def __enter__(self):
-        self.before = os.environ.get("PRDP_GPU")
+        self.before = os.environ.get("PRDP_GPU"), torch.are_deterministic_algorithms_enabled()
         os.environ["PRDP_GPU"] = "required"
+        if self.poison:
+            torch.use_deterministic_algorithms(True)
         self.library().prdp_fibers_begin(*self.settings)
         return self
 
     def __exit__(self, *_):
         self.library().prdp_fibers_end()
-        if self.before is None:
+        use, deterministic = self.before
+        torch.use_deterministic_algorithms(deterministic)
+        if use is None:
             del os.environ["PRDP_GPU"]
         else:
-            os.environ["PRDP_GPU"] = self.before
+            os.environ["PRDP_GPU"] = use

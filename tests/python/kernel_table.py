@@ -1,53 +1,75 @@
-"""Compile the kernel of each method and operator for several cards and print what each takes: `make kernels`."""
+"""Compile every kernel that methods, operators, flows and gradients ask for, for several cards, and print what each
+takes: `make kernels`."""
 
-import functools
 import re
 import time
 
+import test_gpu_flow as flows
 import test_gpu_multigrid as multigrid
+import test_gpu_products as products
 import torch
 from fibers import Fibers
 from test_gpu_kernels import CASES, OPERATORS, right_hand_sides, solve, solver
 
 CAPABILITIES = 80, 90, 120
+DEVICE = {"threads": 1024}
 
 
-def runs():
-    """The label of each, its operator, and a solve in a dtype."""
-
-    def alone(name, method, dtype):
-        return OPERATORS[name](dtype), right_hand_sides(name, dtype), solver(method, max_iter=1)
-
-    def with_cycles(name, method, dtype):
-        a, b = multigrid.OPERATORS[name][0](dtype), multigrid.right_hand_sides(name, dtype)
-        return a, b, multigrid.with_cycles(method, max_iter=1)
-
+def kernels_of_solves(dtype):
+    """With a label each."""
     for name, method in CASES:
-        yield method.__name__, name, functools.partial(alone, name, method)
+        solve(OPERATORS[name](dtype), right_hand_sides(name, dtype), solver(method, max_iter=1), DEVICE)
+        yield f"{method.__name__} of {name}", Fibers().kernels()
     for name, method, _ in multigrid.CASES:
-        yield f"{method.__name__}, multigrid", name, functools.partial(with_cycles, name, method)
+        a, b = multigrid.OPERATORS[name][0](dtype), multigrid.right_hand_sides(name, dtype)
+        solve(a, b, multigrid.with_cycles(method, max_iter=1), DEVICE)
+        coarse_grids, cycles = Fibers().kernels()
+        yield f"coarse grids of {name}", [coarse_grids]
+        yield f"{method.__name__}, multigrid of {name}", [cycles]
+
+
+def kernels_of_loops(dtype):
+    """Of a step of each flow, and of the gradients of each field, forward and back."""
+    for name in flows.CASES:
+        with Fibers(**DEVICE):
+            flows.outcome(name, dtype, steps=1)
+        yield f"flow, {name}", Fibers().kernels()
+    for name in products.CASES:
+        products.gradients(name, dtype, **DEVICE)
+        yield f"gradients, {name}", Fibers().kernels()
+
+
+def print_row(label, dtype, kernel, capability):
+    begin = time.perf_counter()
+    said = kernel.resources(capability)
+    seconds = time.perf_counter() - begin
+    registers = re.search(r"Used (\d+) registers", said)
+    if not registers:
+        raise SystemExit(f"{label} for sm_{capability}: {said}")
+    spilled = sum(int(n) for n in re.findall(r"(\d+) bytes spill stores", said))
+    stack = max(int(n) for n in re.findall(r"(\d+) bytes cumulative stack size", said) or [0])
+    shared = max(int(n) for n in re.findall(r"(\d+) bytes smem", said) or [0])
+    print(
+        f"| {label} | {str(dtype)[6:]} | sm_{capability} | {seconds:.1f} | {registers[1]} | {spilled} | {stack} |"
+        f" {shared} | {kernel.block_memory} |",
+        flush=True,
+    )
 
 
 def main():
-    print("| method | operator | dtype | card | seconds | registers | spilled bytes | stack |")
-    print("|---|---|---|---|---|---|---|---|")
-    for label, name, problem in runs():
-        for dtype in (torch.float32, torch.float64):
-            solve(*problem(dtype), {"threads": 1024})
-            for capability in CAPABILITIES:
-                begin = time.perf_counter()
-                said = Fibers().resources_of_last(capability)
-                seconds = time.perf_counter() - begin
-                registers = re.search(r"Used (\d+) registers", said)
-                if not registers:
-                    raise SystemExit(f"{label} of {name} for sm_{capability}: {said}")
-                spilled = sum(int(n) for n in re.findall(r"(\d+) bytes spill stores", said))
-                stack = max(int(n) for n in re.findall(r"(\d+) bytes cumulative stack size", said) or [0])
-                print(
-                    f"| {label} | {name} | {str(dtype)[6:]} | sm_{capability} | {seconds:.1f} |"
-                    f" {registers[1]} | {spilled} | {stack} |",
-                    flush=True,
-                )
+    print("| kernel | dtype | card | seconds | registers | spilled bytes | stack | shared, static | shared, launch |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    seen = set()
+    for dtype in (torch.float32, torch.float64):
+        for kernels_of in (kernels_of_solves, kernels_of_loops):
+            for label, kernels in kernels_of(dtype):
+                for kernel in kernels:
+                    if kernel in seen:
+                        continue
+                    seen.add(kernel)
+                    body = re.search(r"Each(?:Point|Sample)<(\w+)", kernel.text)
+                    for capability in CAPABILITIES:
+                        print_row(f"{label}: {body[1]}" if body else label, dtype, kernel, capability)
 
 
 if __name__ == "__main__":

@@ -88,6 +88,8 @@ def test_only_the_library_is_built_where_no_header_of_the_system_is_found(tmp_pa
     targets = "\n".join(re.findall(r"^build (\S+)", rules, re.MULTILINE))
     assert "libprdp.so" in targets and "CMakeFiles/_C.dir" in targets
     assert not re.search(r"experiments|prdp_train|prdp_tests", targets)
+    assert "libprdp_fibers.so" in targets  # which `make cuda` asks for, without GoogleTest
+    assert not re.search(r"^build all: .*prdp_fibers", rules, re.MULTILINE)
 
 
 def test_a_part_that_was_asked_for_is_not_left_out(tmp_path):
@@ -128,6 +130,27 @@ def test_make_cuda_takes_the_packages_that_are_there(tmp_path):
     done = cuda_packages(tmp_path / "few", sys._base_executable)
     assert done.returncode == 1 and "cmeel-eigen==" in done.stderr
     assert "prdp: these packages are missing and cannot be installed from here: " in done.stderr
+
+
+def test_make_cuda_runs_each_tool_of_a_sanitizer_where_there_is_one(tmp_path):
+    tool = tmp_path / "compute-sanitizer"
+    tool.write_text('#!/bin/sh\necho "$PYTORCH_NO_CUDA_MEMORY_CACHING $*"; [ "$2" != "$FAILS" ]\n')
+    make = ["make", "--no-print-directory", "-s", "sanitize-cuda"]
+
+    def run(**environment):
+        alone = {"PATH": "/usr/bin:/bin", **environment}
+        return subprocess.run(make, cwd=ROOT, env=alone, capture_output=True, text=True)
+
+    with_tool = f"{tmp_path}:/usr/bin:/bin"
+    assert "no compute-sanitizer here" in run().stdout
+    tool.chmod(0o755)
+    done = run(PATH=with_tool)
+    told = [line.split(" .venv-cuda/bin/python -m pytest -q -m cuda ")[0] for line in done.stdout.splitlines()]
+    tools = ("memcheck", "racecheck", "synccheck")
+    assert done.returncode == 0 and told == [f"1 --tool {name} --error-exitcode 1" for name in tools]
+    done = run(PATH=with_tool, FAILS="racecheck")
+    assert done.returncode != 0 and len(done.stdout.splitlines()) == 2
+    assert "sanitize-cuda" in (ROOT / "Makefile").read_text().partition("\ncuda:\n")[2].partition("\n\n")[0]
 
 
 def test_a_torch_that_is_too_old_is_refused_in_one_sentence(tmp_path):

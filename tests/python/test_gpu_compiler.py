@@ -1,6 +1,5 @@
 """Kernels are compiled by NVRTC, without a GPU, for the cards that are about; and what happens where they cannot be."""
 
-import ctypes
 import os
 import subprocess
 import sys
@@ -8,7 +7,7 @@ import warnings
 
 import pytest
 import torch
-from fibers import ROOT, Fibers
+from fibers import ROOT, Fibers, Kernel
 from test_gpu_flow import outcome
 from test_gpu_kernels import OPERATORS, right_hand_sides, solve, solver
 from test_gpu_products import gradients
@@ -25,44 +24,46 @@ def cache(tmp_path, monkeypatch):
 
 
 def run_once(name="diffusion", method=prdp.CG):
-    """A solve on the fibers, whose text is then compiled."""
+    """A solve on the fibers; returns its kernel."""
     solve(OPERATORS[name](F32), right_hand_sides(name, F32), solver(method), {})
-    return Fibers()
+    return Fibers().kernels()[-1]
 
 
 def test_kernels_compile_for_the_cards_that_are_about(cache):
-    size, error = run_once("stencil", prdp.GMRES).compile_last(90)
+    size, error = run_once("stencil", prdp.GMRES).compile(90)
     assert not error and size > 10_000
-    fibers = run_once("heat 2D", prdp.Chebyshev)
+    kernel = run_once("heat 2D", prdp.Chebyshev)
     for capability in (80, 120):
-        size, error = fibers.compile_last(capability)
+        size, error = kernel.compile(capability)
         assert not error and size > 10_000
-    newer, error = fibers.compile_last(199)  # of tomorrow: PTX, which its driver compiles
+    newer, error = kernel.compile(199)  # of tomorrow: PTX, which its driver compiles
     assert not error and newer > 0
-    assert "knows no device of compute capability 1.0" in fibers.compile_last(10)[1]
+    assert "knows no device of compute capability 1.0" in kernel.compile(10)[1]
 
 
 def test_the_kernels_of_a_flow_and_of_fields_compile(cache):
     outcome("channel", F32, steps=1)  # makes the masks
     with Fibers() as fibers:
         outcome("channel", F32, steps=1)
-        for name in ("diffusion", "stencils", "burgers", "navier-stokes"):
-            gradients(name, F32, threads=32)
-        count, error = fibers.compile_loops(90)
-    assert not error and count >= 14
+    kernels = fibers.kernels()
+    for name in ("diffusion", "stencils", "burgers", "navier-stokes"):
+        gradients(name, F32, threads=32)
+        kernels += fibers.kernels()
+    loops = {kernel for kernel in kernels if "run_each.h" in kernel.text}
+    assert len(loops) >= 14 and not any(error for _, error in (kernel.compile(90) for kernel in loops))
 
 
 def test_a_damaged_file_is_made_again_and_no_folder_is_no_fault(cache, monkeypatch):
-    fibers = run_once("heat 1D", prdp.SteepestDescent)
-    size, _ = fibers.compile_last(90)
+    kernel = run_once("heat 1D", prdp.SteepestDescent)
+    size, _ = kernel.compile(90)
     (file,) = cache.iterdir()
     whole = file.read_bytes()
     for damaged in (whole[:100], whole[:-1] + b"?"):
         file.write_bytes(damaged)
-        assert fibers.compile_last(90) == (size, "") and file.read_bytes() == whole
+        assert kernel.compile(90) == (size, "") and file.read_bytes() == whole
     assert [f.name for f in cache.iterdir()] == [file.name]
     monkeypatch.setenv("PRDP_CACHE", str(file / "below a file"))
-    assert fibers.compile_last(90) == (size, "")
+    assert kernel.compile(90) == (size, "")
 
 
 def test_what_has_no_kernel_is_said_where_kernels_are_required():
@@ -96,7 +97,7 @@ WITHOUT_NVRTC = """
 import sys
 sys.path.insert(0, "tests/python")
 from test_gpu_compiler import run_once
-print(run_once().compile_last(90)[1])
+print(run_once().compile(90)[1])
 """
 
 
@@ -110,29 +111,62 @@ def test_a_machine_without_nvrtc_is_told_what_to_install():
 WHY = """
 import sys
 sys.path.insert(0, "tests/python")
-import ctypes
 from fibers import Fibers
-library = Fibers.library()
-library.prdp_why_no_cuda.restype = ctypes.c_char_p
-print(library.prdp_why_no_cuda().decode())
+print(getattr(Fibers.library(), sys.argv[1])(*[int(a) if a.isdigit() else a.encode() for a in sys.argv[2:]]).decode())
 """
 
 
-def test_a_driver_that_refuses_is_quoted(tmp_path):
-    def why(*options):
+@pytest.fixture
+def ask(tmp_path):
+    """Of a program whose driver is tests/fibers/fake_driver.c, built with these options."""
+
+    def build_and_ask(question, *options, **environment):
         driver = tmp_path / "libcuda.so.1"
         fake = ROOT / "tests/fibers/fake_driver.c"
         subprocess.run(["cc", "-shared", "-fPIC", *options, str(fake), "-o", str(driver)], check=True)
-        environment = {**os.environ, "LD_LIBRARY_PATH": str(tmp_path)}
-        command = [sys.executable, "-c", WHY]
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+        environment = {**os.environ, "LD_LIBRARY_PATH": str(tmp_path), **environment}
+        command = [sys.executable, "-c", WHY, *map(str, question)]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
 
-    assert "the driver does not start: CUDA driver version is insufficient for CUDA runtime version (35)" in why()
-    assert "cuLaunchCooperativeKernel" in why("-DWITHOUT_NEWER")
+    return build_and_ask
+
+
+def test_a_driver_that_refuses_is_quoted(ask):
+    said = "the driver does not start: CUDA driver version is insufficient for CUDA runtime version (35)"
+    assert said in ask(["prdp_why_no_cuda"])
+    assert "cuLaunchCooperativeKernel" in ask(["prdp_why_no_cuda"], "-DWITHOUT_NEWER")
+
+
+@pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
+def test_a_driver_that_captures_and_a_team_that_is_too_large(ask, cache):
+    kernel = Kernel('extern "C" __global__ void prdp_kernel() {}', 0)
+    assert kernel.compile(90)[1] == ""  # and is kept: NVRTC does not work beside a driver like this one
+    why = ["prdp_why_no_kernel_of_cuda", kernel.text]
+    assert ask([*why, 2], "-DWORKS") == ""
+    assert ask([*why, 3], "-DWORKS") == TOO_MANY_BLOCKS
+    said = ask([*why, 1], "-DWORKS", CAPTURING="1")
+    assert "a kernel is to be compiled while a CUDA graph is captured; call prdp.warm_up() before" in said
+
+
+TOO_MANY_BLOCKS = "a sample of this size needs more blocks than the device runs at the same time"
+
+
+def test_a_sample_of_more_blocks_than_the_device_has_is_solved_by_tensor_operations():
+    a, b = OPERATORS["heat 2D"](F32), right_hand_sides("heat 2D", F32)
+    expected, report = solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+    with Fibers(cells=16, most_blocks=2), warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with pytest.raises(RuntimeError, match=f"PRDP_GPU=required: {TOO_MANY_BLOCKS}"):
+            prdp.linear_solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+        os.environ["PRDP_GPU"] = "auto"
+        for _ in range(2):
+            u, info = prdp.linear_solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+    assert [TOO_MANY_BLOCKS in str(warning.message) for warning in said] == [True]
+    assert info.way != "kernel" and torch.equal(info.status, report.status)
+    torch.testing.assert_close(u, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_sample_that_no_kernel_holds_is_named():
-    library = Fibers.library()
-    library.prdp_why_too_large.argtypes = [ctypes.c_int64]
-    library.prdp_why_too_large.restype = ctypes.c_char_p
-    assert library.prdp_why_too_large(1 << 31).decode() == ("a sample of 2147483648 unknowns is too large for a kernel")
+    said = Fibers.library().prdp_why_too_large(1 << 31).decode()
+    assert said == "a sample of 2147483648 unknowns is too large for a kernel"

@@ -88,11 +88,11 @@ def test_pre_commit_runs_the_linters_of_make_test():
         output(ROOT / ".venv/bin" / program, *options, ROOT / files[program])
 
 
-def test_the_workflow_runs_the_commands_of_the_readme():
+def test_the_workflow_runs_the_commands_of_the_readme_and_compiles_the_kernels():
     (job,) = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"].values()
     commands = [step["run"] for step in job["steps"] if "run" in step]
     shown = re.search(r"## Two commands\n\n```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
-    assert commands == [line.split("  ")[0] for line in shown.splitlines()]
+    assert commands == [*(line.split("  ")[0] for line in shown.splitlines()), "make kernels"]
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest == f">={job['strategy']['matrix']['python'][0]}"
 
