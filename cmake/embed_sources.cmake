@@ -1,5 +1,5 @@
 # Writes ${out}: the headers of csrc that kernels of a GPU include, as strings. Run with -Dcsrc=… -Dout=… "-Dheaders=…".
-set(text "#include \"prdp/gpu/sources.h\"\n\nnamespace prdp::gpu {\n\nconst std::vector<Source>& sources() {\n")
+set(text "#include \"prdp/gpu/embedded_headers.h\"\n\nnamespace prdp::gpu {\n\nconst std::vector<Source>& sources() {\n")
 string(APPEND text "  static const std::vector<Source> all{\n")
 foreach(name IN ITEMS algorithm array cmath concepts cstdint limits memory string tuple type_traits utility vector)
   string(APPEND text "      {\"${name}\", \"#include \\\"prdp/gpu/device/standard.h\\\"\\n\"},\n")

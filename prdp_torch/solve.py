@@ -127,9 +127,9 @@ def _warn_of_large_residuals(info: SolveInfo, solver: Solver, kind: str) -> None
     _warned_of.add((solver.method, kind))
     worst = int(info.residual.masked_fill(~open_ones, 0).argmax())
     warnings.warn(
-        f"linear_solve: {int(open_ones.sum())} of {len(open_ones)} samples stopped at max_iter = {solver.max_iter} with "
-        f"a residual above ‖b‖: sample {worst} at {float(info.residual[worst]):.1e}, where rtol = {solver.rtol:g} was "
-        "asked for; take more iterations or a preconditioner, or rtol=0 where this is meant. This is said once",
+        f"linear_solve: {int(open_ones.sum())} of {len(open_ones)} samples stopped at max_iter = {solver.max_iter}, "
+        f"with a residual above ‖b‖: sample {worst} at {float(info.residual[worst]):.1e}, where rtol = {solver.rtol:g} "
+        "was asked for; take more iterations or a preconditioner, or rtol=0 where this is meant. This is said once",
         stacklevel=3,
     )
 

@@ -18,7 +18,7 @@
 #include "prdp/gpu/cuda_runtime.h"
 #include "prdp/gpu/nvrtc.h"
 #include "prdp/gpu/runtime.h"
-#include "prdp/solvers/solve_kernel.h"
+#include "prdp/solvers/solve_kernel_text.h"
 
 namespace {
 

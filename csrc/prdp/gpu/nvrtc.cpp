@@ -6,7 +6,7 @@
 
 #include "prdp/gpu/kernel_cache.h"
 #include "prdp/gpu/shared_library.h"
-#include "prdp/gpu/sources.h"
+#include "prdp/gpu/embedded_headers.h"
 
 namespace prdp::gpu::nvrtc {
 

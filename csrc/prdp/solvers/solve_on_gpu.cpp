@@ -9,7 +9,7 @@
 #include "prdp/solvers/first_result.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
-#include "prdp/solvers/solve_kernel.h"
+#include "prdp/solvers/solve_kernel_text.h"
 
 namespace prdp::gpu {
 

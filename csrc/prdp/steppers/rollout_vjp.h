@@ -49,7 +49,7 @@ struct KeptSolves {
 };
 
 /// The product of the cotangent (batch, solves + 1, channel, *shape) of all solutions of a rollout
-/// (rollout.cpp) with its derivative: gradients of u and of each tensor of the equation, undefined where
+/// (rollout_op.cpp) with its derivative: gradients of u and of each tensor of the equation, undefined where
 /// `needed` (u first) holds 0 or there is none. Sums run in the order in which autograd takes the steps
 /// of a chain. Where autograd records, it is differentiable, if `adjoint_solve` is.
 std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,

@@ -1,4 +1,4 @@
-#include "prdp/solvers/solve_kernel.h"
+#include "prdp/solvers/solve_kernel_text.h"
 
 #include <algorithm>
 #include <limits>
