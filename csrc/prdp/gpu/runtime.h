@@ -35,6 +35,7 @@ enum class Trust { kUnknown, kGood, kNone };
 class Kernel {
  public:
   mutable std::atomic<Trust> trust = Trust::kUnknown;
+  mutable std::atomic<int> looks = 0;  // at its results
 
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
