@@ -2,6 +2,8 @@
 
 #include <ATen/EmptyTensor.h>
 
+#include <string_view>
+
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
@@ -126,7 +128,9 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
     if (!found) found = solve_with_tensors(a, b, request);
   }
   way = how;
-  find_inconsistent_constants(a, b, request, *found);
+  // Where nobody waits for a GPU it would take some sixty operations of torch after each launch.
+  const bool is_awaited = request.may_wait || found->info.status.is_cpu() || std::string_view(how) != "kernel";
+  if (is_awaited) find_inconsistent_constants(a, b, request, *found);
   return *std::move(found);
 }
 
