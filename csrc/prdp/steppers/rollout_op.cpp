@@ -1,5 +1,3 @@
-#include "prdp/steppers/rollout.h"
-
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
@@ -16,6 +14,7 @@
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
+#include "prdp/steppers/rollout.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
@@ -52,7 +51,7 @@ SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymI
 /// The arguments of an op but u; the forward pass hands them on to the backward pass.
 struct Call : torch::CustomClassHolder {
   Equation equation;
-  c10::SymInt solves;
+  c10::SymInt count;  // of solves; of steps in the op rollout
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products{};  // of the preconditioner
 };
@@ -67,7 +66,7 @@ Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef 
                  int64_t picard_steps, c10::SymInt solves, const Options&... packed) {
   Call call;
   call.equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  call.solves = std::move(solves);
+  call.count = std::move(solves);
   call.options = unpack(packed...);
   return call;
 }
@@ -98,16 +97,16 @@ SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10:
 template <class... Args>
 SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
   const auto call = unpack_call(std::move(args)...);
-  return solve_all(call.equation, u, call.solves, call.options);
+  return solve_all(call.equation, u, call.count, call.options);
 }
 
 template <class... Args>
 SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
   const auto call = unpack_call(std::move(args)...);
-  check(call.equation, u, call.solves, call.options);
+  check(call.equation, u, call.count, call.options);
   auto sizes = u.sym_sizes().vec();
-  sizes.insert(sizes.begin() + 1, call.solves + 1);
-  return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.solves})});
+  sizes.insert(sizes.begin() + 1, call.count + 1);
+  return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.count})});
 }
 
 /// The gradients that are needed.
@@ -175,7 +174,7 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
   static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
                                const c10::intrusive_ptr<Call>& call) {
     const auto& options = call->options;
-    auto outputs = call_below(call->equation, u, call->solves, options);
+    auto outputs = call_below(call->equation, u, call->count, options);
     const auto& [solutions, iterations, residual, status, applications, floor] = outputs;
     ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
     ctx->set_materialize_grads(false);
@@ -231,7 +230,7 @@ SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, con
                               const SolveOptions& options) {
   auto call = c10::make_intrusive<Call>();
   call->equation = equation;
-  call->solves = solves;
+  call->count = solves;
   call->options = options;
   const auto tensors = call->equation.tensors;
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
@@ -239,7 +238,7 @@ SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, con
   call->products = products_of(call->options.solver.preconditioner.spec());
   const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
                               (u.requires_grad() || any_requires_grad(tensors));
-  if (!differentiable) return call_below(call->equation, u, call->solves, call->options);
+  if (!differentiable) return call_below(call->equation, u, call->count, call->options);
   const auto out = RolloutSolves::apply(u, at::TensorList(tensors), call);
   return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }
@@ -247,7 +246,7 @@ SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, con
 template <class... Args>
 SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
   const auto call = unpack_call(std::move(args)...);
-  return solve_and_record(call.equation, u, call.solves, call.options);
+  return solve_and_record(call.equation, u, call.count, call.options);
 }
 
 /// The same step by step.
@@ -259,8 +258,8 @@ SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, 
 
 template <class... Args>
 SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);  // its solves are steps here
-  return outputs_of(rollout(call.equation, u, call.solves, call.options));
+  const auto call = unpack_call(std::move(args)...);
+  return outputs_of(rollout(call.equation, u, call.count, call.options));
 }
 
 }  // namespace
