@@ -9,6 +9,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/prepared_batch.h"
+#include "prdp/solvers/verdicts.h"
 
 namespace prdp {
 
