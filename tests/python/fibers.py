@@ -4,6 +4,7 @@ text is compiled by the host's compiler, and its threads run as fibers (tests/fi
 import ctypes
 import os
 import pathlib
+import re
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,21 @@ import prdp_torch  # noqa: F401  the library that the fibers are linked against
 ROOT = pathlib.Path(__file__).parents[2]
 BUILD = ROOT / os.environ.get("PRDP_BUILD_DIR", "build")  # which prdp_torch was built in
 ORDERS = FORWARD, BACKWARD, SHUFFLED = range(3)
+
+
+# Headers of kernels whose barriers these tests leave out; test_gpu_kernels.py takes all others.
+WITH_BARRIERS = {"multigrid": {"cycle", "hierarchy", "pseudo_inverse", "saddle_point"}, "flow": {"flow_pressure"}}
+
+
+def barriers(of=None):
+    """Each one of these headers by its line, or, plus 10,000, by that of a call of meet(); those of the team first."""
+    found, others = [], set().union(*WITH_BARRIERS.values())
+    for header in sorted((ROOT / "csrc/prdp/gpu/device").glob("*.h"), key=lambda h: (h.stem != "team", h.stem)):
+        if header.stem not in others if of is None else header.stem in WITH_BARRIERS[of]:
+            for n, line in enumerate(header.read_text().splitlines(), 1):
+                code = line.partition("//")[0]
+                found += [n] if "__syncthreads()" in code else [10000 + n] if re.search(r"\bmeet\(\)", code) else []
+    return found
 
 
 class Kernel(NamedTuple):

@@ -1,7 +1,11 @@
-"""`advise` on a device, by the stand-in."""
+"""`advise` on a device, by the stand-in and over the fibers."""
+
+import os
+import time
 
 import pytest
 import torch
+from fibers import Fibers
 from stand_in_device import StandIn
 from test_direct_on_devices import FIVE, box, random
 
@@ -51,3 +55,28 @@ def test_the_clock_is_read_when_the_device_is_done(monkeypatch):
     assert called == []
     solver_trials.now(torch.zeros(1, device="meta"))
     assert called == [torch.device("meta")]
+
+
+def test_it_tries_solvers_in_kernels():
+    step = prdp.Heat((6, 7), 0.1, 1.0, solver=prdp.CG(1))
+    with Fibers():
+        os.environ["PRDP_GPU"] = "auto"  # Direct has no kernel
+        found = prdp.advise(step, random(2, 1, 6, 7), seconds=9.0, dtypes=())  # fibers are slow, and done before
+    assert {type(row.solver) for row in found.rows if row.solved} == {prdp.Chebyshev, prdp.CG, prdp.Direct}
+
+
+def test_the_clock_of_a_trial_leaves_compilation_out(monkeypatch):
+    """Here the first run takes longer than all of them may, as it makes a kernel."""
+    step, sample, run, made = prdp.Heat((6, 7), 0.1, 1.0, solver=prdp.CG(1)), random(2, 1, 6, 7), solver_trials.run, []
+
+    def compile_and_run(*args):
+        if not made:
+            made.append("CG of Heat")
+            time.sleep(0.4)
+        return run(*args)
+
+    monkeypatch.setattr(solver_trials._C, "kernels_made", lambda: list(made))
+    monkeypatch.setattr(solver_trials, "run", compile_and_run)
+    rows = solver_trials._measure_one(solver_trials.trial_of(step, sample), prdp.CG(1), 0.4)
+    assert [row.rtol for row in rows] == list(solver_trials.TOLERANCES) and all(row.solved for row in rows)
+    assert max(row.forward.seconds for row in rows) < 0.4

@@ -197,6 +197,39 @@ def test_equations_have_the_derivatives_of_the_cpu(name, backward):
             torch.testing.assert_close(device.fetch(mine), other, rtol=1e-7, atol=1e-9)
 
 
+def constant(shape, boundary, length=1.0):
+    return lambda send: operators.Diffusion(
+        send(torch.full((1, *shape), 1.5, dtype=F64)), 0.4, boundary=boundary, length=length
+    )
+
+
+CONSTANT = {
+    "heat 3D": lambda send: operators.Heat((5, 4, 6), 0.3, 1.0),
+    "poisson 2D": lambda send: operators.Poisson((7, 9)),
+    "poisson 3D": lambda send: operators.Poisson((4, 5, 6)),
+    "diffusion 2D": constant((7, 9), ("zero", "flux"), (1.0, 2.0)),
+    "diffusion 3D": constant((4, 5, 6), ("periodic", "flux", "zero")),
+    "robin": constant((7, 9), ("zero", (("robin", 2.0), "flux"))),
+    "robin 3D": constant((4, 5, 6), ("periodic", "flux", (("robin", 2.0), ("robin", 5.0)))),
+}
+
+
+@pytest.mark.parametrize("name", CONSTANT)
+def test_constant_equations_in_boxes_are_solved_as_by_lapack(name):
+    """By sums over the axes, not by a dense matrix; A is symmetric, so the gradient of b is a solve, too."""
+    here, device = CONSTANT[name](lambda t: t), StandIn()
+    b = noise(here.shape, channels=1)
+    with device:
+        given = device.send(b).requires_grad_()
+        u, info = prdp.linear_solve(CONSTANT[name](device.send), given, prdp.Direct())
+        (gradient,) = torch.autograd.grad(u, given, device.send(b.flip(0)))
+    assert device.fetch(info.status).tolist() == [prdp.SolveStatus.CONVERGED] * 2
+    exact = lapack(here, b)
+    assert_close(device.fetch(u), exact, F64)
+    assert_close(device.fetch(gradient), exact.flip(0), F64)
+    assert "linalg_solve_ex" not in device.operations and device.largest <= 4 * b.numel() + 4 * max(here.shape) ** 2
+
+
 def box(samples, shape=(6, 7)):
     """(samples, 5, *shape): constant coefficients that differ between samples."""
     centre = torch.arange(5, samples + 5, dtype=F64).view(-1, 1, 1, 1).expand(-1, 1, *shape)

@@ -174,6 +174,15 @@ def test_the_links_to_files_lead_somewhere(page):
             assert (ROOT / page).parent.joinpath(target).exists(), target
 
 
+def test_the_page_of_devices_says_on_which_commit_kernels_last_ran_on_which_card():
+    page = " ".join((ROOT / "docs/devices.md").read_text().split())
+    kernels, others = re.search(r"\| last run on a card \| \| (.*?) \| (.*?) \|", page).groups()
+    a_run = r"commit [0-9a-f]{7}, [A-Z]+\d+"
+    assert re.fullmatch(a_run, others) and (kernels == "none" or re.fullmatch(a_run, kernels))
+    never = "it has kernels, which have not run on a GPU yet"
+    assert (never in page) == (kernels == "none"), page[:400]
+
+
 def test_every_page_is_in_the_navigation():
     named = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
     pages = {Path(page) for page in PAGES if page.startswith("docs/")}

@@ -48,6 +48,45 @@ def test_matrix_and_right_hand_side_must_fit():
         prdp.linear_solve(torch.eye(3, device="meta"), torch.zeros(3), prdp.Jacobi(1))
 
 
+OFFSETS = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+
+
+def five_points(**options):
+    c = -torch.ones(1, 5, 5, 6)
+    c[:, 0] = 4.0
+    return operators.Stencil(c, OFFSETS, "periodic", **options)
+
+
+def robin(kappa, h):
+    return operators.Diffusion(kappa, 1.0, boundary=("zero", (("robin", h), "flux")))
+
+
+ELSEWHERE = {  # of a tensor that is not where b is: the operator, channels of b, and the message
+    "stencil": (lambda t: operators.Stencil(t(1, 5, 5, 6), OFFSETS, "zero"), 1, "Stencil: the coefficients are on"),
+    "kappa": (lambda t: operators.Diffusion(t(1, 5, 6)), 1, "Diffusion: its tensors are on"),
+    "shift": (lambda t: operators.Diffusion(torch.ones(1, 5, 6), t(1, 5, 6)), 1, "Diffusion: its tensors are on"),
+    "h": (lambda t: robin(torch.ones(1, 5, 6), t(1, 5)), 1, "Diffusion: its tensors are on"),
+    "burgers": (lambda t: operators.Burgers(t(1, 2, 5, 6), 0.1, 0.1), 2, "Burgers: the winds are on"),
+    "navier-stokes": (lambda t: operators.NavierStokes(t(1, 2, 5, 6), 0.1, 0.1), 3, "NavierStokes: the winds are on"),
+    "null space": (lambda t: five_points(nullspace=t(1, 5, 6)), 1, "Stencil: its null space is on"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_a_tensor_on_another_device_is_named_with_both(name):
+    make, channels, message = ELSEWHERE[name]
+    a = make(lambda *shape: torch.ones(*shape, device="meta"))
+    b = torch.zeros(1, channels, 5, 6)
+    for graph in (torch.no_grad, torch.enable_grad):
+        with graph(), pytest.raises(ValueError, match=f"{message} meta but the vector is on cpu"):
+            prdp.linear_solve(a, b, prdp.GMRES(1))
+
+
+def test_a_start_on_another_device_is_named_with_both():
+    with pytest.raises(ValueError, match=r"x0 must have .* device of b, .* on cpu, got .* on meta"):
+        prdp.linear_solve(five_points(), torch.zeros(1, 1, 5, 6), prdp.CG(1), x0=torch.zeros(1, 1, 5, 6, device="meta"))
+
+
 def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
     nu = torch.nn.Parameter(torch.tensor(1e-3, device="meta"))
     without = torch.ones(5, device="meta")

@@ -8,6 +8,7 @@ import warnings
 import pytest
 import torch
 from fibers import ROOT, Fibers, Kernel
+from small_disk import file_size_limit
 from test_gpu_flow import outcome
 from test_gpu_kernels import OPERATORS, right_hand_sides, solve, solver
 from test_gpu_products import gradients
@@ -64,6 +65,44 @@ def test_a_damaged_file_is_made_again_and_no_folder_is_no_fault(cache, monkeypat
     assert [f.name for f in cache.iterdir()] == [file.name]
     monkeypatch.setenv("PRDP_CACHE", str(file / "below a file"))
     assert kernel.compile(90) == (size, "")
+
+
+TRIVIAL = Kernel('extern "C" __global__ void prdp_kernel() {}', 0)
+
+
+def test_no_room_and_no_home_are_no_fault(cache, monkeypatch):
+    with file_size_limit(100):
+        size, error = TRIVIAL.compile(90)
+    assert not error and size > 100 and not list(cache.iterdir())  # no half of a file either
+    assert TRIVIAL.compile(90) == (size, "") and len(list(cache.iterdir())) == 1
+    monkeypatch.delenv("PRDP_CACHE")
+    monkeypatch.setenv("HOME", "/proc/self")  # where nobody may write
+    assert TRIVIAL.compile(90) == (size, "")
+
+
+AT_ONCE = """
+import sys
+sys.path.insert(0, "tests/python")
+from test_gpu_compiler import TRIVIAL
+print("ready", flush=True)
+input()
+for capability in (80, 90, 120):
+    print(TRIVIAL.compile(capability))
+"""
+
+
+def test_two_processes_that_compile_the_same_at_once(cache):
+    command = [sys.executable, "-W", "ignore", "-c", AT_ONCE]
+    both = [
+        subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
+    for one in both:
+        one.stdin.write("go\n")
+        one.stdin.flush()
+    said = [one.communicate()[0] for one in both]
+    alone = "".join(f"{TRIVIAL.compile(capability)}\n" for capability in (80, 90, 120))
+    assert said == [alone] * 2 and "''" in alone and len(list(cache.iterdir())) == 3
 
 
 def test_what_has_no_kernel_is_said_where_kernels_are_required():
@@ -140,9 +179,8 @@ def test_a_driver_that_refuses_is_quoted(ask):
 
 @pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
 def test_a_driver_that_captures_and_a_team_that_is_too_large(ask, cache):
-    kernel = Kernel('extern "C" __global__ void prdp_kernel() {}', 0)
-    assert kernel.compile(90)[1] == ""  # and is kept: NVRTC does not work beside a driver like this one
-    why = ["prdp_why_no_kernel_of_cuda", kernel.text]
+    assert TRIVIAL.compile(90)[1] == ""  # and is kept: NVRTC does not work beside a driver like this one
+    why = ["prdp_why_no_kernel_of_cuda", TRIVIAL.text]
     assert ask([*why, 2], "-DWORKS") == ""
     assert ask([*why, 3], "-DWORKS") == TOO_MANY_BLOCKS
     said = ask([*why, 1], "-DWORKS", CAPTURING="1")

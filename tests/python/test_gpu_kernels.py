@@ -1,10 +1,8 @@
 """The kernels of a GPU, run as fibers on the CPU, beside the CPU's own loops: the same methods and verdicts."""
 
-import re
-
 import pytest
 import torch
-from fibers import BACKWARD, ROOT, SHUFFLED, Fibers
+from fibers import BACKWARD, SHUFFLED, Fibers, barriers
 
 import prdp_torch as prdp
 from prdp_torch import operators
@@ -144,6 +142,44 @@ def test_methods_and_operators_are_those_of_the_cpu(name, method, dtype):
         agree(solve(a, b, few, TEAMS), solve(a, b, few), dtype, slack=1e4)
 
 
+DIVIDED = [(name, method) for name in ("diffusion", "robin") for method in (prdp.CG, prdp.MINRES)]
+DIVIDED += [(name, method) for name in ("diffusion", "stencil", "matrices") for method in (prdp.GMRES, prdp.BiCGStab)]
+
+
+@pytest.mark.parametrize(("name", "method", "dtype"), [(*case, (F64, F32)[n % 2]) for n, case in enumerate(DIVIDED)])
+def test_the_diagonal_as_preconditioner_is_that_of_the_cpu(name, method, dtype):
+    a, b = OPERATORS[name](dtype), right_hand_sides(name, dtype)
+    rtol = 1e-5 if dtype == F32 else 1e-12
+    divided = solver(method, rtol=rtol, preconditioner="diagonal")
+    mine, other = (solve(a, b, divided, device) for device in ({}, None))
+    agree(mine, other, dtype, slack=5 * rtol / torch.finfo(dtype).eps)
+    assert mine[1].way == "kernel" and mine[1].solved.all()
+
+
+SWAP, ONES = torch.tensor([[0.0, 1.0], [1.0, 0.0]]), torch.tensor([1.0, 0.0])
+ENDS = [  # the status of one sample, what it is made of, and a method
+    ("BREAKDOWN", SWAP, ONES, prdp.CG(9)),
+    ("BREAKDOWN", SWAP, ONES, prdp.SteepestDescent(9)),
+    ("BREAKDOWN", SWAP, ONES, prdp.BiCGStab(9)),
+    ("STAGNATED", SWAP, ONES, prdp.GMRES(40, restart=1)),
+    ("CONVERGED_BREAKDOWN", SWAP, ONES, prdp.GMRES(9, restart=2)),
+    ("OVERFLOW", 1e-20 * torch.eye(2), 1e30 * ONES, prdp.CG(9)),
+    ("OVERFLOW", 1e-20 * torch.eye(2), 1e30 * ONES, prdp.GMRES(9, restart=2)),
+]
+
+
+@pytest.mark.parametrize(("status", "a", "b", "method"), ENDS)
+def test_each_end_of_a_sample_is_that_of_the_cpu(status, a, b, method):
+    """Small whole numbers, so not a bit differs; beside a sample of which nothing is wrong."""
+    matrices, right = torch.stack([a, torch.diag(torch.tensor([2.0, 4.0]))]), torch.stack([b, torch.ones(2)])
+    (u, info), (v, report) = (solve(matrices, right, method, device) for device in ({}, None))
+    assert prdp.SolveStatus(int(info.status[0])).name == status and info.way == "kernel"
+    assert info.status.tolist() == report.status.tolist() and torch.equal(u[0], v[0])
+    torch.testing.assert_close(u[1], v[1])
+    for mine, other in zip(info, report, strict=True):
+        assert not isinstance(mine, torch.Tensor) or torch.equal(mine[0], other[0])
+
+
 BITS = [("heat 2D", prdp.Jacobi), ("heat 2D", prdp.CG), ("diffusion", prdp.GMRES)]
 
 
@@ -259,17 +295,6 @@ def test_gradients_are_those_of_finite_differences(name):
     with Fibers(threads=32):
         inputs = (field().requires_grad_(), b.requires_grad_())
         assert torch.autograd.gradcheck(u, inputs, fast_mode=True, atol=1e-6)
-
-
-def barriers():
-    """Every barrier of the text, by its line: of team.h, or, plus 10,000, of a line that calls meet()."""
-    folder = ROOT / "csrc" / "prdp" / "gpu" / "device"
-    lines = (folder / "team.h").read_text().splitlines()
-    found = [n for n, line in enumerate(lines, 1) if "__syncthreads()" in line and "//" not in line]
-    for name in ("team.h", "block_space.h", "solve.h"):
-        lines = (folder / name).read_text().splitlines()
-        found += [10000 + n for n, line in enumerate(lines, 1) if re.search(r"\bmeet\(\)", line)]
-    return found
 
 
 def outcomes(left_out):

@@ -1,11 +1,10 @@
 """Multigrid in the kernels of a GPU, run as fibers on the CPU, beside the CPU's own loops."""
 
 import collections
-import re
 
 import pytest
 import torch
-from fibers import BACKWARD, FORWARD, ROOT, SHUFFLED, Fibers
+from fibers import BACKWARD, FORWARD, SHUFFLED, Fibers, barriers
 from test_gpu_kernels import F32, F64, OFFSETS, agree, noise, solve
 
 import prdp_torch as prdp
@@ -184,15 +183,6 @@ def test_what_has_no_coarse_grids_fails_alone():
     torch.testing.assert_close(u, v, rtol=1e-6, atol=1e-8)
 
 
-def barriers():
-    """As in test_gpu_kernels.py, of the files of multigrid."""
-    found = []
-    for name in ("cycle", "hierarchy", "pseudo_inverse", "saddle_point"):
-        for n, line in enumerate((ROOT / f"csrc/prdp/gpu/device/{name}.h").read_text().splitlines(), 1):
-            found += [n] if "__syncthreads()" in line else [10000 + n] if re.search(r"\bmeet\(\)", line) else []
-    return found
-
-
 def outcomes(left_out):
     """One after the other."""
     cases = [
@@ -215,7 +205,9 @@ def outcomes(left_out):
 def test_every_barrier_is_needed():
     wanted = list(outcomes(left_out=0))
     unnoticed = [
-        line for line in barriers() if all(mine == other for mine, other in zip(outcomes(line), wanted, strict=True))
+        line
+        for line in barriers("multigrid")
+        if all(mine == other for mine, other in zip(outcomes(line), wanted, strict=True))
     ]
     assert not unnoticed
 

@@ -7,8 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from fibers import ROOT
-from test_gpu_kernels import barriers
+from fibers import ROOT, barriers
 
 FOUND = 66
 

@@ -1,7 +1,10 @@
 """Gradients of `Flow` against finite differences in float64."""
 
+import contextlib
+
 import pytest
 import torch
+from fibers import Fibers
 from flows import random_velocity
 from torch.autograd import gradcheck, gradgradcheck
 
@@ -180,15 +183,17 @@ def test_gradients_stay_finite_over_many_steps():
     assert flow.converged
 
 
-def test_the_backward_pass_keeps_one_state_per_step():
-    flow = prdp.Flow((32, 32), 0.1, 1e-3)
-    u = flow.project(random_velocity((32, 32), dtype=torch.float32)).requires_grad_()
+@pytest.mark.parametrize("device", [contextlib.nullcontext, Fibers], ids=["loops", "kernels"])
+def test_the_backward_pass_keeps_one_state_per_step(device):
+    shape = (32, 32) if device is not Fibers else (6, 8)
+    flow = prdp.Flow(shape, 0.1, 1e-3)
+    u = flow.project(random_velocity(shape, dtype=torch.float32)).requires_grad_()
     kept = {}
 
     def pack(t):
         kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
         return t
 
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+    with device(), torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
         flow.rollout(u, 20)
     assert sum(kept.values()) < 22 * u.nbytes

@@ -1,10 +1,12 @@
 """Rollouts as one op: everything equals the chain of single steps."""
 
+import contextlib
 import re
 
 import pytest
 import torch
 import torch._dynamo.testing
+from fibers import Fibers
 from helpers import field, modes, statuses
 from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
@@ -141,10 +143,11 @@ def test_a_loss_on_one_state_and_a_gradient_for_nu_alone():
         assert t == 0 or (torch.equal(*gradients) and gradients[0] != 0)
 
 
-def test_it_is_one_node_that_keeps_only_what_the_derivative_needs():
+@pytest.mark.parametrize("device", [contextlib.nullcontext, Fibers], ids=["loops", "kernels"])
+def test_it_is_one_node_that_keeps_only_what_the_derivative_needs(device):
     def kept(stepper, channels=1):
         u, sizes = field((20,), channels=channels).requires_grad_(), []
-        with torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.append(t.numel()) or t, lambda t: t):
+        with device(), torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.append(t.numel()) or t, lambda t: t):
             states = stepper.rollout(u, 5)
         assert "RolloutSolves" in states.grad_fn.name()
         assert {type(n[0]).__name__ for n in states.grad_fn.next_functions if n[0]} <= {"AccumulateGrad"}

@@ -1,0 +1,43 @@
+#include <gtest/gtest.h>
+
+#include <cstdlib>
+
+#include "helpers.h"
+#include "prdp/autograd/linear_solve.h"
+#include "prdp/solvers/solve.h"
+
+extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
+                                  int left_out, int64_t most_blocks);
+extern "C" void prdp_fibers_end();
+extern "C" int64_t prdp_fibers_launches();
+
+/// A program without Python takes kernels; tests in Python say that they are right.
+namespace {
+
+TEST(Gpu, ASolveWithItsGradientIsTwoLaunchesWithoutPython) {
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+  GTEST_SKIP() << "kernels are compiled without the sanitizer";
+#endif
+  const prdp::OperatorSpec heat{"heat", {6, 7}, {1.0}, {at::scalar_tensor(1e-2, at::kDouble)}};
+  const auto inverse = at::linalg_inv(at::eye(42, at::kDouble) - 1e-2 * prdp_test::dense_laplacian({6, 7}));
+  const auto b = prdp_test::random_field({6, 7}, 3), weights = b.flip(0);
+  const auto leaf = b.clone().requires_grad_();
+
+  setenv("PRDP_GPU", "required", 1);
+  prdp_fibers_begin(96 << 10, 16384, 64, 0, 0, 0);
+  const auto before = prdp_fibers_launches();
+  const auto u = prdp::linear_solve(heat, leaf, {prdp::CG{.max_iter = 100, .rtol = 1e-12}}).u;
+  EXPECT_STREQ(prdp::way_of_last_solve(), "kernel");
+  (u * weights).sum().backward();
+  EXPECT_EQ(prdp_fibers_launches() - before, 2);
+  prdp_fibers_end();
+  unsetenv("PRDP_GPU");
+
+  const auto error = [&](const at::Tensor& found, const at::Tensor& right) {  // A is symmetric
+    return (found.detach() - at::matmul(right.flatten(1), inverse).view_as(b)).abs().max().item<double>();
+  };
+  EXPECT_LT(error(u, b), 1e-10);
+  EXPECT_LT(error(leaf.grad(), weights), 1e-10);
+}
+
+}  // namespace
