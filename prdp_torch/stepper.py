@@ -263,8 +263,8 @@ class Stepper(torch_private.HearsOfMoves):
         """The options as the ops of torch take them."""
         number = log.number
         if not torch.compiler.is_dynamo_compiling():
-            solver = self.method, self._max_iter, self._rtol, self.restart, self.preconditioner
-            return packed_options(*solver, *self._settings(), adjoint_log=number)
+            k, m, settings = self._max_iter, self.preconditioner, self._settings()
+            return packed_options(self.method, k, self._rtol, self.restart, m, *settings, adjoint_log=number)
         k = torch_private.number_as_graph_input(self, "_max_iter")
         rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
         of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")

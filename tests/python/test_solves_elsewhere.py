@@ -1,12 +1,14 @@
 """Solves in tensor operations on another device: what they report, how they fail, and how often the host looks."""
 
+import itertools
+
 import pytest
 import torch
 from stand_in_device import StandIn
 from test_other_devices import F32, F64, OFFSETS, SHAPE, five_points, noise, product
 
 import prdp_torch as prdp
-from prdp_torch import operators
+from prdp_torch import _C, operators
 
 
 def weighted(v, weight):

@@ -1,10 +1,9 @@
-#include "prdp/autograd/linear_solve.h"
-
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/functions/utils.h>
 #include <torch/library.h>
 
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/linear_solve.h"
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"

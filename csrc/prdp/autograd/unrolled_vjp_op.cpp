@@ -1,5 +1,3 @@
-#include "prdp/autograd/unrolled_vjp.h"
-
 #include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/autograd.h>
 #include <torch/library.h>
@@ -8,6 +6,7 @@
 
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/unrolled_samples.h"
+#include "prdp/autograd/unrolled_vjp.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
 

@@ -4,9 +4,9 @@
 #include <cstdlib>
 #include <filesystem>
 
+#include "prdp/gpu/embedded_headers.h"
 #include "prdp/gpu/kernel_cache.h"
 #include "prdp/gpu/shared_library.h"
-#include "prdp/gpu/embedded_headers.h"
 
 namespace prdp::gpu::nvrtc {
 
