@@ -6,6 +6,7 @@ import functools
 import math
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 
@@ -308,10 +309,12 @@ class _Run:
         if not math.isfinite(error):
             raise _Diverged(f"interval {done}: the relative error is {error}")
         self.curves["error"].append(error)
-        if self.watches_error or isinstance(self.controller, ToleranceController):
-            self.controller.step(error)
-        else:
-            self.controller.step(metric, error=error)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what the controller warns of is in the curves
+            if self.watches_error or isinstance(self.controller, ToleranceController):
+                self.controller.step(error)
+            else:
+                self.controller.step(metric, error=error)
 
     def _check(self, loss: float, refused: float, done: int) -> None:
         if not math.isfinite(loss):

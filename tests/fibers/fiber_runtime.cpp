@@ -31,6 +31,7 @@ struct Settings {
   Limits limits{};
   int order = 0;  // of fibers::Order
   int left_out = 0;  // the line of the barrier that is left out; 0: none
+  bool poisons = true;  // memory of a block
   int64_t most_blocks = 0;  // that are at work at the same time; 0: as many as there are
 };
 Settings settings;
@@ -87,8 +88,9 @@ class FiberKernel final : public prdp::gpu::Kernel {
     const auto text =
         "#include \"fibers.h\"\n" + source.text +
         "extern \"C\" int run(const void* arguments, int blocks, int threads, long memory, int order, int "
-        "left_out) {\n"
+        "left_out, bool poisons) {\n"
         "  fibers::left_out = left_out;\n"
+        "  fibers::poisons = poisons;\n"
         "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
         "    prdp_kernel(*static_cast<const Arguments*>(arguments)); });\n}\n";
     void* const library = dlopen(compiled(text).c_str(), RTLD_NOW);
@@ -101,13 +103,13 @@ class FiberKernel final : public prdp::gpu::Kernel {
     ++launches;
     const bool regular =
         run_(arguments, static_cast<int>(teams * source_.blocks_of_team), static_cast<int>(source_.threads),
-             source_.block_memory + spare, settings.order, settings.left_out);
+             source_.block_memory + spare, settings.order, settings.left_out, settings.poisons);
     TORCH_CHECK(regular, "fibers: some wait where others do not");
   }
 
  private:
   KernelSource source_;
-  int (*run_)(const void*, int, int, long, int, int);
+  int (*run_)(const void*, int, int, long, int, int, bool);
 };
 
 class FiberRuntime final : public prdp::gpu::Runtime {
@@ -151,9 +153,9 @@ struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::
 
 /// From here on, kernels serve tensors of the CPU; and no longer.
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
-                                  int left_out, int64_t most_blocks) {
+                                  int left_out, bool poisons, int64_t most_blocks) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, most_blocks};
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, most_blocks};
   asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }

@@ -106,6 +106,7 @@ struct Block {
 inline thread_local Block* block = nullptr;
 inline thread_local std::function<void()>* body = nullptr;
 inline int left_out = 0;
+inline bool poisons = true;  // memory of a block
 inline std::atomic<bool> stuck = false;  // some block is: the others must not wait for it
 inline std::atomic<int> ended = 0;       // blocks
 struct Stuck {};
@@ -210,7 +211,7 @@ inline bool run_block(int index, int blocks, int threads, int64_t memory, Order 
                       std::function<void()> kernel) {
   const Unwatched here;
   Block mine;
-  poison_shared();
+  if (poisons) poison_shared();
   block = &mine;
   mine.watched = this_fiber();
   body = &kernel;

@@ -25,8 +25,14 @@ def main():
         with Fibers(left_out=int(sys.argv[1]), block_memory=0):
             prdp.linear_solve(a, b, multigrid.with_cycles(prdp.GMRES, max_iter=1, rtol=0.0), on_failure="return")
     flow = prdp.Flow((5, 6), nu=0.1, dt=0.01, solver=prdp.CG(2, 0.0), on_failure="return")
-    with torch.no_grad(), Fibers(left_out=int(sys.argv[1])):
-        flow.project(torch.randn(2, 2, 5, 6))
+    with Fibers(left_out=int(sys.argv[1])):
+        u = torch.randn(2, 2, 5, 6, requires_grad=True)
+        torch.autograd.grad(flow(u).square().sum(), u)
+    kappa = torch.ones(3, 6, 7, requires_grad=True)
+    with Fibers(left_out=int(sys.argv[1]), threads=32):
+        a, b = prdp.operators.Diffusion(kappa, 1.0), right_hand_sides("diffusion", torch.float32)
+        u, _ = prdp.linear_solve(a, b, prdp.CG(2, 0.0), on_failure="return")
+        torch.autograd.grad(u.square().sum(), kappa)
 
 
 if __name__ == "__main__":

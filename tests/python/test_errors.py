@@ -87,6 +87,21 @@ def test_a_start_on_another_device_is_named_with_both():
         prdp.linear_solve(five_points(), torch.zeros(1, 1, 5, 6), prdp.CG(1), x0=torch.zeros(1, 1, 5, 6, device="meta"))
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"nu": torch.tensor(0.1, device="meta")},
+        {"nu": 0.1, "force": torch.ones(1, 2, 5, 6, device="meta")},
+        {"nu": 0.1, "boundary": "wall", "wall_velocity": {(0, "high"): torch.ones(2, device="meta")}},
+        {"nu": 0.1, "boundary": ("wall", "open"), "inflow": torch.ones(2, device="meta")},
+    ],
+    ids=lambda settings: list(settings)[-1],
+)
+def test_a_tensor_without_values_is_refused_by_a_flow(settings):
+    with pytest.raises(ValueError, match="Flow: a tensor of it is on meta, where it has no values: give it some"):
+        prdp.Flow((5, 6), dt=0.01, solver=prdp.CG(9), **settings)(torch.zeros(1, 2, 5, 6))
+
+
 def test_a_tensor_without_values_is_refused_for_a_state_that_has_some():
     nu = torch.nn.Parameter(torch.tensor(1e-3, device="meta"))
     without = torch.ones(5, device="meta")

@@ -139,7 +139,8 @@ I find(I begin, I end, const V& value) {
   return begin;
 }
 
-// Named, but not used there: by the tape, and by iterations that the host does not watch.
+// Named, but not called there: what a method carries from one iteration to the next, for the CPU's tape, and the table of
+// statuses.
 template <class... T>
 struct tuple {};
 template <class... T>
@@ -147,14 +148,6 @@ tuple<T&...> tie(T&...) {
   return {};
 }
 template <class T>
-struct vector {
-  size_t size() const;
-  T& operator[](size_t i) const;
-};
-template <class T>
-void destroy_at(T*);
-template <class T, class... A>
-T* construct_at(T*, A&&...);
-struct string;
+struct vector;
 
 }  // namespace std

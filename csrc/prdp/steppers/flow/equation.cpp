@@ -89,6 +89,9 @@ std::string name_of_wall(size_t i) {
 }
 
 void FlowEquation::check() const {
+  for (const auto& t : tensors())
+    TORCH_CHECK_VALUE(!t.defined() || !t.is_meta(), "Flow: a tensor of it is on meta, where it has no values: give it ",
+                      "some, as with to_empty and load_state_dict");
   TORCH_CHECK_VALUE(std::isfinite(dt) && dt > 0, "Flow: dt must be finite and > 0, got ", dt);
   TORCH_CHECK_VALUE(nu.dim() == 0, "Flow: nu must be a number or a 0-dimensional tensor, got shape ", nu.sizes());
   const double value = nu.item<double>();
