@@ -232,7 +232,7 @@ def linear_solve(
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
-        if found is not None and solver.rtol > 0 and on_failure in ("raise", "warn"):
+        if found is not None and b.is_cpu and solver.rtol > 0 and on_failure in ("raise", "warn"):
             _warn_of_large_residuals(SolveInfo(*found[1:]), solver, A.kind)
     if found is None:
         parts = solver.method, solver.max_iter, solver.rtol, solver.restart, solver.preconditioner

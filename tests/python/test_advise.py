@@ -300,15 +300,15 @@ def test_a_network_within_the_step_is_named(channels):
     wide = torch.nn.Sequential(
         torch.nn.Conv1d(1, channels, 15, padding=7), torch.nn.ReLU(), torch.nn.Conv1d(channels, 1, 15, padding=7)
     ).double()
-    heat = prdp.operators.Heat((200,), 1e-3, 1e-3)
+    heat = prdp.operators.Heat((1000,), 1e-3, 1e-3)
     network = wide if channels > 1 else None
     step = prdp.ImplicitStep(heat, network and (lambda u: u + 1e-3 * network(u)), prdp.CG(1))
-    advice = advise(step, field((200,), batch=8), seconds=0.1)
+    advice = advise(step, field((1000,), batch=8), seconds=0.1)
     told = [note for note in advice.notes if note.startswith("To make A(u) and b(u), and their gradients, takes")]
     assert len(told) == (channels > 1)
     if told:  # what the network takes by itself, of which the solves are a small part
         parts, whole = map(float, re.search(r"takes (\S+) ms of the (\S+) ms", told[0]).groups())
-        alone = 1e3 * network_seconds(wide, field((200,), batch=8), 1.0)
+        alone = 1e3 * network_seconds(wide, field((1000,), batch=8), 1.0)
         assert 0.2 * alone < parts and 0.5 * parts < whole
 
 

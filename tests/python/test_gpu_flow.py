@@ -214,7 +214,7 @@ def test_a_step_is_at_most_eight_launches_beside_its_solves(name):
     an implicit diffusion."""
     with_everything, leaves = with_leaves(name, on_failure="return")
     alone = flow(name, on_failure="return")
-    most_back = 8 if CASES[name][1].get("diffusion") == "explicit" else 20
+    most_back = 8 if CASES[name][1].get("diffusion") == "explicit" else 21
 
     def counted(run):
         before = fibers.launches()

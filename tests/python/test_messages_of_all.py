@@ -118,7 +118,7 @@ WAYS = {
                [("Jacobi", "Stencil"), ("Jacobi", "Matrix"), ("Jacobi", "CSR"), ("SteepestDescent", "Stencil"),
                 ('CG with preconditioner="diagonal"', "Burgers")]),
     "mean pressure": ("INCONSISTENT", r" \(the iterate .*\), ",
-                      r"[\d.]+ % of (b|the cotangent) are a mean of its pressure",
+                      r"[\d.]+ % of (b|the cotangent) is the mean of its pressure",
                       [(m, "NavierStokes") for m in SOLVERS
                        if m == "BiCGStab" or (m[0] in "GD" and m not in DIVIDING)]),
     "small": ("OVERFLOW", r" \(the iterate .*\), ",

@@ -180,9 +180,9 @@ def test_reports_of_two_solves_stay_apart():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda names, *rest: (names[:4], *rest), "5 names, 7 counts and 3 numbers"),
+        (lambda names, *rest: (names[:4], *rest), "5 names, 9 counts and 3 numbers"),
         (lambda names, counts, *rest: (names, counts[:6], *rest), "got 5, 6 and 3"),
-        (lambda names, counts, numbers, m: (names, counts, numbers[:1], m), "got 5, 7 and 1"),
+        (lambda names, counts, numbers, m: (names, counts, numbers[:1], m), "got 5, 9 and 1"),
         (lambda names, *rest: ([*names[:3], "now", names[4]], *rest), "start: unknown name 'now'"),
     ],
 )  # fmt: skip
