@@ -83,7 +83,8 @@ def test_libraries_show_no_symbols_but_their_own():
     the compiler links libstdc++ statically, streams of two copies crashed."""
     own = set(shown_symbols(BUILD / "libprdp.so"))
     assert "prdp::linear_solve" in own and "prdp::Heat::Heat" in own
-    assert {name for name in own if not name.startswith("prdp::")} == set()
+    of_prdp = ("prdp::", "_ZN4prdp", "_ZNK4prdp")  # which is how the demangler leaves what it does not know
+    assert {name for name in own if not name.startswith(of_prdp)} == set()
     for folder in (BUILD, BUILD / "experiments"):
         (module,) = folder.glob("_C.*.so")
         assert set(shown_symbols(module)) == {"PyInit__C"}

@@ -155,6 +155,7 @@ def of_this_process_alone():
     return prdp.PRDPController(window=1, delta=2, tau_step=0.9, process_group=group)
 
 
+@pytest.mark.filterwarnings("ignore:.*said once")
 def test_controllers_refine_in_the_same_interval_on_all_processes(tmp_path):
     dice = torch.Generator().manual_seed(0)
     metrics = (torch.rand(2, 60, generator=dice, dtype=torch.float64) * 0.9 ** torch.arange(60)).tolist()

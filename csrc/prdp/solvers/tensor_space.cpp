@@ -1,6 +1,5 @@
 #include "prdp/solvers/tensor_space.h"
 
-#include <limits>
 #include <utility>
 
 #include "prdp/operators/tensors.h"
@@ -80,8 +79,8 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   d = laid_out(at::where(every, solution, at::zeros_like(solution)));
 }
 
-at::Tensor TensorSpace::is_zero_beside(const Scalar& den, const Scalar& a2, const Scalar& b2) const {
-  return den.detach().abs().le(limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt());
+at::Tensor TensorSpace::rounding_of(const Scalar& a2, const Scalar& b2) const {
+  return limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
 }
 
 TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2,
@@ -92,23 +91,22 @@ TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scala
     return value;
   }
   // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
-  const auto below = den.detach(), is_known = b2.detach().isfinite();
   const auto nothing_left = num.detach() < negligible_;
-  const auto is_long = a2.detach().isfinite().logical_not().logical_and(below.isfinite()).logical_and(below.ne(0));
-  const auto breaks =
-      is_zero_beside(below, a2, b2).logical_and(is_known).logical_and(nothing_left.logical_or(is_long).logical_not());
+  const auto bound = rounding_of(a2, b2).nan_to_num(0.0, 0.0, 0.0);  // of a long direction of M⁻¹, zero alone breaks
+  const auto breaks = den.detach().abs().le(bound).logical_and(nothing_left.logical_not());
   note_broken(breaks);
   const auto none = nothing_left.logical_or(breaks);
   const auto quotient = num / at::where(none, at::ones_like(den), den);
-  return at::where(none, at::zeros_like(num),
-                   at::where(is_known, quotient, at::full_like(num, std::numeric_limits<double>::quiet_NaN())));
+  const auto unless_unknown = at::add(quotient, b2.detach(), 0.0);  // NaN where b2 is not finite
+  return at::where(none, at::zeros_like(num), unless_unknown);
 }
 
 TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2,
                                              const Scalar& active) const {
   if (in_loops_) return batch_loops::breaks_down(den, a2, b2, active);
-  const auto is_known = a2.detach().isfinite().logical_and(b2.detach().isfinite());
-  return is_zero_beside(den, a2, b2).logical_and(is_known).logical_and(active.detach().ne(0)).to(b_.scalar_type());
+  const auto bound = rounding_of(a2, b2);
+  const auto breaks = den.detach().abs().le(bound).logical_and(bound.isfinite());
+  return breaks.logical_and(active.detach().ne(0)).to(b_.scalar_type());
 }
 
 TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {

@@ -234,7 +234,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     const auto now = active_mask_.defined() ? rows.logical_and(active_mask_) : rows;
     broken_ = broken_.defined() ? broken_.logical_or(now) : now;
   }
-  at::Tensor is_zero_beside(const Scalar& den, const Scalar& a2, const Scalar& b2) const;
+  /// What is zero beside the product of two factors, by the squares of their norms.
+  at::Tensor rounding_of(const Scalar& a2, const Scalar& b2) const;
   void set_active(const std::vector<bool>& active);
   void count();
   at::Tensor mask_of(const std::vector<bool>& rows) const;
