@@ -139,8 +139,8 @@ I find(I begin, I end, const V& value) {
   return begin;
 }
 
-// Named, but not called there: what a method carries from one iteration to the next, for the CPU's tape, and the table of
-// statuses.
+// Named, but not called there: what a method carries from one iteration to the next, for the CPU's tape, and the table
+// of statuses.
 template <class... T>
 struct tuple {};
 template <class... T>
