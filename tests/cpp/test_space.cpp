@@ -1,13 +1,19 @@
 #include <gtest/gtest.h>
 #include <torch/torch.h>
 
+#include <array>
+#include <cmath>
 #include <deque>
+#include <limits>
 #include <vector>
 
+#include "prdp/autograd/linear_solve.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/solvers/bicgstab.h"
 #include "prdp/solvers/conjugate_gradient.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
+#include "prdp/solvers/tensor_space.h"
 
 namespace prdp {
 
@@ -112,5 +118,40 @@ TEST(Space, AMethodRunsOnThePrimitivesAlone) {
 }
 
 }  // namespace
+
+TEST(TensorSpace, QuotientsTellBreakdownsAsThoseOfOneSample) {
+  constexpr double inf = std::numeric_limits<double>::infinity(), nan = std::numeric_limits<double>::quiet_NaN();
+  std::vector<std::array<double, 4>> cases;  // num, den, a², b²
+  for (const double num : {0.0, 1.0, -1.0})
+    for (const double den : {0.0, 1e-20, 2.0, inf, nan})
+      for (const double a2 : {1.0, inf})
+        for (const double b2 : {1.0, inf, nan})
+          if ((den != 0.0 || std::isfinite(b2)) && (den != inf || a2 != inf))  // a product that no direction has
+            cases.push_back({num, den, a2, b2});
+  const auto samples = static_cast<int64_t>(cases.size());
+  const auto column = [&](size_t k) {
+    std::vector<double> of_all;
+    for (const auto& numbers : cases) of_all.push_back(numbers[k]);
+    return at::tensor(of_all, at::kDouble).view({samples, 1});
+  };
+  const auto a = make_operator(matrix(at::eye(16, at::kDouble)));
+  const Preconditioner none;
+  for (const bool recording : {false, true}) {
+    std::vector<SampleState> states(cases.size());
+    TensorSpace::System system{*a, none};
+    TensorSpace space(system, at::ones({samples, 16}, at::kDouble), states, recording);
+    const auto found = space.values_of(space.guarded_quotient(column(0), column(1), column(2), column(3)));
+    const auto broken = space.broken();
+    for (size_t i = 0; i < cases.size(); ++i) {
+      const auto& [num, den, a2, b2] = cases[i];
+      bool breaks = false;
+      const double wanted = SampleNumbers<double>::guarded_quotient(num, den, a2, b2, breaks);
+      EXPECT_EQ(broken[i], breaks) << (recording ? "recorded, " : "") << num << " / " << den << ", " << a2 << ", "
+                                   << b2;
+      EXPECT_TRUE(found[i] == wanted || (std::isnan(found[i]) && std::isnan(wanted)))
+          << found[i] << ", not " << wanted << " of " << num << " / " << den << ", " << a2 << ", " << b2;
+    }
+  }
+}
 
 }  // namespace prdp
