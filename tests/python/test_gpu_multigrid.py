@@ -178,6 +178,7 @@ def test_what_has_no_coarse_grids_fails_alone():
     a, solver = operators.Stencil(c, OFFSETS, ("periodic", "zero")), with_cycles(prdp.GMRES, max_iter=9, rtol=1e-8)
     (u, info), (v, report) = (solve(a, b, solver, device) for device in ({}, None))
     assert info.status.tolist() == report.status.tolist()
+    assert info.operator_applications[1:].tolist() == report.operator_applications[1:].tolist()
     names = [prdp.SolveStatus(s).name for s in info.status.tolist()]
     assert names == ["CONVERGED", "ZERO_DIAGONAL", "NONFINITE_OPERATOR", "NONFINITE_INPUT", "CONVERGED"]
     torch.testing.assert_close(u, v, rtol=1e-6, atol=1e-8)

@@ -245,6 +245,19 @@ def test_the_ops_pass_opcheck(backward):
             assert set(opcheck(op.default, args).values()) == {"SUCCESS"}
 
 
+def test_the_ops_refuse_no_solves_a_step():
+    options = packed_options("gmres", 3, 1e-5, 3, None)
+    u, states = field((3, 4), channels=2), torch.randn(2, 5, 2, 3, 4, dtype=torch.float64)
+    equation = ([torch.tensor(1e-2, dtype=torch.float64)], "burgers", [3, 4], [0.1], 0)
+    for call in (
+        lambda: torch.ops.prdp.rollout_solves(u, *equation, 1, *options),
+        lambda: torch.ops.prdp.rollout(u, *equation, -1, *options),
+        lambda: torch.ops.prdp.rollout_vjp(states, states, None, None, None, [1, 0], *equation, *options),
+    ):
+        with pytest.raises(ValueError, match="burgers: picard_steps must be >= 1, got 0"):
+            call()
+
+
 @modes
 @pytest.mark.parametrize("name", ["heat", "burgers_1d"])
 def test_a_compiled_rollout_follows_k_and_compiles_at_most_twice(name, backward):

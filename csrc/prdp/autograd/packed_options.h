@@ -30,7 +30,8 @@ struct AddOptions<Result(Front...)> {
 template <class Signature>
 using WithOptions = typename detail::AddOptions<Signature>::Type;
 
-/// The lists: this, unpack() and `packed_options` in prdp_torch/solvers.py are all that knows what is where.
+/// The lists. Only this, unpack() and `packed_options` in prdp_torch/solvers.py know their order: change all three
+/// together.
 struct PackedOptions {
   explicit PackedOptions(const SolveOptions& o)
       : names({std::string(name(o.solver.method)), std::string(name(o.backward)), std::string(name(o.on_failure)),

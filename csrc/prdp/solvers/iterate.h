@@ -9,8 +9,7 @@
 #include "prdp/solvers/space.h"
 
 /// The one loop around every method: it counts, checks and decides, per sample. A method (jacobi.h,
-/// …) supplies one iteration; a space says what a vector is: one sample in padded memory
-/// (sample_space.h), or a batch of plain tensors (tensor_space.h). Both run these same lines.
+/// …) supplies one iteration; a space (space.h) says what a vector is. All spaces run these same lines.
 namespace prdp {
 
 namespace detail {

@@ -24,8 +24,8 @@ struct SolveRequest {
   bool may_wait = true;
 };
 
-/// Solves A u = b by the CPU loops, or by plain tensor operations if the operator or the device has no such loops.
-/// Samples do not influence each other; in the CPU loops not even in the last bit.
+/// Solves A u = b by a kernel of a GPU, by the CPU loops, or by plain tensor operations where there is neither. Samples
+/// do not influence each other; in kernels and loops not even in the last bit.
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
 /// The report of what came of these samples, with numbers of this dtype.
@@ -34,7 +34,7 @@ SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType rea
 /// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors".
 const char* way_of_last_solve();
 
-/// The same in plain tensor operations, for other devices and as a reference for the tests of the CPU loops.
+/// solve() by plain tensor operations alone: for other devices, and as the tests' reference.
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
 /// The least number of samples per thread, such that each thread has some 100 µs of work. With less work, a second

@@ -12,7 +12,8 @@
 #endif
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
-/// one sample in padded memory (sample_space.h), or a batch of plain tensors (tensor_space.h). An operation
+/// one sample on the CPU (sample_space.h) or a GPU (gpu/device/block_space.h), or a batch of plain tensors
+/// (tensor_space.h). An operation
 /// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new method needs
 /// none of them but those that it calls. A new space needs the operations of each group; those of SpaceDefaults it may
 /// leave to that class, until fusing them is worth its lines.

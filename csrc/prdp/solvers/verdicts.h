@@ -94,8 +94,7 @@ double rounding_of_least_numbers(double scale, int64_t unknowns) {
   return static_cast<double>(std::numeric_limits<T>::denorm_min()) * scale * std::sqrt(static_cast<double>(unknowns));
 }
 
-/// Whether of a start nothing but rounding is left once its part in the null space is taken off; by the squares of the
-/// norms then and before.
+/// Whether a start is rounding alone once its part in the null space is taken off. Squared norms: after, before.
 template <class Number>
 auto leaves_rounding(const Number& left2, const Number& whole2, double epsilon) {
   return left2 <= whole2 * (64.0 * epsilon * (64.0 * epsilon));

@@ -32,7 +32,7 @@ SampleOutcome solve_sample_of(const SolveArguments<typename S::T>& of, int64_t s
   SampleOutcome outcome;
   if (is_settled_beforehand(given.magnitude, start, [&] { return space.prepare_operator(); }, divides_by_zero, outcome))
     return outcome;
-  if (!space.has_preconditioner()) return zero_instead(SolveStatus::kZeroDiagonal, 1.0);
+  if (!space.has_preconditioner()) return zero_instead(SolveStatus::kZeroDiagonal);
   auto method = make_method<Method, S>(space);
   return solve_sample(space, method, given);
 }
