@@ -1,7 +1,6 @@
 """Controllers: they choose K or the tolerance of the solves after each training interval."""
 
 import math
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, Unpack
@@ -31,7 +30,8 @@ class _Attached(_Compiled):
 
     steppers: list[Refinable]
     process_group: "ProcessGroup | None"
-    _warned_for: int
+    _warned_for: int  # intervals
+    _has_spoken: bool
 
     if TYPE_CHECKING:  # each compiled controller has its own
 
@@ -43,7 +43,7 @@ class _Attached(_Compiled):
         if process_group is not None and data_parallel.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
-        self._warned_for = 0
+        self._warned_for, self._has_spoken = 0, False
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
@@ -79,8 +79,8 @@ class _Attached(_Compiled):
         """Say once what `warning` says, if a few intervals have not ended it."""
         warning = self.warning
         self._warned_for = 0 if warning is None or refined else self._warned_for + 1
-        if self._warned_for == PATIENCE:
-            self._warned_for = -sys.maxsize
+        if self._warned_for == PATIENCE and not self._has_spoken:
+            self._has_spoken = True
             warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=4)
 
     def _of_all_processes(

@@ -268,9 +268,20 @@ class Stepper(torch_private.HearsOfMoves):
         k = torch_private.number_as_graph_input(self, "_max_iter")
         rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
         of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")
-        others = self.adjoint_max_iter, None, self.on_failure, self.checkpoint_every, self.start
         return packed_options(
-            self.method, k, 0.0, self.restart, self.preconditioner, self.backward, *others, number, rtol, of_adjoint
+            self.method,
+            k,
+            0.0,
+            self.restart,
+            self.preconditioner,
+            self.backward,
+            adjoint_max_iter=self.adjoint_max_iter,
+            on_failure=self.on_failure,
+            checkpoint_every=self.checkpoint_every,
+            start=self.start,
+            adjoint_log=number,
+            rtol_bits=rtol,
+            adjoint_rtol_bits=of_adjoint,
         )
 
     def _keep_bits(self) -> None:
