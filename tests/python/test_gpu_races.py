@@ -21,7 +21,7 @@ def run(left_out):
     environment = {
         **os.environ,
         "LD_PRELOAD": str(sanitizer()),
-        "TSAN_OPTIONS": f"exitcode={FOUND}:suppressions={ROOT}/tests/fibers/tsan.supp",
+        "TSAN_OPTIONS": f"halt_on_error=1:exitcode={FOUND}:suppressions={ROOT}/tests/fibers/tsan.supp",
         "PRDP_FIBERS_TSAN": "1",
     }
     command = [sys.executable, "-W", "ignore", str(ROOT / "tests/python/races.py"), str(left_out)]
