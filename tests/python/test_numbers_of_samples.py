@@ -1,6 +1,8 @@
 """Numbers that a sample has for itself and may not have, such as κ <= 0: it fails alone where failures do not raise, in
 the CPU loops, in kernels and in tensor operations alike."""
 
+import contextlib
+
 import pytest
 import torch
 from fibers import Fibers
@@ -61,6 +63,18 @@ def test_the_sample_fails_alone(name, value, solver, backward):
     assert torch.equal(u[::2], alone)
     for g, expected in zip(gradients, others, strict=True):
         torch.testing.assert_close(g[::2], expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("kernels", [False, True])
+def test_it_does_so_where_nothing_holds_u_as_well(kernels):
+    """Such an A knows its null space, which is looked at before the solve."""
+    kappa, _, b = numbers("kappa", -0.5)
+    b -= b.mean((-1, -2), keepdim=True)
+    with Fibers() if kernels else contextlib.nullcontext():
+        _, info = prdp.linear_solve(Diffusion(kappa, boundary="flux"), b, SOLVERS["CG"], on_failure="return")
+        with pytest.raises(ValueError, match=r"kappa must be > 0, got -0\.5 in sample 1"):
+            prdp.linear_solve(Diffusion(kappa, boundary="flux"), b, SOLVERS["CG"])
+    assert statuses(info) == ["CONVERGED", "NONFINITE_OPERATOR", "CONVERGED"]
 
 
 @pytest.mark.parametrize("name, value", CASES)

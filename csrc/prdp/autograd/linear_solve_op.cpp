@@ -158,16 +158,14 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
                                 const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
-  const bool kernel_checks = gpu::takes(b, options.solver);
-  const auto on_host = options.on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared;
-  a->check_parameters(kernel_checks ? Checks::kHost : on_host);
+  const auto checks = checks_of(options.on_failure);
+  a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);
   if (!spec.transposed) a->check_null_spaces(b);  // an adjoint solve follows one
   const auto& s = options.solver;
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
   const bool may_wait = waits_for_report(options);
-  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait});
-  if (kernel_checks && std::string_view(way_of_last_solve()) != "kernel") a->check_parameters(on_host);
+  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);

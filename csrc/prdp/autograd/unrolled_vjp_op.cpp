@@ -71,7 +71,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
   for (const auto& t : tensors) a.tensors.push_back(t.detach());
   const auto options = unpack(packed...);
-  make_operator(a)->check_parameters(options.on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared);
+  make_operator(a)->check_parameters(checks_of(options.on_failure));
   auto with_b = needed.vec();  // b̄ tells whether the derivative is one of the solution
   if (!traits(options.solver.method).is_polynomial) with_b[0] = 1;
   const auto found =

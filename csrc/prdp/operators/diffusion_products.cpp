@@ -56,12 +56,13 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
   if (!gpu::each_point(l.device(), product_body<T>("DiffusionProducts", "prdp/gpu/device/diffusion_products.h"), of,
                        count))
     return {};
-  std::vector<at::Tensor> found{of_kappa.squeeze(1)};
-  found.push_back(shift_.dim() == 0 ? sums.result(0) : sums.result(0).squeeze(1));
+  next = 0;
+  const auto of_shift = sums.result(next++);
+  std::vector<at::Tensor> found{of_kappa.squeeze(1), shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (const auto side : sides_[axis]) {
       if (side != Side::kRobin) continue;
-      const auto bar = sums.result(found.size() - 1);
+      const auto bar = sums.result(next++);
       found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + axis).squeeze(1));
     }
   return found;

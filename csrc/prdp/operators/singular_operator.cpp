@@ -154,7 +154,7 @@ void SingularOperator::check_null_spaces(const at::Tensor& b) const {
   static thread_local Remembered checked;
   if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
   const at::NoGradGuard no_grad;
-  a_->check_parameters();  // the products here are no kernel's
+  a_->check_parameters(Checks::kShared);  // the products here are no kernel's
   const auto size = size_of_products(*a_, b);
   check_is_mapped_to_zero(right_, b, size, /*transposed=*/false);
   check_is_mapped_to_zero(left_, b, size, /*transposed=*/true);

@@ -43,8 +43,7 @@ bool is_idle(const SampleState& s) {
 /// Stops those of the `doubtful` samples whose residual is rounding, floor = ε ‖A‖ ‖u‖: one that is no larger, or up to
 /// eight times as large where rtol lies below the floor. An exhausted space is judged with more slack. A floor near ‖b‖
 /// says nothing, nor does a residual near it: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a
-/// product rounds: where columns of A differ much in size, ‖A‖ ‖u‖
-/// overstates that rounding.
+/// product rounds: where columns of A differ much in size, ‖A‖ ‖u‖ overstates that rounding.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {

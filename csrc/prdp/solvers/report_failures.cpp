@@ -111,7 +111,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
   };
   if (std::any_of(failed.begin(), failed.end(), is_of_a))  // a kernel may have found it
-    a.check_parameters(on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared);
+    a.check_parameters(checks_of(on_failure));
 
   constexpr size_t named = 4;
   std::ostringstream text;

@@ -115,7 +115,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
   auto found = gpu::solve(a, b, request);
-  if (!found && gpu::takes(b, request.solver)) a.check_parameters(Checks::kShared);  // as the kernel would have
+  if (!found && gpu::takes(b, request.solver)) a.check_parameters(request.checks);
   const char* how = "kernel";
   if (!found && b.is_cpu() && runs_on_loops(request.solver)) {
     how = "loops";

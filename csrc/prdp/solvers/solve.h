@@ -22,6 +22,8 @@ struct SolveRequest {
   at::Tensor x0{};
   /// Whether the host may wait for another device to read the report there; the kernels of solve_on_gpu.h never wait.
   bool may_wait = true;
+  /// What of A is looked at where a kernel of a GPU was to look, and none runs.
+  Checks checks = Checks::kShared;
 };
 
 /// Solves A u = b by a kernel of a GPU, by the CPU loops, or by plain tensor operations where there is neither. Samples

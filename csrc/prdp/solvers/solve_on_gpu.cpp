@@ -153,7 +153,7 @@ Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, 
   if (!a.has_coarse_grids()) return {};  // the blocks of NavierStokes for Aᵀ are not the transpose of those for A
   const Solver solver{Method::kMultigrid, 1, 0.0, kDefaultRestart, transposed ? m.transposed() : m};
   auto made = prepare(a, transposed, like, solver);
-  if (!made) return {};
+  if (!made || made->kernel->trust == Trust::kNone) return {};
   return [prepared = *std::move(made), solver](const at::Tensor& v) {
     const auto run = v.scalar_type() == at::kFloat ? launch<float> : launch<double>;
     return run(prepared, v.contiguous(), {.solver = solver, .guarded = false}).u;

@@ -154,6 +154,12 @@ enum class Start { kZero, kState };
 /// and A get none from the sample, whether its forward or its adjoint solve failed.
 enum class OnFailure { kRaise, kWarn, kReturn, kZeroGrad };
 
+/// Which numbers of A the host looks at before a solve: those of a sample alone are left to fail alone, unless any
+/// failure raises.
+inline Checks checks_of(OnFailure on_failure) {
+  return on_failure == OnFailure::kRaise ? Checks::kAll : Checks::kShared;
+}
+
 /// Names as users write them; from_name raises ValueError naming the allowed ones.
 std::string_view name(Method method);
 std::string_view name(Backward backward);

@@ -13,10 +13,9 @@
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample on the CPU (sample_space.h) or a GPU (gpu/device/block_space.h), or a batch of plain tensors
-/// (tensor_space.h). An operation
-/// that writes to a vector leaves the samples alone that the loop around the method has frozen. A new method needs
-/// none of them but those that it calls. A new space needs the operations of each group; those of SpaceDefaults it may
-/// leave to that class, until fusing them is worth its lines.
+/// (tensor_space.h). An operation that writes to a vector leaves the samples alone that the loop around the method has
+/// frozen. A new method needs none of them but those that it calls. A new space needs the operations of each group;
+/// those of SpaceDefaults it may leave to that class, until fusing them is worth its lines.
 namespace prdp {
 
 /// A few numbers or handles of vectors that a method keeps beside its vectors, as array<X>() of the space gives them.

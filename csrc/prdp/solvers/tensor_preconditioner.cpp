@@ -96,7 +96,8 @@ class ApplyCycles : public torch::autograd::Function<ApplyCycles> {
 
 c10::intrusive_ptr<Cycles> make_cycles(const Operator& a, const Preconditioner& m, const at::Tensor& b) {
   if (auto product = gpu::make_cycle(a, /*transposed=*/false, m, b))
-    return c10::make_intrusive<CyclesOnGpu>(std::move(product), gpu::make_cycle(a, /*transposed=*/true, m, b));
+    if (auto transpose = gpu::make_cycle(a, /*transposed=*/true, m, b))
+      return c10::make_intrusive<CyclesOnGpu>(std::move(product), std::move(transpose));
   auto kernels = a.kernels(b, false), transpose = a.kernels(b, true);
   if (b.scalar_type() == at::kFloat)
     return c10::make_intrusive<CyclesOnLoops<float>>(std::move(kernels), std::move(transpose), m.smoothing(),

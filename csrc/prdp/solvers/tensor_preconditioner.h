@@ -12,9 +12,9 @@ namespace prdp {
 /// constant.
 using TensorPreconditioner = std::function<at::Tensor(const at::Tensor& v)>;
 
-/// That of the preconditioner of `a` for vectors like b: an operator of the user's own, or V-cycles by the loops of the
-/// CPU, which vectors on another device are copied to; empty for none and for the diagonal. Raises ValueError or
-/// TypeError unless it takes vectors as b.
+/// That of the preconditioner of `a` for vectors like b: an operator of the user's own, or V-cycles, by kernels of a
+/// GPU or by the loops of the CPU, to which vectors of a device without kernels are copied; empty for none and for the
+/// diagonal. Raises ValueError or TypeError unless it takes vectors as b.
 TensorPreconditioner make_inverse(const Operator& a, const Preconditioner& preconditioner, const at::Tensor& b);
 
 }  // namespace prdp

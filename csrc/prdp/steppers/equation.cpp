@@ -29,8 +29,12 @@ at::Tensor rest(const Equation& equation) {
 
 }  // namespace
 
-void Equation::check() const {
+void Equation::check_picard_steps() const {
   TORCH_CHECK_VALUE(picard_steps >= 1, kind, ": picard_steps must be >= 1, got ", picard_steps);
+}
+
+void Equation::check() const {
+  check_picard_steps();
   make_operator(equation_operator(*this, rest(*this)))->check_parameters();
 }
 

@@ -15,6 +15,7 @@ struct Equation {
 
   /// Raises ValueError or TypeError for a bad shape or parameter.
   void check() const;
+  void check_picard_steps() const;
 };
 
 /// The operator A(u) and the right-hand side b(u) at the state u, both differentiable in u.

@@ -71,13 +71,8 @@ Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef 
   return call;
 }
 
-void check_picard_steps(const Equation& equation) {
-  TORCH_CHECK_VALUE(equation.picard_steps >= 1, equation.kind, ": picard_steps must be >= 1, got ",
-                    equation.picard_steps);
-}
-
 void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
-  check_picard_steps(equation);
+  equation.check_picard_steps();
   options.check(equation.kind.c_str());
   check_memory(options, u);
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
@@ -137,7 +132,7 @@ std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTe
                                    c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
                                    int64_t picard_steps, Options... packed) {
   const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  check_picard_steps(equation);
+  equation.check_picard_steps();
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
                         status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
   return solve_all_back(cotangent, kept, equation, unpack(packed...), needed);
