@@ -1,20 +1,26 @@
-"""This library on any device beside an eager torch loop there: `python -m benchmarks.devices --device cuda`.
+"""This library on any device, beside eager torch loops and, where it is installed, JAX on the same device:
+`python -m benchmarks.devices --device cuda`.
 
-The problems are those of the suites. A call is a solve of K iterations with its gradient for b, and ends when the
-device has. One JSON record a line; the time is that which passes.
+The problems are those of the suites, larger grids, and flows. A call is a solve of K iterations, or a rollout, with its
+gradient, and ends when the device has. One JSON record a line: the time that passes, and the errors.
 """
 
 import argparse
+import importlib.util
 import json
+import os
 import statistics
 import time
 
+import numpy as np
 import torch
 
 import prdp_torch as prdp
 from benchmarks import problems
 from benchmarks.peers import stencils, torch_eager
 from prdp_torch import operators
+
+LARGEST_FACTORED = 100_000  # unknowns of a sample, up to which the gradient is compared with that of a direct solve
 
 
 def on(device, problem):
@@ -57,6 +63,9 @@ def calls(problem, device):
             return [loops[solver.method](product, turned, v, k, *more) for turned, v in ((False, b), (True, g))]
 
     found = {f"{solver.method} raise": ours(a, solver), "eager torch loop": eager}
+    found["one iteration"] = ours(a, problem.solver(1), on_failure="return")
+    if with_jax(device):
+        found["JAX jit"] = of_jax(problem, solver)
     if solver.method != "gmres":
         found[f"{solver.method} return"] = ours(a, solver, on_failure="return")
     if solver.method == "cg":
@@ -66,6 +75,53 @@ def calls(problem, device):
         found["cg, multigrid"] = ours(a, prdp.CG(5, rtol=0.0, preconditioner="multigrid"))
         found["multigrid"] = ours(a, prdp.Multigrid(5, rtol=0.0))
     return found
+
+
+def with_jax(device):
+    """Whether there is a JAX that computes where the device is."""
+    if not importlib.util.find_spec("jax"):
+        return False
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # it would take most of the memory
+    import jax
+
+    return jax.default_backend() == {"cuda": "gpu"}.get(device.type, device.type)
+
+
+def of_jax(problem, solver):
+    import jax
+    import jax.numpy as jnp
+
+    from benchmarks.peers import jax_loops
+
+    stencil = stencils.make(problem, jax_loops.Backend, jnp.asarray)
+    b, g = (jnp.asarray(v.numpy()) for v in (problem.b, problem.g))
+    loop = {
+        "jacobi": jax_loops.jacobi,
+        "gmres": jax_loops.gmres,
+        "cg": lambda stencil, turned, b, k: jax_loops.cg(stencil, b, k),
+    }[solver.method]
+    more = (solver.restart,) if solver.method == "gmres" else ()
+    _, both = jax_loops.compiled(stencil, loop, problem.k, *more)
+    return lambda: jax.block_until_ready(both(b, g))
+
+
+def errors(problem, u, gradient):
+    """The residual of u and, where a direct solve can tell it, the error of the gradient for b: the batch's largest."""
+    residual, _ = problem.errors(u)
+    if problem.unknowns > LARGEST_FACTORED:
+        return {"residual": residual}
+    exact = problem.exact[1] if problem.kappa is None else problem.exact[1][0]
+    return {"residual": residual, "gradient_error": largest(gradient - exact, exact)}
+
+
+def in_float64(arrays):
+    """Arrays of any library, on the CPU."""
+    return [torch.tensor(np.asarray(a.cpu() if isinstance(a, torch.Tensor) else a)).double() for a in arrays]
+
+
+def largest(error, of):
+    """Norm of a sample's error relative to that of its truth, the largest of the batch."""
+    return float((error.flatten(1).norm(dim=1) / of.flatten(1).norm(dim=1)).max())
 
 
 def seconds(call, device, rounds):
@@ -89,18 +145,63 @@ def suite(quick):
         return [problems.heat((7, 7), 5, batch=2), problems.burgers((9,), 2, batch=2),
                 problems.diffusion((8, 8), 5, batch=2)]  # fmt: skip
     some = [problems.PROBLEMS[name]() for name in ("heat_1d", "heat_2d", "heat_3d", "burgers_1d", "navier_stokes")]
-    return [*some, problems.DIFFUSION["diffusion_64"](), problems.DIFFUSION["diffusion_256"]()]
+    large = problems.diffusion((1024, 1024), 100, batch=4)
+    return [*some, problems.DIFFUSION["diffusion_64"](), problems.DIFFUSION["diffusion_256"](), large]
+
+
+def flows(quick):
+    """Rollouts of a `Flow` with their gradient: shape, batch, steps."""
+    return [((8, 8), 2, 2)] if quick else [((64, 64), 16, 20), ((256, 256), 1, 10)]
+
+
+def flow_calls(shape, batch, steps, device):
+    """({name: a rollout with its gradient for the first state}, the projection in float64 on the CPU, and what the same
+    call gives there by a direct solve)."""
+    nu, dt = 1e-3, 1e-3
+
+    def flow_of(solver):
+        return prdp.Flow(shape, nu=nu, dt=dt, diffusion="explicit", solver=solver)
+
+    exact = flow_of(prdp.Direct())
+    noise = torch.randn(2, batch, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    start, target = (exact.project(0.1 * v) for v in noise)
+
+    def ours(flow, start, target):
+        def call():
+            leaf = start.clone().requires_grad_()
+            end = flow.rollout(leaf, steps)[:, -1]
+            end.backward(end.detach() - target)
+            return end.detach(), leaf.grad
+
+        return call
+
+    pair = [v.float().to(device) for v in (start, target)]
+    solvers = {"Direct": prdp.Direct(), "CG, multigrid": prdp.CG(100, rtol=1e-5, preconditioner="multigrid")}
+    found = {name: ours(flow_of(solver), *pair) for name, solver in solvers.items()}
+    if with_jax(device):
+        from benchmarks.peers import jax_flow
+
+        found["JAX jit, FFT"] = jax_flow.with_gradient(*(v.float().numpy() for v in (start, target)), steps, nu, dt)
+    return found, exact.project, ours(exact, start, target)()
 
 
 def run(device, quick=False):
     """Yields a record for each problem and way."""
+    rounds = 1 if quick else 9
     for problem in suite(quick):
         for way, call in calls(problem, device).items():
-            residual, _ = problem.errors(call()[0].cpu())
-            yield {
-                "problem": problem.title, "k": problem.k, "way": way, "residual": residual,
-                **seconds(call, device, rounds=1 if quick else 9),
-            }  # fmt: skip
+            shown = {"problem": problem.title, "k": 1 if way == "one iteration" else problem.k, "way": way}
+            yield {**shown, **errors(problem, *in_float64(call())), **seconds(call, device, rounds)}
+    for shape, batch, steps in flows(quick):
+        ways, project, exact = flow_calls(shape, batch, steps, device)
+        for way, call in ways.items():
+            u, gradient = in_float64(call())
+            found = {"error": largest(u - exact[0], exact[0])}
+            # Of changes without divergence: for others the forms of the convective term are other functions.
+            truth = project(exact[1])
+            found["gradient_error"] = largest(project(gradient) - truth, truth)
+            shown = {"problem": f"Flow, {shape[0]} × {shape[1]} × {batch}, {steps} steps", "way": way}
+            yield {**shown, **found, **seconds(call, device, rounds)}
 
 
 def main():
