@@ -37,7 +37,8 @@ test: $(STAMPS)/configure
 	find csrc tests benchmarks -name '*.h' -o -name '*.cpp' | xargs $(BIN)/clang-format --dry-run -Werror
 	[ ! -x $(BIN)/clang-tidy ] || $(MAKE) --no-print-directory tidy
 	$(BIN)/ctest --test-dir build --output-on-failure
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not alone" --numprocesses auto --maxprocesses 8 --dist loadfile
+	$(BIN)/pytest -m alone
 
 # Without a GPU: NVRTC compiles for cards that are not there.
 kernels: $(STAMPS)/configure
