@@ -51,15 +51,12 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
   auto a = solve.a;
   for (auto& t : a.tensors) t = at::alias(t);
   const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.x0, solve.solver, solve.iterations);
-  UnrolledVjp found{std::vector<at::Tensor>(needed.size()), 2 * applications};
   std::vector<at::Tensor> inputs;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) inputs.push_back(i == 0 ? rhs : a.tensors[i - 1]);
   const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
                                                /*create_graph=*/true, /*allow_unused=*/true);
-  for (size_t i = 0, next = 0; i < needed.size(); ++i)
-    if (needed[i]) found.gradients[i] = gradients[next++];
-  return found;
+  return {in_places(gradients, needed), 2 * applications};
 }
 
 template <class... Options>
@@ -107,10 +104,7 @@ SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const O
       call_with_options(op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
                         a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(solved.x0));
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
-  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications, floor}};
-  for (size_t i = 0, next = 0; i < needed.size(); ++i)
-    if (needed[i]) found.gradients[i] = gradients[next++];
-  return found;
+  return {in_places(gradients, needed), {iterations, or_nan, status, applications, floor}};
 }
 
 SolveVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
