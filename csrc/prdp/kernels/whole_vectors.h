@@ -10,9 +10,7 @@
 
 namespace prdp::kernels {
 
-/// Values in a block of a long vector. Sums are taken over blocks and then added in order, so that no bit of them
-/// depends on the number of threads.
-inline constexpr int64_t kBlock = 8192;
+using share_rows::kBlock;
 
 /// Calls body(begin, end) for each block of n values.
 template <class Body>

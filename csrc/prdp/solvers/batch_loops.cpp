@@ -3,9 +3,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/kernels/share_samples.h"
 #include "prdp/kernels/whole_vectors.h"
 #include "prdp/solvers/sample_numbers.h"
+#include "prdp/threads/share_samples.h"
 
 namespace prdp::batch_loops {
 
