@@ -157,7 +157,7 @@ TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {
-  const auto solution = system_.a.solve_directly(r);
+  const auto solution = system_.a.solve_directly(r, /*transposed=*/false);
   const auto finite = solution.isfinite().all(/*dim=*/1, /*keepdim=*/true);
   auto every = finite;
   for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
