@@ -84,7 +84,7 @@ template <class... Args>
 SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
   const auto [a, options, x0] = unpack_call(args...);
   checked_operator(a, b, options, x0);
-  return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), fake_info(b, {b.sym_size(0)})});
+  return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
 }
 
 /// Whether all tensors of a call are plain.

@@ -171,8 +171,8 @@ inline SolveResult result_of(SolveOutputs outputs) {
           {std::move(iterations), std::move(residual), std::move(status), std::move(applications), std::move(floor)}};
 }
 
-/// The same of fake tensors: a report of numbers of these sizes, in the dtype of `like`.
-inline SolveInfo fake_info(const at::Tensor& like, c10::SymIntArrayRef sizes) {
+/// A report of these sizes without values, in the dtype of `like`; of fake tensors, too.
+inline SolveInfo empty_info(const at::Tensor& like, c10::SymIntArrayRef sizes) {
   const auto counts = [&] { return at::empty_symint(sizes, like.options().dtype(at::kLong)); };
   const auto numbers = [&] { return at::empty_symint(sizes, like.options()); };
   return {counts(), numbers(), counts(), counts(), numbers()};

@@ -91,7 +91,7 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
     if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
-  const auto info = fake_info(b, {b.sym_size(0)});
+  const auto info = empty_info(b, {b.sym_size(0)});
   return {gradients, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 

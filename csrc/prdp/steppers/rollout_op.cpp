@@ -90,7 +90,7 @@ SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
   check(call.equation, u, call.count, call.options);
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, call.count + 1);
-  return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.count})});
+  return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), call.count})});
 }
 
 /// The gradients that are needed.
