@@ -144,6 +144,49 @@ auto call_with_options(const Op& op, const SolveOptions& o, const Front&... fron
   return op.call(front..., packed.names, packed.counts, packed.numbers, packed.preconditioner);
 }
 
+/// A solve but its right-hand side, as the ops take it that solve or differentiate one: behind their own arguments, the
+/// operator, the start and the options.
+struct SolveCall {
+  OperatorSpec a;
+  SolveOptions options;
+  at::Tensor x0;
+};
+
+#define PRDP_SOLVE_SCHEMA \
+  "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA
+
+namespace detail {
+
+template <class Signature>
+struct AddSolve;
+template <class Result, class... Front>
+struct AddSolve<Result(Front...)> {
+  using Type = WithOptions<Result(Front..., at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
+                                  bool, const OptionalTensor&)>;
+};
+
+}  // namespace detail
+
+/// The type of the kernel of an op whose schema ends in PRDP_SOLVE_SCHEMA.
+template <class Signature>
+using WithSolve = typename detail::AddSolve<Signature>::Type;
+
+/// Raises as unpack() of its options.
+template <class... Options>
+SolveCall unpack_solve(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                       at::ArrayRef<double> parameters, bool transposed, const OptionalTensor& x0,
+                       const Options&... options) {
+  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
+          unpack(options...),
+          x0.value_or(at::Tensor())};
+}
+
+template <class Op, class... Front>
+auto call_with_solve(const Op& op, const OperatorSpec& a, const at::Tensor& x0, const SolveOptions& o,
+                     const Front&... front) {
+  return call_with_options(op, o, front..., a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(x0));
+}
+
 /// The gradients as an op returns them, those alone that are `needed`, each in the place of its input.
 inline std::vector<at::Tensor> in_places(const std::vector<at::Tensor>& gradients, at::IntArrayRef needed) {
   std::vector<at::Tensor> of_inputs(needed.size());
