@@ -19,7 +19,7 @@ using Point = std::array<int64_t, 3>;
 
 /// Coarse points that one call of the loops takes: the whole row or, where the axis is x, so many points of it that all
 /// have both neighbours, or the one at an end, which may lack one.
-struct Run {
+struct CoarseRun {
   GridRow row;  // of the coarse grid
   int64_t first, count;
 };
@@ -58,7 +58,7 @@ class CoarseCoefficients {
     for (int d = 0; d < 3; ++d) coarse_[d] = coarse.add(place(centre, d));
   }
 
-  void make(const Run& run) const {
+  void make(const CoarseRun& run) const {
     const auto [before, here, after, has_before, has_after] = around(run);
     const T *const zeros = constants_.zeros.data(), *const ones = constants_.ones.data();
     const auto coefficient = [&](int d, const Point& p) {
@@ -98,7 +98,7 @@ class CoarseCoefficients {
   }
 
  private:
-  Neighbourhood around(const Run& run) const {
+  Neighbourhood around(const CoarseRun& run) const {
     const Point coarse{run.row.z, run.row.y, run.first};
     const int64_t extent = a_.grid.shape[axis_];
     const bool periodic = a_.grid.periodic[axis_];

@@ -5,6 +5,9 @@
 
 namespace prdp {
 
+/// Signs without a pattern, the same for every sample: whether number i changes its own.
+inline bool is_negated(int64_t i) { return std::sin(static_cast<double>((i + 1) * (i + 1))) < 0.0; }
+
 /// What the spaces of one sample do with its numbers (space.h): quotients that tell a breakdown from a small number,
 /// and numbers that vanish where they are rounding. b and A are scaled to the order of one.
 template <class T>

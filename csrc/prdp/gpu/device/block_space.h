@@ -10,7 +10,6 @@
 #include "prdp/kernels/scales.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
-#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 
 namespace prdp::gpu {
