@@ -10,7 +10,6 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, data_parallel
 from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
-from prdp_torch.solve import SolveInfo
 from prdp_torch.types import Number, Refinable, Steppers
 
 if TYPE_CHECKING:
@@ -70,7 +69,8 @@ class _Attached(_Compiled):
         """One step of the compiled controller, and what follows from it for the steppers."""
         if converged is None:
             converged = bool(self.steppers) and all(getattr(s, "converged", False) for s in self.steppers)
-        refined = self._step(*self._of_all_processes(metric, bool(converged), error))
+        ended = _Ended.of(self.steppers)
+        refined = self._step(*_Interval.of_processes(metric, bool(converged), error, ended, self.process_group))
         self._push()
         self._speak(refined)
         return refined
@@ -82,31 +82,6 @@ class _Attached(_Compiled):
         if self._warned_for == PATIENCE and not self._has_spoken:
             self._has_spoken = True
             warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=4)
-
-    def _of_all_processes(
-        self, metric: float, converged: bool, error: float | None
-    ) -> tuple[float, bool, float | None, float | None, float]:
-        """(metric, converged, residual, error, idle), the same in every process: means, and whether all have converged.
-        The residual is that where the last solves ended: the mean over the samples, of several steppers the largest;
-        `idle` is the share of solves that took no iteration."""
-        ended = [getattr(stepper, "info", None) for stepper in self.steppers]
-        reports = [_Ended(torch.zeros(0), 0.0) if info is None else _Ended.of(info) for info in ended]
-        residuals = [report.residual for report in reports]
-        idle = max((report.idle for report in reports), default=0.0)
-        many = data_parallel.count(self.process_group)
-        if many > 1:
-            # One that is refused must be refused in every process.
-            numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
-            numbers += [converged, error is not None, idle]
-            metric, error_sum, agree, known, idle, *of_steppers = data_parallel.sums(
-                [*numbers, *(n for r in residuals for n in (float(r.sum()), r.numel()))], self.process_group
-            )
-            metric, converged, error = metric / many, agree == many, error_sum / many if known == many else None
-            idle /= many
-            means = [total / n for total, n in zip(of_steppers[::2], of_steppers[1::2], strict=True) if n]
-        else:
-            means = [float(r.mean()) for r in residuals if r.numel()]
-        return metric, converged, max((r for r in means if math.isfinite(r)), default=None), error, idle
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
@@ -140,18 +115,54 @@ def _kind(controller: type) -> str:
 
 
 class _Ended(NamedTuple):
-    """How solves ended, on the host."""
+    """How the last solves of the steppers ended, on the host."""
 
-    residual: Tensor  # 0 where it is rounding alone
-    idle: float  # the share of samples whose solve took no iteration, though its residual is not small
+    residuals: list[tuple[float, float]]  # of each stepper, the sum over its samples, and their number
+    idle: float  # the share of solves that took no iteration, though their residual is not small; the largest
 
     @classmethod
-    def of(cls, info: SolveInfo) -> Self:
-        parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations)])
-        residual, floor, iterations = parts.cpu()  # one copy of a device
-        residual = residual.masked_fill(floor > 0, 0.0)
-        idle = ((iterations == 0) & (residual > _C.SMALL_RESIDUAL)).double()
-        return cls(residual, float(idle.mean()) if idle.numel() else 0.0)
+    def of(cls, steppers: list[Refinable]) -> Self:
+        residuals, idle = [], [0.0]
+        for info in (getattr(stepper, "info", None) for stepper in steppers):
+            if info is None:
+                residuals.append((0.0, 0.0))
+                continue
+            parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations)])
+            residual, floor, iterations = parts.cpu()  # one copy of a device
+            residual = residual.masked_fill(floor > 0, 0.0)  # it is rounding alone
+            residuals.append((float(residual.sum()), float(residual.numel())))
+            is_idle = ((iterations == 0) & (residual > _C.SMALL_RESIDUAL)).double()
+            idle.append(float(is_idle.mean()) if is_idle.numel() else 0.0)
+        return cls(residuals, max(idle))
+
+
+class _Interval(NamedTuple):
+    """What a controller decides by: the arguments of `_C.Controller._step`, the same in every process."""
+
+    metric: float  # the mean over the processes, as `error` and `idle` are
+    converged: bool  # in all processes
+    residual: float | None  # where the last solves ended: the mean over the samples, of several steppers the largest
+    error: float | None
+    idle: float
+
+    @classmethod
+    def of_processes(
+        cls, metric: float, converged: bool, error: float | None, ended: _Ended, group: "ProcessGroup | None"
+    ) -> Self:
+        residuals, idle = ended
+        processes = data_parallel.count(group)
+        if processes > 1:
+            # A number that is refused must be refused in every process.
+            numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
+            numbers += [converged, error is not None, idle]
+            metric_sum, error_sum, agree, known, idle_sum, *flat = data_parallel.sums(
+                [*numbers, *(number for pair in residuals for number in pair)], group
+            )
+            metric, converged, idle = metric_sum / processes, agree == processes, idle_sum / processes
+            error = error_sum / processes if known == processes else None
+            residuals = list(zip(flat[::2], flat[1::2], strict=True))
+        means = [total / samples for total, samples in residuals if samples]
+        return cls(metric, converged, max((m for m in means if math.isfinite(m)), default=None), error, idle)
 
 
 def _remade(

@@ -112,9 +112,12 @@ TEST(Solve, AnOperatorOfOnesOwnPreconditions) {
   // One iteration is enough where M is A itself.
   const auto a = heat({20});
   const auto b = prdp_test::random_field({20}, 2);
-  const auto products = prdp::RegisteredProducts::make(
-      {[&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); },
-       [&](const at::Tensor& v, const std::vector<at::Tensor>&) { return prdp::make_operator(a)->solve_directly(v); }});
+  const auto products = prdp::RegisteredProducts::make({[&](const at::Tensor& v, const std::vector<at::Tensor>&) {
+                                                          return prdp::make_operator(a)->solve_directly(v, false);
+                                                        },
+                                                        [&](const at::Tensor& v, const std::vector<at::Tensor>&) {
+                                                          return prdp::make_operator(a)->solve_directly(v, false);
+                                                        }});
   const Preconditioner inverse = products->spec({});
   for (const Solver& solver :
        {Solver(prdp::CG{.max_iter = 1, .rtol = 1e-10, .preconditioner = inverse}),

@@ -17,32 +17,12 @@ namespace prdp {
 
 namespace {
 
-constexpr const char* kSchema =
-    "linear_solve(Tensor b, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
-    "transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA ") -> (Tensor u, " PRDP_REPORT_SCHEMA ")";
-
-/// The arguments of the op but b.
-struct Call {
-  OperatorSpec a;
-  SolveOptions options;
-  at::Tensor x0;
-};
-
-using Signature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                           at::ArrayRef<double>, bool, const OptionalTensor&)>;
+constexpr const char* kSchema = "linear_solve(Tensor b, " PRDP_SOLVE_SCHEMA ") -> (Tensor u, " PRDP_REPORT_SCHEMA ")";
+using Signature = WithSolve<SolveOutputs(const at::Tensor&)>;
 
 SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::linear_solve", "").typed<Signature>();
-  return call_with_options(op, o, b, a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(x0));
-}
-
-/// The op's arguments as structures; raises for names that do not exist.
-template <class... Options>
-Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-                 bool transposed, const OptionalTensor& x0, const Options&... options) {
-  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
-          unpack(options...),
-          x0.value_or(at::Tensor())};
+  return call_with_solve(op, a, x0, o, b);
 }
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
@@ -75,16 +55,16 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 
 template <class... Args>
 SolveOutputs solve_kernel(const at::Tensor& b, const Args&... args) {
-  const auto [a, options, x0] = unpack_call(args...);
+  const auto [a, options, x0] = unpack_solve(args...);
   return outputs_of(linear_solve_kernel(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
 SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
-  const auto [a, options, x0] = unpack_call(args...);
+  const auto [a, options, x0] = unpack_solve(args...);
   checked_operator(a, b, options, x0);
-  return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), fake_info(b, {b.sym_size(0)})});
+  return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
 }
 
 /// Whether all tensors of a call are plain.
@@ -139,7 +119,7 @@ struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
   static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel(b, args...); }
   static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
-    const auto [a, options, x0] = unpack_call(args...);
+    const auto [a, options, x0] = unpack_solve(args...);
     return solve_and_record(b, a, options, x0);
   }
 };

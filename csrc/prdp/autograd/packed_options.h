@@ -1,4 +1,5 @@
 #pragma once
+#include <array>
 #include <bit>
 #include <optional>
 #include <string>
@@ -30,26 +31,58 @@ struct AddOptions<Result(Front...)> {
 template <class Signature>
 using WithOptions = typename detail::AddOptions<Signature>::Type;
 
-/// The lists. Only this, unpack() and `packed_options` in prdp_torch/solvers.py know their order: change all three
-/// together.
+/// Where each option stands in its list. `packed_options` in prdp_torch/solvers.py writes the same lists: change both
+/// together. An operator as preconditioner puts its tensors into the fourth list, and its shape and its parameters
+/// behind the counts and the numbers.
+namespace packed {
+
+enum Name : size_t { kMethod, kBackward, kOnFailure, kStart, kPreconditioner, kNames };
+enum Count : size_t {
+  kMaxIter,
+  kRestart,
+  kAdjointLog,
+  kCheckpointEvery,
+  kHasAdjointMaxIter,
+  kAdjointMaxIter,
+  kIsPreconditionerTransposed,
+  kRtolBits,  // in place of the tolerance; -1: see the numbers
+  kAdjointRtolBits,
+  kCounts
+};
+enum Number : size_t { kRtol, kHasAdjointRtol, kAdjointRtol, kNumbers };
+
+}  // namespace packed
+
+/// The lists.
 struct PackedOptions {
-  explicit PackedOptions(const SolveOptions& o)
-      : names({std::string(name(o.solver.method)), std::string(name(o.backward)), std::string(name(o.on_failure)),
-               std::string(name(o.start)), o.solver.preconditioner.spec().kind}),
-        counts{o.solver.max_iter,
-               o.solver.restart,
-               o.adjoint_log,
-               o.checkpoint_every,
-               static_cast<int64_t>(o.adjoint_max_iter.has_value()),
-               o.adjoint_max_iter.value_or(0),
-               static_cast<int64_t>(o.solver.preconditioner.spec().transposed),
-               o.traced_rtol,
-               o.traced_adjoint_rtol},
-        numbers{o.solver.rtol, static_cast<double>(o.adjoint_rtol.has_value()), o.adjoint_rtol.value_or(0.0)},
-        preconditioner(o.solver.preconditioner.spec().tensors) {
-    const auto& m = o.solver.preconditioner.spec();
-    counts.insert(counts.end(), m.shape.begin(), m.shape.end());
-    numbers.insert(numbers.end(), m.parameters.begin(), m.parameters.end());
+  explicit PackedOptions(const SolveOptions& o) : preconditioner(o.solver.preconditioner.spec().tensors) {
+    using namespace packed;
+    const auto& inverse = o.solver.preconditioner.spec();
+    std::array<std::string, kNames> of_options;
+    of_options[kMethod] = name(o.solver.method);
+    of_options[kBackward] = name(o.backward);
+    of_options[kOnFailure] = name(o.on_failure);
+    of_options[kStart] = name(o.start);
+    of_options[kPreconditioner] = inverse.kind;
+    for (auto& one : of_options) names.push_back(std::move(one));
+
+    counts.resize(kCounts);
+    counts[kMaxIter] = o.solver.max_iter;
+    counts[kRestart] = o.solver.restart;
+    counts[kAdjointLog] = o.adjoint_log;
+    counts[kCheckpointEvery] = o.checkpoint_every;
+    counts[kHasAdjointMaxIter] = int64_t{o.adjoint_max_iter.has_value()};
+    counts[kAdjointMaxIter] = o.adjoint_max_iter.value_or(0);
+    counts[kIsPreconditionerTransposed] = int64_t{inverse.transposed};
+    counts[kRtolBits] = o.traced_rtol;
+    counts[kAdjointRtolBits] = o.traced_adjoint_rtol;
+    counts.insert(counts.end(), inverse.shape.begin(), inverse.shape.end());
+
+    numbers.resize(kNumbers);
+    numbers[kRtol] = o.solver.rtol;
+    numbers[kHasAdjointRtol] = o.adjoint_rtol.has_value() ? 1.0 : 0.0;
+    numbers[kAdjointRtol] = o.adjoint_rtol.value_or(0.0);
+    numbers.insert(numbers.end(), inverse.parameters.begin(), inverse.parameters.end());
   }
 
   c10::List<std::string> names;
@@ -73,23 +106,30 @@ void take_bits(const c10::SymInt& bits, Number& tolerance, c10::SymInt& traced) 
 /// Raises ValueError for names that do not exist, and for lists that are too short.
 inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArrayRef counts,
                            at::ArrayRef<double> numbers, at::TensorList preconditioner) {
-  constexpr size_t kNames = 5, kCounts = 9, kNumbers = 3;
+  using namespace packed;
   TORCH_CHECK_VALUE(names.size() == kNames && counts.size() >= kCounts && numbers.size() >= kNumbers,
-                    "the options of a solve are ", kNames, " names, ", kCounts, " counts and ", kNumbers,
-                    " numbers, got ", names.size(), ", ", counts.size(), " and ", numbers.size());
-  OperatorSpec inverse{
-      names.get(4), {}, numbers.slice(kNumbers).vec(), preconditioner.vec(), counts[6].expect_int() != 0};
+                    "the options of a solve are ", int64_t{kNames}, " names, ", int64_t{kCounts}, " counts and ",
+                    int64_t{kNumbers}, " numbers, got ", names.size(), ", ", counts.size(), " and ", numbers.size());
+  const auto count = [&](Count which) { return counts[which].expect_int(); };
+  OperatorSpec inverse{names.get(kPreconditioner),
+                       {},
+                       numbers.slice(kNumbers).vec(),
+                       preconditioner.vec(),
+                       count(kIsPreconditionerTransposed) != 0};
   for (const auto& n : counts.slice(kCounts)) inverse.shape.push_back(n.expect_int());
-  SolveOptions o{{method_from_name(names.get(0)), counts[0], numbers[0], counts[1].expect_int(), std::move(inverse)},
-                 backward_from_name(names.get(1))};
-  if (counts[4].expect_int() != 0) o.adjoint_max_iter = counts[5];
-  if (numbers[1] != 0.0) o.adjoint_rtol = numbers[2];
-  detail::take_bits(counts[7], o.solver.rtol, o.traced_rtol);
-  detail::take_bits(counts[8], o.adjoint_rtol, o.traced_adjoint_rtol);
-  o.on_failure = on_failure_from_name(names.get(2));
-  o.adjoint_log = counts[2].expect_int();
-  o.checkpoint_every = counts[3].expect_int();
-  o.start = start_from_name(names.get(3));
+
+  SolveOptions o{{method_from_name(names.get(kMethod)), counts[kMaxIter]}, backward_from_name(names.get(kBackward))};
+  o.solver.rtol = numbers[kRtol];
+  o.solver.restart = count(kRestart);
+  o.solver.preconditioner = std::move(inverse);
+  if (count(kHasAdjointMaxIter) != 0) o.adjoint_max_iter = counts[kAdjointMaxIter];
+  if (numbers[kHasAdjointRtol] != 0.0) o.adjoint_rtol = numbers[kAdjointRtol];
+  detail::take_bits(counts[kRtolBits], o.solver.rtol, o.traced_rtol);
+  detail::take_bits(counts[kAdjointRtolBits], o.adjoint_rtol, o.traced_adjoint_rtol);
+  o.on_failure = on_failure_from_name(names.get(kOnFailure));
+  o.adjoint_log = count(kAdjointLog);
+  o.checkpoint_every = count(kCheckpointEvery);
+  o.start = start_from_name(names.get(kStart));
   return o;
 }
 
@@ -102,6 +142,57 @@ template <class Op, class... Front>
 auto call_with_options(const Op& op, const SolveOptions& o, const Front&... front) {
   const PackedOptions packed(o);
   return op.call(front..., packed.names, packed.counts, packed.numbers, packed.preconditioner);
+}
+
+/// A solve but its right-hand side, as the ops take it that solve or differentiate one: behind their own arguments, the
+/// operator, the start and the options.
+struct SolveCall {
+  OperatorSpec a;
+  SolveOptions options;
+  at::Tensor x0;
+};
+
+#define PRDP_SOLVE_SCHEMA \
+  "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA
+
+namespace detail {
+
+template <class Signature>
+struct AddSolve;
+template <class Result, class... Front>
+struct AddSolve<Result(Front...)> {
+  using Type = WithOptions<Result(Front..., at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
+                                  bool, const OptionalTensor&)>;
+};
+
+}  // namespace detail
+
+/// The type of the kernel of an op whose schema ends in PRDP_SOLVE_SCHEMA.
+template <class Signature>
+using WithSolve = typename detail::AddSolve<Signature>::Type;
+
+/// Raises as unpack() of its options.
+template <class... Options>
+SolveCall unpack_solve(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
+                       at::ArrayRef<double> parameters, bool transposed, const OptionalTensor& x0,
+                       const Options&... options) {
+  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
+          unpack(options...),
+          x0.value_or(at::Tensor())};
+}
+
+template <class Op, class... Front>
+auto call_with_solve(const Op& op, const OperatorSpec& a, const at::Tensor& x0, const SolveOptions& o,
+                     const Front&... front) {
+  return call_with_options(op, o, front..., a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(x0));
+}
+
+/// The gradients as an op returns them, those alone that are `needed`, each in the place of its input.
+inline std::vector<at::Tensor> in_places(const std::vector<at::Tensor>& gradients, at::IntArrayRef needed) {
+  std::vector<at::Tensor> of_inputs(needed.size());
+  for (size_t i = 0, next = 0; i < needed.size(); ++i)
+    if (needed[i]) of_inputs[i] = gradients[next++];
+  return of_inputs;
 }
 
 /// A SolveResult as an op returns it, and back.
@@ -123,8 +214,8 @@ inline SolveResult result_of(SolveOutputs outputs) {
           {std::move(iterations), std::move(residual), std::move(status), std::move(applications), std::move(floor)}};
 }
 
-/// The same of fake tensors: a report of numbers of these sizes, in the dtype of `like`.
-inline SolveInfo fake_info(const at::Tensor& like, c10::SymIntArrayRef sizes) {
+/// A report of these sizes without values, in the dtype of `like`; of fake tensors, too.
+inline SolveInfo empty_info(const at::Tensor& like, c10::SymIntArrayRef sizes) {
   const auto counts = [&] { return at::empty_symint(sizes, like.options().dtype(at::kLong)); };
   const auto numbers = [&] { return at::empty_symint(sizes, like.options()); };
   return {counts(), numbers(), counts(), counts(), numbers()};

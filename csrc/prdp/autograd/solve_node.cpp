@@ -55,9 +55,7 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
   }
   const WithoutAutocast full_precision;
   const FailuresOfStep here(step_.first, step_.second);
-  if (is_batch_of_cotangents(cotangent))
-    return for_each_cotangent(cotangent, [&](const at::Tensor& one) { return gradients(one, solved, a); });
-  return gradients(cotangent, solved, a);
+  return for_each_cotangent(cotangent, [&](const at::Tensor& one) { return gradients(one, solved, a); });
 }
 
 variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a) const {

@@ -120,8 +120,8 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     const auto first = number(Kind::kDot, dots[0], of, out.version);
     return {first, number(Kind::kSquare, dots[1], out.version)};
   }
-  Scalar sum_of_squares(const Scalar& rr, const Scalar& beta, const Scalar& pp) const {
-    return values_.sum_of_squares(rr.value, beta.value, pp.value);
+  Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) const {
+    return values_.sum_of_squares(v2.value, a.value, w2.value);
   }
   bool is_preconditioned() const { return values_.is_preconditioned(); }
   Scalar precondition(const Vector& v, Vector& out) {
@@ -167,12 +167,12 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
-  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
-    const T length = values_.guarded_quotient(num.value, den.value, a2.value, b2.value);
-    return length == T(0) ? Scalar(length) : num / den;
+  Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
+    const T value = values_.guarded_quotient(num.value, den.value, v2.value, w2.value);
+    return value == T(0) ? Scalar(value) : num / den;
   }
-  Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& going) const {
-    return values_.breaks_down(den.value, a2.value, b2.value, going.value);
+  Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active) const {
+    return values_.breaks_down(den.value, v2.value, w2.value, active.value);
   }
   Scalar ratio(const Scalar& num, const Scalar& den) const {
     const T value = values_.ratio(num.value, den.value);
@@ -181,11 +181,11 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
     values_.break_down_unless_positive(a.value, r2.value);
   }
-  Scalar is_rounding(const Scalar& a, const Scalar& b2, const Scalar& c2, double factor) const {
-    return values_.is_rounding(a.value, b2.value, c2.value, factor);
+  Scalar is_rounding(const Scalar& a, const Scalar& v2, const Scalar& w2, double factor) const {
+    return values_.is_rounding(a.value, v2.value, w2.value, factor);
   }
-  Scalar unless_zero(const Scalar& value, const Scalar& a, const Scalar& b) const {
-    return a.value != 0 && b.value != 0 ? value : Scalar(0);
+  Scalar unless_zero(const Scalar& a, const Scalar& b, const Scalar& active) const {
+    return b.value != 0 && active.value != 0 ? a : Scalar(0);
   }
 
   Scalar constant(const Scalar& a) const { return a.value; }

@@ -2,10 +2,10 @@
 
 #include "prdp/autograd/tape_samples.h"
 #include "prdp/autograd/unrolled_vjp.h"
-#include "prdp/kernels/share_samples.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
+#include "prdp/threads/share_samples.h"
 
 namespace prdp {
 

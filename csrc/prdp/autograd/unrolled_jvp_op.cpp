@@ -14,28 +14,25 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] needed, "
-    "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA
-    ") -> Tensor";
-using Signature = WithOptions<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                                         const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
-                                         at::IntArrayRef, at::ArrayRef<double>, bool, const OptionalTensor&)>;
+    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] "
+    "needed, " PRDP_SOLVE_SCHEMA ") -> Tensor";
+using Signature = WithSolve<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                       const at::Tensor&, at::IntArrayRef)>;
 
 /// The product with the cotangent is linear in it; the transpose of that is the product with the tangents.
-template <class... Options>
+template <class... Args>
 at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Tensor& iterations,
-                      const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed,
-                      at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                      at::ArrayRef<double> parameters, bool transposed, const OptionalTensor& x0, Options... packed) {
-  OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
-  auto options = unpack(packed...);
-  options.adjoint_log = 0;
+                      const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, Args... args) {
+  auto call = unpack_solve(args...);
+  call.options.adjoint_log = 0;
   return with_autograd([&] {
     const auto leaf = [](const at::Tensor& t, bool wanted) { return t.detach().requires_grad_(wanted); };
-    const Solved solved{leaf(b, needed[0]), {}, iterations, status, residual, x0 ? x0->detach() : at::Tensor()};
-    for (size_t i = 0; i < tensors.size(); ++i) a.tensors.push_back(leaf(tensors[i], needed[i + 1]));
+    const Solved solved{
+        leaf(b, needed[0]), {}, iterations, status, residual, call.x0.defined() ? call.x0.detach() : call.x0};
+    auto& tensors = call.a.tensors;
+    for (size_t i = 0; i < tensors.size(); ++i) tensors[i] = leaf(tensors[i], needed[i + 1]);
     const auto cotangent = at::ones_like(b).requires_grad_();  // any: the map is linear
-    const auto found = unrolled_vjp_recorded(cotangent, solved, a, options, needed);
+    const auto found = unrolled_vjp_recorded(cotangent, solved, call.a, call.options, needed);
     std::vector<at::Tensor> gradients, along;
     for (size_t i = 0, next = 0; i < needed.size(); ++i) {
       if (!needed[i]) continue;
@@ -51,10 +48,8 @@ at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Te
   });
 }
 
-template <class... Options>
-at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                       at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, bool,
-                       const OptionalTensor&, Options...) {
+template <class... Others>
+at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, Others...) {
   return at::empty_symint(b.sym_sizes(), b.options());
 }
 
@@ -90,8 +85,8 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
 at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
                         const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
-  return call_with_options(op, options, tangents, solved.b, solved.iterations, solved.status, solved.residual, needed,
-                           a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(solved.x0));
+  return call_with_solve(op, a, solved.x0, options, tangents, solved.b, solved.iterations, solved.status,
+                         solved.residual, needed);
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

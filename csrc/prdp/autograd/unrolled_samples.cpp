@@ -16,12 +16,12 @@ namespace prdp {
 
 namespace {
 
-/// How a sample gets its derivative.
-enum class Way {
-  kIterations,  // that of its iterations
-  kImplicit,    // that of the solution
-  kNone,        // none: its solve failed
-  kRefused,     // none: its cotangent is not finite
+/// Which derivative a sample gets.
+enum class Derivative {
+  kOfIterations,
+  kOfSolution,
+  kNone,     // its solve failed
+  kRefused,  // none: its cotangent is not finite
 };
 
 /// ‖ū - Aᵀ b̄‖ / ‖ū‖ of each sample, within the range of Aᵀ, where A is singular; 0 where ū is.
@@ -54,7 +54,7 @@ struct SampleVjps {
   const bool for_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double asked_ = options_.adjoint_rtol.value_or(options_.solver.rtol);  // tolerance of adjoint solves
-  std::vector<Way> ways_{};
+  std::vector<Derivative> derivatives_{};
   Rows rows_ = finite_rows(cotangent_);        // whose gradients are finite
   at::Tensor bar_ = only(cotangent_, rows_);   // the cotangent of samples that are not refused
   std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
@@ -77,10 +77,10 @@ struct SampleVjps {
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
     for (int64_t i = 0; i < batch_; ++i)
-      ways_.push_back(!rows_[i]                             ? Way::kRefused
-                      : exact[i]                            ? Way::kImplicit
-                      : zero_grad_ && is_failure(status(i)) ? Way::kNone
-                                                            : Way::kIterations);
+      derivatives_.push_back(!rows_[i]                             ? Derivative::kRefused
+                             : exact[i]                            ? Derivative::kOfSolution
+                             : zero_grad_ && is_failure(status(i)) ? Derivative::kNone
+                                                                   : Derivative::kOfIterations);
   }
 
   /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`.
@@ -88,7 +88,7 @@ struct SampleVjps {
     gradients_ = finite_sum(rows, [this](const Rows& some) {
       auto sum = take_iterations_back(some);
       auto implicit = some;
-      for (int64_t i = 0; i < batch_; ++i) implicit[i] = some[i] && ways_[i] == Way::kImplicit;
+      for (int64_t i = 0; i < batch_; ++i) implicit[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
       if (any(implicit)) add_adjoint_solves(implicit, sum);
       return sum;
     });
@@ -99,7 +99,8 @@ struct SampleVjps {
     const bool of_none = !any(rows);  // what the iterations make of no cotangent, finite or not
     for (int64_t i = 0; i < batch_; ++i) {
       outcomes_[i] = {status(i), counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
-      if ((rows[i] || of_none) && ways_[i] == Way::kIterations) caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
+      if ((rows[i] || of_none) && derivatives_[i] == Derivative::kOfIterations)
+        caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
     }
     if (!caps.any().item<bool>()) return std::vector<at::Tensor>(needed_.size());
     auto found = of_iterations_(
@@ -138,8 +139,8 @@ struct SampleVjps {
     bool any_far = false;
     for (int64_t i = 0; i < batch_; ++i) {
       const bool ended = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      if (!ended || ways_[i] != Way::kIterations || !rows_[i] || !(residual[i] > 1.0)) continue;
-      ways_[i] = Way::kImplicit;
+      if (!ended || derivatives_[i] != Derivative::kOfIterations || !rows_[i] || !(residual[i] > 1.0)) continue;
+      derivatives_[i] = Derivative::kOfSolution;
       any_far = true;
     }
     if (any_far) differentiate(rows_);
@@ -153,12 +154,15 @@ struct SampleVjps {
     differentiate(good);
     outcomes_ = said;
   }
-  bool adjoint_failed(int64_t i) const { return ways_[i] == Way::kImplicit && is_failure(outcomes_[i].status); }
+  bool adjoint_failed(int64_t i) const {
+    return derivatives_[i] == Derivative::kOfSolution && is_failure(outcomes_[i].status);
+  }
 
   SolveInfo report() {
     for (int64_t i = 0; i < batch_; ++i)
       if (!rows_[i])
-        outcomes_[i] = zero_instead(ways_[i] == Way::kRefused ? SolveStatus::kNonfiniteInput : SolveStatus::kOverflow);
+        outcomes_[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
+                                                                            : SolveStatus::kOverflow);
     auto failures = outcomes_;
     for (int64_t i = 0; i < batch_; ++i)
       if (rows_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;

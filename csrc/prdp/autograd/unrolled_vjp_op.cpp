@@ -16,12 +16,10 @@ namespace {
 
 constexpr const char* kSchema =
     "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
-    "int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, bool "
-    "transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
+    "int[] needed, " PRDP_SOLVE_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-using Signature = WithOptions<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                                      const at::Tensor&, at::IntArrayRef, at::TensorList, c10::string_view,
-                                      at::IntArrayRef, at::ArrayRef<double>, bool, const OptionalTensor&)>;
+using Signature = WithSolve<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                    const at::Tensor&, at::IntArrayRef)>;
 
 /// The iterations, run again and taken back.
 UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -51,32 +49,25 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
   auto a = solve.a;
   for (auto& t : a.tensors) t = at::alias(t);
   const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.x0, solve.solver, solve.iterations);
-  UnrolledVjp found{std::vector<at::Tensor>(needed.size()), 2 * applications};
   std::vector<at::Tensor> inputs;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) inputs.push_back(i == 0 ? rhs : a.tensors[i - 1]);
   const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
                                                /*create_graph=*/true, /*allow_unused=*/true);
-  for (size_t i = 0, next = 0; i < needed.size(); ++i)
-    if (needed[i]) found.gradients[i] = gradients[next++];
-  return found;
+  return {in_places(gradients, needed), 2 * applications};
 }
 
-template <class... Options>
+template <class... Args>
 Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::Tensor& iterations,
-                   const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, at::TensorList tensors,
-                   c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters, bool transposed,
-                   const OptionalTensor& x0, Options... packed) {
+                   const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, Args... args) {
   const at::NoGradGuard no_grad;
-  OperatorSpec a{std::string(kind), shape.vec(), parameters.vec(), {}, transposed};
-  for (const auto& t : tensors) a.tensors.push_back(t.detach());
-  const auto options = unpack(packed...);
+  auto [a, options, x0] = unpack_solve(args...);
+  for (auto& t : a.tensors) t = t.detach();
   make_operator(a)->check_parameters(checks_of(options.on_failure));
   auto with_b = needed.vec();  // b̄ tells whether the derivative is one of the solution
   if (!traits(options.solver.method).is_polynomial) with_b[0] = 1;
-  const auto found =
-      vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0.value_or(at::Tensor())}, a, options,
-                     with_b, run_iterations_back, linear_solve_kernel);
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, with_b,
+                                    run_iterations_back, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);
@@ -86,15 +77,14 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   return {gradients, info.iterations, residual_or_not, info.status, info.operator_applications, info.floor};
 }
 
-template <class... Options>
+template <class... Others>
 Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
-                    at::IntArrayRef needed, at::TensorList tensors, c10::string_view, at::IntArrayRef,
-                    at::ArrayRef<double>, bool, const OptionalTensor&, Options...) {
+                    at::IntArrayRef needed, at::TensorList tensors, Others...) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
     if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
-  const auto info = fake_info(b, {b.sym_size(0)});
+  const auto info = empty_info(b, {b.sym_size(0)});
   return {gradients, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }
 
@@ -103,14 +93,10 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, c
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
-  const auto [gradients, iterations, residual, status, applications, floor] =
-      call_with_options(op, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed,
-                        a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(solved.x0));
+  const auto [gradients, iterations, residual, status, applications, floor] = call_with_solve(
+      op, a, solved.x0, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed);
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
-  SolveVjp found{std::vector<at::Tensor>(needed.size()), {iterations, or_nan, status, applications, floor}};
-  for (size_t i = 0, next = 0; i < needed.size(); ++i)
-    if (needed[i]) found.gradients[i] = gradients[next++];
-  return found;
+  return {in_places(gradients, needed), {iterations, or_nan, status, applications, floor}};
 }
 
 SolveVjp unrolled_vjp_recorded(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,

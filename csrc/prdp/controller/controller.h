@@ -52,13 +52,13 @@ class Controller {
 
   virtual ~Controller() = default;
   /// K for the next interval.
-  virtual int64_t max_iter() const = 0;
+  int64_t max_iter() const { return state_.max_iter; }
   /// All limits for the next interval, K included.
   virtual Budget budget() const = 0;
   /// Call this after each interval, and once before the first. A smaller metric is better. Returns true if the solves
   /// were refined. Raises ValueError, and changes nothing, for a negative or non-finite metric; a schedule ignores it.
   virtual bool step(double metric, const Solves& solves = {}) = 0;
-  virtual const State& state() const = 0;
+  const State& state() const { return state_; }
   /// Restores a state. Raises ValueError, and changes nothing, for a state that these settings cannot have reached.
   virtual void load_state(State state) = 0;
 
@@ -73,6 +73,7 @@ class Controller {
   std::optional<std::string> warning() const;
 
  protected:
+  explicit Controller(int64_t max_iter) : state_{max_iter} {}
   /// Raises ValueError unless the metric, called `what` in the message, is finite and >= 0. warning() then reports it.
   void check_metric(double metric, const char* what);
   /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0. warning() then
@@ -87,6 +88,8 @@ class Controller {
   virtual bool stalled() const = 0;
   /// The residual that the solves before the last step() were asked for, which is no cause for a warning.
   virtual double asked_for() const { return 0.0; }
+
+  State state_;
 
  private:
   std::string about_metric() const;

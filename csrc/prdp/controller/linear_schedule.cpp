@@ -7,7 +7,7 @@
 namespace prdp {
 
 LinearSchedule::LinearSchedule(int64_t initial, int64_t increment, int64_t maximum, std::optional<double> adjoint_ratio)
-    : initial_(initial), increment_(increment), maximum_(maximum), adjoint_ratio_(adjoint_ratio), state_{initial} {
+    : Controller(initial), initial_(initial), increment_(increment), maximum_(maximum), adjoint_ratio_(adjoint_ratio) {
   TORCH_CHECK_VALUE(initial >= 0, "LinearSchedule: initial must be >= 0, got ", initial);
   TORCH_CHECK_VALUE(increment >= 0, "LinearSchedule: increment must be >= 0, got ", increment);
   TORCH_CHECK_VALUE(maximum >= initial, "LinearSchedule: maximum must be >= initial = ", initial, ", got ", maximum);

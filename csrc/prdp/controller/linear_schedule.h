@@ -11,10 +11,8 @@ class LinearSchedule final : public Controller {
   /// 0 <= initial <= maximum, increment >= 0 and 0 < adjoint_ratio <= 1.
   LinearSchedule(int64_t initial, int64_t increment, int64_t maximum, std::optional<double> adjoint_ratio = {});
 
-  int64_t max_iter() const override { return state_.max_iter; }
   Budget budget() const override;
   bool step(double metric = 0.0, const Solves& solves = {}) override;
-  const State& state() const override { return state_; }
   void load_state(State state) override;
 
   int64_t initial() const { return initial_; }
@@ -29,7 +27,6 @@ class LinearSchedule final : public Controller {
 
   int64_t initial_, increment_, maximum_;
   std::optional<double> adjoint_ratio_;
-  State state_;
 };
 
 }  // namespace prdp

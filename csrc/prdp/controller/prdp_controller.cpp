@@ -7,7 +7,7 @@
 
 namespace prdp {
 
-PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
+PRDPController::PRDPController(PRDPSettings settings) : Controller(settings.initial), settings_(settings) {
   const auto& s = settings_;
   TORCH_CHECK_VALUE(std::isfinite(s.tau_step) && s.tau_step > 0.0,
                     "PRDPController: tau_step must be finite and > 0, got ", s.tau_step);
@@ -21,7 +21,6 @@ PRDPController::PRDPController(PRDPSettings settings) : settings_(settings) {
                     ", got ", s.maximum.value_or(0));
   TORCH_CHECK_VALUE(std::isfinite(s.growth) && s.growth >= 1.0, "PRDPController: growth must be finite and >= 1, got ",
                     s.growth);
-  state_.max_iter = s.initial;
   budget();
 }
 

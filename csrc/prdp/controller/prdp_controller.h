@@ -31,13 +31,11 @@ class PRDPController final : public Controller {
   /// Raises ValueError for a setting outside its range, naming it.
   explicit PRDPController(PRDPSettings settings = {});
 
-  int64_t max_iter() const override { return state_.max_iter; }
   Budget budget() const override;
   /// Raises ValueError, and changes nothing, unless the metric is finite and >= 0.
   bool step(double metric, const Solves& solves = {}) override;
 
   const PRDPSettings& settings() const { return settings_; }
-  const State& state() const override { return state_; }
   void load_state(State state) override;
 
  private:
@@ -49,7 +47,6 @@ class PRDPController final : public Controller {
   bool should_refine() const;
 
   PRDPSettings settings_;
-  State state_;
 };
 
 }  // namespace prdp

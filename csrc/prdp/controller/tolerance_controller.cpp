@@ -8,7 +8,8 @@
 
 namespace prdp {
 
-ToleranceController::ToleranceController(ToleranceSettings settings) : settings_(settings), state_{settings.maximum} {
+ToleranceController::ToleranceController(ToleranceSettings settings)
+    : Controller(settings.maximum), settings_(settings) {
   const auto& s = settings_;
   TORCH_CHECK_VALUE(s.ratio > 0.0 && s.ratio < 1.0, "ToleranceController: ratio must be > 0 and < 1, got ", s.ratio);
   TORCH_CHECK_VALUE(s.floor > 0.0 && s.floor < 1.0, "ToleranceController: floor must be > 0 and < 1, got ", s.floor);

@@ -27,14 +27,12 @@ class ToleranceController final : public Controller {
   /// The rtol for this smallest error so far.
   double rtol_for(double smallest) const;
   double adjoint_rtol() const;
-  int64_t max_iter() const override { return settings_.maximum; }
   Budget budget() const override;
   /// `error` is relative, as Solves::error. Returns true if the tolerance became smaller. Raises ValueError, and
   /// changes nothing, unless the error is finite and >= 0.
   bool step(double error, const Solves& solves = {}) override;
 
   const ToleranceSettings& settings() const { return settings_; }
-  const State& state() const override { return state_; }
   void load_state(State state) override;
 
  private:
@@ -47,7 +45,6 @@ class ToleranceController final : public Controller {
   double asked_for() const override;
 
   ToleranceSettings settings_;
-  State state_;
 };
 
 }  // namespace prdp

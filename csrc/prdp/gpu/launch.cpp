@@ -6,12 +6,13 @@
 #include <limits>
 
 #include "prdp/gpu/fall_back.h"
+#include "prdp/gpu/team_size.h"
 
 namespace prdp::gpu {
 
 namespace {
 
-constexpr int64_t kWarp = 32, kThreadsOfPoints = 256;
+constexpr int64_t kThreadsOfPoints = 256;
 
 /// A kernel counts its points by an int, and adds the number of its threads to it.
 void check_count(int64_t count) {
@@ -32,11 +33,6 @@ std::shared_ptr<const Kernel> kernel_of(Runtime& runtime, c10::Device device, co
 }
 
 }  // namespace
-
-TeamSize team_size(int64_t points, const Limits& limits) {
-  const int64_t blocks = at::divup(points, limits.cells_of_block);
-  return {blocks, std::min(limits.threads, at::divup(at::divup(points, blocks), kWarp) * kWarp)};
-}
 
 bool launch_points(c10::Device device, const Body& body, const void* arguments, int64_t count) {
   auto* const runtime = runtime_of(device);

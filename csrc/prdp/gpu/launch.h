@@ -13,12 +13,6 @@ struct Body {
   std::string type, header;
 };
 
-/// Blocks and threads that work on a sample of so many points: of the device and the sample alone.
-struct TeamSize {
-  int64_t blocks, threads;
-};
-TeamSize team_size(int64_t points, const Limits& limits);
-
 bool launch_points(c10::Device device, const Body& body, const void* arguments, int64_t count);
 
 /// The kernel of a loop over samples, and the memory of its teams.

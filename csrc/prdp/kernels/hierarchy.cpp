@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 
+#include "prdp/kernels/galerkin.h"
 #include "prdp/kernels/given_stencil.h"
 
 namespace prdp::kernels {

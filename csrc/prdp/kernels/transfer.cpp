@@ -47,9 +47,7 @@ int64_t Transfer<T>::weights_at(int64_t z, int64_t y) const {
 template <class T>
 typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights) const {
   const auto& [nz, ny, nx] = fine_.shape;
-  const auto from = [&, ny = ny, nx = nx](int64_t z, int64_t y, int64_t x) {
-    return ((z + 1) * (ny + 2) + y + 1) * (nx + 2) + x + 1;
-  };
+  const RingedGrid ringed(fine_);
   const int64_t first = periodic_ ? 1 : 0, count = between();
   int64_t extent[3] = {nz, ny, nx};
   extent[axis_] = axis_ == 2 ? count + 2 : count;
@@ -60,7 +58,7 @@ typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights
       for (int64_t y = 0; y < extent[1]; ++y) {
         T* const to = some->data() + weights_at(z, y);
         const int64_t fine_z = axis_ == 0 ? 2 * z + first : z, fine_y = axis_ == 1 ? 2 * y + first : y;
-        const T* const row = all->data() + from(fine_z, fine_y, 0);
+        const T* const row = all->data() + ringed.at(fine_z, fine_y, 0);
         if (axis_ != 2) {
           std::copy_n(row, nx, to);
           continue;

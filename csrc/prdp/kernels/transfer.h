@@ -1,7 +1,7 @@
 #pragma once
 #include <vector>
 
-#include "prdp/kernels/galerkin.h"
+#include "prdp/kernels/interpolation_weights.h"
 #include "prdp/kernels/layout.h"
 
 namespace prdp::kernels {

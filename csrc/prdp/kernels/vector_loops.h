@@ -19,7 +19,7 @@ void for_each_block(int64_t first, int64_t count, const Body& body) {
 }
 
 /// Vectors that one pass takes at once.
-constexpr int kBlock = kRegisterBytes == 64 ? 8 : 4;
+constexpr int kVectorsAtOnce = kRegisterBytes == 64 ? 8 : 4;
 
 /// h_j = v_j·(factor·w) for the first Count vectors of v, in as many partial sums as hide the latency of an addition.
 template <int Count, class T>
@@ -42,7 +42,8 @@ void dot_block(const T* const* v, T factor, const T* w, T* h, int64_t n) {
 
 template <class T>
 void multi_dot(const T* const* v, int64_t count, T factor, const T* w, T* h, int64_t n) {
-  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) { dot_block<size.value>(v + j, factor, w, h + j, n); });
+  for_each_block<kVectorsAtOnce>(0, count,
+                                 [&](int64_t j, auto size) { dot_block<size.value>(v + j, factor, w, h + j, n); });
 }
 
 template <class T>
@@ -86,7 +87,7 @@ T axpy_block(T sign, const T* alpha, const T* const* v, T factor, T* w, int64_t 
 template <class T>
 T multi_axpy(T sign, const T* alpha, const T* const* v, int64_t count, T factor, T* w, int64_t n) {
   T norm2 = 0;
-  for_each_block<kBlock>(0, count, [&](int64_t j, auto size) {
+  for_each_block<kVectorsAtOnce>(0, count, [&](int64_t j, auto size) {
     norm2 = axpy_block<size.value>(sign, alpha + j, v + j, j == 0 ? factor : T(1), w, n);
   });
   return norm2;

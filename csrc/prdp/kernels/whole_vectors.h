@@ -2,17 +2,38 @@
 #include <algorithm>
 #include <array>
 #include <cstring>
+#include <memory>
+#include <utility>
 #include <vector>
 
-#include "prdp/kernels/field.h"
 #include "prdp/kernels/loops.h"
 #include "prdp/threads/share_rows.h"
 
 namespace prdp::kernels {
 
-/// Values in a block of a long vector. Sums are taken over blocks and then added in order, so that no bit of them
-/// depends on the number of threads.
-inline constexpr int64_t kBlock = 8192;
+using share_rows::kBlock;
+
+/// Allocates memory without a value. New pages are most of what it costs to set up a large grid, and whoever writes to
+/// them first pays: so all threads fill a field, each its part.
+template <class T>
+struct Unset : std::allocator<T> {
+  template <class U>
+  struct rebind {
+    using other = Unset<U>;
+  };
+  template <class U>
+  void construct(U* at) {
+    ::new (static_cast<void*>(at)) U;
+  }
+  template <class U, class... Values>
+  void construct(U* at, Values&&... values) {
+    ::new (static_cast<void*>(at)) U(std::forward<Values>(values)...);
+  }
+};
+
+/// The coefficients, weights or values of a grid.
+template <class T>
+using Field = std::vector<T, Unset<T>>;
 
 /// Calls body(begin, end) for each block of n values.
 template <class Body>

@@ -3,7 +3,7 @@
 #include <limits>
 
 #include "prdp/kernels/kernel.h"
-#include "prdp/kernels/share_samples.h"
+#include "prdp/threads/share_samples.h"
 
 namespace prdp {
 

@@ -34,13 +34,10 @@ std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, 
   return {as_winds(std::move(channels)), nu.to(step_.nu.options())};
 }
 
-at::Tensor BurgersOperator::solve_directly(const at::Tensor& b) const {
-  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_directly(b);
-  return solve_channels(channel_matrix(*this, winds_.options()), b);
-}
-at::Tensor BurgersOperator::solve_transpose_directly(const at::Tensor& b) const {
-  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_transpose_directly(b);
-  return solve_channels(channel_matrix(*this, winds_.options()).mT(), b);
+at::Tensor BurgersOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  if (!b.is_cpu()) return StencilOperator(as_stencil(b)).solve_directly(b, transposed);
+  const auto matrix = channel_matrix(*this, winds_.options());
+  return solve_channels(transposed ? matrix.mT() : matrix, b);
 }
 
 OperatorSpec BurgersOperator::as_stencil(const at::Tensor& b) const {

@@ -164,12 +164,12 @@ OperatorSpec DiffusionOperator::as_stencil() const {
 
 at::Tensor DiffusionOperator::norm() const { return StencilOperator(as_stencil()).norm(); }
 
-at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b) const {
-  if (!takes_differences() || !b.is_cpu()) return StencilOperator(as_stencil()).solve_directly(b);
+at::Tensor DiffusionOperator::solve_directly(const at::Tensor& b, bool /*transposed*/) const {
+  if (!takes_differences() || !b.is_cpu()) return StencilOperator(as_stencil()).solve_directly(b, false);
   auto wide = *this;  // a diagonal in float32 would lose what the loops keep
   wide.kappa_ = kappa_.to(at::kDouble);
   wide.shift_ = shift_.to(at::kDouble);
-  return StencilOperator(wide.as_stencil()).solve_directly(b.to(at::kDouble)).to(b.scalar_type());
+  return StencilOperator(wide.as_stencil()).solve_directly(b.to(at::kDouble), false).to(b.scalar_type());
 }
 
 std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) const {

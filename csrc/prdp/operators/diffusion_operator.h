@@ -42,8 +42,7 @@ class DiffusionOperator final : public Operator {
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
   at::Tensor diagonal() const override { return coefficients().narrow(1, 0, 1); }
   at::Tensor norm() const override;
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;

@@ -200,12 +200,9 @@ std::vector<int64_t> FunctionOperator::vector_shape() const {
   TORCH_CHECK_VALUE(false, "Function: its matrix has no known size");
 }
 
-at::Tensor FunctionOperator::solve_directly(const at::Tensor& b) const {
-  return solve(probe([this](const at::Tensor& v) { return apply(v); }, b), b);
-}
-
-at::Tensor FunctionOperator::solve_transpose_directly(const at::Tensor& b) const {
-  return solve(probe([this](const at::Tensor& v) { return apply_transpose(v); }, b), b);
+at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  const auto product = [&](const at::Tensor& v) { return transposed ? apply_transpose(v) : apply(v); };
+  return solve(probe(product, b), b);
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

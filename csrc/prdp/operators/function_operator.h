@@ -69,8 +69,7 @@ class FunctionOperator final : public Operator {
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   /// Raises ValueError if it was not given.
   at::Tensor diagonal() const override;
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   /// Not known: 0, or NaN if a tensor is not finite.
   at::Tensor norm() const override;

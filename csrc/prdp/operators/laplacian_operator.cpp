@@ -63,7 +63,7 @@ at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
   return along_axes(waves, axes->bases, /*transposed=*/false).to(b.scalar_type());
 }
 
-at::Tensor LaplacianOperator::solve_directly(const at::Tensor& b) const {
+at::Tensor LaplacianOperator::solve_directly(const at::Tensor& b, bool /*transposed*/) const {
   if (!b.is_cpu()) return solve_on_device(b);
   const auto eigenvalues = symbol(laplacian_eigenvalues(grid_, b.options()));
   return sine_transform(sine_transform(b, grid_) / eigenvalues.to(b.scalar_type()), grid_);

@@ -11,8 +11,7 @@ class LaplacianOperator : public Operator {
   void check_vector(const at::Tensor& b) const override { grid_.check_field(b, 1); }
   at::Tensor apply_transpose(const at::Tensor& v) const override { return apply(v); }
   at::Tensor diagonal() const override;
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve_directly(b); }
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   at::Tensor norm() const override;
   at::Tensor jacobi_radius() const override;
   bool knows_jacobi_radius() const override { return true; }

@@ -47,9 +47,9 @@ void check_rows(const int64_t* crow, const int64_t* col, int64_t n, int64_t stor
                       " rows must lie in [0, ", n, "), got ", col[k], " at index ", k);
 }
 
-at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b) {
+at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b, bool transposed) {
   // A singular matrix gives a non-finite solution here, and a status there.
-  return solve_dense(matrix, b.unsqueeze(-1)).squeeze(-1);
+  return solve_dense(transposed ? matrix.mT() : matrix, b.unsqueeze(-1)).squeeze(-1);
 }
 
 }  // namespace
@@ -72,8 +72,9 @@ at::Tensor DenseOperator::apply_transpose(const at::Tensor& v) const { return ma
 at::Tensor DenseOperator::diagonal() const { return matrix_.diagonal(0, -2, -1); }
 at::Tensor DenseOperator::norm() const { return matrix_.abs().sum(-1).amax(-1); }
 
-at::Tensor DenseOperator::solve_directly(const at::Tensor& b) const { return solve_matrix(matrix_, b); }
-at::Tensor DenseOperator::solve_transpose_directly(const at::Tensor& b) const { return solve_matrix(matrix_.mT(), b); }
+at::Tensor DenseOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  return solve_matrix(matrix_, b, transposed);
+}
 
 std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
@@ -201,8 +202,9 @@ at::Tensor CsrOperator::to_dense() const {
   return flat.view(shape);
 }
 
-at::Tensor CsrOperator::solve_directly(const at::Tensor& b) const { return solve_matrix(to_dense(), b); }
-at::Tensor CsrOperator::solve_transpose_directly(const at::Tensor& b) const { return solve_matrix(to_dense().mT(), b); }
+at::Tensor CsrOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  return solve_matrix(to_dense(), b, transposed);
+}
 
 namespace {
 

@@ -11,8 +11,7 @@ class DenseOperator final : public Operator {
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;
@@ -39,8 +38,7 @@ class CsrOperator final : public Operator {
   at::Tensor apply(const at::Tensor& v) const override;
   at::Tensor apply_transpose(const at::Tensor& v) const override;
   at::Tensor diagonal() const override;
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor norm() const override;
   std::vector<int64_t> first_nonfinite(int64_t sample) const override;

@@ -103,9 +103,9 @@ at::Tensor NavierStokesOperator::regular_matrix() const {
   return a + at::outer(pressure, pressure) / static_cast<double>(cells);
 }
 
-at::Tensor NavierStokesOperator::solve(const at::Tensor& matrix, const at::Tensor& b) const {
-  const auto rhs = project(b).flatten(1).unsqueeze(-1);
-  return project(solve_dense(matrix, rhs).reshape_as(b));
+at::Tensor NavierStokesOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  const auto matrix = regular_matrix(), rhs = project(b).flatten(1).unsqueeze(-1);
+  return project(solve_dense(transposed ? matrix.mT() : matrix, rhs).reshape_as(b));
 }
 
 std::shared_ptr<const kernels::Kernels> NavierStokesOperator::kernels(const at::Tensor& b, bool transposed) const {

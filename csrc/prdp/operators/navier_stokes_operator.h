@@ -31,8 +31,7 @@ class NavierStokesOperator final : public UpwindOperator {
   /// v with its mean pressure taken off.
   at::Tensor project(const at::Tensor& v) const override { return without_mean_pressure(v); }
   /// The solution of least norm to the projected right-hand side.
-  at::Tensor solve_directly(const at::Tensor& b) const override { return solve(regular_matrix(), b); }
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return solve(regular_matrix().mT(), b); }
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   std::unique_ptr<Operator> select(const at::Tensor& index) const override;
   bool has_multigrid_preconditioner() const override { return true; }
@@ -49,7 +48,6 @@ class NavierStokesOperator final : public UpwindOperator {
   at::Tensor couple(const at::Tensor& c1_u1, const at::Tensor& c2_u2, double s, const at::Tensor& v) const;
   /// A plus the mean of the pressure in each of its rows, (batch or 1, n, n).
   at::Tensor regular_matrix() const;
-  at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) const;
 
   mutable std::optional<Momentum> made_;
 };

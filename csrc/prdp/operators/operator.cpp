@@ -70,8 +70,9 @@ class Transposed final : public Operator {
   bool knows_jacobi_radius() const override { return a_->knows_jacobi_radius(); }
   at::Tensor norm() const override { return a_->norm(); }
   std::vector<int64_t> vector_shape() const override { return a_->vector_shape(); }
-  at::Tensor solve_directly(const at::Tensor& b) const override { return a_->solve_transpose_directly(b); }
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override { return a_->solve_directly(b); }
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override {
+    return a_->solve_directly(b, !transposed);
+  }
   std::unique_ptr<Operator> select(const at::Tensor& index) const override {
     auto chosen = a_->select(index);
     return chosen ? std::make_unique<Transposed>(std::move(chosen)) : nullptr;

@@ -52,9 +52,8 @@ class Operator {
   virtual at::Tensor apply_transpose(const at::Tensor& v) const = 0;
   /// The diagonal of A, in a shape that broadcasts against a batch of vectors.
   virtual at::Tensor diagonal() const = 0;
-  /// A⁻¹ b and A⁻ᵀ b by the cheapest exact method in plain tensor operations; differentiable.
-  virtual at::Tensor solve_directly(const at::Tensor& b) const = 0;
-  virtual at::Tensor solve_transpose_directly(const at::Tensor& b) const = 0;
+  /// A⁻¹ b, or A⁻ᵀ b, by the cheapest exact method in plain tensor operations; differentiable.
+  virtual at::Tensor solve_directly(const at::Tensor& b, bool transposed) const = 0;
   /// ∂⟨λ, A(g) u⟩/∂g, one per tensor of A; undefined for tensors without a derivative. Differentiable.
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
   /// ‖A‖∞: one value, or one per sample.

@@ -35,12 +35,11 @@ inline bool any_tangent(at::TensorList tensors) { return std::any_of(tensors.beg
 /// Whether a transform of torch.func is running.
 inline bool in_torch_func() { return at::functorch::maybeCurrentDynamicLayer().has_value(); }
 
-/// Whether a cotangent is the batch of them that autograd.grad(is_grads_batched=True) makes.
-inline bool is_batch_of_cotangents(const at::Tensor& cotangent) { return at::isBatchedTensor(cotangent); }
-
-/// Runs backward(cotangent) for one of such a batch after the other, and joins the gradients again.
+/// backward(cotangent), a gradient for each input. Of the batch of cotangents that autograd.grad(is_grads_batched=True)
+/// makes, one is taken after the other, and the gradients are joined again.
 template <class Backward>
 std::vector<at::Tensor> for_each_cotangent(const at::Tensor& cotangents, const Backward& backward) {
+  if (!at::isBatchedTensor(cotangents)) return backward(cotangents);
   const auto physical = at::MultiBatchVmapTransform::logicalToPhysical(cotangents);
   const int64_t mapped = physical.numBatchDims();
   const auto sizes = physical.tensor().sizes().slice(0, mapped);

@@ -200,17 +200,13 @@ std::optional<at::Tensor> SingularOperator::solve_on_axes(const at::Tensor& b, b
   return u ? std::optional(transposed ? project(*u) : project_solution(*u)) : std::nullopt;
 }
 
-at::Tensor SingularOperator::solve_directly(const at::Tensor& b) const {
-  if (auto u = solve_on_axes(b, /*transposed=*/false)) return *std::move(u);
-  const auto like = b.detach();
-  return project_solution(solve_regular(project(b), orthonormal(right_, like), orthonormal(left_, like),
-                                        [this](const at::Tensor& v) { return apply(v); }));
-}
-at::Tensor SingularOperator::solve_transpose_directly(const at::Tensor& b) const {
-  if (auto u = solve_on_axes(b, /*transposed=*/true)) return *std::move(u);
-  const auto like = b.detach();
-  return project(solve_regular(project_solution(b), orthonormal(left_, like), orthonormal(right_, like),
-                               [this](const at::Tensor& v) { return apply_transpose(v); }));
+at::Tensor SingularOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  if (auto u = solve_on_axes(b, transposed)) return *std::move(u);
+  const auto right = orthonormal(right_, b.detach()), left = orthonormal(left_, b.detach());
+  if (transposed)
+    return project(
+        solve_regular(project_solution(b), left, right, [this](const at::Tensor& v) { return apply_transpose(v); }));
+  return project_solution(solve_regular(project(b), right, left, [this](const at::Tensor& v) { return apply(v); }));
 }
 
 std::vector<at::Tensor> SingularOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

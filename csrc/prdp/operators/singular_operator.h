@@ -37,8 +37,7 @@ class SingularOperator final : public Operator {
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
   at::Tensor project_solution(const at::Tensor& v) const override { return without(right_, v); }
   bool needs_projection() const override { return true; }
-  at::Tensor solve_directly(const at::Tensor& b) const override;
-  at::Tensor solve_transpose_directly(const at::Tensor& b) const override;
+  at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
   at::Tensor nonfinite_samples(const at::Tensor& b) const override { return a_->nonfinite_samples(b); }
   std::vector<int64_t> first_nonfinite(int64_t sample) const override { return a_->first_nonfinite(sample); }

@@ -22,13 +22,13 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-/// A cheap way for some samples of a batch, or for all.
-struct Way {
+/// A solve that is cheap, for some samples of a batch or for all.
+struct FastSolve {
   std::function<at::Tensor(const at::Tensor& b)> solve;  // empty: there is none for any sample
-  at::Tensor rest{};  // of which samples what it says is not to be used, (batch or 1,); undefined: none
+  at::Tensor rest{};  // the samples that it does not solve, (batch or 1,); undefined: none
 };
 
-Way way_but_for(const std::vector<bool>& rest, const at::Device& device, decltype(Way::solve) solve) {
+FastSolve but_for(const std::vector<bool>& rest, const at::Device& device, decltype(FastSolve::solve) solve) {
   const auto count = std::count(rest.begin(), rest.end(), true);
   if (count == std::ssize(rest)) return {};
   if (count == 0) return {std::move(solve)};
@@ -46,14 +46,14 @@ OperatorSpec detached(OperatorSpec a) {
   return a;
 }
 
-Way solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space) {
+FastSolve solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_space) {
   if (null_space.vectors > 0 && !null_space.is_constant) return {};
   const auto real = widest_real(coefficients.device());
   const CyclicReduction line(coefficients.to(real), 8.0 * epsilon_of(coefficients));
   const auto dominant = line.is_dominant().to(at::kCPU);
   std::vector<bool> rest;
   for (int64_t s = 0; s < dominant.size(0); ++s) rest.push_back(!dominant.const_data_ptr<bool>()[s]);
-  return way_but_for(rest, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
+  return but_for(rest, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
     const auto rhs = b.to(real);
     return (null_space.is_constant ? line.solve_with_constant(rhs) : line.solve(rhs)).to(b.scalar_type());
   });
@@ -126,7 +126,7 @@ at::Tensor solve_by(const std::vector<Inverse>& inverses, const at::Tensor& b, c
   return u;
 }
 
-Way solve_sum(const OperatorSpec& a, int64_t null_vectors) {
+FastSolve solve_sum(const OperatorSpec& a, int64_t null_vectors) {
   auto inverses = LastSums::local().find(a, null_vectors);
   std::vector<bool> rest(inverses.size());
   if (inverses.empty()) {
@@ -145,20 +145,20 @@ Way solve_sum(const OperatorSpec& a, int64_t null_vectors) {
       LastSums::local().keep(a, null_vectors, std::move(keys));
   }
   const auto diagonal = StencilOperator(detached(a)).diagonal();
-  return way_but_for(rest, a.tensors[0].device(),
-                     [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
+  return but_for(rest, a.tensors[0].device(),
+                 [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
 }
 
-Way find_way(const OperatorSpec& a, const NamedNullSpace& null_space) {
+FastSolve find_fast_solve(const OperatorSpec& a, const NamedNullSpace& null_space) {
   const at::NoGradGuard no_grad;
   const auto dim = static_cast<int64_t>(a.shape.size());
   if (dim == 1) {
     const auto coefficients = StencilOperator(detached(a)).nearest_coefficients(a.transposed);
-    return coefficients.defined() ? solve_line(coefficients, null_space) : Way{};
+    return coefficients.defined() ? solve_line(coefficients, null_space) : FastSolve{};
   }
   std::array<int64_t, 3> shape{1, 1, 1};
   std::copy(a.shape.begin(), a.shape.end(), shape.end() - dim);
-  return kernels::has_axes_to_diagonalise(dim, shape.data()) ? solve_sum(a, null_space.vectors) : Way{};
+  return kernels::has_axes_to_diagonalise(dim, shape.data()) ? solve_sum(a, null_space.vectors) : FastSolve{};
 }
 
 at::Tensor solve_densely(const OperatorSpec& a, const at::Tensor& b) {
@@ -170,21 +170,21 @@ at::Tensor solve_densely(const OperatorSpec& a, const at::Tensor& b) {
 
 /// What a solve on the axes needs for its derivative, but for tensors.
 struct Plan : public torch::CustomClassHolder {
-  Plan(Way way, OperatorSpec a, const NamedNullSpace& null_space)
-      : way(std::move(way)), a(std::move(a)), null_space(null_space) {
+  Plan(FastSolve fast, OperatorSpec a, const NamedNullSpace& null_space)
+      : fast(std::move(fast)), a(std::move(a)), null_space(null_space) {
     this->a.tensors.clear();
   }
-  Way way;
+  FastSolve fast;
   OperatorSpec a;
   NamedNullSpace null_space;
 };
 
 at::Tensor solve_planned(const Plan& plan, const at::Tensor& coefficients, const at::Tensor& b) {
-  const auto u = plan.way.solve(b);
-  if (!plan.way.rest.defined()) return u;
+  const auto u = plan.fast.solve(b);
+  if (!plan.fast.rest.defined()) return u;
   auto a = plan.a;
   a.tensors = {coefficients};
-  return at::where(per_sample(plan.way.rest, b), solve_densely(a, b), u);
+  return at::where(per_sample(plan.fast.rest, b), solve_densely(a, b), u);
 }
 
 /// The derivative is that of the exact solution, by one more solve and the product rule.
@@ -205,7 +205,7 @@ class SolveStencil : public torch::autograd::Function<SolveStencil> {
     const StencilOperator stencil(a);
     a.transposed = !a.transposed;
     const auto lambda = solve_stencil_on_axes(a, grads[0], plan->null_space);
-    TORCH_INTERNAL_ASSERT(lambda, "there is a way to solve with A, but not with its transpose");
+    TORCH_INTERNAL_ASSERT(lambda, "there is a fast solve with A, but not with its transpose");
     if (!ctx->needs_input_grad(0)) return {{}, *lambda, {}};
     const auto& u = saved[1];
     return {-(a.transposed ? stencil.product_rule(*lambda, u) : stencil.product_rule(u, *lambda))[0], *lambda, {}};
@@ -216,9 +216,9 @@ class SolveStencil : public torch::autograd::Function<SolveStencil> {
 
 std::optional<at::Tensor> solve_stencil_on_axes(const OperatorSpec& a, const at::Tensor& b,
                                                 const NamedNullSpace& null_space) {
-  auto way = find_way(a, null_space);
-  if (!way.solve || (way.rest.defined() && null_space.vectors > 0)) return std::nullopt;
-  return SolveStencil::apply(a.tensors[0], b, c10::make_intrusive<Plan>(std::move(way), a, null_space));
+  auto fast = find_fast_solve(a, null_space);
+  if (!fast.solve || (fast.rest.defined() && null_space.vectors > 0)) return std::nullopt;
+  return SolveStencil::apply(a.tensors[0], b, c10::make_intrusive<Plan>(std::move(fast), a, null_space));
 }
 
 at::Tensor solve_stencil_directly(const OperatorSpec& a, const at::Tensor& b) {

@@ -225,11 +225,10 @@ at::Tensor StencilOperator::norm() const {
   return norms.size(0) == 1 ? norms.squeeze(0) : norms;
 }
 
-at::Tensor StencilOperator::solve_directly(const at::Tensor& b) const { return solve_stencil_directly(spec(), b); }
-at::Tensor StencilOperator::solve_transpose_directly(const at::Tensor& b) const {
-  auto transpose = spec();
-  transpose.transposed = true;
-  return solve_stencil_directly(transpose, b);
+at::Tensor StencilOperator::solve_directly(const at::Tensor& b, bool transposed) const {
+  auto a = spec();
+  a.transposed = transposed;
+  return solve_stencil_directly(a, b);
 }
 
 OperatorSpec StencilOperator::spec() const {

@@ -3,9 +3,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "prdp/kernels/share_samples.h"
 #include "prdp/kernels/whole_vectors.h"
 #include "prdp/solvers/sample_numbers.h"
+#include "prdp/threads/share_samples.h"
 
 namespace prdp::batch_loops {
 
@@ -52,6 +52,19 @@ void for_each_sample(const at::Tensor& v, const Body& body) {
 template <class Body>
 auto with_type(const at::Tensor& t, const Body& body) {
   return t.scalar_type() == at::kFloat ? body(float{}) : body(double{});
+}
+
+/// of_sample(s, its number in each of `numbers`…) of each sample s.
+template <class OfSample, class... Numbers>
+Scalar of_each_number(const OfSample& of_sample, const Scalar& first, const Numbers&... others) {
+  auto found = at::empty_like(first);
+  with_type(first, [&]<class T>(T) {
+    const auto loop = [&, to = found.template mutable_data_ptr<T>()](const auto*... numbers) {
+      for (int64_t s = 0; s < first.numel(); ++s) to[s] = of_sample(s, numbers[s]...);
+    };
+    loop(data<T>(first), data<T>(others)...);
+  });
+  return found;
 }
 
 }  // namespace
@@ -174,50 +187,36 @@ bool any(const Scalar& where) {
   });
 }
 
-at::Tensor sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c) {
-  auto sum = at::empty_like(a);
-  with_type(a, [&]<class T>(T) {
-    const T *first = data<T>(a), *factor = data<T>(b), *second = data<T>(c);
-    T* to = sum.mutable_data_ptr<T>();
-    for (int64_t s = 0; s < a.numel(); ++s) to[s] = first[s] + factor[s] * factor[s] * second[s];
-  });
-  return sum;
+Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) {
+  const auto of_sample = []<class T>(int64_t, T v, T factor, T w) {
+    return SampleNumbers<T>::sum_of_squares(v, factor, w);
+  };
+  return of_each_number(of_sample, v2, a, w2);
 }
 
 Scalar ratio(const Scalar& num, const Scalar& den) {
-  auto quotient = at::empty_like(den);
-  with_type(den, [&]<class T>(T) {
-    const T *above = data<T>(num), *below = data<T>(den);
-    T* to = quotient.mutable_data_ptr<T>();
-    for (int64_t s = 0; s < den.numel(); ++s) to[s] = SampleNumbers<T>::ratio(above[s], below[s]);
-  });
-  return quotient;
+  return of_each_number([]<class T>(int64_t, T n, T d) { return SampleNumbers<T>::ratio(n, d); }, num, den);
 }
 
-Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& active) {
-  auto where = at::empty_like(den);
-  with_type(den, [&]<class T>(T) {
-    const T *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2), *going = data<T>(active);
-    T* to = where.mutable_data_ptr<T>();
-    for (int64_t s = 0; s < den.numel(); ++s)
-      to[s] = SampleNumbers<T>::breaks_down(below[s], left2[s], right2[s], going[s]);
-  });
-  return where;
+Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active) {
+  const auto of_sample = []<class T>(int64_t, T d, T v, T w, T on) {
+    return SampleNumbers<T>::breaks_down(d, v, w, on);
+  };
+  return of_each_number(of_sample, den, v2, w2, active);
 }
 
-Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2) {
-  Quotient quotient{at::empty_like(num), {}};
-  with_type(num, [&]<class T>(T) {
-    const T *above = data<T>(num), *below = data<T>(den), *left2 = data<T>(a2), *right2 = data<T>(b2);
-    T* to = quotient.value.mutable_data_ptr<T>();
-    for (int64_t s = 0; s < num.numel(); ++s) {
-      bool breaks = false;
-      to[s] = SampleNumbers<T>::guarded_quotient(above[s], below[s], left2[s], right2[s], breaks);
-      if (!breaks) continue;
+Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
+  Quotient quotient;
+  const auto of_sample = [&]<class T>(int64_t s, T n, T d, T v, T w) {
+    bool breaks = false;
+    const T value = SampleNumbers<T>::guarded_quotient(n, d, v, w, breaks);
+    if (breaks) {
       if (!quotient.breaks.defined()) quotient.breaks = at::zeros_like(num, num.options().dtype(at::kBool));
       quotient.breaks.mutable_data_ptr<bool>()[s] = true;
     }
-  });
+    return value;
+  };
+  quotient.value = of_each_number(of_sample, num, den, v2, w2);
   return quotient;
 }
 

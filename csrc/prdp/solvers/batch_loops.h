@@ -38,15 +38,14 @@ Scalar combine(double sign, const Scalar* h, const std::vector<Vector>& v, int64
 
 /// Whether a number is not zero.
 bool any(const Scalar& where);
-/// a + b² c
-Scalar sum_of_squares(const Scalar& a, const Scalar& b, const Scalar& c);
 /// The rules of SampleNumbers, for each sample.
+Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2);
 Scalar ratio(const Scalar& num, const Scalar& den);
-Scalar breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2, const Scalar& active);
+Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active);
 struct Quotient {
   Scalar value;
   at::Tensor breaks;  // the samples that break down; undefined: none
 };
-Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2, const Scalar& b2);
+Quotient guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2);
 
 }  // namespace prdp::batch_loops

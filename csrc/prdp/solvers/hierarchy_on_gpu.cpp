@@ -7,8 +7,8 @@
 #include <sstream>
 #include <vector>
 
-#include "prdp/gpu/launch.h"
 #include "prdp/gpu/team_memory.h"
+#include "prdp/gpu/team_size.h"
 #include "prdp/kernels/coarsening.h"
 
 namespace prdp::gpu {

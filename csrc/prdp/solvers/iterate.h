@@ -96,65 +96,64 @@ void refuse_rounding(Space& space, const Method& method, typename Space::States&
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
       if (is_doubtful(s) && space.epsilon() * norm_a[i] * std::sqrt(u2[i]) > 0.25 * std::sqrt(s.b2))
-        s.verdict = Verdict::kZero;
+        s.answer = Answer::kZero;
     }
   }
   for (auto& s : states)
-    if (s.verdict != Verdict::kStands) s.status = SolveStatus::kBreakdown;
+    if (s.answer != Answer::kLast) s.status = SolveStatus::kBreakdown;
 }
 
-/// The verdict on each iterate; returns whether all of them stand.
+/// Which iterate each sample is to hand out; returns whether all hand out their last.
 template <class Space, class Method>
-bool judge_iterates(Space& space, Method& method, typename Space::States& states, bool track) {
+bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
   for (auto& s : states)
-    s.verdict = is_unsolved(s.status) && is_above_b(s, space.epsilon()) ? Verdict::kBestOrZero : Verdict::kStands;
+    s.answer = is_unsolved(s.status) && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
   if constexpr (kIsExact<Method>) refuse_rounding(space, method, states);
   if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
-  bool all_stand = true;
+  bool all_last = true;
   for (auto& s : states) {
-    if (s.verdict == Verdict::kStands) {
-      if (ran_away(s)) s.verdict = Verdict::kBestOrZero;
-      else if (left_rounding_of_b(s)) s.verdict = Verdict::kBest;
-      else if (!track && s.status == SolveStatus::kBreakdown) s.verdict = Verdict::kBeforeBreakdown;
+    if (s.answer == Answer::kLast) {
+      if (ran_away(s)) s.answer = Answer::kBestOrZero;
+      else if (left_rounding_of_b(s)) s.answer = Answer::kBest;
+      else if (!track && s.status == SolveStatus::kBreakdown) s.answer = Answer::kBeforeBreakdown;
     }
-    all_stand = all_stand && s.verdict == Verdict::kStands;
+    all_last = all_last && s.answer == Answer::kLast;
   }
-  return all_stand;
+  return all_last;
 }
 
-/// Makes in place of the iterates that do not stand those that their verdicts name, by the same steps as before: a
+/// Makes the iterates that are to be handed out in place of the last ones, by the same steps as before: a
 /// method that went on from its true residual does so again. Where no residual was looked at, a pass that watches them
 /// finds the best one, or the iteration that broke down. The other samples keep what they have. The cold path.
 template <class Space, class Method>
 void replay(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto first = states;
   const auto kept = method.x;
-  const auto run_again = [&](bool watch, const auto& wanted) {
-    for (size_t i = 0; i < states.size(); ++i)
-      states[i].run_again(states[i].verdict == Verdict::kStands ? 0 : wanted(i));
+  const auto another_pass = [&](bool watch, const auto& wanted) {
+    for (size_t i = 0; i < states.size(); ++i) states[i].rewind(states[i].answer == Answer::kLast ? 0 : wanted(i));
     space.reset();
     run(space, method, states, rtol, watch);
   };
-  if (!track) run_again(/*watch=*/true, [&](size_t i) { return first[i].cap; });
+  if (!track) another_pass(/*watch=*/true, [&](size_t i) { return first[i].cap; });
   const auto watched = states;
-  run_again(track, [&](size_t i) {
-    if (watched[i].verdict == Verdict::kZero) return int64_t{0};
-    return watched[i].verdict == Verdict::kBeforeBreakdown ? watched[i].iterations : watched[i].best;
+  another_pass(track, [&](size_t i) {
+    if (watched[i].answer == Answer::kZero) return int64_t{0};
+    return watched[i].answer == Answer::kBeforeBreakdown ? watched[i].iterations : watched[i].best;
   });
   conclude(space, method, states, rtol);
 
   const auto remade = states;
   bool any_zero = false;  // a recursive residual had said otherwise
   for (auto& s : states) {
-    if (s.verdict != Verdict::kBestOrZero || !is_above_b(s, space.epsilon())) continue;
-    s.verdict = Verdict::kZero;
+    if (s.answer != Answer::kBestOrZero || !is_above_b(s, space.epsilon())) continue;
+    s.answer = Answer::kZero;
     any_zero = true;
   }
   if (any_zero) {
-    run_again(track, [&](size_t i) { return states[i].verdict == Verdict::kZero ? 0 : remade[i].iterations; });
+    another_pass(track, [&](size_t i) { return states[i].answer == Answer::kZero ? 0 : remade[i].iterations; });
     conclude(space, method, states, rtol);
   }
-  const auto is_remade = space.map(states, [](const SampleState& s) { return s.verdict != Verdict::kStands; });
+  const auto is_remade = space.map(states, [](const SampleState& s) { return s.answer != Answer::kLast; });
   for (size_t i = 0; i < states.size(); ++i) {
     if (is_remade[i]) states[i].status = first[i].status;
     else states[i] = first[i];
@@ -172,7 +171,7 @@ void iterate(Space& space, Method& method, typename Space::States& states, doubl
   const bool track = rtol > 0.0;
   detail::run(space, method, states, rtol, track);
   detail::conclude(space, method, states, rtol);
-  if (!guarded || detail::judge_iterates(space, method, states, track)) return;
+  if (!guarded || detail::choose_answers(space, method, states, track)) return;
   detail::replay(space, method, states, rtol, track);
 }
 

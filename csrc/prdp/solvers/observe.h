@@ -120,7 +120,7 @@ PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& sta
     if (!s.candidate) continue;
     s.residual2 = true2[i];
     judge(s, rtol);
-    if (s.active && parted_ways(s, rtol)) s.stop(SolveStatus::kStagnated);
+    if (s.active && has_drifted(s, rtol)) s.stop(SolveStatus::kStagnated);
     if constexpr (kLeastResidual<Method>) {
       if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
     }

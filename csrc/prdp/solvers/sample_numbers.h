@@ -5,6 +5,9 @@
 
 namespace prdp {
 
+/// Signs without a pattern, the same for every sample: whether number i changes its own.
+inline bool is_negated(int64_t i) { return std::sin(static_cast<double>((i + 1) * (i + 1))) < 0.0; }
+
 /// What the spaces of one sample do with its numbers (space.h): quotients that tell a breakdown from a small number,
 /// and numbers that vanish where they are rounding. b and A are scaled to the order of one.
 template <class T>
@@ -14,32 +17,30 @@ class SampleNumbers {
 
   static constexpr double epsilon() { return std::numeric_limits<T>::epsilon() / 2; }
   void assign(Scalar from, Scalar& to) { to = from; }
-  static Scalar sum_of_squares(Scalar rr, Scalar beta, Scalar pp) { return rr + beta * beta * pp; }
+  static Scalar sum_of_squares(Scalar v2, Scalar a, Scalar w2) { return v2 + a * a * w2; }
 
-  /// num/den for a search step, where a2 and b2 are the squared norms of the two factors of den:
-  /// 0 where nothing is left to do, and 0 with a breakdown where den is 0 relative to them.
-  static Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2, bool& breaks) {
-    if (num < kNegligible) return 0;
-    if (!std::isfinite(b2)) return std::numeric_limits<T>::quiet_NaN();
-    if (!std::isfinite(a2) && std::isfinite(den) && den != T(0)) return num / den;  // a long direction of M⁻¹
-    breaks = is_zero_beside(den, a2, b2);
+  static Scalar guarded_quotient(Scalar num, Scalar den, Scalar v2, Scalar w2, bool& breaks) {
+    if (num < kNegligible) return 0;  // nothing is left to do
+    if (!std::isfinite(w2)) return std::numeric_limits<T>::quiet_NaN();
+    if (!std::isfinite(v2) && std::isfinite(den) && den != T(0)) return num / den;  // v: a long direction of M⁻¹
+    breaks = is_zero_beside(den, v2, w2);
     return breaks ? T(0) : num / den;
   }
-  Scalar guarded_quotient(Scalar num, Scalar den, Scalar a2, Scalar b2) {
+  Scalar guarded_quotient(Scalar num, Scalar den, Scalar v2, Scalar w2) {
     bool breaks = false;
-    const Scalar quotient = guarded_quotient(num, den, a2, b2, breaks);
+    const Scalar quotient = guarded_quotient(num, den, v2, w2, breaks);
     broken_ = broken_ || breaks;
     return quotient;
   }
-  static Scalar breaks_down(Scalar den, Scalar a2, Scalar b2, Scalar active) {
-    return active != 0 && std::isfinite(a2) && std::isfinite(b2) && is_zero_beside(den, a2, b2);
+  static Scalar breaks_down(Scalar den, Scalar v2, Scalar w2, Scalar active) {
+    return active != 0 && std::isfinite(v2) && std::isfinite(w2) && is_zero_beside(den, v2, w2);
   }
   static Scalar ratio(Scalar num, Scalar den) { return den < kNegligible ? T(0) : num / den; }
   void break_down_unless_positive(Scalar a, Scalar r2) { broken_ = broken_ || (!(a > 0) && !(r2 < kNegligible)); }
-  static Scalar is_rounding(Scalar a, Scalar b2, Scalar c2, double factor) {
-    return std::abs(a) < std::sqrt(b2) * std::sqrt(c2) * static_cast<T>(factor);
+  static Scalar is_rounding(Scalar a, Scalar v2, Scalar w2, double factor) {
+    return std::abs(a) < std::sqrt(v2) * std::sqrt(w2) * static_cast<T>(factor);
   }
-  static Scalar unless_zero(Scalar value, Scalar a, Scalar b) { return a != 0 && b != 0 ? value : 0; }
+  static Scalar unless_zero(Scalar a, Scalar b, Scalar active) { return b != 0 && active != 0 ? a : 0; }
 
   /// What GMRES needs: numbers that may vanish.
   static constexpr int derivatives() { return 0; }
@@ -67,8 +68,8 @@ class SampleNumbers {
   bool broken_ = false;
 
  private:
-  static bool is_zero_beside(Scalar den, Scalar a2, Scalar b2) {
-    return std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(a2) * std::sqrt(b2);
+  static bool is_zero_beside(Scalar den, Scalar v2, Scalar w2) {
+    return std::abs(den) <= std::numeric_limits<T>::epsilon() * std::sqrt(v2) * std::sqrt(w2);
   }
   /// Squared norms below this are zero to the dtype.
   static constexpr T kNegligible = std::numeric_limits<T>::min() / std::numeric_limits<T>::epsilon();

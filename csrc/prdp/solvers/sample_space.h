@@ -10,7 +10,6 @@
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
 #include "prdp/solvers/sample_system.h"
-#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 #include "prdp/solvers/space.h"
 #include "prdp/threads/interruption.h"

@@ -8,13 +8,13 @@
 /// A sample while it is iterated, and what comes of it. The rules are in verdicts.h.
 namespace prdp {
 
-/// What becomes of the iterate that a sample ends with.
-enum class Verdict {
-  kStands,           // it is handed out
+/// Which iterate of a sample is handed out.
+enum class Answer {
+  kLast,
   kBeforeBreakdown,  // the one before an iteration that broke down where nobody looked
   kBest,             // the one of least residual: b's own rounding was reached and lost again
-  kBestOrZero,       // the same, or zero where that is the better answer: it ran away, or is worse than zero
-  kZero,             // zero: what is there is the rounding of a singular A
+  kBestOrZero,       // the same, or zero where that is the better answer: the last ran away, or is worse than zero
+  kZero,             // none, but zero: what is there is the rounding of a singular A
 };
 
 /// What the loop knows of one sample.
@@ -38,7 +38,7 @@ struct SampleState {
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
-  Verdict verdict = Verdict::kStands;
+  Answer answer = Answer::kLast;
 
   void note(double fresh2) {
     residual2 = fresh2;
@@ -53,7 +53,7 @@ struct SampleState {
   /// The last one changed nothing. A method may break down before the first.
   void take_back_iteration() { iterations = std::max<int64_t>(iterations - 1, 0); }
   /// Back to the start, for another pass of at most `iterations_allowed`.
-  void run_again(int64_t iterations_allowed) {
+  void rewind(int64_t iterations_allowed) {
     cap = iterations_allowed;
     active = cap > 0;
     concluded = candidate = false;

@@ -5,12 +5,12 @@
 #include <string_view>
 
 #include "prdp/kernels/factor_cache.h"
-#include "prdp/kernels/share_samples.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_direct.h"
 #include "prdp/solvers/solve_on_gpu.h"
 #include "prdp/solvers/solve_samples.h"
 #include "prdp/solvers/unnamed_null_space.h"
+#include "prdp/threads/share_samples.h"
 
 namespace prdp {
 

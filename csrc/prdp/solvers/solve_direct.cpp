@@ -39,7 +39,7 @@ at::Tensor square_of(const at::Tensor& t) { return dot_in_order(t, t).view({-1})
 /// where no number leaves the range of the dtype.
 std::optional<SolveResult> solve_ordinary(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   constexpr double least = 1e-10, most = 1e10;  // of the largest entry of b
-  const auto rhs = a.project(b), x = a.solve_directly(rhs), u = a.project_solution(x);
+  const auto rhs = a.project(b), x = a.solve_directly(rhs, /*transposed=*/false), u = a.project_solution(x);
   std::vector<at::Tensor> told{largest_of(b), square_of(rhs), square_of(a.project(rhs - a.apply(x))), largest_of(u)};
   if (a.needs_projection()) told.insert(told.end(), {square_of(b), square_of(b - rhs)});
   const auto host = at::stack(told).to(at::kCPU, at::kDouble);
@@ -61,7 +61,7 @@ std::optional<SolveResult> solve_ordinary(const Operator& a, const at::Tensor& b
 /// The same for any b. Nothing if a sample is not solved.
 std::optional<SolveResult> solve_scaled(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const auto batch = prepare_batch(a, b, request);
-  const auto x = a.solve_directly(batch.rhs);
+  const auto x = a.solve_directly(batch.rhs, /*transposed=*/false);
   const auto r = a.project(batch.rhs - a.apply(x));
   auto u = a.project_solution(x) / batch.scale;
   const auto number = [&](const at::Tensor& t) { return t.flatten().to(b.scalar_type()); };

@@ -4,7 +4,7 @@
 #include <limits>
 #include <sstream>
 
-#include "prdp/gpu/launch.h"
+#include "prdp/gpu/team_size.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
 #include "prdp/solvers/methods.h"
 

@@ -80,23 +80,23 @@ concept FusedOperations =
 template <class S>
 concept NumberOperations =
     requires(S s, typename S::Vector x, typename S::Vector y, typename S::Scalar a, typename S::Scalar b,
-             typename S::Scalar num, typename S::Scalar den, typename S::Scalar a2, typename S::Scalar b2,
+             typename S::Scalar num, typename S::Scalar den, typename S::Scalar v2, typename S::Scalar w2,
              typename S::Scalar active, typename S::Scalar where, double factor) {
       /// b = a
       s.assign(a, b);
-      /// num/den for a step, where |den| <= √a2 √b2. 0 where num is negligible; 0 and a breakdown of the sample where
-      /// |den| <= ε √a2 √b2.
-      { s.guarded_quotient(num, den, a2, b2) } -> std::same_as<typename S::Scalar>;
+      /// num/den for a step, where den = v·w, and v2 = ‖v‖² and w2 = ‖w‖². 0 where num is negligible; 0 and a breakdown
+      /// of the sample where den is rounding, |den| <= ε ‖v‖ ‖w‖.
+      { s.guarded_quotient(num, den, v2, w2) } -> std::same_as<typename S::Scalar>;
       /// 1 where guarded_quotient() would break down and `active` is not zero, else 0; for restore() alone.
-      { s.breaks_down(den, a2, b2, active) } -> std::same_as<typename S::Scalar>;
+      { s.breaks_down(den, v2, w2, active) } -> std::same_as<typename S::Scalar>;
       /// num/den for den >= 0; 0 where den is negligible.
       { s.ratio(num, den) } -> std::same_as<typename S::Scalar>;
-      /// A breakdown of the samples where a is not positive, and b2 not negligible.
-      s.break_down_unless_positive(a, b2);
-      /// a2 + a² b2, the square of the norm of v + a w for orthogonal v and w, for guarded_quotient() alone.
-      { s.sum_of_squares(a2, a, b2) } -> std::same_as<typename S::Scalar>;
-      /// 1 where |a| < factor √a2 √b2, else 0; for restore() alone.
-      { s.is_rounding(a, a2, b2, factor) } -> std::same_as<typename S::Scalar>;
+      /// A breakdown of the samples where a is not positive, and v2 not negligible.
+      s.break_down_unless_positive(a, v2);
+      /// v2 + a² w2, which is ‖v + a w‖² for orthogonal v and w, for guarded_quotient() alone.
+      { s.sum_of_squares(v2, a, w2) } -> std::same_as<typename S::Scalar>;
+      /// 1 where a = v·w is smaller than factor ‖v‖ ‖w‖, else 0; for restore() alone.
+      { s.is_rounding(a, v2, w2, factor) } -> std::same_as<typename S::Scalar>;
       /// a where b and `active` are not zero, else 0.
       { s.unless_zero(a, b, active) } -> std::same_as<typename S::Scalar>;
       /// 1 where a is not zero, else 0.

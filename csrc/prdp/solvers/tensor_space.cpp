@@ -50,6 +50,46 @@ void TensorSpace::check_scale(const at::Tensor& scale) const {
                     "; scale A and b, or take backward=\"implicit\"");
 }
 
+TensorSpace::Scalar TensorSpace::update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q,
+                                                             Vector& x, Vector& r) {
+  const bool projects = system_.a.needs_projection();
+  if (in_loops_ && !projects) return batch_loops::update_iterate_and_residual(alpha, p, q, x, r, active_);
+  x = keep_frozen(at::addcmul(x, alpha, p), x);
+  const auto left = at::addcmul(r, alpha, q, -1);
+  r = keep_frozen(projects ? system_.a.project(left) : left, r);
+  return dot(r, r);
+}
+
+TensorSpace::Vector TensorSpace::product(const Vector& v) {
+  interruption::Watch::local().look();
+  for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += active_.empty() || active_[i];
+  return laid_out(system_.a.apply(in_loops_ ? v.detach() : v));  // a handle of its own, which a product may keep
+}
+
+TensorSpace::Vector TensorSpace::unscaled_product(const Vector& v) {
+  auto made = product(v);
+  define_scale(made, v, system_.scale_of_a);
+  return made;
+}
+
+void TensorSpace::apply(const Vector& v, Vector& out) {
+  const auto made = unscaled_product(v);
+  if (in_loops_) return batch_loops::scale(system_.scale_of_a, made, out);
+  out = made * system_.scale_of_a;
+}
+
+std::array<TensorSpace::Scalar, 2> TensorSpace::apply_along(const Vector& v, const Vector& w, Vector& out) {
+  if (in_loops_) return batch_loops::scale_with_dots(system_.scale_of_a, unscaled_product(v), w, out);
+  apply(v, out);
+  return {dot(w, out), dot(out, out)};
+}
+
+TensorSpace::Scalar TensorSpace::residual(const Vector& x, Vector& r) {
+  const auto ax = product(solution(x));
+  r = keep_frozen(system_.a.project((started() ? whole_b_ : b_) - ax), r);
+  return dot(r, r);
+}
+
 TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
   auto z = system_.inverse ? laid_out(system_.inverse(v)) : v / diagonal();
   if (system_.inverse) {
@@ -61,6 +101,53 @@ TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
   return dot(v, z);
 }
 
+void TensorSpace::correct(const Vector& v, Vector& out) {
+  const auto z = laid_out(system_.inverse(v));
+  out = keep_frozen(system_.a.needs_projection() ? system_.a.project_solution(z) : z, out);
+}
+
+TensorSpace::Vector TensorSpace::swept(const Vector& x, const Vector& change, const Vector& before,
+                                       const Scalar* omega) const {
+  if (!omega) return x + change;
+  const auto step = x + change - before;
+  if (is_number_of_host(*omega)) return at::add(before, step, omega->item());
+  return at::addcmul(before, omega->to(b_.options()), step);
+}
+
+TensorSpace::Scalar TensorSpace::measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega) {
+  const auto change = jacobi_change(c, x);
+  next = swept(x, change, next, omega);
+  const auto r = diagonal() * change;
+  return dot(r, r);
+}
+
+void TensorSpace::dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w,
+                       Scalar* h) const {
+  if (in_loops_) return batch_loops::dots(v, count, factor, w, h);
+  const auto scaled = factor * w.detach();
+  for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
+}
+
+TensorSpace::Scalar TensorSpace::subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count,
+                                                      const Scalar& factor, Vector& w) const {
+  if (in_loops_) return batch_loops::combine(-1.0, h, v, count, &factor, w, {});
+  w = factor * w;
+  for (int64_t i = 0; i < count; ++i) w = at::addcmul(w, h[i], v[i], -1);
+  return dot(w.detach(), w.detach());
+}
+
+void TensorSpace::add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
+  if (in_loops_) return void(batch_loops::combine(1.0, y, v, count, nullptr, x, active_));
+  auto sum = x;
+  for (int64_t i = 0; i < count; ++i) sum = at::addcmul(sum, y[i], v[i]);
+  x = keep_frozen(sum, x);
+}
+
+TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
+  const auto from_zero = system_.scale_of_a.defined() ? x * system_.scale_of_a : x;
+  return started() ? start_ + from_zero : from_zero;
+}
+
 TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
   const auto u = solution(x).detach();
   const auto places = at::arange(1, u[0].numel() + 1, u.options().dtype(at::kDouble));
@@ -70,7 +157,7 @@ TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {
-  const auto solution = system_.a.solve_directly(r);
+  const auto solution = system_.a.solve_directly(r, /*transposed=*/false);
   const auto finite = solution.isfinite().all(/*dim=*/1, /*keepdim=*/true);
   auto every = finite;
   for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
@@ -79,32 +166,32 @@ void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   d = laid_out(at::where(every, solution, at::zeros_like(solution)));
 }
 
-at::Tensor TensorSpace::rounding_of(const Scalar& a2, const Scalar& b2) const {
-  return limits_of(b_).epsilon * a2.detach().sqrt() * b2.detach().sqrt();
+at::Tensor TensorSpace::rounding_of(const Scalar& v2, const Scalar& w2) const {
+  return limits_of(b_).epsilon * v2.detach().sqrt() * w2.detach().sqrt();
 }
 
-TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& a2,
-                                                  const Scalar& b2) {
+TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2,
+                                                  const Scalar& w2) {
   if (in_loops_) {
-    const auto [value, breaks] = batch_loops::guarded_quotient(num, den, a2, b2);
+    const auto [value, breaks] = batch_loops::guarded_quotient(num, den, v2, w2);
     if (breaks.defined()) note_broken(breaks);
     return value;
   }
   // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
-  const auto bound = rounding_of(a2, b2).nan_to_num(0.0, 0.0, 0.0);  // of a long direction of M⁻¹, zero alone breaks
+  const auto bound = rounding_of(v2, w2).nan_to_num(0.0, 0.0, 0.0);  // of a long direction of M⁻¹, zero alone breaks
   const auto breaks = den.detach().abs().le(bound).logical_and(nothing_left.logical_not());
   note_broken(breaks);
   const auto none = nothing_left.logical_or(breaks);
   const auto quotient = num / at::where(none, at::ones_like(den), den);
-  const auto unless_unknown = at::add(quotient, b2.detach(), 0.0);  // NaN where b2 is not finite
+  const auto unless_unknown = at::add(quotient, w2.detach(), 0.0);  // NaN where w2 is not finite
   return at::where(none, at::zeros_like(num), unless_unknown);
 }
 
-TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& a2, const Scalar& b2,
+TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2,
                                              const Scalar& active) const {
-  if (in_loops_) return batch_loops::breaks_down(den, a2, b2, active);
-  const auto bound = rounding_of(a2, b2);
+  if (in_loops_) return batch_loops::breaks_down(den, v2, w2, active);
+  const auto bound = rounding_of(v2, w2);
   const auto breaks = den.detach().abs().le(bound).logical_and(bound.isfinite());
   return breaks.logical_and(active.detach().ne(0)).to(b_.scalar_type());
 }
@@ -115,9 +202,9 @@ TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }
 
-TensorSpace::Scalar TensorSpace::inverse(const Scalar& value, const Scalar& scale) const {
-  const auto vanishing = value.le(16 * limits_of(b_).epsilon * scale.abs()).logical_or(value.lt(negligible_));
-  return at::where(vanishing, at::zeros_like(value), 1 / value);
+TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) const {
+  const auto vanishing = a.le(16 * limits_of(b_).epsilon * scale.abs()).logical_or(a.lt(negligible_));
+  return at::where(vanishing, at::zeros_like(a), 1 / a);
 }
 
 void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale,
@@ -160,6 +247,11 @@ TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, co
   return at::where(mask_of(remade_rows), remade, kept);
 }
 
+void TensorSpace::note_broken(const at::Tensor& rows) {
+  const auto now = active_mask_.defined() ? rows.logical_and(active_mask_) : rows;
+  broken_ = broken_.defined() ? broken_.logical_or(now) : now;
+}
+
 void TensorSpace::reset() {
   broken_ = at::Tensor();
   active_mask_ = at::Tensor();
@@ -171,11 +263,6 @@ void TensorSpace::set_active(const std::vector<bool>& active) {
   active_ = active;
   const bool all = std::all_of(active.begin(), active.end(), [](bool a) { return a; });
   active_mask_ = all ? at::Tensor() : mask_of(active);
-}
-
-void TensorSpace::count() {
-  interruption::Watch::local().look();
-  for (size_t i = 0; i < states_.size(); ++i) states_[i].applications += active_.empty() || active_[i];
 }
 
 at::Tensor TensorSpace::mask_of(const std::vector<bool>& rows) const {

@@ -27,7 +27,7 @@ inline void judge(SampleState& s, double rtol) {
 
 /// The true residual no longer follows the method's own: a second false claim, after the method has
 /// gone on from the true residual of the first, has not even halved it. Just above rtol that is noise.
-inline bool parted_ways(const SampleState& s, double rtol) {
+inline bool has_drifted(const SampleState& s, double rtol) {
   return s.residual2 > 0.25 * s.rejected2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
 }
 
@@ -64,7 +64,7 @@ inline void plan_next_look(SampleState& s, bool log_convex, double rtol) {
   s.next_look = s.iterations + static_cast<int64_t>(stride);
 }
 
-// ---- the verdict on its last iterate
+// ---- its last iterate
 
 /// The iterates have run away: the last one is of no use.
 inline bool ran_away(const SampleState& s) {

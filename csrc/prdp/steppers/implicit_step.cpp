@@ -31,24 +31,22 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
-  info_.reset();  // a step that raises has none
-  auto [next, info] = solve(u, *log_);
+  auto next = reported([&] { return solve(u, *log_); });
   if (next.requires_grad()) logs_of_steps_.clear();
-  info_ = std::move(info);
   return next;
 }
 
 at::Tensor ImplicitStep::rollout(const at::Tensor& u, int64_t steps) {
-  info_.reset();  // a step that raises has none
-  TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
   std::vector<AdjointLog> logs;
-  auto [states, info] = solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) {
-    logs.push_back(open_adjoint_log());
-    return solve(state, *logs.back());
+  auto states = reported([&] {
+    TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
+    return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) {
+      logs.push_back(open_adjoint_log());
+      return solve(state, *logs.back());
+    });
   });
   // A rollout without gradients, such as a validation, leaves the reports of the last backward pass.
   if (states.requires_grad()) logs_of_steps_ = std::move(logs);
-  info_ = std::move(info);
   return states;
 }
 

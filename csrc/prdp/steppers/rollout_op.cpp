@@ -1,21 +1,14 @@
 #include <ATen/core/dispatch/Dispatcher.h>
-#include <torch/csrc/autograd/custom_function.h>
-#include <torch/custom_class.h>
 #include <torch/library.h>
 
 #include <limits>
 
-#include "prdp/autograd/packed_options.h"
-#include "prdp/operators/autocast.h"
-#include "prdp/operators/function_operator.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
-#include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
-#include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/rollout.h"
-#include "prdp/steppers/rollout_vjp.h"
+#include "prdp/steppers/rollout_node.h"
 #include "prdp/steppers/stepper.h"
 #include "prdp/threads/interruption.h"
 
@@ -23,11 +16,6 @@ namespace prdp {
 
 namespace {
 
-using torch::autograd::AutogradContext;
-using torch::autograd::variable_list;
-
-// A rollout is a row of solves, picard_steps to a step: solve s takes its winds from solution s and its
-// right-hand side from the first solution of its step, and makes solution s + 1. Solution 0 is u.
 constexpr const char* kSolvesSchema =
     "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
     "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> (Tensor solutions, " PRDP_REPORT_SCHEMA ")";
@@ -48,12 +36,11 @@ SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymI
   return call_with_options(op, o, u, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps, solves);
 }
 
-/// The arguments of an op but u; the forward pass hands them on to the backward pass.
-struct Call : torch::CustomClassHolder {
+/// The arguments of an op but u.
+struct Call {
   Equation equation;
   c10::SymInt count;  // of solves; of steps in the op rollout
   SolveOptions options;
-  std::shared_ptr<const RegisteredProducts> products{};  // of the preconditioner
 };
 
 Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
@@ -63,12 +50,8 @@ Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArray
 
 template <class... Options>
 Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-                 int64_t picard_steps, c10::SymInt solves, const Options&... packed) {
-  Call call;
-  call.equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  call.count = std::move(solves);
-  call.options = unpack(packed...);
-  return call;
+                 int64_t picard_steps, c10::SymInt count, const Options&... packed) {
+  return {equation_of(tensors, kind, shape, parameters, picard_steps), std::move(count), unpack(packed...)};
 }
 
 void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
@@ -107,7 +90,7 @@ SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
   check(call.equation, u, call.count, call.options);
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, call.count + 1);
-  return outputs_of({at::empty_symint(sizes, u.options()), fake_info(u, {u.sym_size(0), call.count})});
+  return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), call.count})});
 }
 
 /// The gradients that are needed.
@@ -159,103 +142,31 @@ std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const Kept
                            or_none(kept.residual), needed, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps);
 }
 
-/// Whether all tensors of a call are plain. Then it need not cross the dispatcher, which takes longer than a small
-/// solve.
+/// Whether all tensors of a call are plain.
 bool is_plain_call(const Equation& e, const at::Tensor& v, const SolveOptions& o) {
   return is_plain(v) && all_plain(e.tensors) && all_plain(o.solver.preconditioner.spec().tensors);
-}
-
-/// The op below autograd.
-SolveOutputs call_below(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
-  const at::AutoDispatchBelowADInplaceOrView below;
-  return is_plain_call(e, u, o) ? solve_all(e, u, solves, o) : call_solves(e, u, solves, o);
-}
-
-class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
- public:
-  static variable_list forward(AutogradContext* ctx, const at::Tensor& u, at::TensorList tensors,
-                               const c10::intrusive_ptr<Call>& call) {
-    const auto& options = call->options;
-    auto outputs = call_below(call->equation, u, call->count, options);
-    const auto& [solutions, iterations, residual, status, applications, floor] = outputs;
-    ctx->mark_non_differentiable({iterations, residual, status, applications, floor});
-    ctx->set_materialize_grads(false);
-    const bool unrolled = options.backward == Backward::kUnrolled;
-    const bool a_varies = equation_kind(call->equation.kind).linearised || any_requires_grad(tensors);
-    const bool may_have_failed = options.on_failure != OnFailure::kRaise;
-    variable_list saved{unrolled || a_varies ? solutions : at::Tensor(), unrolled ? iterations : at::Tensor(),
-                        unrolled || may_have_failed ? status : at::Tensor(), unrolled ? residual : at::Tensor()};
-    saved.insert(saved.end(), tensors.begin(), tensors.end());
-    ctx->save_for_backward(saved);
-    call->equation.tensors.clear();  // they are among the saved ones
-    ctx->saved_data["call"] = c10::IValue::make_capsule(call);
-    return {solutions, iterations, residual, status, applications, floor};
-  }
-
-  static variable_list backward(AutogradContext* ctx, const variable_list& grads) {
-    const auto saved = ctx->get_saved_variables();
-    const auto call = c10::static_intrusive_pointer_cast<Call>(ctx->saved_data["call"].toCapsule());
-    auto equation = call->equation;
-    equation.tensors.assign(saved.begin() + 4, saved.end());
-    const size_t inputs = equation.tensors.size() + 1;
-    variable_list out(inputs + 1);  // u, the tensors, and the call, which has no gradient
-    if (!grads[0].defined()) return out;
-    std::vector<int64_t> needed(inputs);
-    for (size_t i = 0; i < inputs; ++i) needed[i] = ctx->needs_input_grad(i);
-    const KeptSolves kept{saved[0], saved[1], saved[2], saved[3]};
-    const auto gradients = [&](const at::Tensor& cotangent) {
-      return vjp(cotangent, kept, equation, call->options, needed);
-    };
-    const WithoutAutocast full_precision;
-    const auto found = is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], gradients) : gradients(grads[0]);
-    std::copy(found.begin(), found.end(), out.begin());
-    return out;
-  }
-
- private:
-  static variable_list vjp(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
-                           const SolveOptions& options, at::IntArrayRef needed) {
-    // With create_graph=True the derivative is itself recorded, solve by solve; else it is one op.
-    if (at::GradMode::is_enabled() || has_tangent(cotangent))
-      return vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve);
-    const auto back = is_plain_call(equation, cotangent, options) ? solve_all_back : call_solves_back;
-    const auto found = back(cotangent, kept, equation, options, needed);
-    variable_list gradients(needed.size());
-    for (size_t i = 0, next = 0; i < needed.size(); ++i)
-      if (needed[i]) gradients[i] = found[next++];
-    return gradients;
-  }
-};
-
-/// The op's autograd kernel.
-SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
-                              const SolveOptions& options) {
-  auto call = c10::make_intrusive<Call>();
-  call->equation = equation;
-  call->count = solves;
-  call->options = options;
-  const auto tensors = call->equation.tensors;
-  TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
-                              "rollout_solves: has no forward mode; take the op rollout");
-  call->products = products_of(call->options.solver.preconditioner.spec());
-  const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
-                              (u.requires_grad() || any_requires_grad(tensors));
-  if (!differentiable) return call_below(call->equation, u, call->count, call->options);
-  const auto out = RolloutSolves::apply(u, at::TensorList(tensors), call);
-  return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }
 
 template <class... Args>
 SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
   const auto call = unpack_call(std::move(args)...);
-  return solve_and_record(call.equation, u, call.count, call.options);
+  return record_rollout(call.equation, u, call.count, call.options);
 }
 
-/// The same step by step.
-SolveResult chain(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
+/// A rollout as single steps, each of which has all derivatives.
+SolveResult step_by_step(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
   check(equation, u, steps * equation.picard_steps, options);
   options.adjoint_log = 0;  // it would hold the first step's alone
   return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) { return step(equation, state, options); });
+}
+
+/// The reports of the steps out of those of their solves: the worst status, the last residual.
+SolveInfo reports_of_steps(const SolveInfo& solves, const c10::SymInt& steps, int64_t picard) {
+  const auto by_step = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
+  const auto last = [&](const at::Tensor& t) { return by_step(t).select(-1, picard - 1); };
+  const auto worst = by_step(solves.status).amin(-1);  // the least
+  return {by_step(solves.iterations).sum(-1), last(solves.residual), worst,
+          by_step(solves.operator_applications).sum(-1), floor_of(last(solves.floor), worst)};
 }
 
 template <class... Args>
@@ -266,24 +177,30 @@ SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
 
 }  // namespace
 
+SolveOutputs rollout_below_autograd(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
+                                    const SolveOptions& o) {
+  const at::AutoDispatchBelowADInplaceOrView below;
+  return is_plain_call(e, u, o) ? solve_all(e, u, solves, o) : call_solves(e, u, solves, o);
+}
+
+std::vector<at::Tensor> rollout_vjp_below_autograd(const at::Tensor& cotangent, const KeptSolves& kept,
+                                                   const Equation& e, const SolveOptions& o, at::IntArrayRef needed) {
+  return (is_plain_call(e, cotangent, o) ? solve_all_back : call_solves_back)(cotangent, kept, e, o, needed);
+}
+
 SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
                     const SolveOptions& options) {
   // The one op has neither forward mode nor transforms; its steps have.
   if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
-    return chain(equation, u, steps.expect_int(), options);
+    return step_by_step(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;
   TORCH_CHECK_VALUE(
       steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? solve_and_record : call_solves;
+  const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? record_rollout : call_solves;
   auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
   if (picard == 1) return {solutions, info};
-  const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
-  const auto last = [&](const at::Tensor& t) { return of_steps(t).select(-1, picard - 1); };
-  const auto worst = of_steps(info.status).amin(-1);
-  return {solutions.slice_symint(1, 0, std::nullopt, picard),
-          {of_steps(info.iterations).sum(-1), last(info.residual), worst, of_steps(info.operator_applications).sum(-1),
-           floor_of(last(info.floor), worst)}};
+  return {solutions.slice_symint(1, 0, std::nullopt, picard), reports_of_steps(info, steps, picard)};
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {

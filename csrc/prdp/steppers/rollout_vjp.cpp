@@ -1,5 +1,6 @@
 #include "prdp/steppers/rollout_vjp.h"
 
+#include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/solve.h"
@@ -17,11 +18,7 @@ at::Tensor at_solve(const at::Tensor& of_solves, int64_t s) {
 }  // namespace
 
 SolveInfo side_by_side(std::vector<SolveInfo> infos, const at::Tensor& u) {
-  if (infos.empty()) {
-    const auto counts = [&] { return at::empty({u.size(0), 0}, u.options().dtype(at::kLong)); };
-    const auto numbers = [&] { return at::empty({u.size(0), 0}, u.options()); };
-    return {counts(), numbers(), counts(), counts(), numbers()};
-  }
+  if (infos.empty()) return empty_info(u, {u.sym_size(0), 0});
   SolveInfo all;
   const auto solves = static_cast<int64_t>(infos.size());
   const auto joined = all.parts();

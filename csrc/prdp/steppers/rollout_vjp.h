@@ -1,5 +1,6 @@
 #pragma once
 #include <algorithm>
+#include <array>
 #include <vector>
 
 #include "prdp/autograd/adjoint_log.h"
@@ -28,7 +29,7 @@ SolveResult solve_by_solve(const at::Tensor& u, int64_t solves, int64_t of_step,
   return {at::stack(solutions, 1), side_by_side(std::move(infos), u)};
 }
 
-/// The way back, from the cotangent (batch, solves + 1, …) of the solutions: `back(s)` takes the cotangent of solution
+/// The reverse, from the cotangent (batch, solves + 1, …) of the solutions: `back(s)` takes the cotangent of solution
 /// s + 1 through solve s and returns the report of its adjoint solve, if there is one. The log gets all of them.
 template <class Back>
 void solve_by_solve_back(const at::Tensor& cotangent, int64_t of_step, int64_t log, const Back& back) {
@@ -46,10 +47,13 @@ void solve_by_solve_back(const at::Tensor& cotangent, int64_t of_step, int64_t l
 /// What the solves of a rollout store for their derivative; undefined if it is not needed.
 struct KeptSolves {
   at::Tensor solutions, iterations, status, residual;  // (batch, solves (+ 1), …)
+
+  /// All of them, in this order.
+  std::array<at::Tensor*, 4> parts() { return {&solutions, &iterations, &status, &residual}; }
 };
 
 /// The product of the cotangent (batch, solves + 1, channel, *shape) of all solutions of a rollout
-/// (rollout_op.cpp) with its derivative: gradients of u and of each tensor of the equation, undefined where
+/// (rollout_node.h) with its derivative: gradients of u and of each tensor of the equation, undefined where
 /// `needed` (u first) holds 0 or there is none. Sums run in the order in which autograd takes the steps
 /// of a chain. Where autograd records, it is differentiable, if `adjoint_solve` is.
 std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,

@@ -39,6 +39,14 @@ class StepperBase {
  protected:
   /// Raises ValueError, in the name of `who`, for options out of range.
   StepperBase(std::string who, SolveOptions options);
+  /// What a step or a rollout returns, solve(). Its report is kept; one that raises has none.
+  template <class Solve>
+  at::Tensor reported(const Solve& solve) {
+    info_.reset();
+    auto [u, info] = solve();
+    info_ = std::move(info);
+    return u;
+  }
 
   std::string who_;
   SolveOptions options_;

@@ -24,17 +24,11 @@ Stepper::Stepper(Equation equation, SolveOptions options)
 }
 
 at::Tensor Stepper::operator()(const at::Tensor& u) {
-  info_.reset();  // a step that raises has none
-  auto [next, info] = step(equation_, u, options_);
-  info_ = std::move(info);
-  return next;
+  return reported([&] { return step(equation_, u, options_); });
 }
 
 at::Tensor Stepper::rollout(const at::Tensor& u, int64_t steps) {
-  info_.reset();  // a step that raises has none
-  auto [states, info] = prdp::rollout(equation_, u, steps, options_);
-  info_ = std::move(info);
-  return states;
+  return reported([&] { return prdp::rollout(equation_, u, steps, options_); });
 }
 
 Poisson::Poisson(std::vector<int64_t> shape, Solver solver, Backward backward, Length length)

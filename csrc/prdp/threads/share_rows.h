@@ -6,6 +6,10 @@
 /// Shares the work on one sample among threads, where a batch has fewer samples than there are threads.
 namespace prdp::share_rows {
 
+/// Values in a block of a long vector. Sums are taken over blocks and then added in order, so that no bit of them
+/// depends on the number of threads.
+inline constexpr int64_t kBlock = 8192;
+
 /// Whether this thread shares its loops. Threads that help never do.
 bool wanted();
 

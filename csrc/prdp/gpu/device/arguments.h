@@ -28,6 +28,12 @@ struct CoarseGrid {
   int64_t coefficients;  // of A there
   int64_t weights[3];    // of each such axis: interpolation from before and from after, restriction likewise
   double radius;         // of D⁻¹A, by the rows' sums
+
+  int points() const { return shape[0] * shape[1] * shape[2]; }
+  bool is_coarsened(int axis) const { return (axes >> axis & 1) != 0; }
+  /// Whether no axis before this one, or behind it, is coarsened.
+  bool is_first(int axis) const { return (axes & ((1 << axis) - 1)) == 0; }
+  bool is_last(int axis) const { return axes >> (axis + 1) == 0; }
 };
 /// Each has at most two thirds of the points of the one before.
 inline constexpr int kMostGrids = 56;

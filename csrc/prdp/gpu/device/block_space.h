@@ -10,7 +10,6 @@
 #include "prdp/kernels/scales.h"
 #include "prdp/solvers/iterate.h"
 #include "prdp/solvers/sample_numbers.h"
-#include "prdp/solvers/sign_pattern.h"
 #include "prdp/solvers/solve_damped.h"
 
 namespace prdp::gpu {
@@ -22,12 +21,12 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   using Numbers = SampleNumbers<typename S::T>;
   using Numbers::broken_;
   using Vectors::beyond_;
-  using Vectors::beyond_of;
+  using Vectors::each;
   using Vectors::into;
   using Vectors::largest_over_rows;
-  using Vectors::memory_of;
-  using Vectors::place;
+  using Vectors::own;
   using Vectors::team_;
+  using Vectors::vector_at;
 
  public:
   using T = typename S::T;
@@ -39,7 +38,6 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   using Vectors::add;
   using Vectors::copy;
   using Vectors::dot;
-  using Vectors::each;
   using Vectors::scratch;
   using Vectors::xpby_with_square;
 
@@ -47,7 +45,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, int64_t sample, T* in_block, T* beyond)
       : Vectors(team, in_block + S::Cycles::kInBlock, beyond),
         a_(a),
-        cycle_{of.hierarchy, sample, in_block, beyond + beyond_of(S::kRestart)},
+        cycle_{of.hierarchy, sample, in_block, beyond + Vectors::kCyclesAt},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
         leaks_(of.needs_projection != 0) {}
@@ -74,8 +72,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   T project(Vector v) { return project(left_null_space_, v); }
   T project_solution(Vector v) { return project(null_space_, v); }
   bool is_singular() const { return left_null_space_.count > 0; }
-  Vector start() { return memory_of(2); }
-  Vector whole_b() { return memory_of(3); }
+  Vector start() { return own(Vectors::kStart); }
+  Vector whole_b() { return own(Vectors::kWholeB); }
   /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
   PRDP_ONCE void start_here(T left2) {
     this->template each<1>([&](int i) { return Pair{b()[i], whole_b()[i]}; },
@@ -92,7 +90,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   bool started() const { return started_; }
 
   // ---- what space.h asks for
-  Vector b() { return memory_of(0); }
+  Vector b() { return own(Vectors::kB); }
   Scalar b2() const { return b2_; }
   PRDP_ONCE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
     T s = 0;
@@ -158,9 +156,11 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     T s = 0;
     if constexpr (S::Cycles::kAny) {
       if constexpr (std::is_same<A, typename A::Cycled>::value)
-        cycle_.apply(team_, a_, v, out, place(0), place(1), place(2));
+        cycle_.apply(team_, a_, v, out, vector_at(0), vector_at(1), vector_at(2));
       else
-        SaddlePoint<S>{team_, a_, cycle_, {place(0), place(1), place(2), place(3), place(4), place(5)}}.apply(v, out);
+        SaddlePoint<S>{
+            team_, a_, cycle_, {vector_at(0), vector_at(1), vector_at(2), vector_at(3), vector_at(4), vector_at(5)}}
+            .apply(v, out);
       if (null_space_.count > 0) project_solution(out);  // cycles leave rounding there, which they would amplify
       return dot(v, out);
     }
@@ -195,7 +195,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
                       Scalar* y) const {
     if (keep != 0) return;
-    T* const work = beyond_ + beyond_of(0);
+    T* const work = beyond_ + Vectors::kDampingAt;
     T* const found = work + numbers_of_solve_damped(n);
     if (team_.leads()) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
     team_.meet();

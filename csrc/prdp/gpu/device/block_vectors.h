@@ -11,8 +11,8 @@
 
 namespace prdp::gpu {
 
-/// The vectors of a sample that a team of threads owns, and what is done with them without A. They lie in the memory of
-/// the block, or of the device; every operation is a loop over a thread's share, and a sum is the same in every thread.
+/// The vectors of a sample that a team of threads owns, and what is done with them without A: the operations of
+/// solvers/space.h. Each is a loop over a thread's share of the entries, and a sum is the same in every thread.
 template <class S>
 class BlockVectors {
  public:
@@ -22,10 +22,36 @@ class BlockVectors {
   using Scalar = T;
   using TeamOfSample = Team<S::kBlocks, S::kThreads>;
 
+  /// Vectors lie in the memory of the block, as many as fit, and the others in that of the device, `beyond`. Behind
+  /// these it has numbers for damping, and then the coarse grids.
   BlockVectors(TeamOfSample& team, T* in_block, T* beyond) : team_(team), in_block_(in_block), beyond_(beyond) {}
+  static constexpr int64_t kDampingAt = static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns;
+  static constexpr int64_t kCyclesAt = kDampingAt + numbers_beyond(S::kRestart);
+  static constexpr int64_t kNumbersBeyond = kCyclesAt + S::Cycles::kBeyond;
 
-  Vector vector() { return memory_of(used_++); }
-  Vector scratch() { return memory_of(1); }
+  // ---- a sample (solve_sample.h)
+
+  /// y = factor x, where one of the two is no vector of the space.
+  PRDP_ONCE void load(const T* x, T factor, Vector y) {
+    each<1>([&](int i) { return factor * x[i]; }, into(y));
+  }
+  T store(const T* x, T factor, T* u) {
+    load(x, factor, u);
+    return largest_magnitude(u);
+  }
+  T largest_given(const T* x) { return largest_magnitude(x); }
+  PRDP_ONCE T largest_magnitude(const T* x) {
+    return largest_over_rows([&](int i) { return std::abs(x[i]); });
+  }
+  void scale(T factor, Vector x) { load(x, factor, x); }
+  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
+    each<1>([&](int i) { return y[i] + alpha * x[i]; }, into(y));
+  }
+
+  // ---- primitives
+
+  Vector vector() { return vector_at(S::Cycles::kVectors + used_++); }
+  Vector scratch() { return own(kScratch); }
   static constexpr int64_t unknowns() { return A::kUnknowns; }
   template <class X>
   Slice<X> array(int64_t n) const {
@@ -33,7 +59,6 @@ class BlockVectors {
     used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
     return {first, n};
   }
-
   PRDP_ONCE void fill_zero(Vector v) {
     each([](int) { return T(0); }, into(v));
   }
@@ -47,26 +72,6 @@ class BlockVectors {
   PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
     each([&](int i) { return x[i] + beta * y[i]; }, into(y));
   }
-  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
-    each<1>([&](int i) { return y[i] + alpha * x[i]; }, into(y));
-  }
-  /// x = factor x
-  PRDP_ONCE void scale(T factor, Vector x) {
-    each<1>([&](int i) { return factor * x[i]; }, into(x));
-  }
-  /// y = factor · x, where one of the two is no vector of the space.
-  PRDP_ONCE void load(const T* x, T factor, Vector y) {
-    each<1>([&](int i) { return factor * x[i]; }, into(y));
-  }
-  T store(const T* x, T factor, T* u) {
-    load(x, factor, u);
-    return largest_magnitude(u);
-  }
-  T largest_given(const T* x) { return largest_magnitude(x); }
-  PRDP_ONCE T largest_magnitude(const T* x) {
-    return largest_over_rows([&](int i) { return std::abs(x[i]); });
-  }
-
   PRDP_ONCE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
     return square_of([&](int i) { return x[i] + beta * y[i]; }, y);
   }
@@ -75,6 +80,9 @@ class BlockVectors {
     each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
     return team_.sum(s);
   }
+
+  // ---- GMRES
+
   PRDP_ONCE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
     for (int64_t j = 0; j < count; j += kMostAtOnce) {
       T s[kMostAtOnce] = {};
@@ -107,27 +115,27 @@ class BlockVectors {
         into(x));
   }
 
+ protected:
+  /// The vectors that the space itself keeps.
+  enum Own : int { kB, kScratch, kStart, kWholeB };
+  static_assert(kWholeB + 1 == kOwnVectors);
+  Vector own(Own which) { return vector_at(S::Cycles::kVectors + which); }
+  /// All vectors, those of cycles first, then the space's own and those of the method.
+  Vector vector_at(int i) {
+    if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
+    return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
+  }
+
   /// f(i), and then store(i, f(i)), for this thread's cells. Loops that run a few times in a solve take one cell at
   /// once, which leaves less to compile.
   template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(const F& f, const Store& store) const {
     team_.template each<kAtOnce>(A::kUnknowns, f, store);
   }
-
- protected:
   static auto into(Vector v) {
     return [v](int i, T value) { v[i] = value; };
   }
-  Vector place(int i) {
-    if (i < S::kInBlock) return in_block_ + static_cast<int64_t>(i) * A::kUnknowns;
-    return beyond_ + static_cast<int64_t>(i - S::kInBlock) * A::kUnknowns;
-  }
-  /// The first vectors are those of cycles.
-  Vector memory_of(int i) { return place(i + S::Cycles::kVectors); }
-  /// Numbers beyond the block: vectors, and what damping needs.
-  static constexpr int64_t beyond_of(int restart) {
-    return static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns + numbers_beyond(restart);
-  }
+  /// out = f; returns ‖out‖².
   template <class F>
   T square_of(const F& f, Vector out) {
     T s = 0;

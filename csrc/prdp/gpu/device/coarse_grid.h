@@ -63,6 +63,7 @@ struct CoarsenedAxis {
   int between() const { return n - coarse; }
   int weights() const { return outer * between() * inner; }
   int coarse_entries() const { return outer * coarse * inner; }
+  int fine_entries() const { return outer * n * inner; }
   /// The place on the axis of a coarse point, and of one between.
   int of_coarse(int j) const { return periodic ? 2 * j : 2 * j + 1; }
   int of_between(int k) const { return periodic ? 2 * k + 1 : 2 * k; }

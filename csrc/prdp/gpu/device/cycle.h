@@ -43,36 +43,41 @@ struct Cycle {
 
   HierarchyView<T> hierarchy;
   int64_t sample;
-  T *in_block, *beyond;
+  T *in_block, *beyond;  // memory for the vectors of coarse grids
 
   bool exists() const { return grids().count > 0; }
 
-  /// z = M⁻¹ r; x, y and t are memory.
-  PRDP_ONCE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* t) const {
-    Walk walk{*this, team, a, r, {nullptr, x, y}, t};
-    const int last = static_cast<int>(grids().count) - 1;
-    for (int level = 0; level < last; ++level) walk.go_down(level);
-    walk.solve_coarsest(last);
+  /// z = M⁻¹ r; x, y and spare are memory.
+  PRDP_ONCE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* spare) const {
+    Walk walk{*this, team, a, r, {nullptr, x, y}, spare};
+    const int coarsest = static_cast<int>(grids().count) - 1;
+    for (int level = 0; level < coarsest; ++level) walk.go_down(level);
+    walk.solve_coarsest(coarsest);
     const T* found = walk.vectors.x;
-    for (int level = last - 1; level >= 0; --level) found = walk.go_up(level, found);
+    for (int level = coarsest - 1; level >= 0; --level) found = walk.go_up(level, found);
     team.each(A::kUnknowns, [&](int i) { return found[i]; }, [&](int i, T value) { z[i] = value; });
   }
 
  private:
-  static constexpr int fields() { return A::kUnknowns / A::Points::kPoints; }
+  static constexpr int kFields = A::kUnknowns / A::Points::kPoints;
+  using Stencil = GridStencil<T, A, S::Cycles::kDim>;
+
   const Grids& grids() const { return hierarchy.grids[hierarchy.numbers_of_sample > 0 ? sample : 0]; }
   const T* numbers(int64_t place) const { return hierarchy.numbers + sample * hierarchy.numbers_of_sample + place; }
+
+  static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
 
   /// The right-hand side of a grid and two vectors, which the smoothing steps fill in turn.
   struct Vectors {
     T *b, *x, *y;
   };
+  /// The weights with which a point between two coarse ones takes them.
+  struct Weights {
+    const T *left, *right;
+  };
 
-  static int points(const CoarseGrid& grid) { return grid.shape[0] * grid.shape[1] * grid.shape[2]; }
-  static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
-
-  /// A on the finest grid, and on the others; for all fields.
-  struct Finest {
+  /// A on the finest grid: entry i of all fields.
+  struct OnFinest {
     const A& a;
     const T* diagonals;
     T diagonal(int i) const { return diagonals[i % A::Points::kPoints]; }
@@ -81,8 +86,9 @@ struct Cycle {
       return a.product(v, i);
     }
   };
-  struct Coarse {
-    GridStencil<T, A, S::Cycles::kDim> a;
+  /// A, or its transpose, on a coarse grid likewise.
+  struct OnCoarse {
+    Stencil a;
     int points;
     bool transposed;
     T diagonal(int i) const { return a.coefficients[a.kCentre * points + i % points]; }
@@ -99,82 +105,73 @@ struct Cycle {
     }
   };
 
+  /// One application of M⁻¹, from grid to grid.
   struct Walk {
-    const Cycle& of;
+    const Cycle& cycle;
     TeamOfSample& team;
     const A& a;
-    const T* r;
+    const T* r;       // the right-hand side of the finest grid
     Vectors vectors;  // of the grid where it is
-    T* t;
+    T* spare;
     Vectors finest{};
 
-    const CoarseGrid& grid(int level) const { return of.grids().grid[level]; }
-    int64_t entries(int level) const { return int64_t{fields()} * points(grid(level)); }
-    const T* right_hand_side(int level) const { return level == 0 ? r : vectors.b; }
-    bool transposed() const { return of.hierarchy.transposed != 0; }
+    // ---- from grid to grid
 
-    /// The vectors of a coarse grid, which lie behind those of the grids above it.
-    Vectors vectors_of(int level) const {
-      int64_t place = 0;
-      for (int above = 1; above < level; ++above) place += 3 * entries(above);
-      const int64_t n = entries(level);
-      T* const first = (place + 3 * n <= S::Cycles::kInBlock ? of.in_block : of.beyond) + place;
-      return {first, first + n, first + 2 * n};
-    }
-
+    /// Smooths, and takes the residual to the right-hand side of the next grid, one axis after the other.
     PRDP_ONCE void go_down(int level) {
       const CoarseGrid& here = grid(level);
       smooth(level, /*from_zero=*/true);
       take_residual(level);
-      const T* from = vectors.y;
-      T* const other = vectors.y;
+      T* const residual = vectors.y;
       if (level == 0) finest = vectors;
       vectors = vectors_of(level + 1);
+      const T* from = residual;
       for (int axis = 0; axis < 3; ++axis) {
-        if (!(here.axes >> axis & 1)) continue;
-        T* const to = here.axes >> (axis + 1) == 0 ? vectors.b : from == other ? t : other;
+        if (!here.is_coarsened(axis)) continue;
+        T* const to = here.is_last(axis) ? vectors.b : from == residual ? spare : residual;
         team.meet();
         restrict(here, axis, from, to);
         from = to;
       }
     }
-    /// From the solution of the coarser grid to that of this one, which it returns.
-    PRDP_ONCE const T* go_up(int level, const T* coarse) {
-      vectors = level == 0 ? finest : vectors_of(level);
-      // Each smoothing step but the first had swapped them on the way down.
-      if (level > 0 && of.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
-      const CoarseGrid& here = grid(level);
-      for (int axis = 2; axis >= 0; --axis) {
-        if (!(here.axes >> axis & 1)) continue;
-        const bool is_last = (here.axes & ((1 << axis) - 1)) == 0;
-        T* const to = is_last ? vectors.x : coarse == t ? vectors.y : t;
-        team.meet();
-        interpolate(here, axis, coarse, to, is_last);
-        coarse = to;
-      }
-      smooth(level, /*from_zero=*/false);
-      return vectors.x;
-    }
     PRDP_ONCE void solve_coarsest(int level) {
       const T* const b = right_hand_side(level);
-      const T* const inverse = of.numbers(of.grids().inverse);
-      const int n = points(grid(level));
+      const T* const inverse = cycle.numbers(cycle.grids().inverse);
+      const int n = grid(level).points();
       const bool by_columns = transposed();
       T* const x = vectors.x;
       team.meet();
       const auto given = shared(b);
-      team.for_each(fields() * n, [&](int at) {
+      team.for_each(kFields * n, [&](int at) {
         const int i = at % n;
         T sum = 0;
         PRDP_ROLLED for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
         x[at] = sum;
       });
     }
+    /// Adds the solution of the coarser grid to that of this one, smooths, and returns it.
+    PRDP_ONCE const T* go_up(int level, const T* coarse) {
+      vectors = level == 0 ? finest : vectors_of(level);
+      // Each smoothing step but the first swapped them when the walk came down.
+      if (level > 0 && cycle.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
+      const CoarseGrid& here = grid(level);
+      for (int axis = 2; axis >= 0; --axis) {
+        if (!here.is_coarsened(axis)) continue;
+        T* const to = here.is_first(axis) ? vectors.x : coarse == spare ? vectors.y : spare;
+        team.meet();
+        interpolate(here, axis, coarse, to, /*adds=*/here.is_first(axis));
+        coarse = to;
+      }
+      smooth(level, /*from_zero=*/false);
+      return vectors.x;
+    }
+
+    // ---- on a grid
 
     /// x = M b, or from x on; y is memory.
     PRDP_ONCE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
-      for (int64_t s = 0; s < of.hierarchy.smoothing; ++s) {
+      for (int64_t s = 0; s < cycle.hierarchy.smoothing; ++s) {
         const kernels::SmoothingStep step = steps.next();
         if (from_zero && s == 0) {
           begin(level, static_cast<T>(step.q));
@@ -188,27 +185,23 @@ struct Cycle {
     PRDP_ONCE void begin(int level, T q) {
       const T *const b = right_hand_side(level), *const diagonal = diagonals(level);
       T *const x = vectors.x, *const y = vectors.y;
-      const int n = points(grid(level));
-      team.for_each(fields() * n, [&](int i) {
+      const int n = grid(level).points();
+      team.for_each(kFields * n, [&](int i) {
         x[i] = q * (b[i] / diagonal[i % n]);
         y[i] = 0;
       });
-    }
-    const T* diagonals(int level) const {
-      using Stencil = GridStencil<T, A, S::Cycles::kDim>;
-      return of.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * points(grid(level));
     }
     /// y = b - A x
     void take_residual(int level) { relax(level, T(0), T(0)); }
     /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x: products are most of what there is to compile, so
     /// there is one text of both.
     PRDP_ONCE void relax(int level, T p, T q) {
-      if (level == 0) return relax(Finest{a, diagonals(0)}, r, A::kUnknowns, p, q);
+      if (level == 0) return relax(OnFinest{a, diagonals(0)}, r, A::kUnknowns, p, q);
       const CoarseGrid& here = grid(level);
-      const int n = points(here);
-      const Coarse coarse{
-          {of.numbers(here.coefficients), {here.shape[0], here.shape[1], here.shape[2]}}, n, transposed()};
-      relax(coarse, vectors.b, fields() * n, p, q);
+      const int n = here.points();
+      const OnCoarse coarse{
+          {cycle.numbers(here.coefficients), {here.shape[0], here.shape[1], here.shape[2]}}, n, transposed()};
+      relax(coarse, vectors.b, kFields * n, p, q);
     }
     template <class Level>
     PRDP_ONCE void relax(const Level& level, const T* b, int n, T p, T q) {
@@ -227,36 +220,55 @@ struct Cycle {
       });
     }
 
-    static CoarsenedAxis line_of(const CoarseGrid& of, int axis) {
-      int shape[3] = {of.shape[0], of.shape[1], of.shape[2]};
-      for (int d = 0; d < axis; ++d)
-        if (of.axes >> d & 1) shape[d] = static_cast<int>(kernels::coarse_points(shape[d], A::periodic(d)));
-      return {shape, axis, A::periodic(axis)};
-    }
-    enum class Weights { kInterpolation, kRestriction };
-    /// Of a symmetric operator they are the same.
-    const T* weights(const CoarseGrid& here, int axis, const CoarsenedAxis& line, Weights which) const {
-      const bool second = which == Weights::kRestriction && !of.grids().is_symmetric;
-      return of.numbers(here.weights[axis]) + (second ? 2 * line.weights() : 0);
-    }
+    // ---- between grids, along one axis
+
     PRDP_ONCE void restrict(const CoarseGrid& here, int axis, const T* fine, T* coarse) {
       const CoarsenedAxis line = line_of(here, axis);
-      const T* const left = weights(here, axis, line, transposed() ? Weights::kInterpolation : Weights::kRestriction);
-      const T* const right = left + line.weights();
+      const Weights w = weights(here, axis, line, /*of_restriction=*/true);
       const auto given = shared(fine);
-      team.for_each(fields() * line.coarse_entries(),
-                    [&](int i) { coarse[i] = line.restricted(given, left, right, i); });
+      team.for_each(kFields * line.coarse_entries(),
+                    [&](int i) { coarse[i] = line.restricted(given, w.left, w.right, i); });
     }
     PRDP_ONCE void interpolate(const CoarseGrid& here, int axis, const T* coarse, T* fine, bool adds) {
       const CoarsenedAxis line = line_of(here, axis);
-      const T* const left = weights(here, axis, line, transposed() ? Weights::kRestriction : Weights::kInterpolation);
-      const T* const right = left + line.weights();
+      const Weights w = weights(here, axis, line, /*of_restriction=*/false);
       const auto given = shared(coarse);
-      team.for_each(fields() * line.outer * line.n * line.inner, [&](int i) {
-        const T value = line.interpolated(given, left, right, i);
+      team.for_each(kFields * line.fine_entries(), [&](int i) {
+        const T value = line.interpolated(given, w.left, w.right, i);
         fine[i] = adds ? fine[i] + value : value;
       });
     }
+    static CoarsenedAxis line_of(const CoarseGrid& grid, int axis) {
+      int shape[3] = {grid.shape[0], grid.shape[1], grid.shape[2]};
+      for (int d = 0; d < axis; ++d)
+        if (grid.is_coarsened(d)) shape[d] = static_cast<int>(kernels::coarse_points(shape[d], A::periodic(d)));
+      return {shape, axis, A::periodic(axis)};
+    }
+    /// Those of interpolation come first; of a symmetric operator they are those of restriction, too. The transpose of
+    /// an operator restricts as the operator interpolates, and the other way round.
+    Weights weights(const CoarseGrid& here, int axis, const CoarsenedAxis& line, bool of_restriction) const {
+      const bool second = of_restriction != transposed() && !cycle.grids().is_symmetric;
+      const T* const left = cycle.numbers(here.weights[axis]) + (second ? 2 * line.weights() : 0);
+      return {left, left + line.weights()};
+    }
+
+    // ---- grids, and what is known on them
+
+    const CoarseGrid& grid(int level) const { return cycle.grids().grid[level]; }
+    bool transposed() const { return cycle.hierarchy.transposed != 0; }
+    const T* right_hand_side(int level) const { return level == 0 ? r : vectors.b; }
+    const T* diagonals(int level) const {
+      return cycle.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * grid(level).points();
+    }
+    /// The vectors of a coarse grid, which lie behind those of the grids above it.
+    Vectors vectors_of(int level) const {
+      int64_t place = 0;
+      for (int above = 1; above < level; ++above) place += 3 * entries(above);
+      const int64_t n = entries(level);
+      T* const first = (place + 3 * n <= S::Cycles::kInBlock ? cycle.in_block : cycle.beyond) + place;
+      return {first, first + n, first + 2 * n};
+    }
+    int64_t entries(int level) const { return int64_t{kFields} * grid(level).points(); }
   };
 };
 

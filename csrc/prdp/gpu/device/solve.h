@@ -43,11 +43,9 @@ void solve_batch(const SolveArguments<typename S::T>& of, typename S::T* in_bloc
   using T = typename S::T;
   using Space = BlockSpace<S>;
   const int team = static_cast<int>(blockIdx.x) / S::kBlocks, rank = static_cast<int>(blockIdx.x) % S::kBlocks;
-  const int64_t beyond_of_team = static_cast<int64_t>(S::kVectors - S::kInBlock) * Space::unknowns() +
-                                 numbers_beyond(S::kRestart) + S::Cycles::kBeyond;
   typename Space::TeamOfSample threads(rank, of.arrived + 32 * team, of.parts + 2 * kMostAtOnce * S::kBlocks * team);
   for (int64_t sample = team; sample < of.batch; sample += static_cast<int>(gridDim.x) / S::kBlocks) {
-    Space space(threads, typename S::A(of.a, sample), of, sample, in_block, of.memory + beyond_of_team * team);
+    Space space(threads, typename S::A(of.a, sample), of, sample, in_block, of.memory + Space::kNumbersBeyond * team);
     const SampleOutcome outcome = solve_sample_of<Method, S>(of, sample, space);
     if (outcome.is_zero) space.fill_zero(of.u + sample * Space::unknowns());
     if (!threads.leads()) continue;

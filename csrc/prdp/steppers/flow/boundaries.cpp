@@ -23,11 +23,11 @@ int64_t position(const FlowBox& box, int64_t cell, int64_t axis) {
   return cell / stride(box, axis) % box.shape()[axis];
 }
 
-/// The neighbour of a cell along an axis, `way` = 1 or -1; -1 beyond an end.
-int64_t cell_beside(const FlowBox& box, int64_t cell, int64_t axis, int64_t way) {
-  const int64_t n = box.shape()[axis], at = position(box, cell, axis), to = at + way;
-  if (to >= 0 && to < n) return cell + way * stride(box, axis);
-  return box.boundary(axis) == FlowBoundary::kPeriodic ? cell - way * (n - 1) * stride(box, axis) : -1;
+/// The neighbour of a cell along an axis, to the `side` 1 or -1; -1 beyond an end.
+int64_t cell_beside(const FlowBox& box, int64_t cell, int64_t axis, int64_t side) {
+  const int64_t n = box.shape()[axis], at = position(box, cell, axis), to = at + side;
+  if (to >= 0 && to < n) return cell + side * stride(box, axis);
+  return box.boundary(axis) == FlowBoundary::kPeriodic ? cell - side * (n - 1) * stride(box, axis) : -1;
 }
 
 Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
@@ -39,8 +39,8 @@ Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
     parts.of_cell[first] = parts.count;
     for (; !queue.empty(); queue.pop_front())
       for (int64_t axis = 0; axis < box.dim(); ++axis)
-        for (const int64_t way : {-1, 1}) {
-          const int64_t next = cell_beside(box, queue.front(), axis, way);
+        for (const int64_t side : {-1, 1}) {
+          const int64_t next = cell_beside(box, queue.front(), axis, side);
           if (next < 0 || !is_fluid[next] || parts.of_cell[next] >= 0) continue;
           parts.of_cell[next] = parts.count;
           queue.push_back(next);
@@ -107,15 +107,15 @@ at::Tensor diffusion_coefficients(const FlowBox& box, int64_t along, const at::T
   auto diagonal = at::zeros(box.shape(), at::kDouble);
   std::vector<at::Tensor> of_neighbours;
   for (int64_t axis = 0; axis < box.dim(); ++axis)
-    for (const int64_t way : {-1, 1}) {
+    for (const int64_t side : {-1, 1}) {
       const double coupling = 1.0 / (box.dx(axis) * box.dx(axis));
       // A wall or an inlet along the face's own axis is a whole cell away, along the others half a cell.
-      const bool outlet = box.boundary(axis) == FlowBoundary::kOpen && way > 0;
+      const bool outlet = box.boundary(axis) == FlowBoundary::kOpen && side > 0;
       const double beyond = outlet ? 0.0 : axis == along ? 1.0 : 2.0;
-      const auto weight = neighbour(box, at::ones(box.shape(), at::kDouble), axis, way, beyond);
-      const auto behind = axis == along ? at::zeros_like(weight) : neighbour(box, inside, axis, way, 0.0);
+      const auto weight = neighbour(box, at::ones(box.shape(), at::kDouble), axis, side, beyond);
+      const auto behind = axis == along ? at::zeros_like(weight) : neighbour(box, inside, axis, side, 0.0);
       diagonal = diagonal + coupling * (weight + behind) * free;
-      of_neighbours.push_back(-coupling * free * neighbour(box, free, axis, way, 0.0));
+      of_neighbours.push_back(-coupling * free * neighbour(box, free, axis, side, 0.0));
     }
   return coefficients(diagonal, of_neighbours);
 }
@@ -151,9 +151,9 @@ FlowFields make_flow_fields(const FlowBox& box) {
   for (int64_t c = 0; c < d; ++c) {
     const int64_t along = d - 1 - c;
     for (int64_t axis = 0; axis < d && !regular; ++axis)
-      for (const int64_t way : {-1, 1})
+      for (const int64_t side : {-1, 1})
         if (axis != along)
-          friction[c] += free[c] * neighbour(box, inside[c], axis, way, 0.0) / (box.dx(axis) * box.dx(axis));
+          friction[c] += free[c] * neighbour(box, inside[c], axis, side, 0.0) / (box.dx(axis) * box.dx(axis));
     fields.diffusion.push_back(diffusion_coefficients(box, along, free[c], inside[c]));
   }
   auto known = fluid.logical_not();

@@ -55,25 +55,17 @@ Flow::Flow(std::vector<int64_t> shape, Viscosity nu, double dt, FlowSettings set
     : Flow(make_equation(std::move(shape), std::move(nu), dt, std::move(settings)), {std::move(solver), backward}) {}
 
 at::Tensor Flow::operator()(const at::Tensor& u) {
-  info_.reset();  // a step that raises has none
-  auto [next, info] = flow_next(equation_, u, options_);
-  info_ = std::move(info);
-  return next;
+  return reported([&] { return flow_next(equation_, u, options_); });
 }
 
 std::pair<at::Tensor, at::Tensor> Flow::step_and_pressure(const at::Tensor& u) {
-  info_.reset();  // a step that raises has none
-  auto [both, info] = flow_next_and_pressure(equation_, u, options_);
-  info_ = std::move(info);
+  const auto both = reported([&] { return flow_next_and_pressure(equation_, u, options_); });
   const int64_t d = equation_.box->dim();
   return {both.narrow(1, 0, d), both.narrow(1, d, 1)};
 }
 
 at::Tensor Flow::rollout(const at::Tensor& u, int64_t steps) {
-  info_.reset();  // a step that raises has none
-  auto [states, info] = flow_rollout(equation_, u, steps, options_);
-  info_ = std::move(info);
-  return states;
+  return reported([&] { return flow_rollout(equation_, u, steps, options_); });
 }
 
 at::Tensor Flow::project(const at::Tensor& u) const { return flow_project(equation_, u, options_); }

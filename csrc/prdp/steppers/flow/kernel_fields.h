@@ -1,4 +1,6 @@
 #pragma once
+#include <ATen/Dispatch.h>
+
 #include "prdp/gpu/device/flow.h"
 #include "prdp/gpu/launch.h"
 #include "prdp/gpu/operator_view.h"
@@ -86,8 +88,27 @@ inline std::vector<int64_t> sizes_of_potential(const at::Tensor& like, const Flo
 
 inline int64_t cells_of(const FlowBox& box) { return c10::multiply_integers(box.shape()); }
 
-inline gpu::Body body(const char* name, const char* header, const at::Tensor& like) {
-  return {std::string(name) + "<" + gpu::type_of(like.scalar_type()) + ">", header};
+/// A loop over points or samples: the name of its struct, and the header of gpu/device that has it.
+struct Loop {
+  const char *name, *header;
+  gpu::Body body(const at::Tensor& like) const {
+    return {std::string(name) + "<" + gpu::type_of(like.scalar_type()) + ">", header};
+  }
+};
+
+/// Whether the loop was launched for `count` points, in the dtype of `like`; make(T{}) is its struct.
+template <class Make>
+bool each_point(const Loop& loop, const at::Tensor& like, int64_t count, const Make& make) {
+  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), loop.name, [&] {
+    return gpu::each_point(like.device(), loop.body(like), make(scalar_t{}), count);
+  });
+}
+/// The same for the samples of `like`, of so many points each.
+template <class Make>
+bool each_sample(const Loop& loop, const at::Tensor& like, int64_t points, const Make& make) {
+  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), loop.name, [&] {
+    return gpu::each_sample(like.device(), loop.body(like), make(scalar_t{}), points, like.size(0));
+  });
 }
 
 }  // namespace prdp::flow_kernels

@@ -1,6 +1,5 @@
 #include "prdp/steppers/flow/kernels.h"
 
-#include <ATen/Dispatch.h>
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/gpu/device/flow_pressure.h"
@@ -54,8 +53,7 @@ std::optional<Start> start(const FlowEquation& e, const at::Tensor& u) {
   found.velocity = found.padded;
   for (int64_t axis = 0; axis < d; ++axis) found.velocity = found.velocity.narrow(axis + 2, 1, box.shape()[axis]);
   const bool grows_with_nu = e.advection == FlowAdvection::kCentral && e.diffusion == FlowDiffusion::kImplicit;
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "flow_start", [&] {
-    using T = scalar_t;
+  const bool launched = each_sample({"FlowStart", kFlow}, u, d * cells_of(box), [&]<class T>(T) {
     gpu::FlowStart<T> of{.boundary = {.grid = grid_of(box),
                                       .u = field_of<const T>(u),
                                       .free = field_of<const T>(fields.free),
@@ -71,22 +69,18 @@ std::optional<Start> start(const FlowEquation& e, const at::Tensor& u) {
     for (int64_t axis = 0; axis < d; ++axis)
       for (const bool high : {false, true})
         of.boundary.walls[2 * (axis + 3 - d) + high] = field_of<const T>(e.velocity_of_wall(axis, high));
-    return gpu::each_sample(u.device(), body("FlowStart", kFlow, u), of, d * cells_of(box), batch);
+    return of;
   });
   return launched ? std::optional(found) : std::nullopt;
 }
 
 at::Tensor change(const FlowEquation& e, const Start& start) {
-  const auto& box = *e.box;
-  const auto& like = start.velocity;
-  const auto out = by_channels(like, box);
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_change", [&] {
-    using T = scalar_t;
-    const gpu::FlowChange<T> of{.terms = terms_of<T>(e, start.padded),
-                                .force = field_of<const T>(e.force),
-                                .status = data_of<const int64_t>(start.status),
-                                .change = field_of<T>(out)};
-    return gpu::each_point(like.device(), body("FlowChange", kFlow, like), of, out.numel());
+  const auto out = by_channels(start.velocity, *e.box);
+  const bool launched = each_point({"FlowChange", kFlow}, out, out.numel(), [&]<class T>(T) {
+    return gpu::FlowChange<T>{.terms = terms_of<T>(e, start.padded),
+                              .force = field_of<const T>(e.force),
+                              .status = data_of<const int64_t>(start.status),
+                              .change = field_of<T>(out)};
   });
   return launched ? out : at::Tensor();
 }
@@ -95,17 +89,15 @@ at::Tensor divergence(const FlowBox& box, const Correction& correction, double f
   const auto& like = velocity_like(correction);
   const auto& fields = box.fields(like.options());
   const auto b = at::empty(sizes_of_potential(like, box), like.options());
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_divergence", [&] {
-    using T = scalar_t;
-    const gpu::FlowDivergence<T> of{.u = velocity_of<T>(box, correction, like),
-                                    .cells = field_of<const T>(fields.cells),
-                                    .of_potential = field_of<const T>(correction.of_potential),
-                                    .parts = parts_of<T>(box, like),
-                                    .share = share_of<T>(correction),
-                                    .factor = factor,
-                                    .for_a_solve = for_a_solve,
-                                    .b = data_of<T>(b)};
-    return gpu::each_sample(like.device(), body("FlowDivergence", kPressure, like), of, cells_of(box), like.size(0));
+  const bool launched = each_sample({"FlowDivergence", kPressure}, like, cells_of(box), [&]<class T>(T) {
+    return gpu::FlowDivergence<T>{.u = velocity_of<T>(box, correction, like),
+                                  .cells = field_of<const T>(fields.cells),
+                                  .of_potential = field_of<const T>(correction.of_potential),
+                                  .parts = parts_of<T>(box, like),
+                                  .share = share_of<T>(correction),
+                                  .factor = factor,
+                                  .for_a_solve = for_a_solve,
+                                  .b = data_of<T>(b)};
   });
   return launched ? b : at::Tensor();
 }
@@ -118,21 +110,19 @@ std::optional<Corrected> correct(const FlowBox& box, const Correction& correctio
   const bool own_potential = before.defined() || correction.share_by_nu.defined();
   Corrected result{by_channels(like, box), how.wants_on_free_faces ? by_channels(like, box) : at::Tensor(),
                    own_potential ? at::empty_like(solution) : phi};
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_correction", [&] {
-    using T = scalar_t;
-    const gpu::FlowCorrection<T> of{.u = velocity_of<T>(box, correction, like),
-                                    .cells = field_of<const T>(box.fields(like.options()).cells),
-                                    .parts = parts_of<T>(box, like),
-                                    .share = share_of<T>(correction),
-                                    .factor = how.factor,
-                                    .on_all_faces = how.on_all_faces,
-                                    .found = data_of<const T>(solution),
-                                    .before = data_of<const T>(before),
-                                    .phi = data_of<T>(phi),
-                                    .potential = own_potential ? data_of<T>(result.potential) : nullptr,
-                                    .out = field_of<T>(result.u),
-                                    .on_free_faces = field_of<T>(result.on_free_faces)};
-    return gpu::each_sample(like.device(), body("FlowCorrection", kPressure, like), of, cells_of(box), like.size(0));
+  const bool launched = each_sample({"FlowCorrection", kPressure}, like, cells_of(box), [&]<class T>(T) {
+    return gpu::FlowCorrection<T>{.u = velocity_of<T>(box, correction, like),
+                                  .cells = field_of<const T>(box.fields(like.options()).cells),
+                                  .parts = parts_of<T>(box, like),
+                                  .share = share_of<T>(correction),
+                                  .factor = how.factor,
+                                  .on_all_faces = how.on_all_faces,
+                                  .found = data_of<const T>(solution),
+                                  .before = data_of<const T>(before),
+                                  .phi = data_of<T>(phi),
+                                  .potential = own_potential ? data_of<T>(result.potential) : nullptr,
+                                  .out = field_of<T>(result.u),
+                                  .on_free_faces = field_of<T>(result.on_free_faces)};
   });
   return launched ? std::optional(result) : std::nullopt;
 }
@@ -142,8 +132,7 @@ at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like)
   auto sizes = patterns[0].sizes().vec();
   sizes[0] = static_cast<int64_t>(patterns.size());
   const auto out = at::empty(sizes, like.options());
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_diffusion", [&] {
-    using T = scalar_t;
+  const bool launched = each_point({"FlowDiffusionEntries", kFlow}, out, out.numel(), [&]<class T>(T) {
     gpu::FlowDiffusionEntries<T> of{.patterns = {},
                                     .nu = number_of<T>(e.nu),
                                     .dt = e.dt,
@@ -151,7 +140,7 @@ at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like)
                                     .cells = static_cast<int>(cells_of(*e.box)),
                                     .out = data_of<T>(out)};
     for (size_t k = 0; k < patterns.size(); ++k) of.patterns[k] = data_of<const T>(patterns[k]);
-    return gpu::each_point(like.device(), body("FlowDiffusionEntries", kFlow, like), of, out.numel());
+    return of;
   });
   return launched ? out : at::Tensor();
 }
@@ -162,8 +151,8 @@ std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, con
   const auto like = [](const at::Tensor& t) { return at::empty_like(t, at::MemoryFormat::Contiguous); };
   SolveInfo all{like(first.iterations), like(first.residual), like(first.status), like(first.operator_applications),
                 like(first.floor)};
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(first.residual.scalar_type(), "flow_report", [&] {
-    using T = scalar_t;
+  const int64_t samples = first.residual.size(0);
+  const bool launched = each_point({"FlowReport", kFlow}, first.residual, samples, [&]<class T>(T) {
     gpu::FlowReport<T> of{};
     of.solves = static_cast<int>(infos.size());
     for (size_t k = 0; k < infos.size(); ++k) {
@@ -179,8 +168,7 @@ std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, con
     of.applications_out = data_of<int64_t>(all.operator_applications);
     of.residual_out = data_of<T>(all.residual);
     of.floor_out = data_of<T>(all.floor);
-    return gpu::each_point(first.residual.device(), body("FlowReport", kFlow, first.residual), of,
-                           first.residual.size(0));
+    return of;
   });
   return launched ? std::optional(all) : std::nullopt;
 }

@@ -1,5 +1,3 @@
-#include <ATen/Dispatch.h>
-
 #include "prdp/gpu/device/flow_back.h"
 #include "prdp/operators/shared_sums.h"
 #include "prdp/operators/sums_in_order.h"
@@ -34,18 +32,16 @@ struct Reverse {
 
 at::Tensor of_state(const Reverse& r) {
   const auto out = by_channels(r.like(), r.box());
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(out.scalar_type(), "flow_state_bars", [&] {
-    return gpu::each_point(out.device(), body("FlowStateBars", kBack, out), r.state<scalar_t>(out), out.numel());
-  });
+  const bool launched =
+      each_point({"FlowStateBars", kBack}, out, out.numel(), [&]<class T>(T) { return r.state<T>(out); });
   return launched ? out : at::Tensor();
 }
 
 at::Tensor of_viscosity(const Reverse& r) {
   const auto sums = at::empty({r.batch()}, r.like().options().dtype(at::kDouble));
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(r.like().scalar_type(), "flow_viscosity_bars", [&] {
-    const gpu::FlowViscosityBars<scalar_t> of{r.terms<scalar_t>(), data_of<double>(sums)};
-    return gpu::each_sample(sums.device(), body("FlowViscosityBars", kBack, r.like()), of,
-                            r.box().dim() * cells_of(r.box()), r.batch());
+  const int64_t points = r.box().dim() * cells_of(r.box());
+  const bool launched = each_sample({"FlowViscosityBars", kBack}, r.like(), points, [&]<class T>(T) {
+    return gpu::FlowViscosityBars<T>{r.terms<T>(), data_of<double>(sums)};
   });
   return launched ? total(sums).to(r.like().scalar_type()) : at::Tensor();
 }
@@ -57,8 +53,7 @@ at::Tensor of_end(const Reverse& r, int64_t axis, bool high, const at::Tensor& g
   auto sizes = r.like().sizes().vec();
   sizes[axis + 2] = 1;
   const auto out = at::empty(sizes, r.like().options());
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(out.scalar_type(), "flow_end_bars", [&] {
-    using T = scalar_t;
+  const bool launched = each_point({"FlowEndBars", kBack}, out, out.numel(), [&]<class T>(T) {
     const auto& inlet = box.fields(out.options()).inlet;
     gpu::FlowEndBars<T> of{.state = r.state<T>({}),
                            .inlet = field_of<const T>(is_inflow ? inlet : at::Tensor()),
@@ -69,7 +64,7 @@ at::Tensor of_end(const Reverse& r, int64_t axis, bool high, const at::Tensor& g
     for (int64_t other = 0; other < box.dim(); ++other)  // with_ghosts() makes the open axis' ghosts first
       of.fold[other + 3 - box.dim()] =
           is_inflow ? other != axis : other > axis && box.boundary(other) != FlowBoundary::kOpen;
-    return gpu::each_point(out.device(), body("FlowEndBars", kBack, out), of, out.numel());
+    return of;
   });
   return launched ? at::sum_to(out, given.sizes()) : at::Tensor();
 }
@@ -77,9 +72,8 @@ at::Tensor of_end(const Reverse& r, int64_t axis, bool high, const at::Tensor& g
 at::Tensor of_force(const Reverse& r) {
   SharedSums sums(r.like());
   const auto sum = sums.add(r.equation.force);
-  const bool launched = AT_DISPATCH_FLOATING_TYPES(r.like().scalar_type(), "flow_force_bars", [&] {
-    const gpu::FlowForceBars<scalar_t> of{r.terms<scalar_t>(), sum, sums.memory(0)};
-    return gpu::each_point(r.like().device(), body("FlowForceBars", kBack, r.like()), of, sums.count());
+  const bool launched = each_point({"FlowForceBars", kBack}, r.like(), sums.count(), [&]<class T>(T) {
+    return gpu::FlowForceBars<T>{r.terms<T>(), sum, sums.memory(0)};
   });
   return launched ? sums.result(0) : at::Tensor();
 }

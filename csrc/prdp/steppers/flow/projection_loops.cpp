@@ -22,15 +22,16 @@ class Rows {
   void for_each_axis(const F& f) const {
     for (const auto axis : c10::irange(box_.dim())) f(axis, box_.channel_of(axis), axis == box_.dim() - 1);
   }
-  /// f(first cell of a row, first cell of the row one `way` along the axis), -1 beyond an end that is not periodic.
+  /// f(first cell of a row, first cell of the row one cell to a `side`, -1 or 1, along the axis), -1 beyond an end that
+  /// is not periodic.
   template <class F>
-  void for_each_pair(int64_t axis, int64_t way, const F& f) const {
+  void for_each_pair(int64_t axis, int64_t side, const F& f) const {
     const int64_t a = first_ + axis, stride = a == 0 ? n_[1] * n_[2] : n_[2];
     for (const auto z : c10::irange(n_[0]))
       for (const auto y : c10::irange(n_[1])) {
-        const int64_t here = (z * n_[1] + y) * n_[2], moved = (a == 0 ? z : y) + way;
+        const int64_t here = (z * n_[1] + y) * n_[2], moved = (a == 0 ? z : y) + side;
         const bool inside = moved >= 0 && moved < n_[a];
-        const int64_t wrapped = here + (inside ? way : -way * (n_[a] - 1)) * stride;
+        const int64_t wrapped = here + (inside ? side : -side * (n_[a] - 1)) * stride;
         f(here, inside || periodic(axis) ? wrapped : -1);
       }
   }

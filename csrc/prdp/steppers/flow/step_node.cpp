@@ -102,8 +102,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                  : back(equation, saved[0], saved[1], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
-    const auto found =
-        is_batch_of_cotangents(grads[0]) ? for_each_cotangent(grads[0], of_cotangent) : of_cotangent(grads[0]);
+    const auto found = for_each_cotangent(grads[0], of_cotangent);
     std::copy(found.begin(), found.end(), out.begin());
     return out;
   }

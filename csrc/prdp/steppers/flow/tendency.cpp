@@ -16,19 +16,19 @@ namespace {
 class Padded {
  public:
   Padded(const FlowBox& box, const at::Tensor& all) : box_(box), all_(all) {}
-  /// Channel c, at the neighbour one `way` along an axis.
-  at::Tensor at(int64_t c, int64_t axis, int64_t way) const {
+  /// Channel c, at the neighbour one cell to a `side`, -1 or 1, along an axis.
+  at::Tensor at(int64_t c, int64_t axis, int64_t side) const {
     auto view = all_.select(1, c);
-    for (int64_t a = 0; a < box_.dim(); ++a) view = view.narrow(a + 1, 1 + (a == axis ? way : 0), box_.shape()[a]);
+    for (int64_t a = 0; a < box_.dim(); ++a) view = view.narrow(a + 1, 1 + (a == axis ? side : 0), box_.shape()[a]);
     return view;
   }
-  /// The N + 1 values along `axis` that begin at the ghost (0) or at the first cell (1), at the neighbour one `way`
+  /// The N + 1 values along `axis` that begin at the ghost (0) or at the first cell (1); at the neighbour to that side
   /// along the axis `other`.
-  at::Tensor edges(int64_t c, int64_t axis, int64_t begin, int64_t other = -1, int64_t way = 0) const {
+  at::Tensor edges(int64_t c, int64_t axis, int64_t begin, int64_t other = -1, int64_t side = 0) const {
     auto view = all_.select(1, c);
     for (int64_t a = 0; a < box_.dim(); ++a)
       view = a == axis ? view.narrow(a + 1, begin, box_.shape()[a] + 1)
-                       : view.narrow(a + 1, 1 + (a == other ? way : 0), box_.shape()[a]);
+                       : view.narrow(a + 1, 1 + (a == other ? side : 0), box_.shape()[a]);
     return view;
   }
 

@@ -1,7 +1,6 @@
 #pragma once
 #include <cstdint>
 
-#include "prdp/kernels/whole_vectors.h"
 #include "prdp/threads/interruption.h"
 #include "prdp/threads/share_rows.h"
 
@@ -11,7 +10,7 @@ namespace prdp {
 /// the rows of each.
 template <class Body>
 void share_samples(int64_t size, int64_t unknowns, int64_t grain, const Body& body) {
-  const bool by_rows = size < at::get_num_threads() && unknowns >= 4 * kernels::kBlock && !at::in_parallel_region();
+  const bool by_rows = size < at::get_num_threads() && unknowns >= 4 * share_rows::kBlock && !at::in_parallel_region();
   const share_rows::Scope rows(by_rows);
   if (by_rows) body(0, size);
   else interruption::parallel_for(0, size, grain, body);

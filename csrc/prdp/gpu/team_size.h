@@ -1,0 +1,22 @@
+#pragma once
+#include <ATen/Parallel.h>
+
+#include <algorithm>
+
+#include "prdp/gpu/runtime.h"
+
+namespace prdp::gpu {
+
+/// Blocks that work on a sample together, and threads in each.
+struct TeamSize {
+  int64_t blocks, threads;
+};
+
+/// For a sample of so many points, by the device and the sample alone: no result depends on the batch.
+inline TeamSize team_size(int64_t points, const Limits& limits) {
+  constexpr int64_t warp = 32;
+  const int64_t blocks = at::divup(points, limits.cells_of_block);
+  return {blocks, std::min(limits.threads, at::divup(at::divup(points, blocks), warp) * warp)};
+}
+
+}  // namespace prdp::gpu
