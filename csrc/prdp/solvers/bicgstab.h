@@ -48,8 +48,8 @@ class BiCGStabMethod {
     space_.restore(lost, zero_, inverse_);
 
     const Scalar over_omega = space_.guarded_quotient(tt_, st_, ss_, tt_);
-    space_.xmby(v_, over_omega, p_);
-    space_.xmby(r_, rho * inverse_, p_);
+    space_.xpby(v_, -over_omega, p_);
+    space_.xpby(r_, -(rho * inverse_), p_);
     auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
     const Scalar starts_anew = space_.breaks_down(hv, hh_, vv, inverse_);
     space_.restore(starts_anew, zero_, rho);

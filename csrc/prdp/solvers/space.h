@@ -63,8 +63,6 @@ concept Primitives =
 template <class S>
 concept FusedOperations =
     requires(S s, typename S::Vector x, typename S::Vector y, typename S::Vector p, typename S::Scalar beta) {
-      /// y = x - beta y
-      s.xmby(x, beta, y);
       /// y = x + beta y; returns ‖y‖².
       { s.xpby_with_square(x, beta, y) } -> std::same_as<typename S::Scalar>;
       /// y = A x; returns x·y and ‖y‖².
@@ -203,7 +201,6 @@ concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept,
 template <class Space>
 class SpaceDefaults {
  public:
-  void xmby(const auto& x, const auto& beta, auto&& y) { self().xpby(x, -beta, y); }
   auto xpby_with_square(const auto& x, const auto& beta, auto&& y) {
     self().xpby(x, beta, y);
     return self().dot(y, y);

@@ -99,14 +99,14 @@ struct Loop {
 /// Whether the loop was launched for `count` points, in the dtype of `like`; make(T{}) is its struct.
 template <class Make>
 bool each_point(const Loop& loop, const at::Tensor& like, int64_t count, const Make& make) {
-  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), loop.name, [&] {
+  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_kernels", [&] {
     return gpu::each_point(like.device(), loop.body(like), make(scalar_t{}), count);
   });
 }
 /// The same for the samples of `like`, of so many points each.
 template <class Make>
 bool each_sample(const Loop& loop, const at::Tensor& like, int64_t points, const Make& make) {
-  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), loop.name, [&] {
+  return AT_DISPATCH_FLOATING_TYPES(like.scalar_type(), "flow_kernels", [&] {
     return gpu::each_sample(like.device(), loop.body(like), make(scalar_t{}), points, like.size(0));
   });
 }
