@@ -74,8 +74,8 @@ class Stepper(torch_private.HearsOfMoves):
 
     Attributes:
         max_iter: K, the maximum number of iterations. You or a controller may set it at any time. Under
-            `torch.compile` this does not compile again, except for the second value.
-        rtol, adjoint_rtol: the tolerances. The same holds for them.
+            `torch.compile` this does not compile again.
+        rtol, adjoint_rtol: the tolerances. The same holds for them, and for adjoint_max_iter.
         start: as above. It may be set at any time.
         restart, preconditioner and the options above: they may be set at any time, and are checked then.
         info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised
@@ -268,6 +268,7 @@ class Stepper(torch_private.HearsOfMoves):
         k = torch_private.number_as_graph_input(self, "_max_iter")
         rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
         of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")
+        k_of_adjoint = torch_private.number_as_graph_input(self, "adjoint_max_iter")
         return packed_options(
             self.method,
             k,
@@ -275,7 +276,7 @@ class Stepper(torch_private.HearsOfMoves):
             self.restart,
             self.preconditioner,
             self.backward,
-            adjoint_max_iter=self.adjoint_max_iter,
+            adjoint_max_iter=k_of_adjoint,
             on_failure=self.on_failure,
             checkpoint_every=self.checkpoint_every,
             start=self.start,
