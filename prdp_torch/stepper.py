@@ -56,6 +56,13 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def between_graphs(call: Callable[P, T]) -> Callable[P, T]:
+    """What torch.compile calls as it is, with a break of the graph; with fullgraph=True the reason is said."""
+    reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced"
+    untraced: Callable[P, T] = torch.compiler.disable(call, reason=reason)
+    return untraced
+
+
 class Stepper(torch_private.HearsOfMoves):
     """The base of all steppers. A stepper maps a state u to the next one by solving A(u) u_next = b(u).
 
@@ -299,6 +306,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._max_iter
 
     @max_iter.setter
+    @between_graphs
     def max_iter(self, k: int) -> None:
         who = type(self).__name__
         k = _check.whole(who, "max_iter", k)
@@ -310,6 +318,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._rtol
 
     @rtol.setter
+    @between_graphs
     def rtol(self, rtol: float) -> None:
         who = type(self).__name__
         rtol = _check.real(who, "rtol", rtol)
@@ -322,6 +331,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._adjoint_rtol
 
     @adjoint_rtol.setter
+    @between_graphs
     def adjoint_rtol(self, rtol: float | None) -> None:
         check_options(type(self).__name__, GMRES(1), "implicit", None, rtol, "raise", None)
         self._adjoint_rtol = rtol

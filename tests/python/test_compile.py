@@ -100,3 +100,25 @@ def test_a_step_follows_its_tolerances_too(no_log, name, use, backend):
             assert torch.equal(step.adjoint_info.iterations, eager.adjoint_info.iterations)
     if backend is COUNTER:
         assert COUNTER.frame_count == 1
+
+
+def test_what_is_set_inside_a_compiled_function_breaks_the_graph_and_holds():
+    step = prdp.Heat((16,), 1e-3, 1.0, solver=prdp.CG(50))
+    controller = prdp.ToleranceController([step])
+
+    def update(u, error, k):
+        step.max_iter = k
+        loss = step(u).square().mean()
+        controller.step(error)
+        step.adjoint_rtol = step.rtol / 2
+        return loss
+
+    torch._dynamo.reset()
+    compiled = torch.compile(update, backend="eager")
+    for k, error in ((5, 0.5), (6, 0.25), (7, 0.125)):
+        compiled(field((16,)), error, k)
+        assert (step.max_iter, step.rtol) == (controller.max_iter, controller.rtol)
+        assert step.adjoint_rtol == step.rtol / 2 and step.rtol == pytest.approx(error / 10)
+    torch._dynamo.reset()
+    with pytest.raises(torch._dynamo.exc.Unsupported, match="is called between graphs, not traced"):
+        torch.compile(update, backend="eager", fullgraph=True)(field((16,)), 0.1, 8)
