@@ -49,7 +49,7 @@ def number_as_graph_input(module: torch.nn.Module, name: str) -> Any:
     return number
 
 
-@torch.compiler.assume_constant_result
+@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
 def _list_as_dynamic(name: str) -> str:
     """Called while torch.compile traces, not by what it makes."""
     listed: str = torch.compiler.config.dynamic_sources
@@ -57,7 +57,7 @@ def _list_as_dynamic(name: str) -> str:
     return listed
 
 
-@torch.compiler.assume_constant_result
+@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
 def _list_as_before(listed: str) -> None:
     torch.compiler.config.dynamic_sources = listed
 
