@@ -10,6 +10,7 @@ from torch import Tensor
 
 from prdp_torch import _C, _check, data_parallel
 from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
+from prdp_torch.stepper import between_graphs
 from prdp_torch.types import Number, Refinable, Steppers
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ class _Attached(_Compiled):
         self._warned_for = 0 if warning is None or refined else self._warned_for + 1
         if self._warned_for == PATIENCE and not self._has_spoken:
             self._has_spoken = True
-            warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=4)
+            warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=5)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
@@ -245,6 +246,7 @@ class PRDPController(_C.PRDPController, _Attached):
         super().__init__(**_checked("PRDPController", settings, _C.PRDP_DEFAULTS))
         self._take(steppers, process_group)
 
+    @between_graphs
     def step(self, metric: Number, converged: bool | None = None, error: Number | None = None) -> bool:
         """Decide after an interval. Returns True if K was raised.
 
@@ -308,6 +310,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
         super().__init__(**_checked("ToleranceController", settings, _C.TOLERANCE_DEFAULTS))
         self._take(steppers, process_group)
 
+    @between_graphs
     def step(self, error: Number, converged: bool | None = None) -> bool:
         """Decide after an interval. Returns True if rtol became smaller.
 
@@ -356,6 +359,7 @@ class LinearSchedule(_C.LinearSchedule, _Attached):
         super().__init__(**settings, adjoint_ratio=adjoint_ratio)
         self._take(steppers, process_group)
 
+    @between_graphs
     def step(self, metric: Number = 0.0, converged: bool | None = None, error: Number | None = None) -> bool:
         """Advance the schedule. Returns True if K was raised."""
         error = None if error is None else _number("LinearSchedule", "error", error)

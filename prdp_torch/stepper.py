@@ -56,6 +56,12 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def between_graphs(call: Callable[P, T]) -> Callable[P, T]:
+    """What torch.compile calls as it is, with a break of the graph; with fullgraph=True the reason is said."""
+    reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced"
+    return cast(Callable[P, T], torch.compiler.disable(call, reason=reason))
+
+
 class Stepper(torch_private.HearsOfMoves):
     """The base of all steppers. A stepper maps a state u to the next one by solving A(u) u_next = b(u).
 
@@ -74,8 +80,8 @@ class Stepper(torch_private.HearsOfMoves):
 
     Attributes:
         max_iter: K, the maximum number of iterations. You or a controller may set it at any time. Under
-            `torch.compile` this does not compile again, except for the second value.
-        rtol, adjoint_rtol: the tolerances. The same holds for them.
+            `torch.compile` this does not compile again.
+        rtol, adjoint_rtol: the tolerances. The same holds for them, and for adjoint_max_iter.
         start: as above. It may be set at any time.
         restart, preconditioner and the options above: they may be set at any time, and are checked then.
         info: the `SolveInfo` of the last forward pass or rollout; None before the first, and after one that raised
@@ -268,6 +274,7 @@ class Stepper(torch_private.HearsOfMoves):
         k = torch_private.number_as_graph_input(self, "_max_iter")
         rtol = torch_private.number_as_graph_input(self, "_rtol_bits")
         of_adjoint = torch_private.number_as_graph_input(self, "_adjoint_rtol_bits")
+        k_of_adjoint = torch_private.number_as_graph_input(self, "adjoint_max_iter")
         return packed_options(
             self.method,
             k,
@@ -275,7 +282,7 @@ class Stepper(torch_private.HearsOfMoves):
             self.restart,
             self.preconditioner,
             self.backward,
-            adjoint_max_iter=self.adjoint_max_iter,
+            adjoint_max_iter=k_of_adjoint,
             on_failure=self.on_failure,
             checkpoint_every=self.checkpoint_every,
             start=self.start,
@@ -298,6 +305,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._max_iter
 
     @max_iter.setter
+    @between_graphs
     def max_iter(self, k: int) -> None:
         who = type(self).__name__
         k = _check.whole(who, "max_iter", k)
@@ -309,6 +317,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._rtol
 
     @rtol.setter
+    @between_graphs
     def rtol(self, rtol: float) -> None:
         who = type(self).__name__
         rtol = _check.real(who, "rtol", rtol)
@@ -321,6 +330,7 @@ class Stepper(torch_private.HearsOfMoves):
         return self._adjoint_rtol
 
     @adjoint_rtol.setter
+    @between_graphs
     def adjoint_rtol(self, rtol: float | None) -> None:
         check_options(type(self).__name__, GMRES(1), "implicit", None, rtol, "raise", None)
         self._adjoint_rtol = rtol

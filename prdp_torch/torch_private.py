@@ -4,7 +4,7 @@ Where a release of torch changes one of them, `tests/python/test_torch_private.p
 """
 
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -35,13 +35,31 @@ def unwrapped(t: Tensor) -> Tensor:
     return t
 
 
-def number_as_graph_input(module: torch.nn.Module, name: str) -> int:
-    """A whole number that a module holds, inside torch.compile, which otherwise takes it for a constant and compiles
-    again for each value. torch.compiler has no such switch for one number: its dynamic_sources is a list for the whole
-    process."""
-    with torch._dynamo.patch_dynamo_config(allow_unspec_int_on_nn_module=True):
-        number: int = getattr(module, name) + 0  # the number is read where it is used first, which must be here
+def number_as_graph_input(module: torch.nn.Module, name: str) -> Any:
+    """A whole number that a module holds, or None, inside torch.compile, which otherwise takes it for a constant and
+    compiles again for each value. torch.compiler has no such switch for one number: its dynamic_sources is a list for
+    the whole process, which therefore has the number only while it is read."""
+    if torch.compiler.is_exporting():
+        return getattr(module, name)
+    listed = _list_as_dynamic(name)
+    number = getattr(module, name)
+    if number is not None:
+        number = number + 0  # the number is read where it is used first, which must be here
+    _list_as_before(listed)
     return number
+
+
+@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
+def _list_as_dynamic(name: str) -> str:
+    """Called while torch.compile traces, not by what it makes."""
+    listed: str = torch.compiler.config.dynamic_sources
+    torch.compiler.config.dynamic_sources = f"{listed},.*\\b{name}\\b"
+    return listed
+
+
+@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
+def _list_as_before(listed: str) -> None:
+    torch.compiler.config.dynamic_sources = listed
 
 
 def graph_is_freed(t: Tensor) -> bool:
