@@ -262,7 +262,7 @@ def bench(
     out: Annotated[Path | None, _folder("runs/bench")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few budgets and rounds, to see that all of it runs.")] = False,
     device: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Time solves on this device instead, beside a loop in torch.")
+        str | None, typer.Option(metavar="NAME", help="Time solves and flows there instead, beside torch and JAX.")
     ] = None,
 ) -> None:
     """Time the solvers beside their errors, on one thread, with the other libraries that are installed."""

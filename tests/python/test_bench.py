@@ -119,6 +119,7 @@ def test_readings_are_taken_in_turn():
     assert all(0 <= reading["min"] <= reading["median"] for reading in seconds.values())
 
 
+@pytest.mark.alone  # what it measures is compared with what the processor can do
 def test_all_suites_run_and_leave_a_page(tmp_path):
     suites = ("roofline", "training", "memory", "large")
     done = subprocess.run(

@@ -17,6 +17,7 @@ from benchmarks import measure, problems
 from prdp_torch import _C, operators
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.alone
 
 # problem, method: how many times as fast the loops are at least
 BOUNDS = {

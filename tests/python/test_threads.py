@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 SETUP = """
 import time, torch, prdp_torch as prdp
 torch.manual_seed(0)
@@ -111,6 +113,7 @@ print(cases, "cases")
 """)
 
 
+@pytest.mark.alone
 def test_two_threads_share_a_batch():
     """Minima of interleaved runs of some 0.1 s; half the time on two idle cores."""
     one, two = map(
