@@ -12,7 +12,6 @@ import os
 import statistics
 import time
 
-import numpy as np
 import torch
 
 import prdp_torch as prdp
@@ -55,17 +54,17 @@ def calls(problem, device):
 
         return call
 
-    loops = {"jacobi": torch_eager.jacobi, "gmres": torch_eager.gmres, "cg": torch_eager.cg}
-    more = (solver.restart,) if solver.method == "gmres" else ()
+    more = (k, solver.restart) if solver.method == "gmres" else (k,)
 
     def eager():
+        loop = getattr(torch_eager, solver.method)
         with torch.no_grad():
-            return [loops[solver.method](product, turned, v, k, *more) for turned, v in ((False, b), (True, g))]
+            return [loop(product, turned, v, *more) for turned, v in ((False, b), (True, g))]
 
     found = {f"{solver.method} raise": ours(a, solver), "eager torch loop": eager}
     found["one iteration"] = ours(a, problem.solver(1), on_failure="return")
     if with_jax(device):
-        found["JAX jit"] = of_jax(problem, solver)
+        found["JAX jit"] = of_jax(problem, solver.method, *more)
     if solver.method != "gmres":
         found[f"{solver.method} return"] = ours(a, solver, on_failure="return")
     if solver.method == "cg":
@@ -87,7 +86,7 @@ def with_jax(device):
     return jax.default_backend() == {"cuda": "gpu"}.get(device.type, device.type)
 
 
-def of_jax(problem, solver):
+def of_jax(problem, method, *more):
     import jax
     import jax.numpy as jnp
 
@@ -95,13 +94,7 @@ def of_jax(problem, solver):
 
     stencil = stencils.make(problem, jax_loops.Backend, jnp.asarray)
     b, g = (jnp.asarray(v.numpy()) for v in (problem.b, problem.g))
-    loop = {
-        "jacobi": jax_loops.jacobi,
-        "gmres": jax_loops.gmres,
-        "cg": lambda stencil, turned, b, k: jax_loops.cg(stencil, b, k),
-    }[solver.method]
-    more = (solver.restart,) if solver.method == "gmres" else ()
-    _, both = jax_loops.compiled(stencil, loop, problem.k, *more)
+    _, both = jax_loops.compiled(stencil, getattr(jax_loops, method), *more)
     return lambda: jax.block_until_ready(both(b, g))
 
 
@@ -111,17 +104,7 @@ def errors(problem, u, gradient):
     if problem.unknowns > LARGEST_FACTORED:
         return {"residual": residual}
     exact = problem.exact[1] if problem.kappa is None else problem.exact[1][0]
-    return {"residual": residual, "gradient_error": largest(gradient - exact, exact)}
-
-
-def in_float64(arrays):
-    """Arrays of any library, on the CPU."""
-    return [torch.tensor(np.asarray(a.cpu() if isinstance(a, torch.Tensor) else a)).double() for a in arrays]
-
-
-def largest(error, of):
-    """Norm of a sample's error relative to that of its truth, the largest of the batch."""
-    return float((error.flatten(1).norm(dim=1) / of.flatten(1).norm(dim=1)).max())
+    return {"residual": residual, "gradient_error": problems.largest(problems.as_double(gradient) - exact, exact)}
 
 
 def seconds(call, device, rounds):
@@ -191,15 +174,15 @@ def run(device, quick=False):
     for problem in suite(quick):
         for way, call in calls(problem, device).items():
             shown = {"problem": problem.title, "k": 1 if way == "one iteration" else problem.k, "way": way}
-            yield {**shown, **errors(problem, *in_float64(call())), **seconds(call, device, rounds)}
+            yield {**shown, **errors(problem, *call()), **seconds(call, device, rounds)}
     for shape, batch, steps in flows(quick):
         ways, project, exact = flow_calls(shape, batch, steps, device)
         for way, call in ways.items():
-            u, gradient = in_float64(call())
-            found = {"error": largest(u - exact[0], exact[0])}
+            u, gradient = map(problems.as_double, call())
+            found = {"error": problems.largest(u - exact[0], exact[0])}
             # Of changes without divergence: for others the forms of the convective term are other functions.
             truth = project(exact[1])
-            found["gradient_error"] = largest(project(gradient) - truth, truth)
+            found["gradient_error"] = problems.largest(project(gradient) - truth, truth)
             shown = {"problem": f"Flow, {shape[0]} × {shape[1]} × {batch}, {steps} steps", "way": way}
             yield {**shown, **found, **seconds(call, device, rounds)}
 

@@ -60,25 +60,26 @@ class Problem:
     def errors(self, u, gradient=None):
         """Largest over the batch: the true residual of u and the error of the gradient, both relative.
         Arrays of any library, of any shape with the right number of values."""
-        u = _as_double(u).reshape(self.b.shape)
+        u = as_double(u).reshape(self.b.shape)
         b = self.b.double()
-        residual = _largest(b - make_operator(self, torch.float64).apply(u), b)
+        residual = largest(b - make_operator(self, torch.float64).apply(u), b)
         if gradient is None:
             return residual, None
         found, exact = ([one] if self.kappa is None else one for one in (gradient, self.exact[1]))
-        pairs = [(_as_double(f).reshape(e.shape), e) for f, e in zip(found, exact, strict=True)]
-        return residual, max(_largest(f - e, e) for f, e in pairs)
+        pairs = [(as_double(f).reshape(e.shape), e) for f, e in zip(found, exact, strict=True)]
+        return residual, max(largest(f - e, e) for f, e in pairs)
 
 
 def gradient_of(b, kappa=None):
     return b.grad if kappa is None else (b.grad, kappa.grad)
 
 
-def _as_double(array):
-    return (array if isinstance(array, torch.Tensor) else torch.tensor(np.asarray(array))).double()
+def as_double(array):
+    """An array of any library, on the CPU."""
+    return (array.cpu() if isinstance(array, torch.Tensor) else torch.tensor(np.asarray(array))).double()
 
 
-def _largest(error, of):
+def largest(error, of):
     """Over the batch; a field without one, (Ny, Nx), counts as a single sample."""
     error, of = (t if t.dim() > 2 else t[None] for t in (error, of))
     return float((error.flatten(1).norm(dim=1) / of.flatten(1).norm(dim=1)).max())

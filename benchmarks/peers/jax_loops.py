@@ -32,7 +32,7 @@ def jacobi(stencil, transposed, b, k):
     return jax.lax.fori_loop(1, k, lambda _, u: (b - stencil.off_diagonal(u)) * scale, b * scale)
 
 
-def cg(stencil, b, k):
+def cg(stencil, transposed, b, k):
     """Of a symmetric operator."""
 
     def step(_, state):
@@ -171,7 +171,7 @@ def run_jitted(solution, b, g, kappa):
 
 def entries(problem):
     if problem.kappa is not None:
-        prepare = lambda k: diffusion_calls(problem, lambda stencil, b: cg(stencil, b, k))  # noqa: E731
+        prepare = lambda k: diffusion_calls(problem, lambda stencil, b: cg(stencil, False, b, k))  # noqa: E731
         yield Entry("JAX jit, CG", "implicit", [problem.k], prepare, same_as="CG")
         return
     stencil = stencils.make(problem, Backend, jnp.asarray)
