@@ -270,6 +270,10 @@ def test_bench_times_a_device(tmp_path):
     record = json.loads((tmp_path / "devices.json").read_text())
     first, *rows = record["devices"]
     assert first["device"] == record["machine"]["device"] == "cpu" and first["torch"] == torch.__version__
-    assert len(rows) > 10 and all(row["seconds"] > 0 and row["residual"] < 1 for row in rows)
+    solves = [row for row in rows if "residual" in row]
+    flows = [row for row in rows if row["problem"].startswith("Flow")]
+    assert len(solves) > 10 and len(flows) >= 2 and len(solves) + len(flows) == len(rows)
+    assert all(row["seconds"] > 0 for row in rows) and all(row["residual"] < 1 for row in solves)
+    assert all(row["error"] < 1e-3 and row["gradient_error"] < 1e-3 for row in flows)
     named = CliRunner().invoke(cli.app, [*command, "accuracy"])
     assert "bench: the suites time the CPU; with --device give none, got accuracy" in named.stderr
