@@ -277,6 +277,7 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
   const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? solve_and_record : call_solves;
   auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
+  if (options.backward == Backward::kNone) solutions = from_state(u, solutions);
   if (picard == 1) return {solutions, info};
   const auto of_steps = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
   const auto last = [&](const at::Tensor& t) { return of_steps(t).select(-1, picard - 1); };
