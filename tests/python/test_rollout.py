@@ -163,13 +163,6 @@ def test_it_is_one_node_that_keeps_only_what_the_derivative_needs(device):
     assert kept(prdp.Heat((20,), 1e-3, 1.0, solver=jacobi, backward="unrolled")) == states
 
 
-def test_none_gives_states_without_a_gradient():
-    heat = prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3), backward="none")
-    u = field((9,)).requires_grad_()
-    states = heat.rollout(u, 3)
-    assert not states.requires_grad and torch.equal(states, chain(heat, u.detach(), 3)[0])
-
-
 def test_no_steps_return_the_start():
     heat = prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3))
     u = field((9,)).requires_grad_()
