@@ -236,7 +236,10 @@ class Stepper(torch_private.HearsOfMoves):
             self._last_log = log
         kept = None if report is None else outlive_transforms(report)
         compiling = torch.compiler.is_compiling()
-        info = None if kept is None else SolveInfo(*kept, log, "" if compiling else _C.way_of_last_solve())
+        if kept is None:
+            info = None
+        else:  # without a solve, that of another one would be told
+            info = SolveInfo(*kept, log, "" if compiling or not kept[0].numel() else _C.way_of_last_solve())
         if compiling:
             self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve
