@@ -14,7 +14,6 @@ from torch import Tensor
 from prdp_torch import _check
 from prdp_torch.operators.base import full_precision
 from prdp_torch.stepper import Stepper
-from prdp_torch.steppers import EquationStepper
 from prdp_torch.types import Length
 
 _Y, _X = -2, -1
@@ -64,7 +63,7 @@ def rollout(stepper: Callable[[Tensor], Tensor], u: Tensor, steps: int) -> Tenso
 
     `stepper` may be any callable, such as a network. For steppers of this library `Stepper.rollout` is called.
     """
-    if isinstance(stepper, Stepper) and type(stepper).forward in (Stepper.forward, EquationStepper.forward):
+    if isinstance(stepper, Stepper):
         return stepper.rollout(u, steps)
     if _check.whole("rollout", "steps", steps) < 0:
         raise ValueError(f"rollout: steps must be >= 0, got {steps}")

@@ -160,7 +160,7 @@ class Flow(HoldsTensors, Stepper):
         u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
     @forgets_if_it_raises
@@ -169,7 +169,7 @@ class Flow(HoldsTensors, Stepper):
         u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step_and_pressure(u, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log, found[0])
         d = len(self.shape)
         return found[0][:, :d], found[0][:, d:]
 
@@ -178,12 +178,15 @@ class Flow(HoldsTensors, Stepper):
         """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
 
         It is a single node of autograd, whose backward pass needs the states alone. `info` and `adjoint_info` then hold
-        tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1."""
+        tensors of shape (batch, steps). If a step fails, the error gives its number, counted from 1. Where a subclass
+        has a forward of its own, or there are hooks, it repeats the calls of the module."""
+        if self._calls_do_more_than(Flow.forward):
+            return super().rollout(u, steps)
         u = _field("Flow", "u", u)
         steps = _check.whole("rollout", "steps", steps)
         log = self._adjoint_log.number
         found: Solution = self._equation().rollout(u, steps, self._options_kept(), self._max_iter, log)
-        self._keep(found[1:], self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
     def project(self, u: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """`linear_solve`, and the reports of solves."""
 
+import math
 import warnings
 from collections import Counter
 from enum import IntEnum
@@ -87,7 +88,7 @@ class SolveInfo(NamedTuple):
         found = Counter(SolveStatus(s).name for s in self.status.flatten().tolist())
         statuses = ", ".join(f"{count} {name}" for name, count in found.items())
         ranges = ", ".join(
-            f"{name} {min(values):g} to {max(values):g}"
+            _range(name, values)
             for name in ("iterations", "residual", "operator_applications")
             if (values := getattr(self, name).flatten().tolist())
         )
@@ -111,6 +112,11 @@ class SolveInfo(NamedTuple):
         Unrolled mode has no adjoint solve. Its report then has the iterations and the status of the solve itself,
         NaN as the residual, and the number of products in the whole backward pass."""
         return None if self.log is None else self.log.read()
+
+
+def _range(name: str, values: list[float]) -> str:
+    known = [value for value in values if not math.isnan(value)]
+    return f"{name} {min(known):g} to {max(known):g}" if known else f"{name} not measured"
 
 
 _warned_of: set[tuple[str, str]] = set()

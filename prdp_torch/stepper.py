@@ -100,6 +100,7 @@ class Stepper(torch_private.HearsOfMoves):
     on_failure: OnFailure
     checkpoint_every: CheckpointEvery
     info: SolveInfo | None
+    _is_rolling_out = False  # while a rollout calls the module
 
     if TYPE_CHECKING:
 
@@ -181,9 +182,7 @@ class Stepper(torch_private.HearsOfMoves):
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
         found = self._solve(u, self._adjoint_log)
-        self._keep(found[1:], self._adjoint_log)
-        if found[0].requires_grad and self._last_log is not self._adjoint_log:
-            self._last_log = self._adjoint_log
+        self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
     @forgets_if_it_raises
@@ -191,7 +190,8 @@ class Stepper(torch_private.HearsOfMoves):
         """Repeat the step. Returns all states, u included: (batch, steps + 1, channel, *shape).
 
         `info` and `adjoint_info` then hold tensors of shape (batch, steps). If a step fails, the error gives its
-        number, counted from 1. For the backward pass each step stores what a single step stores."""
+        number, counted from 1. For the backward pass each step stores what a single step stores. Where a subclass
+        has a forward of its own, or there are hooks, it repeats the calls of the module."""
         compiling = torch.compiler.is_compiling()
         if not compiling:
             _check.dense(type(self).__name__, "u", u)
@@ -199,33 +199,59 @@ class Stepper(torch_private.HearsOfMoves):
                 raise ValueError(f"rollout: steps must be >= 0, got {steps}")
         u = full_precision(u)
         logs = AdjointLogs(0 if compiling else steps)
+        step_from = self._called if self._calls_do_more_than(Stepper.forward) else self._solve
         states, reports = [u], []
         for step in range(steps):
             if compiling:
-                found = self._solve(states[-1], self._adjoint_log)
+                found = step_from(states[-1], self._adjoint_log)
             else:
                 with _C.StepOfRollout(step + 1, steps):
-                    found = self._solve(states[-1], logs[step])
+                    found = step_from(states[-1], logs[step])
             states.append(found[0])
             reports.append(found[1:])
         if steps > 0:
-            report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=True)]
+            report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=False)]
         else:
             report = [
                 u.new_empty((len(u), 0), dtype=t) for t in (torch.int64, u.dtype, torch.int64, torch.int64, u.dtype)
             ]
         log = self._adjoint_log if compiling else logs
-        self._keep(cast(Report, tuple(report)), log)
         all_states = torch.stack(states, 1)
-        # A rollout without gradients, such as a validation, leaves the report of the last backward pass.
-        if all_states.requires_grad:
-            self._last_log = log
+        self._keep(cast(Report, tuple(report)) if all(reports) else None, log, all_states)
         return all_states
 
-    def _keep(self, report: Report, log: AdjointLog | AdjointLogs) -> None:
-        kept = outlive_transforms(report)
+    def _calls_do_more_than(self, forward: Callable[..., Tensor]) -> bool:
+        """Whether a call of the module is more than this forward: a subclass or an attribute replaces it, or there are
+        hooks."""
+        is_replaced = type(self).forward is not forward or "forward" in vars(self)
+        return is_replaced or torch_private.calls_have_hooks(self)
+
+    def _called(self, u: Tensor, log: AdjointLog) -> tuple[Tensor, ...]:
+        """What a call of the module makes of u, and the report of its last step: none if it makes none."""
+        if self._is_rolling_out:
+            raise RuntimeError(
+                f"{type(self).__name__}.rollout: it repeats the calls of the module, and its forward calls rollout; "
+                "let the forward call the rollout of a step that the module holds"
+            )
+        own = self._adjoint_log
+        self._adjoint_log, self.info, self._is_rolling_out = log, None, True
+        try:
+            state = self(u)
+        finally:
+            self._adjoint_log, self._is_rolling_out = own, False
+        return state, *(() if self.info is None else self.info[:5])
+
+    def _keep(self, report: Report | None, log: AdjointLog | AdjointLogs, u: Tensor) -> None:
+        """Keep the report of what made u. Without gradients, as in a validation, that of the last backward pass
+        stays."""
+        if u.requires_grad and self._last_log is not log:
+            self._last_log = log
+        kept = None if report is None else outlive_transforms(report)
         compiling = torch.compiler.is_compiling()
-        info = None if kept is None else SolveInfo(*kept, log, "" if compiling else _C.way_of_last_solve())
+        if kept is None:
+            info = None
+        else:  # without a solve, that of another one would be told
+            info = SolveInfo(*kept, log, "" if compiling or not kept[0].numel() else _C.way_of_last_solve())
         if compiling:
             self.info = info
         else:  # past __setattr__ of modules, which takes as long as a small solve

@@ -123,7 +123,7 @@ class EquationStepper(HoldsTensors, Stepper):
         if found is None:
             solution: Solution = torch.ops.prdp.step(u, *self._equation(), *self._packed_options(self._adjoint_log))
             found = solution
-        self._keep(found[1:], self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
     @forgets_if_it_raises
@@ -133,13 +133,16 @@ class EquationStepper(HoldsTensors, Stepper):
         Values and gradients equal those of single calls bit for bit. A rollout is faster, because it is one
         operation with one backward pass. `info` and `adjoint_info` then hold tensors of shape (batch, steps). If
         a step fails, the error gives its number, counted from 1. The backward pass needs the states; in implicit
-        mode `Poisson`, and `Heat` with a number as nu, need nothing."""
+        mode `Poisson`, and `Heat` with a number as nu, need nothing. Where a subclass has a forward of its own, or
+        there are hooks, it repeats the calls of the module."""
+        if self._calls_do_more_than(EquationStepper.forward):
+            return super().rollout(u, steps)
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)
             steps = _check.whole("rollout", "steps", steps)
         packed = self._packed_options(self._adjoint_log)
         found: Solution = torch.ops.prdp.rollout(u, *self._equation(), steps, *packed)
-        self._keep(found[1:], self._adjoint_log)
+        self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
     def _equation(self) -> tuple[list[Tensor], str, list[int], list[float], int]:

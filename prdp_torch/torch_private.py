@@ -3,7 +3,7 @@
 Where a release of torch changes one of them, `tests/python/test_torch_private.py` fails with its name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import torch
@@ -91,6 +91,21 @@ def leaves_of(t: Tensor) -> list[Tensor]:
             leaves.append(leaf)
         nodes += [before for before, _ in node.next_functions]
     return leaves
+
+
+def calls_have_hooks(module: torch.nn.Module) -> bool:
+    """Whether a call of the module runs hooks, its own or those of all modules, beside its forward."""
+    places: tuple[Mapping[int, object], ...] = (
+        module._forward_hooks,
+        module._forward_pre_hooks,
+        module._backward_hooks,
+        module._backward_pre_hooks,
+        torch.nn.modules.module._global_forward_hooks,
+        torch.nn.modules.module._global_forward_pre_hooks,
+        torch.nn.modules.module._global_backward_hooks,
+        torch.nn.modules.module._global_backward_pre_hooks,
+    )
+    return any(len(hooks) > 0 for hooks in places)
 
 
 class HearsOfMoves(torch.nn.Module):

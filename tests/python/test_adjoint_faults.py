@@ -223,3 +223,22 @@ def test_direct_gives_the_same_bits_in_any_company(kind):
         assert torch.equal(b_bar(order), together[order])
         for i in range(batch):
             assert torch.equal(b_bar(torch.tensor([i])), together[i : i + 1])
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_a_gradient_of_the_operator_that_overflows_fails_in_words(backward):
+    kappa, b = (random(1, 16, seed=1).exp().float(), (1e21 * random(2, 1, 16, seed=2)).float())  # fmt: skip
+    kappa, b = kappa.requires_grad_(), b.requires_grad_()
+    a = operators.Diffusion(kappa, shift=1.0)
+    u, info = prdp.linear_solve(a, b, prdp.Direct(), backward=backward)
+    with pytest.raises(torch.linalg.LinAlgError, match="adjoint solve: 2 of 2 samples failed: sample 0 OVERFLOW"):
+        grad(u.square().sum(), (b, kappa))
+    assert statuses(info.adjoint) == ["OVERFLOW"] * 2
+
+
+def test_the_report_of_an_unrolled_derivative_says_that_it_has_no_residual():
+    u, info = prdp.linear_solve(
+        operators.Heat((9,), 1e-3, 1.0), field((9,)).requires_grad_(), prdp.Jacobi(3), backward="unrolled"
+    )
+    u.sum().backward()
+    assert "residual not measured, " in repr(info.adjoint)

@@ -299,3 +299,18 @@ def test_a_compiled_step_takes_low_precision_too():
     step = torch.compile(heat, fullgraph=True, backend="aot_eager")
     with autocast():
         assert torch.equal(step(u), heat(u))
+
+
+@pytest.mark.filterwarnings("default:adjoint solve. the cotangent of")
+@pytest.mark.parametrize("on_failure", ["return", "zero_grad"])
+def test_an_infinite_cotangent_is_not_dropped_in_silence(on_failure):
+    said = torch.is_warn_always_enabled()
+    torch.set_warn_always(True)  # else once
+    try:
+        u = field((8,)).requires_grad_()
+        v = prdp.Heat((8,), 1e-2, 0.1, prdp.CG(9), on_failure=on_failure)(u)
+        with pytest.warns(UserWarning, match="cotangent of 2 of 2 samples contains NaN or Inf.* A GradScaler cannot"):
+            v.backward(torch.full_like(v, torch.inf))
+    finally:
+        torch.set_warn_always(said)
+    assert not u.grad.any()

@@ -104,7 +104,7 @@ def test_an_adjoint_solve_says_what_is_wrong_with_the_loss(backward):
     with pytest.raises(
         torch.linalg.LinAlgError,
         match=r"adjoint solve: 1 of 1 .* sample 0 NONFINITE_INPUT at index \(0, 0\), CG on Heat: the cotangent is NaN "
-        "or Inf there; look at the loss",
+        "or Inf there; look at the loss, at the scale of a GradScaler, or",
     ):
         u.backward(torch.full_like(u, torch.nan))
 

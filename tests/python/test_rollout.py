@@ -12,7 +12,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.library import opcheck
 
 import prdp_torch as prdp
-from prdp_torch import fields
+from prdp_torch import fields, operators
 from prdp_torch.solvers import packed_options
 
 # name: (stepper, grid, channels, physics beside nu)
@@ -163,13 +163,6 @@ def test_it_is_one_node_that_keeps_only_what_the_derivative_needs(device):
     assert kept(prdp.Heat((20,), 1e-3, 1.0, solver=jacobi, backward="unrolled")) == states
 
 
-def test_none_gives_states_without_a_gradient():
-    heat = prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3), backward="none")
-    u = field((9,)).requires_grad_()
-    states = heat.rollout(u, 3)
-    assert not states.requires_grad and torch.equal(states, chain(heat, u.detach(), 3)[0])
-
-
 def test_no_steps_return_the_start():
     heat = prdp.Heat((9,), 1e-3, 1.0, solver=prdp.Jacobi(3))
     u = field((9,)).requires_grad_()
@@ -303,6 +296,65 @@ def test_fields_rollout_takes_it_unless_forward_is_the_users():
     heat, forced = (cls((9,), 1e-3, 1.0, solver=prdp.Jacobi(3)) for cls in (prdp.Heat, Forced))
     assert "RolloutSolves" in fields.rollout(heat, u, 2).grad_fn.name()
     assert torch.equal(fields.rollout(forced, u, 2), torch.stack([u, forced(u), forced(forced(u))], 1))
+
+
+def halved(step, how):
+    """The step and half of what it makes: by a subclass, a hook, or a forward of its own."""
+    if how == "subclass":
+        step.__class__ = type(
+            "Half", (type(step),), {"forward": lambda self, u: 0.5 * type(step).__mro__[1].forward(self, u)}
+        )
+    elif how == "hook":
+        step.register_forward_hook(lambda module, given, found: 0.5 * found)
+    else:
+        forward = step.forward
+        step.forward = lambda u: 0.5 * forward(u)
+    return step
+
+
+@pytest.mark.parametrize("how", ["subclass", "hook", "attribute"])
+@pytest.mark.parametrize("step", ["heat", "own", "flow"])
+def test_a_rollout_equals_calls_where_they_do_more_than_the_step(step, how):
+    u = field((8,)) if step != "flow" else 0.1 * fields.project(field((8, 8), channels=2))
+    solver = prdp.CG(20)
+    half = halved(
+        prdp.Heat((8,), 1e-2, 1.0, solver)
+        if step == "heat"
+        else prdp.ImplicitStep(operators.Heat((8,), 1e-2, 1.0), solver=solver)
+        if step == "own"
+        else prdp.Flow((8, 8), nu=1e-3, dt=1e-2),
+        how,
+    )
+    ends = half(half(v := u.clone().requires_grad_()))
+    ends.sum().backward()
+    for rollout in (half.rollout, lambda u, steps: fields.rollout(half, u, steps)):
+        states = rollout(w := u.clone().requires_grad_(), 2)
+        states[:, -1].sum().backward()
+        assert torch.equal(states[:, -1], ends) and torch.equal(v.grad, w.grad)
+        assert half.info.status.shape == half.adjoint_info.status.shape == (2, 2)
+    half(w).sum().backward()
+    assert half.adjoint_info.status.shape == (2,)
+
+
+def test_a_forward_that_calls_the_rollout_that_calls_it_is_named():
+    class Coarse(prdp.Heat):
+        def forward(self, u):
+            return self.rollout(u, 2)[:, -1]
+
+    coarse = Coarse((8,), 1e-2, 1.0, prdp.CG(20))
+    with pytest.raises(RuntimeError, match=r"Coarse\.rollout: it repeats .* the forward call the rollout of a step"):
+        coarse(field((8,)))
+
+
+@pytest.mark.parametrize("flow", [False, True])
+def test_the_first_state_keeps_its_gradient_where_steps_have_none(flow):
+    heat = prdp.Heat((8,), 1e-2, 1.0, prdp.CG(20), backward="none")
+    step = prdp.Flow((8, 8), nu=1e-3, dt=1e-2, backward="none") if flow else heat
+    u = (0.1 * fields.project(field((8, 8), channels=2)) if flow else field((8,))).requires_grad_()
+    states = step.rollout(u, 2)
+    assert torch.equal(states, torch.stack([u, step(u), step(step(u))], 1))
+    (found,) = torch.autograd.grad((states**2).sum(), u)
+    assert torch.equal(found, 2 * u)
 
 
 @pytest.mark.parametrize(

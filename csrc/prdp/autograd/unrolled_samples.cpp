@@ -127,7 +127,8 @@ struct SampleVjps {
     for (int64_t i = 0; i < batch_; ++i) {
       if (!rows[i]) continue;
       const auto said = static_cast<SolveStatus>(status[i]);
-      const bool good = status[i] < 0 && !is_refused(said) && residual[i] <= asked_;
+      const bool has_none = is_refused(said) || said == SolveStatus::kOverflow;  // no gradient, whatever its residual
+      const bool good = status[i] < 0 && !has_none && residual[i] <= asked_;
       outcomes_[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
     }
   }

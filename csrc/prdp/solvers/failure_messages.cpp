@@ -200,8 +200,10 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
       case SolveStatus::kInconsistent: return inconsistent(role, a, b, sample);
       case SolveStatus::kNonfiniteInput:
         if (!b.select(0, sample).isfinite().all().item<bool>())
-          return role.adjoint ? "the cotangent is NaN or Inf there; look at the loss, or at the steps after this one"
-                              : "the right-hand side is NaN or Inf there; look at the state that it is made of";
+          return role.adjoint
+                     ? "the cotangent is NaN or Inf there; look at the loss, at the scale of a GradScaler, or at the "
+                       "steps after this one"
+                     : "the right-hand side is NaN or Inf there; look at the state that it is made of";
         return "the start is NaN or Inf there; take another one, or none";
       case SolveStatus::kNonfiniteOperator:
         if (const auto refused = a.refusal(sample); !refused.empty())

@@ -84,6 +84,24 @@ void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
   warning_sink()(text.str());
 }
 
+/// Warns where zeros take the place of gradients that a NaN or Inf in the cotangent has spoilt: a loss scaler waits for
+/// those, and skips no update. Only what the host has is looked at: nobody waits for a device.
+void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
+  if (!role.adjoint || !info.status.is_cpu()) return;
+  const auto status = info.status.accessor<int64_t, 1>();
+  int64_t lost = 0;
+  for (int64_t i = 0; i < status.size(0); ++i)
+    lost += static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteInput;
+  if (lost == 0 || !is_news("cotangents")) return;
+  std::ostringstream text;
+  text << of_step() << "adjoint solve: the cotangent of " << lost << " of " << status.size(0)
+       << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
+          "without "
+          "one, or a small scale that stays, such as GradScaler(init_scale=256.0, growth_interval=10**9). This is said "
+          "once";
+  warning_sink()(text.str());
+}
+
 }  // namespace
 
 FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
@@ -96,7 +114,8 @@ std::pair<int64_t, int64_t> FailuresOfStep::now() { return {step_now, steps_in_a
 
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure) {
-  if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad) return;
+  if (on_failure == OnFailure::kReturn || on_failure == OnFailure::kZeroGrad)
+    return warn_of_lost_cotangents(role, info);
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();

@@ -199,6 +199,7 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
   const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? record_rollout : call_solves;
   auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
+  if (options.backward == Backward::kNone) solutions = from_state(u, solutions);
   if (picard == 1) return {solutions, info};
   return {solutions.slice_symint(1, 0, std::nullopt, picard), reports_of_steps(info, steps, picard)};
 }

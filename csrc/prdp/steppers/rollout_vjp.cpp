@@ -1,5 +1,7 @@
 #include "prdp/steppers/rollout_vjp.h"
 
+#include <ATen/core/grad_mode.h>
+
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/tensors.h"
@@ -29,6 +31,11 @@ SolveInfo side_by_side(std::vector<SolveInfo> infos, const at::Tensor& u) {
     *joined[part] = at::cat(of_solves).view_symint({solves, batch}).t().contiguous();  // stack() takes longer
   }
   return all;
+}
+
+at::Tensor from_state(const at::Tensor& u, const at::Tensor& solutions) {
+  if (!at::GradMode::is_enabled() || !u.requires_grad()) return solutions;
+  return at::cat({u.unsqueeze(1), solutions.slice(1, 1)}, 1);
 }
 
 std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,

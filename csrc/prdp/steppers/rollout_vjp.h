@@ -14,6 +14,9 @@ namespace prdp {
 /// dtype.
 SolveInfo side_by_side(std::vector<SolveInfo> infos, const at::Tensor& u);
 
+/// The solutions (batch, solves + 1, …) of a rollout whose steps have no derivative: the first is u, which has one.
+at::Tensor from_state(const at::Tensor& u, const at::Tensor& solutions);
+
 /// The solutions u, …, (batch, solves + 1, …), where `next(solution, s)` returns what solve s makes of the one before
 /// it, with its report; so many solves are a step. Autograd sees each solve by itself.
 template <class Next>

@@ -207,7 +207,9 @@ SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int6
                          const SolveOptions& options) {
   TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
   if (options.backward == Backward::kUnrolled) return unrolled(equation, u, steps, options);
-  return record(equation, u, steps, Returned::kStates, options);
+  auto found = record(equation, u, steps, Returned::kStates, options);
+  if (options.backward == Backward::kNone) found.u = from_state(u, found.u);
+  return found;
 }
 
 }  // namespace prdp
