@@ -40,9 +40,11 @@ SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOpti
 template <class... Options>
 Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
                  bool transposed, const OptionalTensor& x0, const Options&... options) {
-  return {{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
-          unpack(options...),
-          x0.value_or(at::Tensor())};
+  Call call{{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), transposed},
+            unpack(options...),
+            x0.value_or(at::Tensor())};
+  call.options.report_apart = true;
+  return call;
 }
 
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
@@ -116,7 +118,7 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
-  const auto out = call_below(b, a, options, x0);
+  const auto out = call_below(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
   if (reverse) torch::autograd::set_history(u, node);
@@ -127,8 +129,9 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
 SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
-  const bool plain = no_mode_is_on() && is_plain_call(b, a, options, x0);
-  return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
+  if (!no_mode_but_a_profiler_is_on() || !is_plain_call(b, a, options, x0)) return call_op(b, a, options, x0);
+  RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
+  return solve_and_record(b, a, options, x0);
 }
 
 /// A function pointer with the op's signature out of a template over its arguments.
@@ -165,12 +168,12 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
   const bool may_wait = waits_for_report(options);
-  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks});
+  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks, options.report_apart, options.hierarchy.get()});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
-  if (!b.is_cpu())
-    for (auto* part : info.parts()) *part = part->to(b.device());
+  for (auto* part : info.parts())
+    if (part->device() != b.device()) *part = part->to(b.device());
   return result;
 }
 

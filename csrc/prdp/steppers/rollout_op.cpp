@@ -11,6 +11,7 @@
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
@@ -238,6 +239,8 @@ SolveOutputs solve_and_record(const Equation& equation, const at::Tensor& u, con
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
   call->products = products_of(call->options.solver.preconditioner.spec());
+  if (!equation_kind(equation.kind).linearised && is_plain(u) && !solves.is_symbolic())  // A is that of all steps
+    gpu::share_hierarchy(call->options, u, solves.expect_int());
   const bool differentiable = at::GradMode::is_enabled() && call->options.backward != Backward::kNone &&
                               (u.requires_grad() || any_requires_grad(tensors));
   if (!differentiable) return call_below(call->equation, u, call->count, call->options);
