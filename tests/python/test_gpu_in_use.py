@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from fibers import FORWARD, ROOT, SHUFFLED, Fibers
+from fibers import ROOT, SHUFFLED, Fibers
 from test_gpu_kernels import noise, sparse
 
 import prdp_torch as prdp
@@ -229,18 +229,26 @@ def test_a_kernel_refuses_numbers_that_are_not_allowed(name):
     torch.testing.assert_close(u[::2], exact, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("poison", [False, True], ids=["numbers", "NaN"])
-def test_a_kernel_with_a_wrong_first_result_is_not_used(poison, monkeypatch):
-    """As of a fault of a compiler or a driver; here a barrier is left out, so that threads add up what is not there:
-    other numbers, or NaN, and the kernel says that b is not finite."""
-    shape = (8, 9) if poison else (9, 8)  # a kernel of its own
+FAULTS = {  # a barrier that is left out: its header and function
+    "numbers": ("team.h", "void reduce(", "__syncthreads()"),
+    "NaN": ("block_space.h", "void product(", "meet()"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_kernel_with_a_wrong_first_result_is_not_used(fault, monkeypatch):
+    """As of a fault of a compiler or a driver: threads take what is not there yet, which is other numbers, or NaN; then
+    the kernel says OVERFLOW."""
+    header, function, call = FAULTS[fault]
+    shape = {"numbers": (9, 8), "NaN": (8, 9)}[fault]  # a kernel of its own
     a, b = operators.Heat(shape, 1e-2, 1.0), noise(2, 1, *shape)
     solver = prdp.CG(max_iter=11, rtol=1e-10)
     expected = prdp.linear_solve(a, b, solver)[0]
-    text = (ROOT / "csrc/prdp/gpu/device/team.h").read_text().splitlines()
-    reduce = next(i for i, line in enumerate(text) if "void reduce(" in line)
-    barrier = next(i for i in range(reduce, len(text)) if "__syncthreads()" in text[i]) + 1
-    with Fibers(order=FORWARD if poison else SHUFFLED, left_out=barrier, poison=poison):
+    text = (ROOT / "csrc/prdp/gpu/device" / header).read_text().splitlines()
+    start = next(i for i, line in enumerate(text) if function in line)
+    line = next(i for i in range(start, len(text)) if call in text[i]) + 1
+    barrier = line if call == "__syncthreads()" else 10000 + line
+    with Fibers(order=SHUFFLED, left_out=barrier, poison=fault == "NaN"):
         with pytest.raises(RuntimeError, match="PRDP_GPU=required: .* is not that of tensor operations"):
             prdp.linear_solve(a, b, solver, on_failure="return")
         monkeypatch.setenv("PRDP_GPU", "auto")
