@@ -249,7 +249,7 @@ def test_a_kernel_with_a_wrong_first_result_is_not_used(fault, monkeypatch):
     line = next(i for i in range(start, len(text)) if call in text[i]) + 1
     barrier = line if call == "__syncthreads()" else 10000 + line
     with Fibers(order=SHUFFLED, left_out=barrier, poison=fault == "NaN"):
-        with pytest.raises(RuntimeError, match="PRDP_GPU=required: .* is not that of tensor operations"):
+        with pytest.raises(RuntimeError, match=r"PRDP_GPU=required: .* is not that of tensor operations"):
             prdp.linear_solve(a, b, solver, on_failure="return")
         monkeypatch.setenv("PRDP_GPU", "auto")
         with warnings.catch_warnings():
