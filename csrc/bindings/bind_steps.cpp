@@ -18,7 +18,7 @@ namespace {
 bool is_exact(py::handle t) { return THPVariable_CheckExact(t.ptr()); }
 
 bool nobody_in_python_watches(const py::object& b, const std::vector<py::object>& tensors) {
-  return no_mode_is_on() && !at::impl::torch_function_mode_enabled() && is_exact(b) &&
+  return no_mode_but_a_profiler_is_on() && !at::impl::torch_function_mode_enabled() && is_exact(b) &&
          std::all_of(tensors.begin(), tensors.end(), is_exact);
 }
 
@@ -56,8 +56,10 @@ py::object call_step(const py::object& u, const std::vector<py::object>& tensors
   if (!nobody_in_python_watches(u, tensors)) return py::none();
   auto whole = equation;
   whole.tensors = unwrapped(tensors);
-  return report(
-      [&, state = THPVariable_Unpack(u.ptr())] { return step(whole, state, with(options, max_iter, adjoint_log)); });
+  return report([&, state = THPVariable_Unpack(u.ptr())] {
+    RECORD_FUNCTION("prdp::step", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
+    return step(whole, state, with(options, max_iter, adjoint_log));
+  });
   END_HANDLE_TH_ERRORS_PYBIND
 }
 

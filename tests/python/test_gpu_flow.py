@@ -263,6 +263,24 @@ def test_the_gradient_of_a_force_is_one_launch_more(name):
     assert with_force == launches + 1 and of_torch_with_force <= of_torch + 2, found
 
 
+def test_the_coarse_grids_of_the_pressure_are_made_once():
+    """For all steps and their reverses: with multigrid, there are no more launches than without."""
+    u = (0.5 * noise(2, 2, *PLANE, seed=1)).requires_grad_()
+    w, launches = noise(2, 2, *PLANE, seed=2), []
+    for cycles in (None, "multigrid"):
+        solver = prdp.CG(200, rtol=1e-12, preconditioner=cycles)
+        step = prdp.Flow(PLANE, dt=0.01, nu=0.01, diffusion="explicit", solver=solver, on_failure="return")
+        expected = torch.autograd.grad(step(u), u, w)[0]
+        with Fibers() as fibers:
+            torch.autograd.grad(step(u), u, w)
+            before = fibers.launches()
+            found = torch.autograd.grad(step(u), u, w)[0]
+            launches.append(fibers.launches() - before)
+        assert step.info.way == "kernel"
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+    assert launches[0] == launches[1]
+
+
 # Operations that compute nothing: memory, views, and reading a number of the host.
 FREE = {
     f"aten::{name}"

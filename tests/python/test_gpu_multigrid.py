@@ -213,24 +213,53 @@ def test_every_barrier_is_needed():
     assert not unnoticed
 
 
-def test_operations_of_torch_around_a_solve_and_its_gradient():
-    """Two launches each, and new memory; the host reads ν, which is its own here, and nothing else."""
-    a, b = OPERATORS["heat"][0](F32), right_hand_sides("heat", F32).requires_grad_()
-    w = torch.ones_like(b)
+WITH_SHARED_GRIDS = {  # one A for all samples
+    "heat": (lambda: OPERATORS["heat"][0](F32), (24, 1, 13, 10), prdp.CG),
+    "wind": (lambda: operators.Stencil(winds(F32, 1), OFFSETS, ("periodic", "zero")), (24, 2, 9, 11), prdp.GMRES),
+}
 
-    def solve_and_differentiate():
-        u, _ = prdp.linear_solve(a, b, with_cycles(prdp.CG, max_iter=9, rtol=1e-4), on_failure="return")
-        return torch.autograd.grad(u, b, w)
 
+@pytest.mark.parametrize("name", WITH_SHARED_GRIDS)
+def test_coarse_grids_are_kept_for_the_adjoint_solve(name):
+    """Where they are small beside b; that of a sample alone makes its own, and both gradients have the same bits. A
+    launch for the grids, one for each solve, and new memory: the host looks at nothing."""
+    make, shape, method = WITH_SHARED_GRIDS[name]
+    a, b, w = make(), noise(*shape, seed=3, dtype=F32), noise(*shape, seed=5, dtype=F32)
+
+    def solve_and_differentiate(b, w):
+        u, _ = prdp.linear_solve(a, b, with_cycles(method, max_iter=4, rtol=1e-4), on_failure="return")
+        return torch.autograd.grad(u, b, w)[0]
+
+    found = []
     with Fibers(poison=False) as fibers:
-        solve_and_differentiate()  # the first result of a kernel is compared
+        for samples, launches, memory in ((slice(None), 3, 5 + 3), (slice(7, 8), 4, 5 + 5)):
+            given = b[samples].clone().requires_grad_(), w[samples]
+            solve_and_differentiate(*given)  # the first results of a kernel are compared
+            before = fibers.launches()
+            with torch.autograd.profiler.profile() as profiler:
+                found.append(solve_and_differentiate(*given))
+            assert fibers.launches() - before == launches
+            seen = collections.Counter(e.name for e in profiler.function_events if e.name.startswith("aten::"))
+            assert seen == {"aten::empty": memory}
+    assert found[0][7].any() and torch.equal(found[0][7], found[1][0])
+
+
+def test_a_rollout_with_the_same_operator_makes_its_coarse_grids_once():
+    step = prdp.Heat((13, 10), nu=0.5, dt=1.0, solver=prdp.CG(4, preconditioner="multigrid"), on_failure="return")
+    u = noise(24, 1, 13, 10, dtype=F32).requires_grad_()
+
+    def launches(run):
         before = fibers.launches()
-        with torch.autograd.profiler.profile() as profiler:
-            solve_and_differentiate()
-        launches = fibers.launches() - before
-    seen = collections.Counter(e.name for e in profiler.function_events if e.name.startswith("aten::"))
-    assert launches == 4
-    assert seen <= collections.Counter({"aten::empty": 20, "aten::item": 6, "aten::_local_scalar_dense": 6}), seen
+        found = run()
+        return found, fibers.launches() - before
+
+    with Fibers() as fibers:
+        step.rollout(u, 3).sum().backward()
+        states, forward = launches(lambda: step.rollout(u, 3))
+        _, back = launches(lambda: states.sum().backward())
+        chain = step(step(step(u.detach())))
+    assert (forward, back) == (4, 3)
+    assert torch.equal(states[:, 3], chain)
 
 
 @pytest.mark.parametrize(("name", "method"), [("jumps", prdp.CG), ("navier-stokes", prdp.GMRES)])

@@ -25,6 +25,14 @@ SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOpti
   return call_with_solve(op, a, x0, o, b);
 }
 
+/// The op's arguments; a compiled graph takes no results that share their memory.
+template <class... Args>
+SolveCall unpack_op(const Args&... args) {
+  auto call = unpack_solve(args...);
+  call.options.report_apart = true;
+  return call;
+}
+
 const char* role_of(const OperatorSpec& a) { return a.transposed ? "adjoint solve" : "linear_solve"; }
 
 void check_multigrid(const Operator& a, const OperatorSpec& spec, const Solver& solver) {
@@ -55,14 +63,14 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 
 template <class... Args>
 SolveOutputs solve_kernel(const at::Tensor& b, const Args&... args) {
-  const auto [a, options, x0] = unpack_solve(args...);
+  const auto [a, options, x0] = unpack_op(args...);
   return outputs_of(linear_solve_kernel(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
 SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
-  const auto [a, options, x0] = unpack_solve(args...);
+  const auto [a, options, x0] = unpack_op(args...);
   checked_operator(a, b, options, x0);
   return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
 }
@@ -96,7 +104,7 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
-  const auto out = call_below(b, a, options, x0);
+  const auto out = call_below(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
   if (reverse) torch::autograd::set_history(u, node);
@@ -107,8 +115,9 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
 SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
-  const bool plain = no_mode_is_on() && is_plain_call(b, a, options, x0);
-  return plain ? solve_and_record(b, a, options, x0) : call_op(b, a, options, x0);
+  if (!no_mode_but_a_profiler_is_on() || !is_plain_call(b, a, options, x0)) return call_op(b, a, options, x0);
+  RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
+  return solve_and_record(b, a, options, x0);
 }
 
 /// A function pointer with the op's signature out of a template over its arguments.
@@ -119,7 +128,7 @@ struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
   static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel(b, args...); }
   static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
-    const auto [a, options, x0] = unpack_solve(args...);
+    const auto [a, options, x0] = unpack_op(args...);
     return solve_and_record(b, a, options, x0);
   }
 };
@@ -145,12 +154,12 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
   const bool may_wait = waits_for_report(options);
-  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks});
+  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks, options.report_apart, options.hierarchy.get()});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);
-  if (!b.is_cpu())
-    for (auto* part : info.parts()) *part = part->to(b.device());
+  for (auto* part : info.parts())
+    if (part->device() != b.device()) *part = part->to(b.device());
   return result;
 }
 

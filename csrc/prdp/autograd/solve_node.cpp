@@ -3,6 +3,7 @@
 #include "prdp/operators/autocast.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/kept_hierarchy.h"
 
 namespace prdp {
 
@@ -14,7 +15,9 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
       a_(std::move(a)),
       options_(std::move(options)),
       products_(products_of(a_)),
-      products_of_inverse_(products_of(options_.solver.preconditioner.spec())) {}
+      products_of_inverse_(products_of(options_.solver.preconditioner.spec())) {
+  if (options_.backward == Backward::kImplicit && is_plain(b)) gpu::share_hierarchy(options_, b);
+}
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
   // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve
@@ -37,6 +40,7 @@ void SolveNode::release_variables() {
   const std::lock_guard lock(mutex_);
   for (auto* saved : {&b_, &x0_, &u_, &iterations_, &status_, &residual_}) saved->reset_data();
   for (auto& saved : tensors_) saved.reset_data();
+  if (options_.hierarchy) options_.hierarchy->let_go();
 }
 
 variable_list SolveNode::apply(variable_list&& cotangents) {

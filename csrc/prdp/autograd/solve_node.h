@@ -19,6 +19,8 @@ class SolveNode final : public torch::autograd::Node {
   torch::autograd::variable_list apply(torch::autograd::variable_list&& cotangents) override;
   void release_variables() override;
   std::string name() const override { return "LinearSolve"; }
+  /// Those of the solve, with what it is to keep for the adjoint solve.
+  const SolveOptions& options() const { return options_; }
 
  private:
   torch::autograd::variable_list gradients(const at::Tensor& cotangent, const Solved& solved,

@@ -4,8 +4,6 @@
 #include <mutex>
 #include <set>
 
-#include "prdp/gpu/runtime.h"
-
 namespace prdp::gpu {
 
 namespace {

@@ -36,23 +36,19 @@ std::shared_ptr<const Kernel> kernel_of(Runtime& runtime, c10::Device device, co
 
 bool launch_points(c10::Device device, const Body& body, const void* arguments, int64_t count) {
   auto* const runtime = runtime_of(device);
-  if (!runtime) return false;
-  try {
-    check_count(count);
-    const TeamSize team{1, std::min(kThreadsOfPoints, runtime->limits(device).threads)};
-    const auto kernel = kernel_of(*runtime, device, body, "EachPoint", "", team);
-    kernel->launch(std::min(at::divup(count, team.threads), 4 * kernel->teams()), arguments);
-    return true;
-  } catch (const Unavailable& reason) {
-    fall_back(reason.what());
-    return false;
-  }
+  return runtime && or_fall_back([&] {
+           check_count(count);
+           const TeamSize team{1, std::min(kThreadsOfPoints, runtime->limits(device).threads)};
+           const auto kernel = kernel_of(*runtime, device, body, "EachPoint", "", team);
+           kernel->launch(std::min(at::divup(count, team.threads), 4 * kernel->teams()), arguments);
+           return true;
+         });
 }
 
 SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int64_t batch) {
   auto* const runtime = runtime_of(device);
   if (!runtime) return {};
-  try {
+  return or_fall_back([&] {
     check_count(points);
     const auto team = team_size(points, runtime->limits(device));
     const auto sizes = c10::str("<", team.blocks, ", ", team.threads, ">");
@@ -60,20 +56,14 @@ SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int
     loop.teams = std::min(batch, team.blocks > 1 ? loop.kernel->teams() : 4 * loop.kernel->teams());
     loop.memory = {team.blocks, loop.teams, at::TensorOptions().device(device)};
     return loop;
-  } catch (const Unavailable& reason) {
-    fall_back(reason.what());
-    return {};
-  }
+  });
 }
 
 bool launch_samples(const SampleLoop& loop, const void* arguments) {
-  try {
+  return or_fall_back([&] {
     loop.kernel->launch(loop.teams, arguments);
     return true;
-  } catch (const Unavailable& reason) {
-    fall_back(reason.what());
-    return false;
-  }
+  });
 }
 
 }  // namespace prdp::gpu

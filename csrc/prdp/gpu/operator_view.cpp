@@ -4,12 +4,18 @@
 
 namespace prdp::gpu {
 
+namespace {
+
+bool is_of_all(const at::Tensor& t) { return t.dim() == 1 || t.size(0) == 1; }
+
+}  // namespace
+
 OperatorArguments arguments_of(const OperatorView& a) {
   OperatorArguments arguments{};
   for (size_t i = 0; i < a.tensors.size(); ++i) {
     if (!a.tensors[i].defined()) continue;
     arguments.tensors[i] = a.tensors[i].const_data_ptr();
-    arguments.sample_strides[i] = a.tensors[i].size(0) == 1 ? 0 : a.tensors[i].stride(0);
+    arguments.sample_strides[i] = is_of_all(a.tensors[i]) ? 0 : a.tensors[i].stride(0);
   }
   std::copy(a.numbers.begin(), a.numbers.end(), arguments.numbers);
   return arguments;
@@ -17,7 +23,7 @@ OperatorArguments arguments_of(const OperatorView& a) {
 
 bool is_shared(const OperatorView& a) {
   return std::all_of(a.tensors.begin(), a.tensors.end(),
-                     [](const at::Tensor& t) { return !t.defined() || t.size(0) == 1; });
+                     [](const at::Tensor& t) { return !t.defined() || is_of_all(t); });
 }
 
 std::string type_of(at::ScalarType dtype) { return dtype == at::kFloat ? "float" : "double"; }

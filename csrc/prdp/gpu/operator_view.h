@@ -13,7 +13,7 @@ namespace prdp::gpu {
 /// it.
 struct OperatorView {
   std::string type;  // "Laplacian<float, Grid<1, 64, 64>>"
-  /// Contiguous, with one sample or as many as the vectors; undefined: there is none.
+  /// Contiguous, with one sample or as many as the vectors, or one axis, for all of them; undefined: there is none.
   std::vector<at::Tensor> tensors{};
   std::vector<double> numbers{};
   /// Orthonormal vectors of one field, (count, length); without entries: the constant one; undefined: no null space.

@@ -57,6 +57,17 @@ Runtime* runtime_of(c10::Device device);
 /// For tests: what runs the kernels of this kind of device from here on; null: nothing.
 void set_runtime(c10::DeviceType type, Runtime* runtime);
 
+/// While it lives, its thread takes no kernels.
+class WithoutKernels {
+ public:
+  WithoutKernels();
+  WithoutKernels(const WithoutKernels&) = delete;
+  ~WithoutKernels();
+
+ private:
+  bool before_;
+};
+
 /// PRDP_GPU: kernels where there are any; an error where there are none; none.
 enum class Use { kAuto, kRequired, kOff };
 Use use();

@@ -2,26 +2,45 @@
 #include <ATen/ATen.h>
 
 #include "prdp/gpu/device/arguments.h"
+#include "prdp/gpu/part_of.h"
 
 namespace prdp::gpu {
 
-/// Where the blocks of a team meet, and where they add up; nothing for teams of one block.
-struct TeamMemory {
+/// What the teams of a launch work in, in one tensor: where the blocks of a team meet and where they add up, if it has
+/// several; and then what the kernel itself needs.
+class TeamMemory {
+ public:
   TeamMemory() = default;
-  TeamMemory(int64_t blocks, int64_t teams, const at::TensorOptions& options) {
-    if (blocks == 1) return;
-    arrived = at::zeros({32 * teams}, options.dtype(at::kInt));
-    parts = at::empty({2 * kMostAtOnce * blocks * teams}, options.dtype(at::kDouble));
+  /// `own`: bytes of the kernel.
+  TeamMemory(int64_t blocks, int64_t teams, const at::TensorOptions& options, int64_t own = 0)
+      : arrived_(blocks > 1 ? kArrivedOfTeam * teams : 0), parts_(blocks > 1 ? kPartsOfBlock * blocks * teams : 0) {
+    if (arrived_ + own == 0) return;
+    memory_ = at::empty({arrived_ + parts_ + own}, options.dtype(at::kByte));
+    if (arrived_ > 0) part_of(memory_, 0, arrived_, at::kByte).zero_();
   }
   /// Into the arguments of a kernel.
   template <class Arguments>
   void put_into(Arguments& arguments) const {
-    if (!arrived.defined()) return;
-    arguments.arrived = static_cast<unsigned*>(arrived.mutable_data_ptr());
-    arguments.parts = parts.mutable_data_ptr<double>();
+    if (arrived_ == 0) return;
+    arguments.arrived = place<unsigned>(0);
+    arguments.parts = place<double>(arrived_);
+  }
+  /// What the kernel itself needs.
+  template <class T>
+  T* own() const {
+    return memory_.defined() ? place<T>(arrived_ + parts_) : nullptr;
   }
 
-  at::Tensor arrived, parts;
+ private:
+  static constexpr int64_t kArrivedOfTeam = 32 * 4, kPartsOfBlock = 2 * kMostAtOnce * 8;  // bytes
+
+  template <class T>
+  T* place(int64_t byte) const {
+    return reinterpret_cast<T*>(static_cast<char*>(memory_.mutable_data_ptr()) + byte);
+  }
+
+  at::Tensor memory_{};
+  int64_t arrived_ = 0, parts_ = 0;  // bytes
 };
 
 }  // namespace prdp::gpu

@@ -1,9 +1,12 @@
+#include <ATen/EmptyTensor.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include <cmath>
 
 #include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"
+#include "prdp/operators/step_parameters.h"
 #include "prdp/operators/tensors.h"
 
 /// What a Diffusion is made of, what of it is refused, and what it warns of.
@@ -14,6 +17,17 @@ namespace {
 /// The least mean of a sample.
 double mean_of_least_sample(const at::Tensor& t) {
   return t.dim() == 0 ? t.item<double>() : t.to(at::kDouble).flatten(1).mean(1).min().item<double>();
+}
+
+/// `t` in this dtype; a number of the host without operations of torch, four of them, where autograd does not care.
+at::Tensor in_dtype(const at::Tensor& t, at::ScalarType dtype) {
+  if (t.scalar_type() == dtype) return t;
+  if (t.dim() > 0 || !t.is_cpu() || !t.has_storage() || !is_plain(t) || t.requires_grad() || has_tangent(t))
+    return t.to(dtype);
+  auto number = at::detail::empty_cpu({}, dtype);
+  if (dtype == at::kFloat) *number.mutable_data_ptr<float>() = static_cast<float>(number_of(t));
+  else *number.mutable_data_ptr<double>() = number_of(t);
+  return number;
 }
 
 }  // namespace
@@ -61,7 +75,7 @@ DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
                            shift.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_))),
       "Diffusion: shift must be a number or have the shape of kappa, got ", shift.sym_sizes());
   kappa_ = per_axis_ ? kappa : kappa.unsqueeze(1);
-  shift_ = shift.to(kappa.scalar_type());
+  shift_ = in_dtype(shift, kappa.scalar_type());
   if (shift.dim() > 0) shift_ = shift_.unsqueeze(1);
   const auto axes = static_cast<size_t>(dim());
   TORCH_CHECK_VALUE(spec.parameters.size() == 3 * axes + 1, "Diffusion: expected ", 3 * axes + 1, " parameters, got ",
@@ -94,7 +108,7 @@ void DiffusionOperator::take_robin(const std::vector<at::Tensor>& tensors, int64
                     "Diffusion: h of the ", end == 0 ? "low" : "high", " side of axis ", axis,
                     " must be a number or have shape (batch or 1, *side), where side is ", at::IntArrayRef(side),
                     ", got ", h.sym_sizes());
-  const auto taken = h.to(kappa_.scalar_type());
+  const auto taken = in_dtype(h, kappa_.scalar_type());
   robin_.push_back(h.dim() == 0 ? taken : taken.unsqueeze(1 + axis).unsqueeze(1));
 }
 

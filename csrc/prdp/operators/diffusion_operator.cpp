@@ -6,6 +6,7 @@
 
 #include "prdp/gpu/operator_view.h"
 #include "prdp/operators/stencil_operator.h"
+#include "prdp/operators/step_parameters.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
@@ -205,10 +206,10 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
   view.numbers.resize(10);
   // A single number of the host is an argument; one of the device becomes a field.
   const auto take = [&](const at::Tensor& t, at::IntArrayRef field, size_t tensor, size_t number) {
-    if (t.dim() == 0 && t.is_cpu()) view.numbers[number] = t.item<double>();
-    else view.tensors[tensor] = (t.dim() == 0 ? t.detach().expand(field) : t.detach()).contiguous();
+    if (t.dim() == 0 && t.is_cpu()) view.numbers[number] = number_of(t);
+    else view.tensors[tensor] = (t.dim() == 0 ? t.expand(field) : t).contiguous();
   };
-  view.tensors[0] = kappa_.detach().contiguous();
+  view.tensors[0] = kappa_.contiguous();
   auto field = kappa_.sizes().vec();
   field[0] = 1;
   take(shift_, field, 1, 0);

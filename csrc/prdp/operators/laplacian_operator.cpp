@@ -105,7 +105,7 @@ std::optional<gpu::OperatorView> LaplacianOperator::gpu_view(const at::Tensor& b
   view.numbers = {alpha, beta, 0.0, 0.0, 0.0};  // 1/h² along z, y and x
   for (int64_t d = 0; d < dim; ++d) view.numbers[5 - dim + d] = 1.0 / (grid_.dx(d) * grid_.dx(d));
   if (!nu.defined()) return view;
-  if (nu.is_cpu()) view.numbers[1] *= nu.item<double>();
+  if (nu.is_cpu()) view.numbers[1] *= number_of(nu);
   else view.tensors = {nu.detach().to(b.scalar_type()).reshape({1})};  // nobody waits for it
   return view;
 }

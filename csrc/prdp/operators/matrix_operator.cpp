@@ -3,6 +3,7 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 
 #include "prdp/gpu/operator_view.h"
+#include "prdp/gpu/part_of.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/products_by_kernel.h"
@@ -97,7 +98,7 @@ std::optional<gpu::OperatorView> DenseOperator::gpu_view(const at::Tensor& b, bo
   const auto n = matrix_.size(-1);
   gpu::OperatorView view{"Dense<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n) + ", " +
                          std::to_string(transposed) + ">"};
-  view.tensors = {matrix_.detach().contiguous().view({-1, n, n})};
+  view.tensors = {matrix_.contiguous().view({-1, n, n})};
   return view;
 }
 
@@ -138,7 +139,7 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
                       index->sym_sizes(), " and ", values_.sym_sizes());
   check_has_rows(crow.sym_size(-1) - 1);
   const auto for_values = [&](const at::Tensor& index) {
-    const auto whole = index.to(at::kLong);
+    const auto whole = index.scalar_type() == at::kLong ? index : index.to(at::kLong);
     return batched && whole.dim() == 1 ? whole.expand_symint({values_.sym_size(0), -1}) : whole;
   };
   crow_ = for_values(crow);
@@ -210,7 +211,8 @@ namespace {
 
 /// Contiguous; one row for all where they share it.
 at::Tensor shared_or_own(const at::Tensor& t) {
-  return (t.dim() == 2 && t.stride(0) == 0 ? t.narrow(0, 0, 1) : t).contiguous();
+  if (t.dim() != 2 || t.stride(0) != 0 || t.stride(1) != 1) return t.contiguous();
+  return gpu::part_of(t, t.storage_offset() * t.element_size(), t.size(1), t.scalar_type());
 }
 /// The step from the row of one matrix to that of the next.
 int64_t step(const at::Tensor& t) { return t.dim() == 2 && t.size(0) > 1 ? t.stride(0) : 0; }
@@ -282,7 +284,7 @@ std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b
 }
 
 std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool transposed) const {
-  auto crow = shared_or_own(crow_), col = shared_or_own(col_), values = values_.detach().contiguous();
+  auto crow = shared_or_own(crow_), col = shared_or_own(col_), values = values_.contiguous();
   if (transposed) {  // columns as rows
     col = col_.contiguous();
     const auto order = col.argsort(/*stable=*/true, /*dim=*/-1, /*descending=*/false);
@@ -295,7 +297,7 @@ std::optional<gpu::OperatorView> CsrOperator::gpu_view(const at::Tensor& b, bool
   }
   gpu::OperatorView view{"Csr<" + gpu::type_of(b.scalar_type()) + ", " + std::to_string(n()) + ">"};
   view.numbers = {static_cast<double>(values.size(-1))};
-  for (const auto& t : {crow, col, values}) view.tensors.push_back(t.view({t.dim() == 2 ? t.size(0) : 1, t.size(-1)}));
+  view.tensors = {crow, col, values};
   return view;
 }
 

@@ -1,5 +1,6 @@
 #include "prdp/operators/navier_stokes_operator.h"
 
+#include "prdp/gpu/part_of.h"
 #include "prdp/kernels/navier_stokes.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/sums_in_order.h"
@@ -114,7 +115,7 @@ std::shared_ptr<const kernels::Kernels> NavierStokesOperator::kernels(const at::
 
 std::optional<gpu::OperatorView> NavierStokesOperator::gpu_view(const at::Tensor& b, bool transposed) const {
   auto view = upwind_view(b, "NavierStokes", std::to_string(transposed), 1.0 / step_.dt, 1.0);
-  view.null_space = view.left_null_space = at::empty({0}, b.options());
+  view.null_space = view.left_null_space = gpu::part_of(b, 0, 0, b.scalar_type());
   view.null_field = 2;  // the pressure
   return view;
 }

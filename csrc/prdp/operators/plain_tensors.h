@@ -21,12 +21,12 @@ inline bool is_plain(const at::Tensor& t) {
 inline bool all_plain(at::TensorList tensors) { return std::all_of(tensors.begin(), tensors.end(), is_plain); }
 
 /// Whether an op that this thread calls with plain tensors comes to its autograd kernel and nowhere else: no mode,
-/// transform, trace, autocast or profiler is on.
-inline bool no_mode_is_on() {
+/// transform, trace or autocast is on; and no profiler.
+inline bool no_mode_but_a_profiler_is_on() {
   const auto here = c10::impl::tls_local_dispatch_key_set();
-  return here.included_ == c10::default_included_set && here.excluded_ == c10::default_excluded_set &&
-         !at::hasCallbacks();
+  return here.included_ == c10::default_included_set && here.excluded_ == c10::default_excluded_set;
 }
+inline bool no_mode_is_on() { return no_mode_but_a_profiler_is_on() && !at::hasCallbacks(); }
 
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }

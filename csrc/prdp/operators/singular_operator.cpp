@@ -3,6 +3,7 @@
 #include <ATen/core/grad_mode.h>
 
 #include "prdp/gpu/operator_view.h"
+#include "prdp/gpu/part_of.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
@@ -233,7 +234,7 @@ std::optional<gpu::OperatorView> SingularOperator::gpu_view(const at::Tensor& b,
   auto view = a_->gpu_view(b, transposed);
   if (!view) return view;
   const auto given = [&](const Basis& basis) {
-    return basis.is_constant() ? at::empty({0}, b.options()) : orthonormal(basis, b.detach()).contiguous();
+    return basis.is_constant() ? gpu::part_of(b, 0, 0, b.scalar_type()) : orthonormal(basis, b.detach()).contiguous();
   };
   view->null_space = given(transposed ? left_ : right_);
   view->left_null_space = given(transposed ? right_ : left_);

@@ -347,7 +347,7 @@ std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, 
   for (const auto& offset : offsets_)
     type << ", Offset<" << offset.along[0] << ", " << offset.along[1] << ", " << offset.along[2] << ">";
   type << ">";
-  return gpu::OperatorView{type.str(), {coefficients_.detach().contiguous()}};
+  return gpu::OperatorView{type.str(), {coefficients_.contiguous()}};
 }
 
 std::optional<kernels::FactorKey> StencilOperator::key(bool transposed) const {

@@ -29,13 +29,13 @@ void StepParameters::check_values(Checks checks) const {
   TORCH_CHECK_VALUE(std::isfinite(value) && value >= 0.0, owner, ": nu must be finite and >= 0, got ", value);
 }
 
-double StepParameters::nu_value() const {
+double number_of(const at::Tensor& t) {
   // Read where it lies: item() takes as long as a tenth of a small step.
-  if (nu.is_cpu() && nu.has_storage() && !nu.is_neg()) {
-    if (nu.scalar_type() == at::kDouble) return *nu.const_data_ptr<double>();
-    if (nu.scalar_type() == at::kFloat) return *nu.const_data_ptr<float>();
+  if (t.is_cpu() && t.has_storage() && !t.is_neg()) {
+    if (t.scalar_type() == at::kDouble) return *t.const_data_ptr<double>();
+    if (t.scalar_type() == at::kFloat) return *t.const_data_ptr<float>();
   }
-  return nu.item<double>();
+  return t.item<double>();
 }
 
 }  // namespace prdp

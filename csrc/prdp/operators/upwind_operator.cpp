@@ -45,10 +45,10 @@ gpu::OperatorView UpwindOperator::upwind_view(const at::Tensor& b, const std::st
   gpu::OperatorView view{name + "<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(grid_.shape()) + ", " +
                          others + ">"};
   const auto dim = grid_.dim();
-  view.tensors = {winds_.detach().to(b.scalar_type()).contiguous()};
+  view.tensors = {(winds_.scalar_type() == b.scalar_type() ? winds_ : winds_.to(b.scalar_type())).contiguous()};
   view.numbers = {alpha, beta, 1.0, dim > 1 ? 1.0 / grid_.dx(0) : 0.0, 1.0 / grid_.dx(dim - 1)};
   const auto& nu = step_.nu;
-  if (nu.is_cpu()) view.numbers[2] = nu.item<double>();
+  if (nu.is_cpu()) view.numbers[2] = step_.nu_value();
   else view.tensors.push_back(nu.detach().to(b.scalar_type()).reshape({1}));  // nobody waits for it
   return view;
 }

@@ -21,17 +21,42 @@ Trust trust_by_samples(const Operator& a, const at::Tensor& b, const at::Tensor&
   return judged.any().item<bool>() ? Trust::kGood : Trust::kUnknown;
 }
 
+/// Of samples that ended by a NaN or Inf, or by a zero where there may be none, as the kernel has it.
+Trust trust_by_failed(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+  try {
+    a.check_parameters(Checks::kAll);  // others may not be able to read it
+  } catch (const c10::Error&) {
+    return Trust::kUnknown;
+  }
+  const WithoutKernels by_others;
+  const auto status = solve(a, b, request).info.status;
+  return status.ge(static_cast<int64_t>(SolveStatus::kStagnated)).any().item<bool>() ? Trust::kNone : Trust::kUnknown;
+}
+
 }  // namespace
 
-Trust trust_by(const Operator& a, const at::Tensor& b, const SolveResult& result) {
+Trust trust_by(const Operator& a, const at::Tensor& b, const SolveRequest& request, const SolveResult& result) {
   const at::NoGradGuard no_grad;
+  const auto& info = result.info;
   // Tensor operations may not be able to read the A of others.
-  const auto index = (result.info.status >= static_cast<int64_t>(SolveStatus::kStagnated)).nonzero().flatten();
-  if (index.numel() == 0) return Trust::kUnknown;
-  const auto chosen = a.select(index);
-  if (!chosen) return Trust::kUnknown;
-  return trust_by_samples(*chosen, b.index_select(0, index), result.u.index_select(0, index),
-                          result.info.residual.index_select(0, index));
+  const auto judged = [&](const at::Tensor& index, const auto& judge) {
+    const auto chosen = index.numel() > 0 ? a.select(index) : nullptr;
+    return chosen ? judge(*chosen, b.index_select(0, index)) : Trust::kUnknown;
+  };
+  const auto where = [](const at::Tensor& mask) { return mask.nonzero().flatten(); };
+  const auto is = [&](SolveStatus status) { return info.status == static_cast<int64_t>(status); };
+  const auto ended_well = where(info.status >= static_cast<int64_t>(SolveStatus::kStagnated));
+  const auto trust = judged(ended_well, [&](const Operator& of, const at::Tensor& rhs) {
+    return trust_by_samples(of, rhs, result.u.index_select(0, ended_well), info.residual.index_select(0, ended_well));
+  });
+  if (trust == Trust::kNone || ended_well.numel() == b.size(0)) return trust;
+  const auto not_finite = where(is(SolveStatus::kOverflow) | is(SolveStatus::kZeroDiagonal) |
+                                is(SolveStatus::kNonfiniteInput) | is(SolveStatus::kNonfiniteOperator));
+  const auto of_failed = judged(not_finite, [&](const Operator& of, const at::Tensor& rhs) {
+    const auto x0 = request.x0.defined() ? request.x0.index_select(0, not_finite) : at::Tensor();
+    return trust_by_failed(of, rhs, {.solver = request.solver, .x0 = x0});
+  });
+  return of_failed == Trust::kNone ? of_failed : trust;
 }
 
 }  // namespace prdp::gpu

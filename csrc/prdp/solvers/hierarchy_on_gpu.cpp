@@ -49,17 +49,17 @@ int64_t most_coarse_points(at::IntArrayRef shape) {
 }
 
 template <class T>
-void launch(const HierarchyKernel& of, int64_t samples, const MadeHierarchy& made, const at::TensorOptions& options) {
-  const int64_t teams = std::min(samples, of.kernel->teams());
-  const TeamMemory memory(of.blocks_of_team, teams, options);
-  const auto work = at::empty({teams * numbers_of_inverse(kMostOfCoarsest)}, options.dtype(at::kDouble));
+void launch(const HierarchyKernel& of, const at::Tensor& made) {
+  constexpr int64_t of_inverse = numbers_of_inverse(kMostOfCoarsest) * static_cast<int64_t>(sizeof(double));
+  const int64_t teams = std::min(made.size(0), of.kernel->teams());
+  const TeamMemory memory(of.blocks_of_team, teams, made.options(), teams * of_inverse);
   HierarchyArguments<T> arguments{};
   arguments.a = arguments_of(of.a);
-  arguments.grids = static_cast<Grids*>(made.grids.mutable_data_ptr());
-  arguments.numbers = made.numbers.mutable_data_ptr<T>();
+  arguments.grids = grids_of(made);
+  arguments.numbers = numbers_of<T>(made);
   arguments.numbers_of_sample = of.numbers_of_sample;
-  arguments.work = work.mutable_data_ptr<double>();
-  arguments.samples = samples;
+  arguments.work = memory.own<double>();
+  arguments.samples = made.size(0);
   arguments.nullity = of.nullity;
   memory.put_into(arguments);
   of.kernel->launch(teams, &arguments);
@@ -89,13 +89,10 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
   return {std::move(kernel), std::move(a), blocks, numbers, nullity};
 }
 
-MadeHierarchy make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
-  const bool shared = is_shared(kernel.a);
-  const int64_t samples = shared ? 1 : b.size(0);
-  const MadeHierarchy made{
-      at::empty({samples, static_cast<int64_t>(sizeof(Grids) / sizeof(int64_t))}, b.options().dtype(at::kLong)),
-      at::empty({samples, kernel.numbers_of_sample}, b.options()), shared ? 0 : kernel.numbers_of_sample};
-  (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, samples, made, b.options());
+at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
+  const auto of_grids = static_cast<int64_t>(sizeof(Grids) / b.element_size());
+  const auto made = at::empty({is_shared(kernel.a) ? 1 : b.size(0), of_grids + kernel.numbers_of_sample}, b.options());
+  (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, made);
   return made;
 }
 

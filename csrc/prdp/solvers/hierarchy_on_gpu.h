@@ -15,12 +15,16 @@ struct HierarchyKernel {
 /// Of this operator, for vectors like b, (batch, channel, *shape). Raises Unavailable.
 HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Tensor& b);
 
-/// The grids of each sample; of one, where all share A.
-struct MadeHierarchy {
-  at::Tensor grids, numbers;
-  int64_t numbers_of_sample;  // 0: they share them
-};
-MadeHierarchy make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b);
+/// The grids of all samples, and then their numbers, with a row for each sample; for one, where all share A.
+at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b);
+inline Grids* grids_of(const at::Tensor& hierarchy) { return static_cast<Grids*>(hierarchy.mutable_data_ptr()); }
+template <class T>
+T* numbers_of(const at::Tensor& hierarchy) {
+  return reinterpret_cast<T*>(grids_of(hierarchy) + hierarchy.size(0));
+}
+inline int64_t numbers_of_sample(const at::Tensor& hierarchy) {
+  return hierarchy.size(1) - static_cast<int64_t>(sizeof(Grids) / hierarchy.element_size());
+}
 
 /// Numbers of the vectors of a cycle on all grids but the finest: what they take at most, and what they take where
 /// every long axis is coarsened at once.

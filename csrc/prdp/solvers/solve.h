@@ -24,6 +24,9 @@ struct SolveRequest {
   bool may_wait = true;
   /// What of A is looked at where a kernel of a GPU was to look, and none runs.
   Checks checks = Checks::kShared;
+  /// As in SolveOptions.
+  bool report_apart = false;
+  gpu::KeptHierarchy* hierarchy = nullptr;
 };
 
 /// Solves A u = b by a kernel of a GPU, by the CPU loops, or by plain tensor operations where there is neither. Samples

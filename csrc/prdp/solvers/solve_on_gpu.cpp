@@ -5,9 +5,11 @@
 #include <algorithm>
 
 #include "prdp/gpu/fall_back.h"
+#include "prdp/gpu/part_of.h"
 #include "prdp/gpu/team_memory.h"
 #include "prdp/solvers/first_result.h"
 #include "prdp/solvers/hierarchy_on_gpu.h"
+#include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve_kernel_text.h"
 
@@ -16,7 +18,7 @@ namespace prdp::gpu {
 namespace {
 
 constexpr const char* kDisagrees =
-    "the first result of a kernel does not have the residual that it reports; please report this, with your device";
+    "the first result of a kernel is not that of tensor operations; please report this, with your device";
 
 /// Why a solve has no kernel, which is no fault.
 std::string not_made(const Solver& solver) {
@@ -47,22 +49,29 @@ struct Prepared {
   std::shared_ptr<const Kernel> kernel;
   SolveKernel source;
   OperatorView a;
-  MadeHierarchy hierarchy;  // nothing without cycles
+  at::Tensor hierarchy;  // undefined without cycles
 };
+
+/// Memory for a report, in one piece: each operation of torch takes its time. Or `apart`, as a compiled graph wants it.
+SolveInfo new_report(const at::Tensor& b, bool apart) {
+  const int64_t batch = b.size(0);
+  const auto whole = apart ? at::Tensor() : at::empty({5 * batch}, b.options().dtype(at::kLong));
+  const auto part = [&](int64_t k, at::ScalarType dtype) {
+    return apart ? at::empty({batch}, b.options().dtype(dtype))
+                 : part_of(whole, k * batch * static_cast<int64_t>(sizeof(int64_t)), batch, dtype);
+  };
+  const auto real = b.scalar_type();
+  return {part(0, at::kLong), part(1, real), part(2, at::kLong), part(3, at::kLong), part(4, real)};
+}
 
 template <class T>
 SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& request) {
   const auto& [kernel, source, a, hierarchy] = of;
   const int64_t batch = b.size(0);
-  const auto counts = b.options().dtype(at::kLong);
-  // Memory of their own: a compiled graph takes no results that share theirs.
-  SolveResult result{at::empty(b.sizes(), b.options()),
-                     {at::empty({batch}, counts), at::empty({batch}, b.options()), at::empty({batch}, counts),
-                      at::empty({batch}, counts), at::empty({batch}, b.options())}};
+  SolveResult result{at::empty(b.sizes(), b.options()), new_report(b, request.report_apart)};
   const int64_t blocks = source.source.blocks_of_team;
   const int64_t teams = std::min(batch, blocks > 1 ? kernel->teams() : 4 * kernel->teams());
-  const auto memory = at::empty({std::max<int64_t>(teams * source.memory_of_team, 1)}, b.options());
-  const TeamMemory of_teams(blocks, teams, b.options());
+  const TeamMemory memory(blocks, teams, b.options(), teams * source.memory_of_team * b.element_size());
   const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
 
@@ -79,18 +88,18 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   arguments.applications = result.info.operator_applications.mutable_data_ptr<int64_t>();
   arguments.residual = result.info.residual.mutable_data_ptr<T>();
   arguments.floor = result.info.floor.mutable_data_ptr<T>();
-  arguments.memory = memory.mutable_data_ptr<T>();
-  of_teams.put_into(arguments);
+  arguments.memory = memory.own<T>();
+  memory.put_into(arguments);
   arguments.batch = batch;
   arguments.max_iter = request.solver.max_iter.expect_int();
   arguments.rtol = request.solver.rtol;
   arguments.guarded = request.guarded;
   arguments.needs_projection = a.needs_projection;
-  if (hierarchy.grids.defined()) {
+  if (hierarchy.defined()) {
     const auto& preconditioner = request.solver.preconditioner;
-    arguments.hierarchy = {.grids = static_cast<const Grids*>(hierarchy.grids.const_data_ptr()),
-                           .numbers = hierarchy.numbers.const_data_ptr<T>(),
-                           .numbers_of_sample = hierarchy.numbers_of_sample,
+    arguments.hierarchy = {.grids = grids_of(hierarchy),
+                           .numbers = numbers_of<T>(hierarchy),
+                           .numbers_of_sample = hierarchy.size(0) == 1 ? 0 : numbers_of_sample(hierarchy),
                            .smoothing = preconditioner.smoothing(),
                            .transposed = preconditioner.spec().transposed};
   }
@@ -98,8 +107,9 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   return result;
 }
 
-/// For A, or Aᵀ. Nothing where there is none.
-std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver) {
+/// For A, or Aᵀ; `kept` may have its coarse grids, or keeps them. Nothing where there is none.
+std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver,
+                                KeptHierarchy* kept) {
   auto* const runtime = runtime_of(b.device());
   if (!runtime || b.numel() == 0) return std::nullopt;
   const auto by_design = [](const std::string& reason) {
@@ -109,19 +119,19 @@ std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Te
   if (!has_kernel(solver)) return by_design(not_made(solver));
   auto view = a.gpu_view(b, transposed);
   if (!view) return by_design("this operator has no kernel");
-  try {
-    std::optional<HierarchyKernel> hierarchy;
-    if (const auto& m = solver.preconditioner; m.is_multigrid())  // of A, where this is its transpose
-      hierarchy = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
+  return or_fall_back([&]() -> std::optional<Prepared> {
+    const auto& m = solver.preconditioner;
+    auto hierarchy = m.is_multigrid() && kept ? kept->get() : at::Tensor();
+    std::optional<HierarchyKernel> maker;
+    if (m.is_multigrid() && !hierarchy.defined())  // of A, where this is its transpose
+      maker = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
     const auto source = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
     auto kernel = runtime->kernel(b.device(), source.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
-    return Prepared{std::move(kernel), source, *std::move(view),
-                    hierarchy ? make_hierarchy(*hierarchy, b) : MadeHierarchy{}};
-  } catch (const Unavailable& reason) {
-    fall_back(reason.what());
-    return std::nullopt;
-  }
+    if (maker) hierarchy = make_hierarchy(*maker, b);
+    if (maker && kept) kept->keep(hierarchy);
+    return Prepared{std::move(kernel), source, *std::move(view), std::move(hierarchy)};
+  });
 }
 
 }  // namespace
@@ -130,29 +140,26 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   if (!runtime_of(b.device())) return std::nullopt;
   const at::NoGradGuard no_grad;
   const auto rhs = b.contiguous();
-  const auto prepared = prepare(a, /*transposed=*/false, rhs, request.solver);
+  const auto prepared = prepare(a, /*transposed=*/false, rhs, request.solver, request.hierarchy);
   if (!prepared) return std::nullopt;
   const auto run = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
   auto& trust = prepared->kernel->trust;
-  try {
+  return or_fall_back([&]() -> std::optional<SolveResult> {
     if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     auto found = run(*prepared, rhs, request);
     constexpr int few = 3;  // a look waits for the device, and there may be nothing to judge, as where b is 0
     if (trust == Trust::kUnknown && request.guarded && prepared->kernel->looks++ < few) {
-      trust = trust_by(a, rhs, found);
+      trust = trust_by(a, rhs, request, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     }
     return found;
-  } catch (const Unavailable& reason) {
-    fall_back(reason.what());
-    return std::nullopt;
-  }
+  });
 }
 
 Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, const at::Tensor& like) {
   if (!a.has_coarse_grids()) return {};  // the blocks of NavierStokes for Aᵀ are not the transpose of those for A
   const Solver solver{Method::kMultigrid, 1, 0.0, kDefaultRestart, transposed ? m.transposed() : m};
-  auto made = prepare(a, transposed, like, solver);
+  auto made = prepare(a, transposed, like, solver, /*kept=*/nullptr);
   if (!made || made->kernel->trust == Trust::kNone) return {};
   return [prepared = *std::move(made), solver](const at::Tensor& v) {
     const auto run = v.scalar_type() == at::kFloat ? launch<float> : launch<double>;
@@ -161,5 +168,10 @@ Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, 
 }
 
 bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }
+
+void share_hierarchy(SolveOptions& options, const at::Tensor& b, int64_t solves) {
+  if (options.hierarchy || !options.solver.preconditioner.is_multigrid() || !runtime_of(b.device())) return;
+  options.hierarchy = std::make_shared<KeptHierarchy>(4 * solves * static_cast<int64_t>(b.nbytes()));
+}
 
 }  // namespace prdp::gpu

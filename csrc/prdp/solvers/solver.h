@@ -2,6 +2,7 @@
 #include <ATen/ATen.h>
 
 #include <array>
+#include <memory>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -10,6 +11,10 @@
 #include "prdp/solvers/status.h"
 
 namespace prdp {
+
+namespace gpu {
+class KeptHierarchy;
+}
 
 /// What each of them is, methods.h says.
 enum class Method {
@@ -205,6 +210,10 @@ struct SolveOptions {
   /// With n > 0, unrolled mode stores every n-th iterate and recomputes the others; 0 stores all.
   int64_t checkpoint_every = 0;
   Start start = Start::kZero;  // only for steps and rollouts; linear_solve() has the argument x0
+  /// Whether each part of a report has memory of its own on a GPU, too, as the results of an op of torch must.
+  bool report_apart = false;
+  /// On a GPU, the coarse grids of A, which solves with it and with its transpose share; null: nothing is kept.
+  std::shared_ptr<gpu::KeptHierarchy> hierarchy{};
   /// Only while a graph is being traced: the tolerances, if they are symbolic, each as the integer of its bits.
   c10::SymInt traced_rtol{-1}, traced_adjoint_rtol{-1};
 

@@ -7,6 +7,7 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/equation_kinds.h"
 
 namespace prdp {
@@ -93,7 +94,10 @@ class RolloutSolves : public torch::autograd::Function<RolloutSolves> {
 }  // namespace
 
 SolveOutputs record_rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
-                            const SolveOptions& options) {
+                            const SolveOptions& given) {
+  auto options = given;
+  if (!equation_kind(equation.kind).linearised && is_plain(u) && !solves.is_symbolic())  // A is that of all steps
+    gpu::share_hierarchy(options, u, solves.expect_int());
   const at::TensorList tensors = equation.tensors;
   TORCH_CHECK_NOT_IMPLEMENTED(!has_tangent(u) && !any_tangent(tensors),
                               "rollout_solves: has no forward mode; take the op rollout");
@@ -103,8 +107,8 @@ SolveOutputs record_rollout(const Equation& equation, const at::Tensor& u, const
   auto call = c10::make_intrusive<Call>();
   call->equation = equation;
   call->solves = solves;
-  call->options = options;
-  call->products = products_of(options.solver.preconditioner.spec());
+  call->options = std::move(options);
+  call->products = products_of(call->options.solver.preconditioner.spec());
   const auto out = RolloutSolves::apply(u, tensors, call);
   return {out[0], out[1], out[2], out[3], out[4], out[5]};
 }

@@ -4,7 +4,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
+#include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/flow/boundaries.h"
 
 namespace prdp {
@@ -87,6 +89,7 @@ const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
     if (t->defined()) *t = t->to(options.device(), dtype);
   for (auto* list : {&found.diffusion, &found.high_sign})
     for (auto& t : *list) t = t.to(options.device(), dtype);
+  found.coarse_grids = std::make_shared<gpu::KeptHierarchy>(/*most=*/std::numeric_limits<int64_t>::max());
   return found;
 }
 

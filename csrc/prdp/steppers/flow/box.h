@@ -2,11 +2,16 @@
 #include <ATen/ATen.h>
 
 #include <map>
+#include <memory>
 #include <mutex>
 #include <string>
 #include <vector>
 
 namespace prdp {
+
+namespace gpu {
+class KeptHierarchy;
+}
 
 /// What is at the two ends of an axis of a flow.
 enum class FlowBoundary {
@@ -30,6 +35,7 @@ struct FlowFields {
   /// (parts, *shape): 1 in the cells of each closed part of the fluid, where the pressure has no level; empty for one
   /// part of all cells, undefined if there are none.
   at::Tensor closed_parts;
+  std::shared_ptr<gpu::KeptHierarchy> coarse_grids;  // of the pressure, on a GPU
 };
 
 /// A box of cells with a staggered grid (Harlow and Welch 1965): pressures in the centres, and each component of the

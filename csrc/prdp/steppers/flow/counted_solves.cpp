@@ -2,6 +2,7 @@
 
 #include <limits>
 
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/steppers/flow/kernels.h"
 
 namespace prdp {
@@ -32,7 +33,10 @@ SolveInfo CombinedInfo::info(const at::Tensor& refused) const {
 }
 
 at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info) {
-  auto result = linear_solve(a, b, options);
+  // Within a node of autograd there is nothing to record, and what is kept between solves does not cross a dispatcher.
+  const bool at_once = !at::GradMode::is_enabled() && is_plain(b) && all_plain(a.tensors) && !has_tangent(b) &&
+                       all_plain(options.solver.preconditioner.spec().tensors);
+  auto result = (at_once ? linear_solve_kernel : linear_solve)(a, b, options, /*x0=*/{});
   info.add(result.info);
   return result.u;
 }

@@ -33,6 +33,12 @@ OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const So
   return with_null_space(std::move(a), fields.closed_parts);
 }
 
+/// All solves for the pressure share the coarse grids.
+SolveOptions for_pressure(const FlowBox& box, const at::Tensor& b, SolveOptions options) {
+  options.hierarchy = box.fields(b.options()).coarse_grids;
+  return options;
+}
+
 /// Takes off the mean of each closed part of the fluid: differences of pressures have none, but for rounding.
 at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
   const auto& parts = box.fields(t.options()).closed_parts;
@@ -99,7 +105,8 @@ std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, co
   const auto b = flow_kernels::divergence(box, by.given, factor, /*for_a_solve=*/true);
   if (!b.defined()) return std::nullopt;
   const auto a = pressure_operator(box, b, options);
-  const auto found = by.reverse ? solve_vjp(a, b, {}, options, info).b : solve(a, b, options, info);
+  const auto o = for_pressure(box, b, options);
+  const auto found = by.reverse ? solve_vjp(a, b, {}, o, info).b : solve(a, b, o, info);
   return flow_kernels::correct(box, by.corrected, found, by.how);
 }
 
@@ -107,7 +114,8 @@ Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& o
   const auto& fields = box.fields(u.options());
   const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
   // A preconditioner may leave something in the cells of solids.
-  const auto found = masked(solve(pressure_operator(box, u, options), b, options, info), fields.cells);
+  const auto found =
+      masked(solve(pressure_operator(box, u, options), b, for_pressure(box, b, options), info), fields.cells);
   const auto phi = without_means(box, found);
   return {add_gradient(box, u, phi, -1.0, fields.free), phi};
 }
@@ -147,7 +155,7 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_p
   if (of_potential.defined()) phi_bar = phi_bar + masked(of_potential, fields.cells);
   phi_bar = without_least_numbers(without_means(box, phi_bar));
   const auto a = pressure_operator(box, cotangent, options);
-  const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, options, info).b);
+  const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
   const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});
   return {u_bar, masked(u_bar, fields.free)};
 }
