@@ -224,15 +224,18 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   struct Pair {
     T first, second;
   };
+  /// A row of the Navier-Stokes equations has loads enough.
+  static constexpr int kRowsAtOnce = requires { A::kVelocity; } ? 1 : kCellsAtOnce;
   /// store(i, (A v)_i) for this thread's cells. Slower threads still read v: between a product and the next write to v
   /// there must be a barrier, which a sum or another product has. Every method has one; a test leaves them out in turn.
-  template <int kAtOnce = kCellsAtOnce, class Store>
+  template <int kAtOnce = kRowsAtOnce, class Store>
   void product(const T* v, const Store& store) {
     ++state_->applications;
     team_.meet();
-    const Shared<S::kBlocks, T> of_all{v};
-    this->template each<kAtOnce>([&](int i) { return a_.product(of_all, i); }, store);
+    if constexpr (kAtOnce == 1) this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
+    else this->template each<kAtOnce>([&](int i) { return a_.product(Shared<S::kBlocks, T>{v}, i); }, store);
   }
+  PRDP_ONCE T entry_of_product(const T* v, int i) const { return a_.product(Shared<S::kBlocks, T>{v}, i); }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
   template <class Tell>
   void sweep(const T* c, const T* x, Vector next, const T* omega, const Tell& tell) {

@@ -60,14 +60,14 @@ class BlockVectors {
     return {first, n};
   }
   PRDP_ONCE void fill_zero(Vector v) {
-    each([](int) { return T(0); }, into(v));
+    each<1>([](int) { return T(0); }, into(v));
   }
   PRDP_ONCE void copy(const T* from, Vector to) {
     each([&](int i) { return from[i]; }, into(to));
   }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
   PRDP_ONCE void add(const T* d, Vector x) {
-    each([&](int i) { return x[i] + d[i]; }, into(x));
+    each<1>([&](int i) { return x[i] + d[i]; }, into(x));
   }
   PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
     each([&](int i) { return x[i] + beta * y[i]; }, into(y));

@@ -105,14 +105,14 @@ struct FlowStateBars {
 /// The cotangents of the inflow, or of the velocity of a wall, at the faces of an end: (batch, dim, faces).
 template <class T>
 struct FlowEndBars {
-  FlowStateBars<T> state;
   FlowField<const T> inlet;  // of an inflow
   int axis;
   bool high;
   bool fold[3];  // the axes whose ghosts were made of those here
   FlowField<T> out;
+  int count;
 
-  void operator()(int i) const {
+  void operator()(int i, const FlowStateBars<T>& state) const {
     auto faces = state.reverse.terms.grid;
     const int last = faces.n[axis];
     faces.n[axis] = 1;
@@ -124,37 +124,17 @@ struct FlowEndBars {
   }
 };
 
-/// The cotangent of the force, on the free faces, summed over what shares it.
-template <class T>
-struct FlowForceBars {
-  FlowReverse<T> reverse;
-  SharedSum shared;
-  double* out;
-
-  void operator()(int i) const {
-    out[i] = shared.sum(
-        i, [&](const int (&at)[SharedSum::kAxes]) { return reverse.given(at[0], at[1], {{at[2], at[3], at[4]}}); });
-  }
-};
-
-/// The cotangent of ν of each sample.
+/// The cotangent of ν, a sum over all faces.
 template <class T>
 struct FlowViscosityBars {
-  FlowReverse<T> reverse;
-  double* out;  // (batch,)
+  // Of I - ν dt Δ: its solutions, the cotangents of what they solve for, and -Δ of each channel. Absent: no system.
+  FlowField<const T> diffused, lambda;
+  const T* patterns[3];
+  // Of the share of the pressure that is taken off beyond a largest ν. Absent: the whole one is.
+  FlowField<const T> change, balanced, potential, of_potential;
+  double largest_nu;
 
-  template <class Team>
-  void operator()(int s, Team& team) const {
-    const auto& grid = reverse.terms.grid;
-    double sum = 0;
-    for (int c = 0; c < grid.dim; ++c)
-      team.each(grid.cells(), [&](int i) { return at(s, c, grid.place(i)); }, [&](int, double v) { sum += v; });
-    sum = team.sum(sum);
-    if (team.leads()) out[s] = sum;
-  }
-
- private:
-  double at(int s, int c, const FlowPlace& p) const {
+  double at(const FlowReverse<T>& reverse, int s, int c, const FlowPlace& p) const {
     const auto& terms = reverse.terms;
     const auto& grid = terms.grid;
     double sum = 0;
@@ -163,7 +143,58 @@ struct FlowViscosityBars {
     if (terms.friction)
       sum -= static_cast<double>(terms.friction.at(s, c, p) * reverse.given(s, c, p)) *
              static_cast<double>(terms.point(s, c, 2 - c, p).here);
+    if (!diffused) return sum;
+    const double bar = static_cast<double>(lambda.at(s, c, p)), nu = static_cast<double>(terms.nu.value());
+    sum -= terms.dt * bar * of_pattern(grid, s, c, p);
+    if (!balanced || nu <= largest_nu) return sum;
+    double of_share = bar * static_cast<double>(balanced.at(s, c, p) - change.at(s, c, p));
+    if (c == 0 && of_potential)
+      of_share += static_cast<double>(of_potential.at(s, 0, p)) * static_cast<double>(potential.at(s, 0, p));
+    return sum - of_share / nu;
+  }
+
+ private:
+  /// -Δ of what was diffused. The entries: of the point itself, and of its neighbours low and high along each axis.
+  double of_pattern(const FlowGrid& grid, int s, int c, const FlowPlace& p) const {
+    const T* entry = patterns[c] + (p.at[0] * grid.n[1] + p.at[1]) * grid.n[2] + p.at[2];
+    double sum = static_cast<double>(*entry) * static_cast<double>(diffused.at(s, c, p));
+    for (int a = grid.first_axis(); a < 3; ++a)
+      for (int cells = -1; cells <= 1; cells += 2) {
+        const auto q = grid.wrapped(p.moved(a, cells));
+        entry += grid.cells();
+        if (grid.has(q)) sum += static_cast<double>(*entry) * static_cast<double>(diffused.at(s, c, q));
+      }
     return sum;
+  }
+};
+
+/// The cotangents of all that the explicit part is made of, one after the other: of u, where it is wanted; of its ends;
+/// of the force, on the free faces, summed over what shares it; and of ν.
+template <class T>
+struct FlowBars {
+  static constexpr int kMostEnds = 6;
+  FlowStateBars<T> state;
+  int of_state, ends;
+  FlowEndBars<T> end[kMostEnds];
+  SharedSum force, of_nu;  // of none: without terms
+  FlowViscosityBars<T> nu;
+  double *force_out, *nu_out;
+
+  void operator()(int i) const {
+    if (i < of_state) return state(i);
+    i -= of_state;
+    for (int k = 0; k < ends; ++k) {
+      if (i < end[k].count) return end[k](i, state);
+      i -= end[k].count;
+    }
+    const auto& reverse = state.reverse;
+    using At = int[SharedSum::kAxes];
+    if (i < force.count) {
+      force_out[i] = force.sum(i, [&](const At& at) { return reverse.given(at[0], at[1], {{at[2], at[3], at[4]}}); });
+      return;
+    }
+    i -= force.count;
+    nu_out[i] = of_nu.sum(i, [&](const At& at) { return nu.at(reverse, at[0], at[1], {{at[2], at[3], at[4]}}); });
   }
 };
 

@@ -50,13 +50,16 @@ struct SaddlePoint {
   }
   /// Sweeps from zero; returns the vector that holds the result.
   PRDP_ONCE const T* solve_velocity(const T* c) const {
-    T *x = memory[4], *next = memory[5];
-    team.for_each(kVelocity, [&](int i) { x[i] = c[i] / a.diagonal(i); });
+    T *x = memory[4], *next = memory[5], *const diagonal = memory[0];
+    team.for_each(kVelocity, [&](int i) {
+      diagonal[i] = a.diagonal(i);
+      x[i] = c[i] / diagonal[i];
+    });
     constexpr int64_t sweeps_per_smoothing = 2;
-    for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
+    PRDP_ROLLED for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
       team.meet();
       const Part velocity{{x}, /*is_pressure=*/false};
-      team.for_each(kVelocity, [&](int i) { next[i] = x[i] + (c[i] - product(velocity, i)) / a.diagonal(i); });
+      team.for_each(kVelocity, [&](int i) { next[i] = x[i] + (c[i] - product(velocity, i)) / diagonal[i]; });
     }
     return x;
   }

@@ -43,7 +43,8 @@ class Team {
   template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(int n, const F& f, const Store& store) const {
     const Share mine = share_of(n);
-    for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end; first += kThreads * kAtOnce) {
+    PRDP_ROLLED for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end;
+                     first += kThreads * kAtOnce) {
       decltype(f(0)) value[kAtOnce];
       PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
           f(first + k * kThreads);
@@ -56,7 +57,7 @@ class Team {
   template <class F>
   void for_each(int n, const F& f) const {
     const Share mine = share_of(n);
-    for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
+    PRDP_ROLLED for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
   }
 
   /// Waits for all threads of the team, and sees what they wrote. Tests leave out the one of a line, and must notice.

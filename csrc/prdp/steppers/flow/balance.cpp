@@ -13,14 +13,13 @@ bool is_incremental(const FlowEquation& e) {
          e.box->fields(e.nu.options()).free.defined();
 }
 
-/// The largest ν for which the whole pressure is taken off.
+}  // namespace
+
 double largest_viscosity(const FlowEquation& e) {
   double least = e.box->dx(0);
   for (int64_t axis = 1; axis < e.box->dim(); ++axis) least = std::min(least, e.box->dx(axis));
   return kLargestWhole * least * least / e.dt;
 }
-
-}  // namespace
 
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
   if (!is_incremental(e)) return {change, {}};

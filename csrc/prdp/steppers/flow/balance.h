@@ -12,6 +12,9 @@ namespace prdp {
 Projected balance(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
                   CombinedInfo& info);
 
+/// The largest ν for which the whole of this pressure is taken off.
+double largest_viscosity(const FlowEquation& equation);
+
 /// The cotangents of the change and of ν from those of the result. ν's needs the change; both are undefined without.
 struct BalanceVjp {
   FlowParts change;

@@ -6,9 +6,6 @@
 
 namespace prdp {
 
-namespace {
-
-/// I - ν dt Δ from each -Δ.
 std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::Tensor& like) {
   const auto& patterns = e.box->fields(like.options()).diffusion;
   const auto made = flow_kernels::take(like) ? flow_kernels::diffusion_coefficients(e, like) : at::Tensor();
@@ -25,8 +22,6 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::T
   return operators;
 }
 
-}  // namespace
-
 OperatorSpec stencil_of(const FlowBox& box, const at::Tensor& coefficients) {
   OperatorSpec spec{"stencil", box.shape(), {}, {coefficients}};
   const int64_t d = box.dim();
@@ -37,9 +32,8 @@ OperatorSpec stencil_of(const FlowBox& box, const at::Tensor& coefficients) {
   return spec;
 }
 
-FlowParts diffuse(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
-                  CombinedInfo& info) {
-  const auto operators = diffusion_operators(equation, change);
+FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>& operators, const at::Tensor& change,
+                  const SolveOptions& options, CombinedInfo& info) {
   const auto width = change.size(1) / static_cast<int64_t>(operators.size());
   FlowParts parts;
   for (size_t k = 0; k < operators.size(); ++k)
@@ -50,11 +44,11 @@ FlowParts diffuse(const FlowEquation& equation, const at::Tensor& change, const 
   return {free.defined() ? all * free : all};  // a preconditioner may leave something on the faces of solids
 }
 
-DiffuseVjp diffuse_vjp(const FlowEquation& equation, const at::Tensor& cotangent, const at::Tensor& result,
-                       const SolveOptions& options, CombinedInfo& info) {
+DiffuseVjp diffuse_vjp(const FlowEquation& equation, const std::vector<OperatorSpec>& operators,
+                       const at::Tensor& cotangent, const at::Tensor& result, const SolveOptions& options,
+                       CombinedInfo& info) {
   const auto& patterns = equation.box->fields(cotangent.options()).diffusion;
   const auto width = cotangent.size(1) / static_cast<int64_t>(patterns.size());
-  const auto operators = diffusion_operators(equation, cotangent);
   FlowParts parts;
   at::Tensor nu;
   for (size_t k = 0; k < patterns.size(); ++k) {

@@ -54,10 +54,19 @@ at::Tensor diffusion_coefficients(const FlowEquation& equation, const at::Tensor
 /// The reports of solves as one; `refused` as above. Undefined parts where there is no kernel.
 std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, const at::Tensor& refused);
 
+/// What ν acted on after the explicit part: a change of the velocity, what balance() made of it with which potential,
+/// and what diffuse() made of that; λ and the cotangent of the potential are what comes back. Empty: it did not.
+struct ImplicitPart {
+  at::Tensor change = {}, balanced = {}, potential = {};
+  FlowParts diffused = {}, lambda = {};
+  at::Tensor of_potential = {};
+  double largest_nu = 0;  // for which the whole pressure is taken off
+};
+
 /// The cotangents of u and of what the equation is made of, in the order of its tensors, from those of the velocity and
-/// of its change: as `needed` says, u first. With all their axes.
+/// of its change: as `needed` says, u first. With all their axes, in one launch.
 std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const Start& start,
                                                     const at::Tensor& velocity_bar, const FlowParts& change_bar,
-                                                    at::IntArrayRef needed);
+                                                    const ImplicitPart& part, at::IntArrayRef needed);
 
 }  // namespace prdp::flow_kernels

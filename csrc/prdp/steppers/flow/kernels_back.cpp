@@ -1,100 +1,108 @@
+#include <ATen/ExpandUtils.h>
+
+#include <algorithm>
+
 #include "prdp/gpu/device/flow_back.h"
 #include "prdp/operators/shared_sums.h"
-#include "prdp/operators/sums_in_order.h"
-#include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/kernel_fields.h"
 
 namespace prdp::flow_kernels {
 
 namespace {
 
-constexpr const char* kBack = "prdp/gpu/device/flow_back.h";
-
-/// What the reverse of the explicit part starts from.
-struct Reverse {
-  const FlowEquation& equation;
-  const Start& start;
-  const at::Tensor& velocity_bar;
-  const FlowParts& change_bar;
-
-  const FlowBox& box() const { return *equation.box; }
-  const at::Tensor& like() const { return start.velocity; }
-  int64_t batch() const { return like().size(0); }
-  template <class T>
-  gpu::FlowReverse<T> terms() const {
-    return {terms_of<T>(equation, start.padded), field_of<const T>(change_bar)};
-  }
-  template <class T>
-  gpu::FlowStateBars<T> state(const at::Tensor& u_bar) const {
-    return {terms<T>(), field_of<const T>(velocity_bar), field_of<T>(u_bar)};
-  }
+/// At the faces of an end of an axis; later summed where samples or faces share it.
+struct End {
+  size_t place;  // among the tensors
+  int64_t axis;
+  bool high;
+  at::Tensor bar;
 };
 
-at::Tensor of_state(const Reverse& r) {
-  const auto out = by_channels(r.like(), r.box());
-  const bool launched =
-      each_point({"FlowStateBars", kBack}, out, out.numel(), [&]<class T>(T) { return r.state<T>(out); });
-  return launched ? out : at::Tensor();
+/// The inflow comes in through the open axis; each wall is at an end of its own.
+std::vector<End> ends_of(const FlowBox& box, const at::Tensor& like, const std::vector<bool>& wanted) {
+  constexpr size_t inflow = 3, walls = 4;
+  std::vector<End> ends;
+  for (size_t i = inflow; i < wanted.size(); ++i) {
+    if (!wanted[i]) continue;
+    const int64_t axis = i == inflow ? box.open_axis() : static_cast<int64_t>(i - walls) / 2;
+    auto sizes = like.sizes().vec();
+    sizes[axis + 2] = 1;
+    ends.push_back({i, axis, i > inflow && (i - walls) % 2 != 0, at::empty(sizes, like.options())});
+  }
+  return ends;
 }
 
-at::Tensor of_viscosity(const Reverse& r) {
-  const auto sums = at::empty({r.batch()}, r.like().options().dtype(at::kDouble));
-  const int64_t points = r.box().dim() * cells_of(r.box());
-  const bool launched = each_sample({"FlowViscosityBars", kBack}, r.like(), points, [&]<class T>(T) {
-    return gpu::FlowViscosityBars<T>{r.terms<T>(), data_of<double>(sums)};
-  });
-  return launched ? total(sums).to(r.like().scalar_type()) : at::Tensor();
+template <class T>
+gpu::FlowEndBars<T> bars_of(const FlowBox& box, const End& end) {
+  const bool is_inflow = box.boundary(end.axis) == FlowBoundary::kOpen;
+  gpu::FlowEndBars<T> of{.inlet = field_of<const T>(is_inflow ? box.fields(end.bar.options()).inlet : at::Tensor()),
+                         .axis = static_cast<int>(end.axis + 3 - box.dim()),
+                         .high = end.high,
+                         .fold = {},
+                         .out = field_of<T>(end.bar),
+                         .count = static_cast<int>(end.bar.numel())};
+  for (int64_t other = 0; other < box.dim(); ++other)  // with_ghosts() makes the open axis' ghosts first
+    of.fold[other + 3 - box.dim()] =
+        is_inflow ? other != end.axis : other > end.axis && box.boundary(other) != FlowBoundary::kOpen;
+  return of;
 }
 
-/// Of the inflow, or of a wall: at an end of an axis, summed where samples or faces share it.
-at::Tensor of_end(const Reverse& r, int64_t axis, bool high, const at::Tensor& given) {
-  const auto& box = r.box();
-  const bool is_inflow = box.boundary(axis) == FlowBoundary::kOpen;
-  auto sizes = r.like().sizes().vec();
-  sizes[axis + 2] = 1;
-  const auto out = at::empty(sizes, r.like().options());
-  const bool launched = each_point({"FlowEndBars", kBack}, out, out.numel(), [&]<class T>(T) {
-    const auto& inlet = box.fields(out.options()).inlet;
-    gpu::FlowEndBars<T> of{.state = r.state<T>({}),
-                           .inlet = field_of<const T>(is_inflow ? inlet : at::Tensor()),
-                           .axis = static_cast<int>(axis + 3 - box.dim()),
-                           .high = high,
-                           .fold = {},
-                           .out = field_of<T>(out)};
-    for (int64_t other = 0; other < box.dim(); ++other)  // with_ghosts() makes the open axis' ghosts first
-      of.fold[other + 3 - box.dim()] =
-          is_inflow ? other != axis : other > axis && box.boundary(other) != FlowBoundary::kOpen;
-    return of;
-  });
-  return launched ? at::sum_to(out, given.sizes()) : at::Tensor();
-}
-
-at::Tensor of_force(const Reverse& r) {
-  SharedSums sums(r.like());
-  const auto sum = sums.add(r.equation.force);
-  const bool launched = each_point({"FlowForceBars", kBack}, r.like(), sums.count(), [&]<class T>(T) {
-    return gpu::FlowForceBars<T>{r.terms<T>(), sum, sums.memory(0)};
-  });
-  return launched ? sums.result(0) : at::Tensor();
+template <class T>
+gpu::FlowViscosityBars<T> bars_of(const FlowBox& box, const ImplicitPart& part) {
+  gpu::FlowViscosityBars<T> of{.diffused = field_of<const T>(part.diffused),
+                               .lambda = field_of<const T>(part.lambda),
+                               .patterns = {},
+                               .change = field_of<const T>(part.change),
+                               .balanced = field_of<const T>(part.potential.defined() ? part.balanced : at::Tensor()),
+                               .potential = field_of<const T>(part.potential),
+                               .of_potential = field_of<const T>(part.of_potential),
+                               .largest_nu = part.largest_nu};
+  if (part.diffused.empty()) return of;
+  const auto& patterns = box.fields(part.change.options()).diffusion;
+  for (size_t c = 0; c < static_cast<size_t>(box.dim()); ++c)
+    of.patterns[c] = data_of<const T>(patterns[std::min(c, patterns.size() - 1)]);
+  return of;
 }
 
 }  // namespace
 
 std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const Start& start,
                                                     const at::Tensor& velocity_bar, const FlowParts& change_bar,
-                                                    at::IntArrayRef needed) {
-  const Reverse r{equation, start, velocity_bar, change_bar};
+                                                    const ImplicitPart& part, at::IntArrayRef needed) {
+  const auto& box = *equation.box;
+  const auto& like = start.velocity;
   const auto given = equation.tensors();
   std::vector<at::Tensor> found(given.size() + 1);
-  for (size_t i = 0; i < found.size(); ++i) {
-    if (!needed[i] || (i > 0 && !given[i - 1].defined())) continue;
-    found[i] = i == 0   ? of_state(r)
-               : i == 1 ? of_viscosity(r)
-               : i == 2 ? of_force(r)
-               : i == 3 ? of_end(r, equation.box->open_axis(), /*high=*/false, given[i - 1])
-                        : of_end(r, static_cast<int64_t>(i - 4) / 2, (i - 4) % 2 != 0, given[i - 1]);
-    if (!found[i].defined()) return std::nullopt;
-  }
+  std::vector<bool> wanted(found.size());
+  for (size_t i = 0; i < found.size(); ++i) wanted[i] = needed[i] && (i == 0 || given[i - 1].defined());
+  if (wanted[0]) found[0] = by_channels(like, box);
+  const auto ends = ends_of(box, like, wanted);
+  SharedSums sums(like);
+  const auto nothing = gpu::SharedSum{};
+  const auto of_nu = wanted[1] ? sums.add(equation.nu) : nothing;
+  const auto force = wanted[2] ? sums.add(equation.force) : nothing;
+  int64_t count = sums.count() + (wanted[0] ? found[0].numel() : 0);
+  for (const auto& end : ends) count += end.bar.numel();
+  if (count == 0) return found;
+  const bool launched = each_point({"FlowBars", "prdp/gpu/device/flow_back.h"}, like, count, [&]<class T>(T) {
+    gpu::FlowBars<T> of{.state = {{terms_of<T>(equation, start.padded), field_of<const T>(change_bar)},
+                                  field_of<const T>(velocity_bar),
+                                  field_of<T>(found[0])},
+                        .of_state = static_cast<int>(wanted[0] ? found[0].numel() : 0),
+                        .ends = static_cast<int>(ends.size()),
+                        .end = {},
+                        .force = force,
+                        .of_nu = of_nu,
+                        .nu = bars_of<T>(box, part),
+                        .force_out = wanted[2] ? sums.memory(wanted[1]) : nullptr,
+                        .nu_out = wanted[1] ? sums.memory(0) : nullptr};
+    for (size_t k = 0; k < ends.size(); ++k) of.end[k] = bars_of<T>(box, ends[k]);
+    return of;
+  });
+  if (!launched) return std::nullopt;
+  if (wanted[1]) found[1] = sums.result(0);
+  if (wanted[2]) found[2] = sums.result(wanted[1]);
+  for (const auto& end : ends) found[end.place] = at::sum_to(end.bar, given[end.place - 1].sizes());
   return found;
 }
 

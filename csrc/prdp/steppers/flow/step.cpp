@@ -141,6 +141,40 @@ std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, cons
   return as_given(equation, std::move(all), {}, needed);
 }
 
+/// The way back through the diffusion and the balance.
+struct ImplicitBack {
+  const FlowEquation& e;
+  const at::Tensor &cotangent, &of_potential;
+  const SolveOptions& options;
+  std::vector<OperatorSpec> operators{};
+  flow_kernels::ImplicitPart part{};
+
+  ImplicitBack(const FlowEquation& equation, const at::Tensor& diffused_bar, const at::Tensor& potential_bar,
+               const SolveOptions& o)
+      : e(equation), cotangent(diffused_bar), of_potential(potential_bar), options(o) {
+    if (is_implicit(e)) operators = diffusion_operators(e, cotangent);
+  }
+
+  /// The way forth, for the gradient of ν.
+  void go_again(const at::Tensor& change) {
+    CombinedInfo unseen;
+    const auto balanced = balance(e, change, options, unseen);
+    part = {.change = change,
+            .balanced = balanced.u,
+            .potential = balanced.potential,
+            .diffused = diffuse(e, operators, balanced.u, options, unseen),
+            .of_potential = of_potential,
+            .largest_nu = largest_viscosity(e)};
+  }
+  DiffuseVjp back(bool of_nu, CombinedInfo& info) {
+    auto found = diffuse_vjp(e, operators, cotangent, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
+    part.lambda = found.change;
+    auto balanced = balance_vjp(e, found.change, of_potential, of_nu ? part.change : at::Tensor(), options, info);
+    add_to(balanced.nu, found.nu);
+    return {balanced.change, balanced.nu};
+  }
+};
+
 }  // namespace
 
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
@@ -153,7 +187,8 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   const auto [velocity, change] = explicit_part(e, beginning);
   CombinedInfo info;
   const auto balanced = balance(e, change, options, info);
-  const auto diffused = is_implicit(e) ? diffuse(e, balanced.u, options, info) : FlowParts{change};
+  const auto diffused =
+      is_implicit(e) ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info) : FlowParts{change};
   const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
   const bool none = looks && !refused.mask.defined();
   return {cleared(next, beginning.mask()), cleared(potential, beginning.mask()),
@@ -171,19 +206,17 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   const auto velocity_bar =
       project_vjp(*e.box, cleared(cotangent.u, refused), of_potential, beginning.status(), options, adjoint);
   DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
+  ImplicitBack implicit(e, velocity_bar.on_free_faces, of_potential, options);
   if (is_implicit(e)) {
-    CombinedInfo again;
-    const auto change = needed[1] ? explicit_part(e, beginning).change : at::Tensor();
-    const auto diffused = needed[1] ? joined(diffuse(e, balance(e, change, options, again).u, options, again)) : change;
-    back = diffuse_vjp(e, back.change[0], diffused, options, adjoint);
-    auto balanced = balance_vjp(e, back.change, of_potential, change, options, adjoint);
-    back.change = balanced.change;
-    add_to(back.nu, balanced.nu);
+    if (needed[1]) implicit.go_again(explicit_part(e, beginning).change);
+    back = implicit.back(/*of_nu=*/!beginning.of_kernels, adjoint);
   }
   info = adjoint.info();
   if (beginning.of_kernels) {
-    auto found = flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, needed);
-    if (found) return as_given(equation, *std::move(found), back.nu, needed);
+    auto found =
+        flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
+    if (found) return as_given(equation, *std::move(found), {}, needed);
+    if (is_implicit(e)) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
   const auto by_loops = flow_has_loops(u);
