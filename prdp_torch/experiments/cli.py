@@ -123,7 +123,10 @@ def train(
     device: Device = None,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write the curves for TensorBoard.")] = False,
 ) -> None:
-    """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
+    """Train a scene with one way of choosing K, over seeds; write a record each.
+
+    Exit 1 if one diverges: a number is not finite, or the error ends above ten times its size and its first value.
+    """
     loaded = _load(scene, device, backward, intervals)
     chosen = [
         name
@@ -175,8 +178,8 @@ def train(
                 _bar(progress, "data, steps"),
             )
             progress.update(task, completed=loaded.training.intervals, note=f"metric {curves['metric'][-1]:.3e}")
-            if "diverged" in curves:
-                diverged[seed] = curves["diverged"]
+            if (why := comparison.why_lost(curves)) is not None:
+                diverged[seed] = why
             if "warning" in curves:
                 warnings[seed] = curves["warning"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)

@@ -67,7 +67,7 @@ class Row:
 
     def diverged(self) -> int:
         """How many seeds were lost."""
-        return sum("diverged" in c for c in self.curves)
+        return sum(why_lost(c) is not None for c in self.curves)
 
     @property
     def capped(self) -> bool:
@@ -89,6 +89,20 @@ class Row:
 
     def reaches(self, target: float) -> np.ndarray:
         return np.asarray((self.stack("metric") <= target).any(1))
+
+
+_LOST = 10  # an error so many times its own size, and that of before the training
+
+
+def why_lost(curves: Curves) -> str | None:
+    """Why a training is lost, or None: its numbers were no longer finite, or are so large that they say nothing else.
+    A loss that has overflowed in float32 is still finite in float64."""
+    if "diverged" in curves:
+        return curves["diverged"]
+    first, last = curves["error"][0], curves["error"][-1]
+    if last <= _LOST * max(1.0, first):
+        return None
+    return f"its relative error is {last:.1e} at the end, and was {first:.1e} before the first interval"
 
 
 def rows_of(scene: _C.Scene) -> list[Row]:
