@@ -153,8 +153,7 @@ def train(
     diverged: dict[int, str] = {}
     warnings: dict[int, str] = {}
     with records.alone_in([folder / refinement.label]), _progress() as progress:
-        if not resume:
-            comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment)
+        comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment, resume)
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
