@@ -28,7 +28,7 @@ from rich.table import Table
 
 from prdp_torch import data_parallel
 from prdp_torch._C import VERSION, sentence
-from prdp_torch.experiments import _C, datasets, records, report, scene_advice, trajectories
+from prdp_torch.experiments import _C, array_files, datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
@@ -229,7 +229,7 @@ def compare(
 @command
 def export(
     scene: SceneName,
-    out: Annotated[Path | None, typer.Option(help="The file, HDF5 or .npz; default SCENE.h5.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The file, .h5, .hdf5 or .npz; default SCENE.h5.")] = None,
     steps: Annotated[
         int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
     ] = None,
@@ -237,6 +237,7 @@ def export(
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
     path = out or Path(f"{loaded.name}.h5")
+    array_files.check_name(path)
     records.prepare_folder(path.parent)
     with _progress() as progress:
         samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch._C import sentence
-from prdp_torch.experiments import _C, pdebench
+from prdp_torch.experiments import _C, array_files, pdebench
 
 OnData: TypeAlias = Callable[[int, int], None]
 """Called with (steps done, all steps)."""
@@ -79,9 +79,10 @@ def export(
 
     Args:
         scene: a scene that trains a network and makes its own data.
-        path: of the file, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
+        path: of the file, .h5, .hdf5 or .npz, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
         steps: how many steps each has; by default what the training and the validation metric need.
     """
+    array_files.check_name(path)  # before any work
     steps = max(scene.data.trained_steps, scene.data.valid_steps) if steps is None else steps
     trajectories = _C.all_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
     pdebench.write(path, trajectories, scene)
