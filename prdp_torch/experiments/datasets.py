@@ -58,6 +58,9 @@ def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) ->
     _check_times("validation", valid, scene.data.valid_steps)
     starts, *between, end = (train[:, n : train.shape[1] - steps + n].flatten(0, 1) for n in range(steps + 1))
     valid_start, valid_end = (valid[:, n].contiguous() for n in (0, scene.data.valid_steps))
+    _check_scale(scene, "validation", valid_end, 1, scene.data.valid_steps)
+    if scene.training.loss == "nmse":
+        _check_scale(scene, "training", end, train.shape[1] - steps, steps)
     parts = starts, torch.stack(between, 1), end, valid_start, valid_end
     return Data(*(part.to(scene.device) for part in parts))
 
@@ -177,6 +180,15 @@ def _tensor(scene: _C.Scene, name: str, own: Own) -> Tensor:
     found = found.detach().to("cpu", scene.dtype)
     pdebench.check_finite(f"train: {name}", found)
     return found
+
+
+def _check_scale(scene: _C.Scene, what: str, states: Tensor, per_trajectory: int, steps: int) -> None:
+    """ValueError for a state of zeros, which errors would be divided by."""
+    of = slice(0, 1) if scene.task == "corrector" and what == "validation" else slice(None)
+    zeros = (states[:, of] == 0).flatten(1).all(1).nonzero().flatten()
+    if len(zeros):
+        number = int(zeros[0]) // per_trajectory
+        raise ValueError(f"train: {what} trajectory {number} is zero after {steps} steps; errors are relative to it")
 
 
 def _check_times(what: str, trajectories: Tensor, steps: int) -> None:
