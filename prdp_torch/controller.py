@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, TypeVar, Unpack
 
 import torch
 from torch import Tensor
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 else:
     _Compiled = object  # the controllers have the compiled one as their first base
 
+
+R = TypeVar("R")
+Row: TypeAlias = tuple[float, float, int, bool, float | None, float | None]
+"""What the compiled controllers keep of a call of `step`, as a `Record` has it."""
 
 PATIENCE = 5
 """A `warning` that lasts so many intervals without a refinement is said aloud."""
@@ -44,6 +48,7 @@ class _Attached(_Compiled):
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
         self._warned_for, self._has_spoken = 0, False
+        self._records: list[Any] = []  # what `history` has returned
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
         self.steppers = list(steppers)
@@ -84,6 +89,13 @@ class _Attached(_Compiled):
             self._has_spoken = True
             warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=5)
 
+    def _recorded(self, record: Callable[[list[Row], int], R]) -> list[R]:
+        """The history, of `record(rows, number)` each. Those made before are kept: a loop that reads the last one would
+        take a time that grows with the square of its length."""
+        rows = self._history
+        self._records += [record(rows, number) for number in range(len(self._records), len(rows))]
+        return list(self._records)
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state as plain values, for `load_state_dict`."""
         state = {"max_iter": self.max_iter, "checkpoint": self._checkpoint, "history": self._history}
@@ -102,6 +114,7 @@ class _Attached(_Compiled):
             raise ValueError(
                 f"{type(self).__name__}: expected a state as state_dict() returns it, got {state!r:.80}"
             ) from None
+        self._records = []
         self._push()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -262,7 +275,7 @@ class PRDPController(_C.PRDPController, _Attached):
     @property
     def history(self) -> list[Record]:
         """Every call of `step` as a `Record`."""
-        return [Record(*row) for row in self._history]
+        return self._recorded(lambda rows, number: Record(*rows[number]))
 
     def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items() if value is not None)
@@ -326,11 +339,12 @@ class ToleranceController(_C.ToleranceController, _Attached):
     @property
     def history(self) -> list[ToleranceRecord]:
         """Every call of `step` as a `ToleranceRecord`."""
-        before = [math.inf, *(smallest for _, smallest, *_ in self._history)]
-        return [
-            ToleranceRecord(error, smallest, self._rtol_for(earlier), tightened, residual)
-            for earlier, (error, smallest, _, tightened, _, residual) in zip(before, self._history, strict=False)
-        ]
+        return self._recorded(self._record)
+
+    def _record(self, rows: list[Row], number: int) -> ToleranceRecord:
+        error, smallest, _, tightened, _, residual = rows[number]
+        earlier = rows[number - 1][1] if number else math.inf
+        return ToleranceRecord(error, smallest, self._rtol_for(earlier), tightened, residual)
 
     def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value:g}" for name, value in self.settings.items())

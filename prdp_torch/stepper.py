@@ -58,7 +58,7 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
 
 def between_graphs(call: Callable[P, T]) -> Callable[P, T]:
     """What torch.compile calls as it is, with a break of the graph; with fullgraph=True the reason is said."""
-    reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced"
+    reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced: compile without fullgraph=True"
     return cast(Callable[P, T], torch.compiler.disable(call, reason=reason))
 
 

@@ -24,13 +24,28 @@ _DAMAGED = (
 )  # fmt: skip
 
 
+_HDF5 = (".h5", ".hdf5")
+
+
 def is_npz(path: str | Path) -> bool:
     return Path(path).suffix.lower() == ".npz"
 
 
+def check_name(path: str | Path) -> None:
+    """ValueError unless the name of a file that is to be written tells its format; ImportError if the package h5py is
+    missing for it."""
+    suffix = Path(path).suffix
+    if suffix.lower() not in (".npz", *_HDF5):
+        got = f"'{suffix}'" if suffix else "none"
+        raise ValueError(f"data: '{path}' must end in {', '.join(_HDF5)} or .npz, which tells the format; got {got}")
+    if not is_npz(path):
+        _h5py()
+
+
 def write(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays, whole or not at all. ValueError if the file cannot be written; ImportError if the package
-    h5py is missing."""
+    """Write named arrays, whole or not at all. ValueError if the file cannot be written or its name tells no format;
+    ImportError if the package h5py is missing."""
+    check_name(path)
     content = io.BytesIO()
     if is_npz(path):
         np.savez(content, **arrays)  # type: ignore[arg-type]  # for all it knows, one is called allow_pickle
@@ -52,6 +67,11 @@ def opened(path: str | Path) -> Iterator["File"]:
         if not Path(path).is_file():
             what = "it is not a regular file" if Path(path).exists() else "no such file"
             raise ValueError(f"data: cannot read '{path}': {what}")
+        if Path(path).suffix.lower() == ".npy":
+            raise ValueError(
+                f"data: '{path}' holds one array without its grid; write an .npz file, "
+                "np.savez(path, tensor=..., **{'x-coordinate': ..., 't-coordinate': ...}), or HDF5"
+            )
         with _words_for(path):
             file = stack.enter_context(kind(path))
         yield file

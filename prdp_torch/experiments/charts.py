@@ -130,12 +130,14 @@ def k_over_intervals(scene: _C.Scene, rows: list[Row]) -> Figure:
 
 def total_iterations(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> Figure:
     """Iterations of a whole training as bars, with what incomplete convergence (K ends below the
-    converged one) and progressive refinement (K starts lower still) save of the converged run's."""
+    converged one) and progressive refinement (K starts lower still) save of the converged run's. A row that fails or
+    warns saves nothing, as in the table."""
     chosen = [entry for entry in table if entry["kind"] in ("converged", "prdp", "growth", "schedule")]
     figure, (axes,) = make_figure(height=1.6 + 0.55 * len(chosen))
     base = max(1.0, chosen[0]["budget"])
     spent = np.array([entry["budget"] / base for entry in chosen])
-    saved = np.maximum(0.0, 1 - spent)
+    verdicts = ["" if e["as_good"] and not e["warning"] else "warns" if e["as_good"] else "fails" for e in chosen]
+    saved = np.array([max(0.0, 1 - s) if not verdict else 0.0 for s, verdict in zip(spent, verdicts, strict=True)])
     ic = np.minimum([entry["saved_by_incomplete_convergence"] for entry in chosen], saved)
     left = np.zeros(len(chosen))
     rows_down = np.arange(len(chosen))[::-1]
@@ -150,6 +152,8 @@ def total_iterations(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> Fi
         texts = [f"{100 * share:.0f} %" if share > 0.045 else "" for share in shares]
         axes.bar_label(bars, texts, label_type="center", color="white" if name == "spent" else "black")
         left += shares
+    for down, share, verdict in zip(rows_down, spent, verdicts, strict=True):
+        axes.text(100 * share + 1, down, verdict, va="center")
     axes.set_yticks(rows_down, [entry["title"] for entry in chosen])
     until = "" if scene.compare.target is None else f" until the error is {scene.compare.target:g}"
     axes.set_xlabel(f"% of the converged training's {base:,.0f} iterations{until}")
@@ -190,8 +194,9 @@ def _cost_panels(scene: _C.Scene, draw: Callable[[Axes, str], None], limits: Lim
         if high > 10 * low:  # powers of ten suffice; other labels run into each other
             axes.yaxis.set_minor_formatter(NullFormatter())
         else:
-            axes.yaxis.set_minor_formatter(FuncFormatter(lambda y, _: f"{y:.2g}"))
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.2g}"))
+            digits = max(2, 1 + math.ceil(math.log10(10 * high / (high - low))))  # ticks are that close
+            for name in ("minor", "major"):
+                getattr(axes.yaxis, f"set_{name}_formatter")(FuncFormatter(lambda y, _, n=digits: f"{y:.{n}g}"))
         axes.xaxis.set_major_locator(MaxNLocator(5))
         if cost == "operator_applications":
             axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
@@ -310,7 +315,8 @@ def all_charts(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> list[Dra
             "iterations",
             total_iterations(scene, rows, table),
             "Iterations that the solver was allowed in all, as shares of the converged training's. K ending below "
-            "the converged one saves by incomplete convergence, K starting lower still by progressive refinement.",
+            "the converged one saves by incomplete convergence, K starting lower still by progressive refinement. A "
+            "row that fails or warns saves nothing.",
         ),
         (
             "accuracy_against_cost",

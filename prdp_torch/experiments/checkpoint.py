@@ -4,6 +4,7 @@ import json
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,11 +22,26 @@ class Checkpoint(_C.Checkpoint):
 
     Args:
         path: the file. It is written to a temporary name first, so it is never half written.
-        settings: everything that the training depends on. A file with other settings is ignored.
+        settings: everything that the training depends on. A file with other settings is ignored; see `refuse_other`.
     """
 
     def __init__(self, path: str | os.PathLike[str], **settings: Any) -> None:
-        super().__init__(path, json.dumps({"trainer": "Python", **settings}))
+        self._path = Path(path)
+        self._settings = {"trainer": "Python", **settings}
+        super().__init__(path, json.dumps(self._settings))
+
+    def refuse_other(self, record: Path) -> None:
+        """ValueError, naming a setting that differs, where the file is of an unfinished training with other settings,
+        which one that begins here would overwrite."""
+        self.remove_before(record)
+        for path in (self._path, self._path.with_name(f"{self._path.name}.before")):
+            there = _settings_in(path)
+            if there is not None and there != self._settings:
+                raise ValueError(
+                    f"checkpoint: '{path}' is of a training that has not ended, with other settings: "
+                    f"{difference(there, self._settings)}; give its settings and --resume to go on with it, or another "
+                    "--out, or delete the file"
+                )
 
     def due(self) -> bool:
         return data_parallel.is_first() and super().due()
@@ -54,6 +70,33 @@ class Checkpoint(_C.Checkpoint):
         if self.notice and data_parallel.is_first():
             warnings.warn(self.notice, stacklevel=5)
         return there
+
+
+def _settings_in(path: Path) -> dict[str, Any] | None:
+    """What a checkpoint says it is of, in its second line; None where there is none that can be read."""
+    try:
+        with open(path, "rb") as file:
+            file.readline()
+            found = json.loads(file.readline())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The first setting in which two trainings differ, in words; of two scene files, their first line."""
+    for name in dict.fromkeys([*here, *there]):
+        old, new = there.get(name), here.get(name)
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            return difference(old, new)
+        if name == "text" and isinstance(old, str) and isinstance(new, str):
+            lines = zip_longest(old.splitlines(), new.splitlines(), fillvalue="")
+            old, new = next((pair for pair in lines if pair[0] != pair[1]), (old, new))
+            name = "the scene file"
+        return f"{name} was {str(old)!r:.80}, and is {str(new)!r:.80}"
+    return "none"
 
 
 def check_tensors(network: torch.nn.Module) -> None:

@@ -28,7 +28,7 @@ from rich.table import Table
 
 from prdp_torch import data_parallel
 from prdp_torch._C import VERSION, sentence
-from prdp_torch.experiments import _C, datasets, records, report, scene_advice, trajectories
+from prdp_torch.experiments import _C, array_files, datasets, records, report, scene_advice, trajectories
 from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
@@ -123,7 +123,10 @@ def train(
     device: Device = None,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write the curves for TensorBoard.")] = False,
 ) -> None:
-    """Train a scene with one way of choosing K, over seeds; write a record each. Exit 1 if one diverges."""
+    """Train a scene with one way of choosing K, over seeds; write a record each.
+
+    Exit 1 if one diverges: a number is not finite, or the error ends above ten times its size and its first value.
+    """
     loaded = _load(scene, device, backward, intervals)
     chosen = [
         name
@@ -150,8 +153,7 @@ def train(
     diverged: dict[int, str] = {}
     warnings: dict[int, str] = {}
     with records.alone_in([folder / refinement.label]), _progress() as progress:
-        if not resume:
-            comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment)
+        comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment, resume)
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
 
@@ -175,8 +177,8 @@ def train(
                 _bar(progress, "data, steps"),
             )
             progress.update(task, completed=loaded.training.intervals, note=f"metric {curves['metric'][-1]:.3e}")
-            if "diverged" in curves:
-                diverged[seed] = curves["diverged"]
+            if (why := comparison.why_lost(curves)) is not None:
+                diverged[seed] = why
             if "warning" in curves:
                 warnings[seed] = curves["warning"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)
@@ -227,7 +229,7 @@ def compare(
 @command
 def export(
     scene: SceneName,
-    out: Annotated[Path | None, typer.Option(help="The file, HDF5 or .npz; default SCENE.h5.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The file, .h5, .hdf5 or .npz; default SCENE.h5.")] = None,
     steps: Annotated[
         int | None, typer.Option(**COUNT, help="Time steps of each trajectory; default: what the training needs.")
     ] = None,
@@ -235,6 +237,7 @@ def export(
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
     path = out or Path(f"{loaded.name}.h5")
+    array_files.check_name(path)
     records.prepare_folder(path.parent)
     with _progress() as progress:
         samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))

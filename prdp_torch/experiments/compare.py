@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from prdp_torch import data_parallel
 from prdp_torch.experiments import _C, records
-from prdp_torch.experiments.checkpoint import Checkpoint
+from prdp_torch.experiments.checkpoint import Checkpoint, difference
 from prdp_torch.experiments.datasets import OnData
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.refinement import Refinement
@@ -67,7 +68,7 @@ class Row:
 
     def diverged(self) -> int:
         """How many seeds were lost."""
-        return sum("diverged" in c for c in self.curves)
+        return sum(why_lost(c) is not None for c in self.curves)
 
     @property
     def capped(self) -> bool:
@@ -89,6 +90,20 @@ class Row:
 
     def reaches(self, target: float) -> np.ndarray:
         return np.asarray((self.stack("metric") <= target).any(1))
+
+
+_LOST = 10  # an error so many times its own size, and that of before the training
+
+
+def why_lost(curves: Curves) -> str | None:
+    """Why a training is lost, or None: its numbers were no longer finite, or are so large that they say nothing else.
+    A loss that has overflowed in float32 is still finite in float64."""
+    if "diverged" in curves:
+        return curves["diverged"]
+    first, last = curves["error"][0], curves["error"][-1]
+    if last <= _LOST * max(1.0, first):
+        return None
+    return f"its relative error is {last:.1e} at the end, and was {first:.1e} before the first interval"
 
 
 def rows_of(scene: _C.Scene) -> list[Row]:
@@ -135,8 +150,7 @@ def run(
     environment = records.environment(scene.device)
     rows = rows_of(scene)
     with records.alone_in([folder / row.label for row in rows]):
-        if not resume:
-            refuse_to_lose(scene, [row.label for row in rows], seeds, folder, environment)
+        refuse_to_lose(scene, [row.label for row in rows], seeds, folder, environment, resume)
         for row in rows:
             for seed in range(seeds):
 
@@ -184,13 +198,36 @@ def run_one(
 
 
 def refuse_to_lose(
-    scene: _C.Scene, labels: Iterable[str], seeds: int, folder: Path, environment: dict[str, Any]
+    scene: _C.Scene, labels: Iterable[str], seeds: int, folder: Path, environment: dict[str, Any], resume: bool
 ) -> None:
-    """ValueError where one of these trainings has a checkpoint to go on from, which beginning anew would delete."""
+    """ValueError where one of these trainings would overwrite a checkpoint: of other settings, or of its own where it
+    begins anew. Finished records that will be replaced are told on stderr."""
+    replaced = []
     for label in labels:
         for seed in range(seeds):
             path, checkpoint = _files_of(scene, label, seed, folder, environment)
-            data_parallel.from_first(functools.partial(checkpoint.refuse_to_lose, path))
+            data_parallel.from_first(functools.partial(checkpoint.refuse_other, path))
+            if not resume:
+                data_parallel.from_first(functools.partial(checkpoint.refuse_to_lose, path))
+            replaced += data_parallel.from_first(functools.partial(_replaced, path, scene, resume))
+    if replaced and data_parallel.is_first():
+        others = f", and {len(replaced) - 1} more" if len(replaced) > 1 else ""
+        print(f"prdp: replaces when it ends: {replaced[0]}{others}", file=sys.stderr)
+
+
+def _replaced(path: Path, scene: _C.Scene, resume: bool) -> list[str]:
+    """The finished record at a path, if this training writes its own over it, and how the two differ."""
+    try:
+        record = records.read_training(path)
+    except ValueError:  # damaged; who reads it says so
+        return []
+    if record is None:
+        return []
+    there, here = record["settings"], records.settings(scene)
+    if there == here:
+        return [] if resume else [f"'{path}', of the same settings"]
+    same = {**there, "intervals": here["intervals"]} == here
+    return [] if resume and same else [f"'{path}', whose {difference(there, here)}"]
 
 
 def _files_of(

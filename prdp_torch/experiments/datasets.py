@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch._C import sentence
-from prdp_torch.experiments import _C, pdebench
+from prdp_torch.experiments import _C, array_files, pdebench
 
 OnData: TypeAlias = Callable[[int, int], None]
 """Called with (steps done, all steps)."""
@@ -58,6 +58,9 @@ def of_scene(scene: _C.Scene, own: Own = None, on_data: OnData | None = None) ->
     _check_times("validation", valid, scene.data.valid_steps)
     starts, *between, end = (train[:, n : train.shape[1] - steps + n].flatten(0, 1) for n in range(steps + 1))
     valid_start, valid_end = (valid[:, n].contiguous() for n in (0, scene.data.valid_steps))
+    _check_scale(scene, "validation", valid_end, 1, scene.data.valid_steps)
+    if scene.training.loss == "nmse":
+        _check_scale(scene, "training", end, train.shape[1] - steps, steps)
     parts = starts, torch.stack(between, 1), end, valid_start, valid_end
     return Data(*(part.to(scene.device) for part in parts))
 
@@ -79,9 +82,10 @@ def export(
 
     Args:
         scene: a scene that trains a network and makes its own data.
-        path: of the file, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
+        path: of the file, .h5, .hdf5 or .npz, in PDEBench's layout (`prdp_torch.experiments.pdebench`).
         steps: how many steps each has; by default what the training and the validation metric need.
     """
+    array_files.check_name(path)  # before any work
     steps = max(scene.data.trained_steps, scene.data.valid_steps) if steps is None else steps
     trajectories = _C.all_trajectories(scene, steps, on_data)  # type: ignore[arg-type]  # it takes None
     pdebench.write(path, trajectories, scene)
@@ -176,6 +180,15 @@ def _tensor(scene: _C.Scene, name: str, own: Own) -> Tensor:
     found = found.detach().to("cpu", scene.dtype)
     pdebench.check_finite(f"train: {name}", found)
     return found
+
+
+def _check_scale(scene: _C.Scene, what: str, states: Tensor, per_trajectory: int, steps: int) -> None:
+    """ValueError for a state of zeros, which errors would be divided by."""
+    of = slice(0, 1) if scene.task == "corrector" and what == "validation" else slice(None)
+    zeros = (states[:, of] == 0).flatten(1).all(1).nonzero().flatten()
+    if len(zeros):
+        number = int(zeros[0]) // per_trajectory
+        raise ValueError(f"train: {what} trajectory {number} is zero after {steps} steps; errors are relative to it")
 
 
 def _check_times(what: str, trajectories: Tensor, steps: int) -> None:

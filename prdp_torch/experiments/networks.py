@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from prdp_torch import _C as library
 from prdp_torch.experiments import _C, own_networks
 
 
@@ -138,9 +139,12 @@ _KINDS: dict[str, Callable[[_C.Physics, _C.Network], torch.nn.Module]] = {
 
 def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> torch.nn.Module:
     """Make the network of a scene. The same seed gives the same weights in Python and in C++. `without_memory` makes
-    it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is."""
+    it on the device "meta", for weights that are loaded into it; a class of the user's own is made as it is. ValueError
+    for one whose training this machine cannot hold."""
     if scene.network.python:
         return own_networks.make(scene, seed)
+    if not without_memory:
+        _check_memory(scene, make_network(scene, seed, without_memory=True))
     physics, network = scene.physics, scene.network
     with torch.random.fork_rng(devices=[]), torch.device("meta" if without_memory else "cpu"):
         torch.manual_seed(seed)
@@ -149,3 +153,15 @@ def make_network(scene: _C.Scene, seed: int, without_memory: bool = False) -> to
             for parameter in list(made.parameters())[-2:]:  # weight and bias of the last layer
                 torch.nn.init.zeros_(parameter)
         return made.to(scene.dtype)
+
+
+def _check_memory(scene: _C.Scene, network: torch.nn.Module) -> None:
+    """Before minutes go into initial weights, which would fill the memory."""
+    count = sum(parameter.numel() for parameter in network.parameters())
+    copies = 4 if scene.device.type == "cpu" else 1  # the gradient, and the two moments of Adam
+    needed = copies * count * scene.dtype.itemsize
+    if needed > library.physical_memory():
+        raise ValueError(
+            f"network: {count:,} weights would take {needed / 1e9:.3g} GB in the training, and this machine has "
+            f"{library.physical_memory() / 1e9:.3g} GB"
+        )

@@ -18,9 +18,9 @@ _SPACING = 1e-3  # relative; float32 coordinates are that exact
 
 
 def write(path: str | Path, trajectories: Tensor, scene: _C.Scene) -> None:
-    """Write trajectories (samples, times, channels, *shape) of a scene: as .npz if the path ends so, else as HDF5. The
-    file is written whole or not at all. Raises ValueError if it cannot be written, and ImportError without the package
-    h5py."""
+    """Write trajectories (samples, times, channels, *shape) of a scene: as .npz or HDF5 (.h5, .hdf5), as the path
+    ends. The file is written whole or not at all. Raises ValueError if it cannot be written or ends otherwise, and
+    ImportError without the package h5py."""
     dim = len(scene.physics.shape)
     spatial = range(2 + dim, 2, -1)
     tensor = trajectories.permute(0, 1, *spatial, 2).numpy()

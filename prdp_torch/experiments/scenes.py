@@ -30,11 +30,22 @@ def load(scene: str | Path) -> _C.Scene:
     """Read a scene by its name, or by the path of a .toml file. The ValueError for a mistake names the file, the line
     and what is allowed."""
     if str(scene).endswith(".toml"):
-        return _C.read_scene(str(scene))
+        return _checked(_C.read_scene(str(scene)))
     known = available()
     if str(scene) not in known:
         raise ValueError(f"no scene '{scene}'; available: {', '.join(known)}; or give the path of a .toml file")
-    return _C.read_scene(str(known[str(scene)]))
+    return _checked(_C.read_scene(str(known[str(scene)])))
+
+
+def _checked(scene: _C.Scene) -> _C.Scene:
+    """The scene, whose solver can be made: what the solver itself refuses is told with the file."""
+    try:
+        make_solver(scene, scene.max_iter)
+    except ValueError as error:
+        raise ValueError(f"{scene.path}: [solver]: {error}") from None
+    if scene.compare.rtol is not None and scene.compare.rtol >= 1:
+        raise ValueError(f"{scene.path}: compare.rtol: must be < 1, got {scene.compare.rtol:g}")
+    return scene
 
 
 def placed(scene: _C.Scene, device: "str | torch.device | None" = None) -> _C.Scene:

@@ -13,7 +13,9 @@ def table_with(errors):
     costs = ("operator_applications", "adjoint_applications", "seconds", "budget", "iterations")
     for row, error in zip(rows, errors, strict=True):
         spent = {name: [100.0 * (1 + row.k)] for name in costs}
-        row.curves = [{"metric": [1.0, s * error], "max_iter": [row.k], **spent} for s in (0.98, 1.02)]
+        row.curves = [
+            {"metric": [1.0, s * error], "error": [1.0, s * error], "max_iter": [row.k], **spent} for s in (0.98, 1.02)
+        ]
     return compare.summarise(scene, rows)
 
 
@@ -60,3 +62,28 @@ def test_a_kept_table_is_drawn_again():
     figure = charts.accuracy_against_cost(scenes.load("heat_1d"), table)
     figure.draw_without_rendering()
     assert "converged, K = 25" in labels(figure)
+
+
+@pytest.mark.parametrize("errors", [[1.05, 1.1, 1.15], [0.04, 0.0401], [0.6, 2.0]])
+def test_ticks_that_are_close_have_labels_that_differ(errors):
+    for axes in drawn(errors).axes:
+        low, high = axes.get_ylim()
+        ticks = [*zip(axes.yaxis.get_majorticklocs(), axes.yaxis.get_majorticklabels(), strict=True),
+                 *zip(axes.yaxis.get_minorticklocs(), axes.yaxis.get_minorticklabels(), strict=True)]  # fmt: skip
+        shown = [(place, label.get_text()) for place, label in ticks if low <= place <= high]
+        assert len(shown) > 1 and len({text for _, text in shown}) == len(shown)
+        assert all(float(text) == pytest.approx(place, rel=1e-9) for place, text in shown)
+
+
+def test_a_row_that_fails_or_warns_has_no_saving_in_its_bar():
+    scene, table = scenes.load("heat_1d"), table_with([0.04] * 6)
+    rows = compare.rows_of(scene)[:6]
+    of = {entry["label"]: entry for entry in table}
+    of["prdp"] |= {"warning": "the solves stop far off", "budget": 1.0}
+    of["prdp_growth"] |= {"as_good": False, "budget": 1.0}
+    figure = charts.total_iterations(scene, rows, table)
+    figure.draw_without_rendering()
+    assert [text.get_text() for text in figure.axes[0].texts if text.get_text()] == ["100 %", "warns", "fails"]
+    assert labels(figure) == ["spent"]
+    of["prdp"] |= {"warning": None, "saved_by_incomplete_convergence": 0.0}
+    assert "saved by progressive refinement (PR)" in labels(charts.total_iterations(scene, rows, table))

@@ -156,6 +156,23 @@ def test_repr_and_history_can_be_read():
     assert (last.metric, last.smoothed, last.max_iter, last.refined) == (1.0, 1.0, 1, True)
 
 
+@pytest.mark.parametrize("make", [prdp.PRDPController, prdp.ToleranceController])
+def test_records_are_made_once_and_not_kept_from_another_state(make):
+    """Else a loop that reads the last record takes a time that grows with the square of its length."""
+    controller, other = make(), make()
+    for metric in (1.0, 0.5, 0.4):
+        controller.step(metric)
+        seen = controller.history
+    again = controller.history
+    assert all(one is two for one, two in zip(again, seen, strict=True)) and len(again) == 3
+    again.clear()  # a list of the caller's
+    for metric in (3.0, 2.0, 1.0, 0.5):
+        other.step(metric)
+    assert [record[0] for record in controller.history] == [1.0, 0.5, 0.4]
+    controller.load_state_dict(other.state_dict())
+    assert controller.history == other.history and copy.deepcopy(controller).history == other.history
+
+
 def test_the_manual_schedule_has_the_same_interface():
     heat = prdp.Heat((5,), 1e-3, 1.0, solver=prdp.Jacobi(1))
     schedule = prdp.LinearSchedule([heat], initial=25, increment=6, maximum=40)

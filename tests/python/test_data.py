@@ -102,6 +102,16 @@ def test_the_cpp_trainer_refuses_a_file(tmp_path):
     )
 
 
+@pytest.mark.parametrize("zeros", [slice(None), slice(3, 4), slice(51, 52)])
+def test_states_of_zeros_that_errors_would_be_divided_by_are_refused(tmp_path, zeros):
+    scene = heat(tmp_path)
+    trajectories = random_trajectories(scene, 4)
+    trajectories[zeros] = 0
+    what = {3: "training trajectory 3", 51: "validation trajectory 1"}.get(zeros.start, "validation trajectory 0")
+    with pytest.raises(ValueError, match=f"train: {what} is zero after 2 steps; errors are relative to it"):
+        train(scene, Refinement.prdp(scene), data=trajectories)
+
+
 def test_keys_of_made_data_do_not_go_with_a_file(tmp_path):
     with pytest.raises(ValueError, match=r"data\.modes: only for `emulator`, not with `file`"):
         scenes.load(written(tmp_path, ("modes = 5 ", 'file = "x.h5"\nmodes = 5 '), ("seed = 0\n", "")))

@@ -11,8 +11,9 @@ import pytest
 import torch
 from helpers import written
 from trainings import without_seconds
+from typer.testing import CliRunner
 
-from prdp_torch.experiments import _C, array_files, datasets, pdebench, scenes
+from prdp_torch.experiments import _C, array_files, cli, datasets, pdebench, scenes
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.training import train
 
@@ -224,6 +225,19 @@ def test_an_export_sees_that_it_can_write_before_it_computes(tmp_path):
     command = [*PRDP, "export", "navier_stokes", "--out", "file/x.npz"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and "--out: cannot write to 'file'" in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("name, got", [("x.csv", "'.csv'"), ("x", "none")])
+def test_an_export_into_another_format_is_refused_before_it_computes(tmp_path, name, got):
+    done = CliRunner().invoke(cli.app, ["export", "navier_stokes", "--out", str(tmp_path / name)])
+    words = f"prdp: data: '{tmp_path / name}' must end in .h5, .hdf5 or .npz, which tells the format; got {got}\n"
+    assert (done.exit_code, done.stderr, list(tmp_path.iterdir())) == (2, words, [])
+
+
+def test_a_single_array_is_no_file_of_trajectories(tmp_path):
+    np.save(tmp_path / "x.npy", np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"x\.npy' holds one array without its grid; write an \.npz file"):
+        datasets.of_scene(from_file(tmp_path, "x.npy"))
 
 
 def test_npz_needs_no_h5py(tmp_path):

@@ -1,8 +1,11 @@
 """The scenes' networks: shapes, boundaries, sizes, and that a seed determines them."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
+from helpers import written
 
 from prdp_torch.experiments import scenes
 from prdp_torch.experiments.networks import MLP, ResNet, UNet, make_network
@@ -183,3 +186,11 @@ def test_weights_depend_on_the_seed_alone(name):
         assert torch.equal(p, q) and not torch.equal(p, r)
     u = torch.zeros(2, scene.physics.channels, *scene.physics.shape)
     assert first(u).shape == u.shape
+
+
+def test_a_network_that_the_machine_cannot_hold_is_refused_before_it_is_made(tmp_path):
+    scene = scenes.load(written(tmp_path, ("shape = [30]", "shape = [1000000000]")))
+    started = time.perf_counter()
+    with pytest.raises(ValueError, match=r"network: 129,000,008,384 weights would take 2\.06e\+03 GB in the training"):
+        make_network(scene, 0)
+    assert time.perf_counter() - started < 5

@@ -1,5 +1,7 @@
 """Scene files: what they say is read, and what is wrong in them is said with file and line."""
 
+import re
+
 import pytest
 import torch
 from helpers import assert_refused, written
@@ -131,6 +133,19 @@ def test_mistakes_of_gmres_and_the_resnet_are_named_too(tmp_path, before, after,
 )  # fmt: skip
 def test_mistakes_of_the_unet_are_named_too(tmp_path, before, after, where, message):
     assert_refused(written(tmp_path, (before, after), scene="kolmogorov_unet"), where, message)
+
+
+@pytest.mark.parametrize(
+    "before, after, message",
+    [
+        ("rtol = 1e-5", "rtol = 1.5", "[solver]: Jacobi: rtol must be < 1, got 1.5; u = 0 would meet it"),
+        ("[compare]\n", "[compare]\nrtol = 2.0\n", "compare.rtol: must be < 1, got 2"),
+    ],
+)
+def test_what_the_solver_refuses_is_named_with_the_file(tmp_path, before, after, message):
+    path = written(tmp_path, (before, after))
+    with pytest.raises(ValueError, match=re.escape(f"{path}: {message}")):
+        scenes.load(path)
 
 
 def test_missing_files_and_unknown_scenes():

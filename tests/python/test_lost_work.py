@@ -1,0 +1,85 @@
+"""What the command `prdp` does not pass over in silence: trainings that are lost, and records that it replaces."""
+
+import json
+
+import pytest
+from helpers import written
+from typer.testing import CliRunner
+
+from prdp_torch.experiments import cli, compare, records, scenes
+from prdp_torch.experiments.refinement import Refinement
+
+
+def prdp(*arguments):
+    """Exit status, and what was said on stderr."""
+    done = CliRunner().invoke(cli.app, list(map(str, arguments)))
+    return done.exit_code, done.stderr
+
+
+@pytest.mark.parametrize(
+    "rate, why",
+    [
+        ("1e17", "its relative error is "),  # finite in float64
+        ("1e300", "interval 1: the metric is "),
+        ("1e-3", None),
+    ],
+)
+def test_a_training_that_ends_nowhere_is_exit_1_with_its_record(tmp_path, rate, why):
+    changes = ("float32", "float64"), ("learning_rate = 1e-3", f"learning_rate = {rate}"), ("train = 200", "train = 20")
+    scene = written(tmp_path, *changes)
+    status, said = prdp("train", scene, "--intervals", 2, "--out", tmp_path)
+    assert status == (0 if why is None else 1)
+    assert why is None or f"prdp: seed 0 diverged, {why}" in said
+    curves = json.loads((tmp_path / "auto/seed_0.json").read_text())["curves"]
+    assert why is None or curves["metric"][-1] is None or curves["metric"][-1] > 1e20
+
+
+def unfinished(scene, folder, intervals=4):
+    """The checkpoint of a training that has stopped after its first interval, and what is in it."""
+    loaded = scenes.load(scene)
+    loaded.training.intervals = intervals
+    refinement, environment = Refinement.auto(), records.environment()
+    with pytest.raises(KeyboardInterrupt):
+        compare.run_one(loaded, refinement.label, refinement, 0, folder, environment, False, [interrupt])
+    path = folder / "auto/seed_0.checkpoint"
+    return path, path.read_bytes()
+
+
+def interrupt(interval):
+    raise KeyboardInterrupt
+
+
+SHORT = ("train = 200", "train = 20"), ("epochs = 100", "epochs = 4")
+
+
+@pytest.mark.parametrize("options", [[], ["--resume"]])
+@pytest.mark.parametrize(
+    "changes, more, differs",
+    [
+        ([], ["--backward", "unrolled"], "backward was 'implicit', and is 'unrolled'"),
+        ([("nu = 1e-3", "nu = 2e-3")], [], "the scene file was 'nu = 1e-3', and is 'nu = 2e-3'"),
+    ],
+)
+def test_an_unfinished_training_of_other_settings_is_refused_in_words(
+    tmp_path, monkeypatch, options, changes, more, differs
+):
+    monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "0")
+    path, left = unfinished(written(tmp_path, *SHORT), tmp_path)
+    status, said = prdp("train", written(tmp_path, *SHORT, *changes), *more, *options, "--out", tmp_path)
+    assert status == 2 and path.read_bytes() == left
+    assert f"checkpoint: '{path}' is of a training that has not ended, with other settings: {differs}; " in said
+    status, said = prdp("train", written(tmp_path, *SHORT), "--resume", "--out", tmp_path)
+    assert (status, said) == (0, "") and not path.exists()
+
+
+def test_finished_records_that_are_replaced_are_told_before(tmp_path):
+    scene = written(tmp_path, *SHORT)
+    train = "train", scene, "--intervals", 1, "--out", tmp_path
+    record = tmp_path / "auto/seed_0.json"
+    assert prdp(*train) == (0, "")
+    assert prdp(*train, "--resume") == (0, "")
+    assert prdp(*train) == (0, f"prdp: replaces when it ends: '{record}', of the same settings\n")
+    words = f"prdp: replaces when it ends: '{record}', whose backward was 'implicit', and is 'unrolled'\n"
+    assert prdp(*train, "--backward", "unrolled", "--resume", "--seeds", 2) == (0, words)
+    record.write_text("damaged")
+    assert prdp(*train) == (0, "")
