@@ -285,6 +285,28 @@ def test_of_a_right_hand_side_of_few_eigenvectors_the_iterations_have_no_useful_
     assert info.adjoint.residual[0] < 1e-5
 
 
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("solver", [prdp.CG(200, rtol=1e-3), prdp.MINRES(200, rtol=1e-3)], ids=repr)
+def test_rounding_that_recurrences_amplify_is_no_gradient_of_a_solved_sample(solver, shared):
+    """A κ of 32² cells and a rough b: the derivative of the iterations is off by factors of a million and more."""
+    n, batch = 32, 2
+    noise = torch.randn(batch + 2, 1, n, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    b, weights = noise[:batch], noise[-1]
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    kappa = torch.exp(0.5 * torch.sin(2 * torch.pi * x)[:, None] * torch.cos(torch.pi * x)).expand(batch, n, n)
+    kappa = (kappa[:1] if shared else kappa).clone().requires_grad_()
+
+    def gradient(solver, backward):
+        u, info = prdp.linear_solve(operators.Diffusion(kappa), b, solver, backward=backward)
+        (found,) = torch.autograd.grad((u * weights).sum(), kappa)
+        return found, info
+
+    truth, _ = gradient(prdp.Direct(2), "implicit")
+    found, info = gradient(solver, "unrolled")
+    assert info.solved.all() and (info.adjoint.residual < 1e-3).all()
+    assert (found - truth).norm() < 0.1 * truth.norm()
+
+
 def test_truncated_iterations_keep_their_own_derivative():
     a, b = operators.Poisson((30,)), torch.ones(1, 1, 30, dtype=torch.float64, requires_grad=True)
     u, info = prdp.linear_solve(a, b, prdp.CG(3, rtol=0.0), backward="unrolled")

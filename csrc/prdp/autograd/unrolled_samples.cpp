@@ -7,6 +7,7 @@
 #include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/solved_to_rounding.h"
 #include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -52,6 +53,8 @@ struct SampleVjps {
   const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);  // and the status, of the solve
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
   const bool for_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
+  const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
+  const std::vector<int64_t> wanted_ = wanted();                            // needed_, and what that looks at
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double asked_ = options_.adjoint_rtol.value_or(options_.solver.rtol);  // tolerance of adjoint solves
   std::vector<Derivative> derivatives_{};
@@ -61,6 +64,11 @@ struct SampleVjps {
   std::vector<at::Tensor> gradients_{};
   at::Tensor u_{};
 
+  std::vector<int64_t> wanted() const {
+    auto all = needed_.vec();
+    if (for_a_ && may_mislead_) all[0] = 1;
+    return all;
+  }
   SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses_[i]); }
 
   SolveVjp find() {
@@ -68,6 +76,7 @@ struct SampleVjps {
     differentiate(rows_);
     retry_implicitly();
     if (zero_grad_) leave_out_failed_adjoints();
+    if (!needed_[0]) gradients_[0] = at::Tensor();
     for (size_t i = 0; i < needed_.size(); ++i)
       if (needed_[i] && !gradients_[i].defined())
         gradients_[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
@@ -102,10 +111,10 @@ struct SampleVjps {
       if ((rows[i] || of_none) && derivatives_[i] == Derivative::kOfIterations)
         caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
     }
-    if (!caps.any().item<bool>()) return std::vector<at::Tensor>(needed_.size());
+    if (!caps.any().item<bool>()) return std::vector<at::Tensor>(wanted_.size());
     auto found = of_iterations_(
         only(bar_, rows), solved_.b,
-        {spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()), options_.checkpoint_every}, needed_);
+        {spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()), options_.checkpoint_every}, wanted_);
     const auto applications = to_host<int64_t>(found.operator_applications, batch_);
     for (int64_t i = 0; i < batch_; ++i) outcomes_[i].applications = applications[i];
     return std::move(found.gradients);
@@ -118,7 +127,7 @@ struct SampleVjps {
     implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
     implicit.adjoint_rtol = std::min(asked_, kRoundings / 2 * epsilon_of(solved_.b));
     const auto u = for_a_ ? solution() : at::Tensor();
-    const auto found = implicit_vjp(only(bar_, rows), u, spec_, implicit, needed_, any_solve_);
+    const auto found = implicit_vjp(only(bar_, rows), u, spec_, implicit, wanted_, any_solve_);
     for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
     const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
     const auto residual = to_host<double>(found.info.residual, batch_);
@@ -133,18 +142,53 @@ struct SampleVjps {
     }
   }
 
-  /// The samples whose iterations say little about the derivative of the solution: it is one in few directions.
+  /// The solved samples whose iterations say little about the derivative of the solution: b̄ is one in few directions,
+  /// and Ā may be rounding that recurrences amplify. So where b̄ or Ā is worse than zero, the solution's takes its
+  /// place.
   void retry_implicitly() {
-    if (!gradients_[0].defined() || traits(options_.solver.method).is_polynomial) return;
-    const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
-    bool any_far = false;
+    if (!may_mislead_ || !gradients_[0].defined()) return;
+    Rows solved(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
       const bool ended = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      if (!ended || derivatives_[i] != Derivative::kOfIterations || !rows_[i] || !(residual[i] > 1.0)) continue;
-      derivatives_[i] = Derivative::kOfSolution;
-      any_far = true;
+      solved[i] = ended && derivatives_[i] == Derivative::kOfIterations && rows_[i];
     }
-    if (any_far) differentiate(rows_);
+    if (!any(solved)) return;
+    const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
+    Rows far(batch_), near(batch_);
+    for (int64_t i = 0; i < batch_; ++i) {
+      far[i] = solved[i] && residual[i] > 1.0;
+      near[i] = solved[i] && !far[i];
+    }
+    if (for_a_ && any(near)) add_far_from_product_rule(near, far);
+    if (!any(far)) return;
+    for (int64_t i = 0; i < batch_; ++i)
+      if (far[i]) derivatives_[i] = Derivative::kOfSolution;
+    differentiate(rows_);
+  }
+
+  /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that share a
+  /// tensor of A are looked at together: it has the sum of their gradients.
+  void add_far_from_product_rule(const Rows& rows, Rows& far) {
+    bool alone = true;
+    for (int64_t i = 0; i < batch_; ++i)
+      alone = alone && (rows[i] || !rows_[i] || derivatives_[i] == Derivative::kNone);
+    const auto said = outcomes_;
+    const auto found = alone ? gradients_ : take_iterations_back(rows);
+    outcomes_ = said;
+    const auto u = only(solution().detach(), rows);
+    const at::NoGradGuard no_grad;
+    const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);
+    for (size_t k = 0; k < of_solution.size(); ++k) {
+      if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
+      const auto right = of_solution[k].to(at::kDouble), off = found[k + 1].detach() + right;
+      const bool of_samples = right.dim() > 2 && right.size(0) == batch_ && !is_function(spec_);
+      const auto norms = [&](const at::Tensor& t) {
+        const auto norm = of_samples ? t.flatten(1).norm(2, 1) : t.norm().expand({batch_});
+        return to_host<double>(norm.contiguous(), batch_);
+      };
+      const auto error = norms(off), whole = norms(right);
+      for (int64_t i = 0; i < batch_; ++i) far[i] = far[i] || (rows[i] && error[i] > whole[i]);
+    }
   }
 
   void leave_out_failed_adjoints() {

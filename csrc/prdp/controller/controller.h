@@ -1,4 +1,5 @@
 #pragma once
+#include <concepts>
 #include <cstdint>
 #include <limits>
 #include <optional>
@@ -20,7 +21,9 @@ struct Solves {
   /// The share of samples whose solve took no iteration, as its start met the tolerance, and is above rounding.
   double idle = 0.0;
 
-  Solves(bool converged = false, std::optional<double> residual = {}, std::optional<double> error = {})
+  Solves() = default;
+  /// From a bool alone: an error or a residual in its place would pass for true.
+  Solves(std::same_as<bool> auto converged, std::optional<double> residual = {}, std::optional<double> error = {})
       : converged(converged), residual(residual), error(error) {}
 };
 

@@ -69,6 +69,7 @@ at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
 }  // namespace
 
 std::shared_ptr<const RegisteredProducts> RegisteredProducts::make(Products products) {
+  TORCH_CHECK_VALUE(products.apply, "Function: apply, the product with A, must be given");
   const std::shared_ptr<RegisteredProducts> made(new RegisteredProducts(std::move(products)));
   const std::lock_guard lock(registry().mutex);
   made->number_ = ++registry().last;

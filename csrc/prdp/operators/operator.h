@@ -58,15 +58,15 @@ class Operator {
   virtual std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const = 0;
   /// ‖A‖∞: one value, or one per sample.
   virtual at::Tensor norm() const = 0;
-  /// v without its part in the null space of Aᵀ, which no product with A has, and without that in the null space of A,
-  /// which no product changes; v itself if A is regular. Differentiable.
+  /// project(): v projected onto the range of A. project_solution(): v without its part in the null space of A. Both
+  /// return v if A is regular. Differentiable.
   virtual at::Tensor project(const at::Tensor& v) const { return v; }
   virtual at::Tensor project_solution(const at::Tensor& v) const { return project(v); }
-  /// Whether rounding leaves parts along the null spaces in what methods carry on, which no product takes away; as of
-  /// operators whose null space somebody named.
+  /// Whether vectors must be projected again in every iteration, because A maps its declared null space to zero only up
+  /// to rounding.
   virtual bool needs_projection() const { return false; }
-  /// Whether it is of somebody's own numbers or functions, and may be singular though nobody said so. Then Aᵀ v is to
-  /// be had without derivatives.
+  /// Whether its entries or functions are the user's own: it may be singular though nobody declared a null space. Then
+  /// apply_transpose() must work without autograd.
   virtual bool may_be_singular() const { return false; }
   /// ρ, the spectral radius of I - D⁻¹A, whose eigenvalues come in pairs ±μ. Differentiable in the tensors of A. Raises
   /// ValueError if it is not known.
@@ -94,7 +94,7 @@ class Operator {
   /// Tells a kernel that all samples share from those of other operators; nothing if they do not share it, or if to
   /// make it takes no longer than to read its numbers.
   virtual std::optional<kernels::FactorKey> key(bool transposed) const;
-  /// What is not allowed of the numbers of a sample, though it is finite: "kappa must be > 0, got -1". Else empty.
+  /// Why the parameters of a sample are refused though they are finite, "kappa must be > 0, got -1"; or empty.
   virtual std::string refusal(int64_t /*sample*/) const { return {}; }
 
   /// A as a matrix (n, n), or (batch, n, n) if A differs between samples.

@@ -1,19 +1,14 @@
 #include "prdp/operators/stencil_operator.h"
 
-#include <ATen/TensorSubclassLikeUtils.h>
-#include <ATen/core/grad_mode.h>
-
 #include <algorithm>
 #include <cmath>
 
 #include "prdp/gpu/operator_view.h"
+#include "prdp/kernels/given_stencil.h"
 #include "prdp/kernels/kernel.h"
-#include "prdp/kernels/stencil_products.h"
-#include "prdp/operators/products_by_kernel.h"
 #include "prdp/operators/stencil_direct.h"
 #include "prdp/operators/tensor_factor_key.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/threads/interruption.h"
 
 namespace prdp {
 
@@ -38,45 +33,6 @@ std::vector<kernels::Offset> turned(std::vector<kernels::Offset> offsets) {
   for (auto& offset : offsets)
     for (auto& cells : offset.along) cells = -cells;
   return offsets;
-}
-
-/// The product rule by loops: products (batch or 1, k, *shape) from λ and u (batch, channel, *shape).
-template <class T>
-void add_all_products(const kernels::StencilSparsity& pattern, const at::Tensor& lambda, const at::Tensor& u,
-                      const at::Tensor& products) {
-  const int64_t samples = lambda.size(0), channels = lambda.size(1), given = products.size(1);
-  const int64_t points = products.numel() / (products.size(0) * given);
-  const int64_t share = products.size(0) == 1 ? samples : 1;  // samples that add up to one product
-  const auto *l = lambda.const_data_ptr<T>(), *v = u.const_data_ptr<T>();
-  auto* out = products.mutable_data_ptr<T>();
-  constexpr int64_t worthwhile = 1 << 18;  // multiplications for a thread
-  const int64_t grain = std::max<int64_t>(1, worthwhile / std::max<int64_t>(1, share * channels * points));
-  interruption::parallel_for(0, products.size(0) * given, grain, [&](int64_t begin, int64_t end) {
-    for (int64_t p = begin; p < end; ++p) {
-      const int64_t place = pattern.places[p % given], first = p / given * channels;
-      for (int64_t field = first; place >= 0 && field < first + share * channels; ++field)
-        kernels::add_products(pattern.grid, pattern.offsets[place], l + field * points, v + field * points,
-                              out + p * points);
-    }
-  });
-}
-
-/// The same in one launch; undefined where there is no kernel.
-template <class T>
-at::Tensor products_by_kernel(const kernels::StencilSparsity& pattern, const std::vector<kernels::Offset>& offsets,
-                              const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& coefficients) {
-  const auto out = at::empty(coefficients.sizes(), coefficients.options());
-  gpu::StencilProducts<T> of{};
-  of.pair = pair_of<T>(lambda, u, out.size(0));
-  of.count = static_cast<int>(offsets.size());
-  of.out = out.mutable_data_ptr<T>();
-  for (int axis = 0; axis < 3; ++axis) {
-    of.n[axis] = static_cast<int>(pattern.grid.shape[axis]);
-    of.periodic[axis] = pattern.grid.periodic[axis];
-    for (size_t k = 0; k < offsets.size(); ++k) of.offsets[k][axis] = static_cast<signed char>(offsets[k].along[axis]);
-  }
-  const bool launched = gpu::each_point(out.device(), product_body<T>("StencilProducts"), of, out.numel());
-  return launched ? out : at::Tensor();
 }
 
 }  // namespace
@@ -261,27 +217,6 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
     all.select(1, 2 + 2 * axis).narrow(1 + axis, extent(axis) - 1, 1).zero_();
   }
   return all;
-}
-
-std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (has_product_kernel(lambda, u)) {
-    const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
-    const kernels::StencilSparsity pattern(grid_, offsets_);
-    const auto all = by_kernel(pattern, offsets_, lambda.contiguous(), u.contiguous(), coefficients_);
-    if (all.defined()) return {all};
-  }
-  const bool plain = !at::isTensorSubclassLike(lambda) && !at::isTensorSubclassLike(u);
-  if (!at::GradMode::is_enabled() && plain && lambda.is_cpu()) {
-    const auto all = at::zeros(coefficients_.sizes(), coefficients_.options());
-    const kernels::StencilSparsity pattern(grid_, offsets_);
-    const auto add = lambda.scalar_type() == at::kFloat ? add_all_products<float> : add_all_products<double>;
-    add(pattern, lambda.contiguous(), u.contiguous(), all);
-    return {all};
-  }
-  std::vector<at::Tensor> products;
-  for (const auto& offset : offsets_) products.push_back((lambda * shifted(u, offset)).sum(1));
-  const auto all = at::stack(products, 1);
-  return {coefficients_.sym_size(0) == 1 ? all.sum(0, /*keepdim=*/true) : all};
 }
 
 std::vector<int64_t> StencilOperator::first_nonfinite(int64_t sample) const {

@@ -146,12 +146,25 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 /// Why the residual fell no further, far above what was asked for.
 std::string stagnated(const Solver& solver, const at::Tensor& b) {
   const bool single = b.scalar_type() == at::kFloat;
+  const std::string others = solver.method == Method::kDirect ? "take an iterative method"
+                             : solver.preconditioner.is_multigrid()
+                                 ? "take another preconditioner than multigrid, or Direct"
+                                 : "take another preconditioner or Direct";
   if (traits(solver.method).counts == Counts::kCycles)
-    return "its cycles take nothing more off the residual; take a larger restart, a preconditioner or Direct" +
-           std::string(single ? ", or float64" : "");
+    return "its cycles take nothing more off the residual; take a larger restart, " +
+           std::string(solver.preconditioner.is_multigrid() ? "no multigrid" : "a preconditioner") + ", or Direct" +
+           (single ? ", or float64" : "");
   return "the residual falls no further in " + std::string(single ? "float32" : "float64") + ", and u may be wrong; " +
-         (single ? "solve it in float64 once to see, and if it is, stay there, or " : "") +
-         "take another preconditioner or Direct, or scale A and b so that their rows are of one size";
+         (single ? "solve it in float64 once to see, and if it is, stay there, or " : "") + others +
+         ", or scale A and b so that their rows are of one size";
+}
+
+/// Why no iterate came nearer than the start.
+std::string no_progress(const Solver& solver) {
+  if (solver.preconditioner.is_multigrid())
+    return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
+           "diffusion; take upwind differences, leave out multigrid, or take Direct";
+  return "take more iterations, a preconditioner, GMRES or Direct";
 }
 
 std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
@@ -210,6 +223,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       case SolveStatus::kStagnated: return stagnated(role.solver, b);
+      case SolveStatus::kMaxIter: return no_progress(role.solver);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

@@ -102,6 +102,23 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   warning_sink()(text.str());
 }
 
+/// Warns of samples whose answer is the start, mostly zero, as no iterate came nearer, though a tolerance was asked
+/// for.
+void warn_of_no_progress(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                         const std::vector<int64_t>& unmoved) {
+  if (unmoved.empty()) return;
+  const std::string who = role.adjoint ? "adjoint solve" : "linear_solve";
+  if (!is_news("no progress: " + who + std::string(name(role.solver.method)) + role.a.kind)) return;
+  const int64_t first = unmoved.front();
+  std::ostringstream text;
+  text << of_step() << who << ": " << unmoved.size() << " of " << b.size(0) << " samples returned "
+       << (role.x0.defined() ? "their start" : "zero") << ", as none of the " << role.solver.max_iter
+       << " iterates came nearer to rtol = " << role.solver.rtol << ": sample " << first << " is at relative residual "
+       << info.residual[first].item<double>() << ", " << diagnosis(role, a, b, SolveStatus::kMaxIter, first)
+       << ". This is said once";
+  warning_sink()(text.str());
+}
+
 }  // namespace
 
 FailuresOfStep::FailuresOfStep(int64_t step, int64_t steps)
@@ -119,13 +136,19 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();
-  std::vector<int64_t> failed, stagnated;
+  const bool asked = role.solver.rtol > 0.0 && role.solver.max_iter.expect_int() > 0;
+  const auto iterations = asked ? info.iterations.to(at::kCPU) : at::Tensor();
+  std::vector<int64_t> failed, stagnated, unmoved;
   for (int64_t i = 0; i < batch; ++i) {
     const auto what = static_cast<SolveStatus>(status[i]);
     if (is_failure(what)) failed.push_back(i);
     if (what == SolveStatus::kStagnated) stagnated.push_back(i);
+    if (asked && what == SolveStatus::kMaxIter && iterations.const_data_ptr<int64_t>()[i] == 0) unmoved.push_back(i);
   }
-  if (failed.empty()) return warn_of_stagnation(role, a, b, info, stagnated);
+  if (failed.empty()) {
+    warn_of_no_progress(role, a, b, info, unmoved);
+    return warn_of_stagnation(role, a, b, info, stagnated);
+  }
   const auto is_of_a = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;
   };

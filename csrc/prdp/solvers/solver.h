@@ -68,6 +68,9 @@ inline constexpr double kDefaultRtol = 1e-5;
 /// Products in a cycle of GMRES.
 inline constexpr int64_t kDefaultRestart = 10;
 
+/// A max_iter that nobody set, which every solve refuses.
+inline constexpr int64_t kToBeGiven = -1;
+
 /// A solver and its limits. Each sample starts from zero or from a given start. It stops when ‖b - A u‖ <= rtol ‖b‖, or
 /// after max_iter iterations. With rtol = 0, exactly max_iter iterations run.
 struct Solver {
@@ -83,31 +86,31 @@ struct Solver {
 };
 
 struct Jacobi {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kJacobi, max_iter, rtol}; }
 };
 /// Jacobi's iteration, accelerated with the known spectrum of A; for Heat and Poisson only (Golub and Varga 1961).
 struct Chebyshev {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kChebyshev, max_iter, rtol}; }
 };
 struct SteepestDescent {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   operator Solver() const { return {Method::kSteepestDescent, max_iter, rtol}; }
 };
 /// For symmetric definite operators.
 struct CG {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kConjugateGradient, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
 /// For any operator; two products with A per iteration. Preconditioned from the right.
 struct BiCGStab {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kBiCGStab, max_iter, rtol, kDefaultRestart, preconditioner}; }
@@ -115,21 +118,21 @@ struct BiCGStab {
 /// Restarted; max_iter counts cycles. Preconditioned from the right.
 struct GMRES {
   int64_t restart = kDefaultRestart;
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kGmres, max_iter, rtol, restart, preconditioner}; }
 };
 /// For symmetric operators, definite or not. A preconditioner must be positive definite.
 struct MINRES {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   Preconditioner preconditioner{};
   operator Solver() const { return {Method::kMinres, max_iter, rtol, kDefaultRestart, preconditioner}; }
 };
 /// V-cycles, u ← u + M⁻¹(b - A u); max_iter counts them. For the operators that Preconditioner::multigrid() is for.
 struct Multigrid {
-  int64_t max_iter;
+  int64_t max_iter = kToBeGiven;
   double rtol = kDefaultRtol;
   int64_t smoothing = kDefaultSmoothing;
   operator Solver() const {

@@ -39,6 +39,7 @@ void StepperBase::set_max_iter(int64_t k) {
 }
 
 std::optional<SolveInfo> StepperBase::adjoint_info() const {
+  if (!log_) return std::nullopt;  // moved from
   if (logs_of_steps_.empty()) return adjoint_log::read(*log_);
   std::vector<int64_t> numbers;
   for (const auto& log : logs_of_steps_) numbers.push_back(*log);
