@@ -3,6 +3,7 @@
 
 #include <cmath>
 #include <limits>
+#include <type_traits>
 
 #include "prdp/controller/attach.h"
 #include "prdp/controller/linear_schedule.h"
@@ -75,6 +76,9 @@ TEST(PRDPController, KeepsKWhereSolvesAlreadyMeetTheirTolerance) {
   EXPECT_EQ(controller.state().checkpoint, std::numeric_limits<double>::infinity());
   EXPECT_TRUE(controller.step(1.0, /*converged=*/false));
 }
+
+// An error in the place of Solves would pass for "converged".
+static_assert(std::is_convertible_v<bool, prdp::Solves> && !std::is_convertible_v<double, prdp::Solves>);
 
 TEST(PRDPController, ABadMetricRaisesAndChangesNothing) {
   PRDPController controller;

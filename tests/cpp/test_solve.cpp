@@ -112,6 +112,7 @@ TEST(Solve, AnOperatorOfOnesOwnPreconditions) {
   // One iteration is enough where M is A itself.
   const auto a = heat({20});
   const auto b = prdp_test::random_field({20}, 2);
+  EXPECT_THROW(prdp::RegisteredProducts::make({}), c10::ValueError);
   const auto products = prdp::RegisteredProducts::make({[&](const at::Tensor& v, const std::vector<at::Tensor>&) {
                                                           return prdp::make_operator(a)->solve_directly(v, false);
                                                         },

@@ -107,6 +107,15 @@ TEST(Heat, CopiesReportToTheSameAdjointLog) {
   EXPECT_TRUE(heat.adjoint_info());
 }
 
+TEST(Heat, OneThatWasMovedFromHasNoReports) {
+  auto heat = prdp::Heat({8}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 2});
+  auto u = at::ones({1, 1, 8}).requires_grad_();
+  heat(u).sum().backward();
+  const auto moved = std::move(heat);
+  EXPECT_TRUE(moved.adjoint_info());
+  EXPECT_FALSE(heat.adjoint_info());  // NOLINT(bugprone-use-after-move)
+}
+
 TEST(Poisson, SolvesForTheLoadWithItsSign) {
   auto poisson = prdp::Poisson({31}, prdp::Direct{});
   const auto load = prdp_test::random_field({31}, 2);
@@ -218,6 +227,7 @@ TEST(Stepper, RefusesBadArgumentsBeforeAnyWork) {
   EXPECT_THROW(prdp::Heat({}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 1}), c10::ValueError);
   EXPECT_THROW(prdp::Heat({30}, 1e-3, 1.0, prdp::Jacobi{.max_iter = -1}), c10::ValueError);
   EXPECT_THROW(prdp::Heat({30}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 1, .rtol = -1.0}), c10::ValueError);
+  EXPECT_THROW(prdp::Heat({30}, 1e-3, 1.0, prdp::CG{.rtol = 1e-5}), c10::ValueError);  // without a max_iter
   auto heat = prdp::Heat({30}, 1e-3, 1.0, prdp::Jacobi{.max_iter = 1});
   EXPECT_THROW(heat(at::zeros({25, 30})), c10::ValueError);
   EXPECT_THROW(heat(at::zeros({25, 1, 30}, at::kLong)), c10::TypeError);

@@ -4,26 +4,27 @@ import subprocess
 import sys
 import warnings
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 import torch
 
 import prdp_torch as prdp
-from prdp_torch.operators import Diffusion, Function, Poisson
+from prdp_torch.operators import Diffusion, Function, Poisson, Stencil
 
 F64 = torch.float64
 
 
 @contextmanager
-def told():
-    """The warnings, each as often as it is due."""
+def told(phrase="STAGNATED"):
+    """The warnings with this phrase, each as often as it is due."""
     torch.set_warn_always(True)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             words = []
             yield words
-            words += [str(w.message) for w in caught if "STAGNATED" in str(w.message)]
+            words += [str(w.message) for w in caught if phrase in str(w.message)]
     finally:
         torch.set_warn_always(False)
 
@@ -122,6 +123,31 @@ for restart in (1, 1, 2):
     prdp.linear_solve(a, torch.eye(8)[:1], prdp.GMRES(50, restart=restart))
 step = prdp.ImplicitStep(a, solver=prdp.MINRES(50))
 """
+
+
+def wind_in_central_differences(peclet, n=32):
+    """-Δu + w·∇u with cells of this Péclet number."""
+    west, east = -1 - peclet / 2, -1 + peclet / 2
+    coefficients = torch.tensor([4.0, east, west, east, west]).view(1, 5, 1, 1).expand(1, 5, n, n).contiguous()
+    return Stencil(coefficients, [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+
+
+def test_iterations_in_vain_are_told():
+    a, b = wind_in_central_differences(100.0), torch.randn(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    for solver, remedy in [
+        (prdp.BiCGStab(100, preconditioner="multigrid"), "upwind differences"),
+        (prdp.BiCGStab(3), "GMRES or Direct"),
+    ]:
+        with told("far above rtol") as words:
+            u, info = prdp.linear_solve(a, b, solver)
+        assert (u == 0).all() and names(info) == {"MAX_ITER"} and info.residual.min() > 0.99
+        assert len(words) == 1 and "2 of 2 samples" in words[0] and "returned zero" in words[0] and remedy in words[0]
+        for silent in ({"on_failure": "return"}, {}):
+            with told("far above rtol") as words:
+                prdp.linear_solve(a, b, solver if silent else replace(solver, rtol=0.0), **silent)
+            assert not words
+    truth, _ = prdp.linear_solve(a, b, prdp.Direct())
+    assert truth.norm() > 0.1
 
 
 def test_it_is_said_once():

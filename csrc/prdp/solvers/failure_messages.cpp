@@ -159,8 +159,8 @@ std::string stagnated(const Solver& solver, const at::Tensor& b) {
          ", or scale A and b so that their rows are of one size";
 }
 
-/// Why no iterate came nearer than the start.
-std::string no_progress(const Solver& solver) {
+/// Why iterations were in vain.
+std::string in_vain(const Solver& solver) {
   if (solver.preconditioner.is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";
@@ -223,7 +223,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       case SolveStatus::kStagnated: return stagnated(role.solver, b);
-      case SolveStatus::kMaxIter: return no_progress(role.solver);
+      case SolveStatus::kMaxIter: return in_vain(role.solver);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

@@ -6,6 +6,7 @@
 #include <sstream>
 #include <utility>
 
+#include "prdp/operators/tensors.h"
 #include "prdp/solvers/failure_messages.h"
 #include "prdp/solvers/raise_or_warn.h"
 
@@ -60,16 +61,18 @@ bool is_news(const std::string& what) {
   return said.insert(what).second || c10::WarningUtils::get_warnAlways();
 }
 
+/// A residual above so many tolerances, and above that, is told.
+constexpr double kFar = 10.0, kWrong = 0.01;
+
 /// Warns of samples whose residual stopped far above what was asked for. That is no failure: the residual may be all
 /// that rounding leaves of a u that is good enough, but nobody else would say that it may not be.
 void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                         const std::vector<int64_t>& stagnated) {
   if (stagnated.empty()) return;
-  constexpr double far = 10.0, wrong = 0.01;
   // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
   const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
   const auto* residual = residuals.const_data_ptr<double>();
-  const double bound = std::max(far * role.solver.rtol, wrong);
+  const double bound = std::max(kFar * role.solver.rtol, kWrong);
   const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
   const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
   if (!(residual[worst] > bound)) return;
@@ -102,20 +105,37 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   warning_sink()(text.str());
 }
 
-/// Warns of samples whose answer is the start, mostly zero, as no iterate came nearer, though a tolerance was asked
-/// for.
-void warn_of_no_progress(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
-                         const std::vector<int64_t>& unmoved) {
-  if (unmoved.empty()) return;
+/// Whether max_iter stopped a sample far from its tolerance whose later iterations were in vain: its answer is the
+/// start, mostly zero, or comes from the first half of many. Below so many, residuals may yet fall.
+bool was_in_vain(const Solver& solver, SolveStatus status, int64_t iterations, double residual) {
+  const int64_t max_iter = solver.max_iter.expect_int();
+  constexpr int64_t many = 20;
+  if (status != SolveStatus::kMaxIter || !(residual > std::max(kFar * solver.rtol, kWrong))) return false;
+  return max_iter > 0 && (iterations == 0 || (max_iter >= many && iterations < max_iter / 2));
+}
+
+/// Warns of those, where a tolerance was asked for.
+void warn_of_vain_iterations(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info) {
+  if (!(role.solver.rtol > 0.0)) return;
+  const auto iterations = to_host<int64_t>(info.iterations, b.size(0)),
+             status = to_host<int64_t>(info.status, b.size(0));
+  const auto residual = to_host<double>(info.residual, b.size(0));
+  std::vector<int64_t> vain;
+  for (int64_t i = 0; i < b.size(0); ++i)
+    if (was_in_vain(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i])) vain.push_back(i);
+  if (vain.empty()) return;
   const std::string who = role.adjoint ? "adjoint solve" : "linear_solve";
-  if (!is_news("no progress: " + who + std::string(name(role.solver.method)) + role.a.kind)) return;
-  const int64_t first = unmoved.front();
+  const char* cycles = role.solver.preconditioner.is_multigrid() ? " with multigrid" : "";
+  if (!is_news("in vain: " + who + std::string(name(role.solver.method)) + cycles + role.a.kind)) return;
+  const int64_t first = vain.front();
   std::ostringstream text;
-  text << of_step() << who << ": " << unmoved.size() << " of " << b.size(0) << " samples returned "
-       << (role.x0.defined() ? "their start" : "zero") << ", as none of the " << role.solver.max_iter
-       << " iterates came nearer to rtol = " << role.solver.rtol << ": sample " << first << " is at relative residual "
-       << info.residual[first].item<double>() << ", " << diagnosis(role, a, b, SolveStatus::kMaxIter, first)
-       << ". This is said once";
+  text << of_step() << who << ": " << vain.size() << " of " << b.size(0)
+       << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
+       << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
+           : role.x0.defined()   ? "its start"
+                                 : "zero")
+       << " at relative residual " << residual[first] << ", as none of the " << role.solver.max_iter
+       << " iterates came nearer, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first) << ". This is said once";
   warning_sink()(text.str());
 }
 
@@ -136,17 +156,16 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();
-  const bool asked = role.solver.rtol > 0.0 && role.solver.max_iter.expect_int() > 0;
-  const auto iterations = asked ? info.iterations.to(at::kCPU) : at::Tensor();
-  std::vector<int64_t> failed, stagnated, unmoved;
+  std::vector<int64_t> failed, stagnated;
+  bool any_open = false;
   for (int64_t i = 0; i < batch; ++i) {
     const auto what = static_cast<SolveStatus>(status[i]);
     if (is_failure(what)) failed.push_back(i);
+    any_open = any_open || what == SolveStatus::kMaxIter;
     if (what == SolveStatus::kStagnated) stagnated.push_back(i);
-    if (asked && what == SolveStatus::kMaxIter && iterations.const_data_ptr<int64_t>()[i] == 0) unmoved.push_back(i);
   }
   if (failed.empty()) {
-    warn_of_no_progress(role, a, b, info, unmoved);
+    if (any_open) warn_of_vain_iterations(role, a, b, info);
     return warn_of_stagnation(role, a, b, info, stagnated);
   }
   const auto is_of_a = [&](int64_t i) {
