@@ -226,4 +226,5 @@ def test_making_data_is_shown_as_a_bar_and_reading_them_is_not(tmp_path):
     made, read = (subprocess.run(command, cwd=tmp_path, capture_output=True, text=True) for _ in range(2))
     assert made.returncode == 0 == read.returncode
     assert made.stdout.count("data, steps") == 1 and "26/26" in made.stdout
-    assert "data" not in read.stdout and made.stderr == read.stderr == ""
+    assert "data" not in read.stdout and made.stderr == ""
+    assert read.stderr.startswith("prdp: replaces when it ends: ") and read.stderr.count("\n") == 1

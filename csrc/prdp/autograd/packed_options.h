@@ -45,7 +45,7 @@ enum Count : size_t {
   kHasAdjointMaxIter,
   kAdjointMaxIter,
   kIsPreconditionerTransposed,
-  kRtolBits,  // in place of the tolerance; -1: see the numbers
+  kRtolBits,  // the bit pattern of rtol; -1: see kRtol
   kAdjointRtolBits,
   kCounts
 };
@@ -53,7 +53,7 @@ enum Number : size_t { kRtol, kHasAdjointRtol, kAdjointRtol, kNumbers };
 
 }  // namespace packed
 
-/// The lists.
+/// The lists of `o`, which must outlive them; unpack() is the inverse.
 struct PackedOptions {
   explicit PackedOptions(const SolveOptions& o) : preconditioner(o.solver.preconditioner.spec().tensors) {
     using namespace packed;
@@ -93,8 +93,8 @@ struct PackedOptions {
 
 namespace detail {
 
-/// A tolerance may come as the integer of its bits instead, of which -1 is none: compiled graphs take an integer as it
-/// is, and would have to be compiled again for each float.
+/// Compiled graphs are specialised on floats but not on integers. So a tolerance may be passed as its bit pattern; -1:
+/// none is.
 template <class Number>
 void take_bits(const c10::SymInt& bits, Number& tolerance, c10::SymInt& traced) {
   if (bits.is_symbolic()) traced = bits;

@@ -69,7 +69,7 @@ class CoarseCoefficients {
     const auto weight_of_row = [&](const Field<T>& weights, const Point& p) {
       return weights.data() + ringed_.at(p[0], p[1], p[2]);
     };
-    // What a coefficient is multiplied with lies at the offset in the other axes.
+    // Interpolation weights are those of the column: at the offset of the coefficient in the other axes.
     const auto weight_of_column = [&](const Field<T>& weights, const Point& p) {
       const auto& o = offset_.along;
       return weights.data() + ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]);
@@ -108,7 +108,8 @@ class CoarseCoefficients {
       p[axis_] = (along_axis + extent) % extent;
       return p;
     };
-    // An odd ring has no point between its last and its first; a line of an even number has none behind its last.
+    // Periodic with an odd number: the first and the last point are both coarse, and nothing lies between them. Ended
+    // by zeros with an even number: the last point is coarse.
     return {fine(here - 1), fine(here), fine(here + 1), here > 0 || (periodic && extent % 2 == 0), here + 1 < extent};
   }
   /// With offset d - 1 along the axis.
@@ -124,11 +125,11 @@ class CoarseCoefficients {
   T* coarse_[3] = {};
 };
 
-/// See kVanishing.
+/// See kVanishing in coarsening.h.
 template <class T>
 void keep_vanishing_diagonals(const StencilFields<T>& a, int axis, StencilFields<T>& coarse) {
   const T* const fine = a.coefficients[StencilFields<T>::kCentre];
-  T* const diagonal = const_cast<T*>(coarse.coefficients[StencilFields<T>::kCentre]);  // in its own memory
+  T* const diagonal = const_cast<T*>(coarse.coefficients[StencilFields<T>::kCentre]);  // of memory that `coarse` owns
   const auto is_alone = [&](int64_t i) {
     for (int k = 0; k < 27; ++k)
       if (k != StencilFields<T>::kCentre && coarse.coefficients[k] && coarse.coefficients[k][i] != T(0)) return false;

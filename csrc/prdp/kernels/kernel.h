@@ -74,8 +74,8 @@ class Kernel {
   /// The spectral radius of I - D⁻¹A, which is symmetric there; nothing if it is not known.
   virtual std::optional<double> radius() const { return std::nullopt; }
 
-  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); y holds the iterate before x, before, and the one after it,
-  /// after. And r = b - A x. Only for a grid_operator().
+  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); On entry y is the iterate before x,
+  /// on return the one after it. And r = b - A x. Only for a grid_operator().
   virtual void smooth(const T* b, const T* x, T* y, T p, T q) const;
   virtual void residual(const T* b, const T* x, T* r) const;
   /// What multigrid makes its coarse grids of; nothing if the operator is not of that kind.

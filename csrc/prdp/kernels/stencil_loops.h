@@ -96,7 +96,7 @@ struct NeighbourRow {
 /// Calls body.finish(i, v, A v, diagonal) for every register i of a field v.
 template <int Dim, bool Differences, class T, class Body>
 void go_along_rows(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& shared) {
-  Body body = shared;  // a copy, which no store can change for all the compiler knows
+  Body body = shared;  // a copy: the compiler can prove that no store changes it
   for (int64_t line = lines.begin; line < lines.end; ++line) {
     NeighbourRow<Dim, T, Differences> u(a, line / a.ny, line % a.ny, v);
     for (int64_t i = 0, at = line * a.row; i < a.row; i += kWidth<T>) {

@@ -139,7 +139,8 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
                       index->sym_sizes(), " and ", values_.sym_sizes());
   check_has_rows(crow.sym_size(-1) - 1);
   const auto for_values = [&](const at::Tensor& index) {
-    const auto whole = index.scalar_type() == at::kLong ? index : index.to(at::kLong);
+    // Each operation takes its time on a GPU; within a transform this one makes of the index what the values are.
+    const auto whole = index.scalar_type() == at::kLong && !in_torch_func() ? index : index.to(at::kLong);
     return batched && whole.dim() == 1 ? whole.expand_symint({values_.sym_size(0), -1}) : whole;
   };
   crow_ = for_values(crow);

@@ -49,8 +49,8 @@ PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states,
   }
 }
 
-/// Iteration `done` + 1, to be differentiated, as run() took it: where a method's own residual had claimed convergence
-/// in vain, it goes on from the true one, which `confirm()` recomputes.
+/// Iteration `done` + 1, to be differentiated, as run() took it: where a recursively updated residual had met the
+/// tolerance and the true one had not, it goes on from the true one, which `confirm()` recomputes.
 template <class Method, class Confirm>
 void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& confirm) {
   if constexpr (kHasRecursiveResidual<Method>)
@@ -86,8 +86,8 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
   }
 }
 
-/// Where a method that solves in one iteration leaves a u so large that its rounding, ε ‖A‖ ‖u‖, is of the order of b,
-/// A is singular to the dtype: zero takes its place. A small residual says that it is not.
+/// For direct methods: zero replaces u where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖ and the residual exceeds
+/// 1e-2 ‖b‖, as A is singular to the dtype there.
 template <class Space, class Method>
 void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };

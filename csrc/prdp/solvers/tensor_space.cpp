@@ -179,7 +179,8 @@ TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scala
   }
   // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
-  const auto bound = rounding_of(v2, w2).nan_to_num(0.0, 0.0, 0.0);  // of a long direction of M⁻¹, zero alone breaks
+  const auto bound = rounding_of(v2, w2).nan_to_num(
+      0.0, 0.0, 0.0);  // v2 may overflow for a long direction of M⁻¹; then only den = 0 is a breakdown
   const auto breaks = den.detach().abs().le(bound).logical_and(nothing_left.logical_not());
   note_broken(breaks);
   const auto none = nothing_left.logical_or(breaks);
@@ -209,6 +210,8 @@ TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) c
 
 void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale,
                        const Scalar& keep, Scalar* y) const {
+  // argmin ‖[R; ε s I] y - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it: the factorisation stays
+  // regular.
   const auto wanted = keep.detach().eq(0);
   if (!wanted.any().item<bool>()) return;
   const int64_t batch = b_.size(0);

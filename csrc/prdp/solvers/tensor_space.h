@@ -28,8 +28,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
 
   // ---- the system
 
-  /// What a solve computes with: A, and the inverse of the preconditioner unless it is the diagonal. Both are scaled by
-  /// a power of two for each sample, which their first product gives: so no product of theirs over- or underflows.
+  /// A and the preconditioner (undefined `inverse`: the diagonal). The first product with each sets a power of two per
+  /// sample that keeps later products in range.
   struct System {
     const Operator& a;
     const Preconditioner& preconditioner;
@@ -41,8 +41,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   TensorSpace(System& system, at::Tensor b, States& states, bool recording = false);
   /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
   void start_from(at::Tensor x, at::Tensor r);
-  /// On another device, where each operation of torch is a launch.
-  bool is_far() const { return !b_.is_cpu() && !recording_; }
+  /// Not on the CPU, and not recording: each operation of torch is a launch.
+  bool is_on_device() const { return !b_.is_cpu() && !recording_; }
   /// Squared norms below this are zero to the dtype.
   double negligible() const { return negligible_; }
 
@@ -186,16 +186,18 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   /// Sets the scale that brings the product to the order of v, if it is not known yet.
   void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
   void check_scale(const at::Tensor& scale) const;
-  /// As batch_loops take it.
+  /// Contiguous, which batch_loops require.
   Vector laid_out(const Vector& v) const { return in_loops_ ? v.contiguous() : v; }
 
   // ---- the diagonal
-  /// D; 1 in place of its zeros, whose samples are refused: no NaN comes from behind their mask.
+  /// D. Zeros are replaced by 1: those samples are refused, and a division by 0 would send NaN through the mask in the
+  /// backward pass.
   const at::Tensor& diagonal();
   Vector jacobi_change(const Vector& c, const Vector& x) { return at::addcdiv(c, product(x), diagonal(), -1); }
   Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) const;
-  /// As a plain nu leaves: an argument of operations on another device, not a tensor beside those there.
-  bool is_number_of_host(const at::Tensor& t) const { return is_far() && t.is_cpu() && t.dim() == 0; }
+  /// A CPU scalar in a solve on another device, such as the diagonal of a plain nu. It is passed as a number: as a
+  /// tensor, torch would refuse or copy it.
+  bool is_number_of_host(const at::Tensor& t) const { return is_on_device() && t.is_cpu() && t.dim() == 0; }
 
   /// What is zero beside the product of two factors, by the squares of their norms.
   at::Tensor rounding_of(const Scalar& v2, const Scalar& w2) const;

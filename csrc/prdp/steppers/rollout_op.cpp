@@ -77,7 +77,7 @@ SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10:
   }));
 }
 
-/// Below autograd.
+/// The kernel of prdp::rollout_solves below autograd.
 template <class... Args>
 SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
   const auto call = unpack_call(std::move(args)...);
@@ -93,7 +93,7 @@ SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
   return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), call.count})});
 }
 
-/// The gradients that are needed.
+/// The reverse of solve_all(): a gradient for each 1 in `needed`, zeros where there is none.
 std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
                                        const SolveOptions& options, at::IntArrayRef needed) {
   const at::NoGradGuard no_grad;
@@ -190,7 +190,7 @@ std::vector<at::Tensor> rollout_vjp_below_autograd(const at::Tensor& cotangent, 
 
 SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
                     const SolveOptions& options) {
-  // The one op has neither forward mode nor transforms; its steps have.
+  // prdp::rollout_solves supports neither forward mode nor torch.func; single steps do.
   if (in_torch_func() || has_tangent(u) || any_tangent(equation.tensors))
     return step_by_step(equation, u, steps.expect_int(), options);
   const int64_t picard = equation.picard_steps;

@@ -22,8 +22,8 @@ class BlockVectors {
   using Scalar = T;
   using TeamOfSample = Team<S::kBlocks, S::kThreads>;
 
-  /// Vectors lie in the memory of the block, as many as fit, and the others in that of the device, `beyond`. Behind
-  /// these it has numbers for damping, and then the coarse grids.
+  /// As many vectors as fit lie in shared memory. `beyond`, in global memory, has the others, then the numbers for
+  /// damping (kDampingAt), then the coarse grids (kCyclesAt).
   BlockVectors(TeamOfSample& team, T* in_block, T* beyond) : team_(team), in_block_(in_block), beyond_(beyond) {}
   static constexpr int64_t kDampingAt = static_cast<int64_t>(S::kVectors - S::kInBlock) * A::kUnknowns;
   static constexpr int64_t kCyclesAt = kDampingAt + numbers_beyond(S::kRestart);
@@ -39,6 +39,7 @@ class BlockVectors {
     load(x, factor, u);
     return largest_magnitude(u);
   }
+  /// Of an array that is no vector of the space; only spaces that pad their vectors tell the two apart.
   T largest_given(const T* x) { return largest_magnitude(x); }
   PRDP_ONCE T largest_magnitude(const T* x) {
     return largest_over_rows([&](int i) { return std::abs(x[i]); });

@@ -29,13 +29,13 @@ struct CycleSetting {
   static constexpr bool kAny = true;
   static constexpr int kDim = dimensions;
   static constexpr int kVectors = vectors;    // of a sample, that the preconditioner keeps
-  static constexpr int kInBlock = in_block;   // numbers of coarse grids in the memory of the block
-  static constexpr int64_t kBeyond = beyond;  // and in that of the device, for those that do not fit
+  static constexpr int kInBlock = in_block;   // numbers of coarse grids in shared memory
+  static constexpr int64_t kBeyond = beyond;  // numbers of coarse grids in global memory: those that do not fit
   template <class S>
   using Of = Cycle<S, typename S::A::Cycled>;
 };
 
-/// A: of views.h, what the hierarchy was made of.
+/// S: the constants of the kernel (setting.h). A: the operator on the finest grid (views.h).
 template <class S, class A>
 struct Cycle {
   using T = typename S::T;
@@ -47,7 +47,7 @@ struct Cycle {
 
   bool exists() const { return grids().count > 0; }
 
-  /// z = M⁻¹ r; x, y and spare are memory.
+  /// z = M⁻¹ r; x, y and spare are scratch.
   PRDP_ONCE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* spare) const {
     Walk walk{*this, team, a, r, {nullptr, x, y}, spare};
     const int coarsest = static_cast<int>(grids().count) - 1;
@@ -152,7 +152,7 @@ struct Cycle {
     /// Adds the solution of the coarser grid to that of this one, smooths, and returns it.
     PRDP_ONCE const T* go_up(int level, const T* coarse) {
       vectors = level == 0 ? finest : vectors_of(level);
-      // Each smoothing step but the first swapped them when the walk came down.
+      // On the way down smooth() swapped x and y once for each step but the first.
       if (level > 0 && cycle.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
       const CoarseGrid& here = grid(level);
       for (int axis = 2; axis >= 0; --axis) {
@@ -168,7 +168,7 @@ struct Cycle {
 
     // ---- on a grid
 
-    /// x = M b, or from x on; y is memory.
+    /// x = M b with `from_zero`; else it continues from x. y is scratch.
     PRDP_ONCE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
       for (int64_t s = 0; s < cycle.hierarchy.smoothing; ++s) {

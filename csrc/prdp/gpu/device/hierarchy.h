@@ -91,7 +91,7 @@ class HierarchyMaker {
     return made;
   }
 
-  /// To the last bit. Others' coefficients are there, as a radius has been found since they were written.
+  /// To the last bit. It needs no barrier first: radius_of() has met since the coefficients were written.
   PRDP_ONCE bool is_symmetric(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
@@ -115,7 +115,7 @@ class HierarchyMaker {
     }));
   }
 
-  /// By a sample of the points.
+  /// Estimated from some 4,096 of the points.
   PRDP_ONCE kernels::Axes axes_to_coarsen(const Stencil& a) {
     const int n = a.points(), step = (n / 4096 > 1 ? n / 4096 : 1) | 1;
     const auto entry = shared(a.coefficients);
