@@ -146,14 +146,14 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 /// Why the residual fell no further, far above what was asked for.
 std::string stagnated(const Solver& solver, const at::Tensor& b) {
   const bool single = b.scalar_type() == at::kFloat;
-  const std::string others = solver.method == Method::kDirect ? "take an iterative method"
-                             : solver.preconditioner.is_multigrid()
-                                 ? "take another preconditioner than multigrid, or Direct"
-                                 : "take another preconditioner or Direct";
   if (traits(solver.method).counts == Counts::kCycles)
     return "its cycles take nothing more off the residual; take a larger restart, " +
            std::string(solver.preconditioner.is_multigrid() ? "no multigrid" : "a preconditioner") + ", or Direct" +
            (single ? ", or float64" : "");
+  const std::string others = solver.method == Method::kDirect ? "take an iterative method"
+                             : solver.preconditioner.is_multigrid()
+                                 ? "take another preconditioner than multigrid, or Direct"
+                                 : "take another preconditioner or Direct";
   return "the residual falls no further in " + std::string(single ? "float32" : "float64") + ", and u may be wrong; " +
          (single ? "solve it in float64 once to see, and if it is, stay there, or " : "") + others +
          ", or scale A and b so that their rows are of one size";

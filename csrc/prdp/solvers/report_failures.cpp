@@ -61,8 +61,21 @@ bool is_news(const std::string& what) {
   return said.insert(what).second || c10::WarningUtils::get_warnAlways();
 }
 
-/// A residual above so many tolerances, and above that, is told.
-constexpr double kFar = 10.0, kWrong = 0.01;
+/// Warns with what `say` writes, the first time for this `key`.
+template <class Say>
+void warn_once(const std::string& key, const Say& say) {
+  if (!is_news(key)) return;
+  std::ostringstream text;
+  text << of_step();
+  say(text);
+  text << ". This is said once";
+  warning_sink()(text.str());
+}
+
+const char* name_of(const SolveRole& role) { return role.adjoint ? "adjoint solve" : "linear_solve"; }
+
+/// A residual above this is told.
+double far_above(double rtol) { return std::max(10.0 * rtol, 0.01); }
 
 /// Warns of samples whose residual stopped far above what was asked for. That is no failure: the residual may be all
 /// that rounding leaves of a u that is good enough, but nobody else would say that it may not be.
@@ -72,19 +85,17 @@ void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
   // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
   const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
   const auto* residual = residuals.const_data_ptr<double>();
-  const double bound = std::max(kFar * role.solver.rtol, kWrong);
+  const double bound = far_above(role.solver.rtol);
   const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
   const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
   if (!(residual[worst] > bound)) return;
   const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
-  const std::string who = role.adjoint ? "adjoint solve" : "linear_solve";
-  if (!is_news(who + std::string(name(role.solver.method)) + role.a.kind)) return;
-  std::ostringstream text;
-  text << of_step() << who << ": " << many << " of " << b.size(0)
-       << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst << " at relative residual "
-       << residual[worst] << " after " << info.iterations[worst].item<int64_t>() << " iterations, "
-       << diagnosis(role, a, b, SolveStatus::kStagnated, worst) << ". This is said once";
-  warning_sink()(text.str());
+  warn_once(name_of(role) + std::string(name(role.solver.method)) + role.a.kind, [&](std::ostream& text) {
+    text << name_of(role) << ": " << many << " of " << b.size(0)
+         << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst
+         << " at relative residual " << residual[worst] << " after " << info.iterations[worst].item<int64_t>()
+         << " iterations, " << diagnosis(role, a, b, SolveStatus::kStagnated, worst);
+  });
 }
 
 /// Warns where zeros take the place of gradients that a NaN or Inf in the cotangent has spoilt: a loss scaler waits for
@@ -95,14 +106,12 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   int64_t lost = 0;
   for (int64_t i = 0; i < status.size(0); ++i)
     lost += static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteInput;
-  if (lost == 0 || !is_news("cotangents")) return;
-  std::ostringstream text;
-  text << of_step() << "adjoint solve: the cotangent of " << lost << " of " << status.size(0)
-       << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
-          "without "
-          "one, or a small scale that stays, such as GradScaler(init_scale=256.0, growth_interval=10**9). This is said "
-          "once";
-  warning_sink()(text.str());
+  if (lost == 0) return;
+  warn_once("cotangents", [&](std::ostream& text) {
+    text << name_of(role) << ": the cotangent of " << lost << " of " << status.size(0)
+         << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
+            "without one, or a small scale that stays, such as GradScaler(init_scale=256.0, growth_interval=10**9)";
+  });
 }
 
 /// Whether max_iter stopped a sample far from its tolerance whose later iterations were in vain: its answer is the
@@ -110,7 +119,7 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
 bool was_in_vain(const Solver& solver, SolveStatus status, int64_t iterations, double residual) {
   const int64_t max_iter = solver.max_iter.expect_int();
   constexpr int64_t many = 20;
-  if (status != SolveStatus::kMaxIter || !(residual > std::max(kFar * solver.rtol, kWrong))) return false;
+  if (status != SolveStatus::kMaxIter || !(residual > far_above(solver.rtol))) return false;
   return max_iter > 0 && (iterations == 0 || (max_iter >= many && iterations < max_iter / 2));
 }
 
@@ -124,19 +133,17 @@ void warn_of_vain_iterations(const SolveRole& role, const Operator& a, const at:
   for (int64_t i = 0; i < b.size(0); ++i)
     if (was_in_vain(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i])) vain.push_back(i);
   if (vain.empty()) return;
-  const std::string who = role.adjoint ? "adjoint solve" : "linear_solve";
   const char* cycles = role.solver.preconditioner.is_multigrid() ? " with multigrid" : "";
-  if (!is_news("in vain: " + who + std::string(name(role.solver.method)) + cycles + role.a.kind)) return;
-  const int64_t first = vain.front();
-  std::ostringstream text;
-  text << of_step() << who << ": " << vain.size() << " of " << b.size(0)
-       << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
-       << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
-           : role.x0.defined()   ? "its start"
-                                 : "zero")
-       << " at relative residual " << residual[first] << ", as none of the " << role.solver.max_iter
-       << " iterates came nearer, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first) << ". This is said once";
-  warning_sink()(text.str());
+  const std::string key = name_of(role) + std::string(name(role.solver.method)) + cycles + role.a.kind;
+  warn_once("in vain: " + key, [&, first = vain.front()](std::ostream& text) {
+    text << name_of(role) << ": " << vain.size() << " of " << b.size(0)
+         << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
+         << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
+             : role.x0.defined()   ? "its start"
+                                   : "zero")
+         << " at relative residual " << residual[first] << ", as none of the " << role.solver.max_iter
+         << " iterates came nearer, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
+  });
 }
 
 }  // namespace
@@ -176,8 +183,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 
   constexpr size_t named = 4;
   std::ostringstream text;
-  text << (role.adjoint ? "adjoint solve" : "linear_solve") << ": " << failed.size() << " of " << batch
-       << " samples failed";
+  text << name_of(role) << ": " << failed.size() << " of " << batch << " samples failed";
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);

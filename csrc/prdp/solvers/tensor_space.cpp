@@ -179,8 +179,8 @@ TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scala
   }
   // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
-  const auto bound = rounding_of(v2, w2).nan_to_num(
-      0.0, 0.0, 0.0);  // v2 may overflow for a long direction of M⁻¹; then only den = 0 is a breakdown
+  // v2 may overflow for a long direction of M⁻¹; then only den = 0 is a breakdown.
+  const auto bound = rounding_of(v2, w2).nan_to_num(0.0, 0.0, 0.0);
   const auto breaks = den.detach().abs().le(bound).logical_and(nothing_left.logical_not());
   note_broken(breaks);
   const auto none = nothing_left.logical_or(breaks);
