@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, data_parallel
+from prdp_torch.calls import between_graphs
 from prdp_torch.controller_records import PRDPSettings, Record, ToleranceRecord, ToleranceSettings
-from prdp_torch.stepper import between_graphs
 from prdp_torch.types import Number, Refinable, Steppers
 
 if TYPE_CHECKING:

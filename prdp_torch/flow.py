@@ -1,7 +1,6 @@
 """`Flow`: incompressible flow by projection."""
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Unpack
 
@@ -9,33 +8,18 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, flow_walls
+from prdp_torch.calls import forgets_if_it_raises, not_in_graphs
 from prdp_torch.flow_walls import Side, WallVelocity
 from prdp_torch.held_tensors import HoldsTensors
 from prdp_torch.operators.base import full_precision, real_tensor
 from prdp_torch.solvers import CG, Kept, Solver
-from prdp_torch.stepper import P, Stepper, T, between_graphs, forgets_if_it_raises
+from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 
 Boundary: TypeAlias = Literal["periodic", "wall", "open"]
 VECTORS = {"force", "inflow"}
 # What may be set for the next steps.
 TENSORS = {"nu", *VECTORS, *flow_walls.NAMES.values()}
-
-
-def _not_in_graphs(call: Callable[P, T]) -> Callable[P, T]:
-    """What looks at values, so that no graph can hold it: torch.compile calls it between graphs, torch.export is told
-    in words."""
-
-    @functools.wraps(call)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.compiler.is_exporting():
-            raise NotImplementedError(
-                f"{call.__qualname__}: torch.export cannot hold a step of Flow, which looks at values; export the "
-                "network alone, or an ImplicitStep"
-            )
-        return call(*args, **kwargs)
-
-    return between_graphs(checked)
 
 
 class Flow(HoldsTensors, Stepper):
@@ -172,7 +156,7 @@ class Flow(HoldsTensors, Stepper):
         if start != "zero":
             raise ValueError(f"Flow: start must be 'zero': its solves are for changes, got {start!r}")
 
-    @_not_in_graphs
+    @not_in_graphs
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
         u = _field("Flow", "u", u)
@@ -181,7 +165,7 @@ class Flow(HoldsTensors, Stepper):
         self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
-    @_not_in_graphs
+    @not_in_graphs
     @forgets_if_it_raises
     def step_and_pressure(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next state and the `pressure` of the step, by one step. Its gradient takes one adjoint step."""
@@ -192,7 +176,7 @@ class Flow(HoldsTensors, Stepper):
         d = len(self.shape)
         return found[0][:, :d], found[0][:, d:]
 
-    @_not_in_graphs
+    @not_in_graphs
     @forgets_if_it_raises
     def rollout(self, u: Tensor, steps: int) -> Tensor:
         """Repeat the step. Returns all states, u included: (batch, steps + 1, d, *shape).
@@ -209,18 +193,18 @@ class Flow(HoldsTensors, Stepper):
         self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
 
-    @_not_in_graphs
+    @not_in_graphs
     def project(self, u: Tensor) -> Tensor:
         """Return the velocity nearest to u that has the boundary values and no divergence."""
         return self._equation().project(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
-    @_not_in_graphs
+    @not_in_graphs
     def pressure(self, u: Tensor) -> Tensor:
         """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
         unless an axis is open."""
         return self._equation().pressure(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
-    @_not_in_graphs
+    @not_in_graphs
     def divergence(self, u: Tensor) -> Tensor:
         """Return ∇·u of u with the boundary values, (batch, 1, *shape). It is zero in solid cells, and in the last
         cells before an open end, whose high faces take what mass conservation gives."""

@@ -5,13 +5,14 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping
 from operator import is_
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
+from prdp_torch.calls import between_graphs, forgets_if_it_raises
 from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
@@ -31,35 +32,10 @@ from prdp_torch.solvers import (
 )
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Report, Solution, Start
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
 # What may be set on a stepper at any time: as properties, and as plain attributes.
 PROPERTIES = ("max_iter", "rtol", "adjoint_rtol", "start")
 PLAIN = ("restart", "preconditioner", "backward", "adjoint_max_iter", "on_failure", "checkpoint_every")
 SETTINGS = (*PROPERTIES, *PLAIN)
-
-
-def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
-    """A step that raises has no report, and leaves none of an earlier one. Until then, other threads read theirs."""
-
-    @functools.wraps(step)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.compiler.is_compiling():
-            return step(*args, **kwargs)
-        try:
-            return step(*args, **kwargs)
-        except BaseException:
-            vars(args[0])["info"] = None
-            raise
-
-    return call
-
-
-def between_graphs(call: Callable[P, T]) -> Callable[P, T]:
-    """What torch.compile calls as it is, with a break of the graph; with fullgraph=True the reason is said."""
-    reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced: compile without fullgraph=True"
-    return cast(Callable[P, T], torch.compiler.disable(call, reason=reason))
 
 
 class Stepper(torch_private.HearsOfMoves):
