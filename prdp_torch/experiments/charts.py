@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import matplotlib
 import numpy as np
@@ -17,9 +17,7 @@ from numpy.typing import ArrayLike
 from PIL import Image
 
 from prdp_torch.experiments import _C
-
-if TYPE_CHECKING:
-    from prdp_torch.experiments.compare import Entry, Row
+from prdp_torch.experiments.compare import Entry, Row, verdict
 
 Colour: TypeAlias = str | tuple[float, float, float, float]
 Limits: TypeAlias = tuple[float, float]
@@ -136,8 +134,8 @@ def total_iterations(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> Fi
     figure, (axes,) = make_figure(height=1.6 + 0.55 * len(chosen))
     base = max(1.0, chosen[0]["budget"])
     spent = np.array([entry["budget"] / base for entry in chosen])
-    verdicts = ["" if e["as_good"] and not e["warning"] else "warns" if e["as_good"] else "fails" for e in chosen]
-    saved = np.array([max(0.0, 1 - s) if not verdict else 0.0 for s, verdict in zip(spent, verdicts, strict=True)])
+    verdicts = [verdict(entry) for entry in chosen]
+    saved = np.array([0.0 if why else max(0.0, 1 - share) for share, why in zip(spent, verdicts, strict=True)])
     ic = np.minimum([entry["saved_by_incomplete_convergence"] for entry in chosen], saved)
     left = np.zeros(len(chosen))
     rows_down = np.arange(len(chosen))[::-1]
@@ -152,8 +150,8 @@ def total_iterations(scene: _C.Scene, rows: list[Row], table: list[Entry]) -> Fi
         texts = [f"{100 * share:.0f} %" if share > 0.045 else "" for share in shares]
         axes.bar_label(bars, texts, label_type="center", color="white" if name == "spent" else "black")
         left += shares
-    for down, share, verdict in zip(rows_down, spent, verdicts, strict=True):
-        axes.text(100 * share + 1, down, verdict, va="center")
+    for down, share, why in zip(rows_down, spent, verdicts, strict=True):
+        axes.text(100 * share + 1, down, why, va="center")
     axes.set_yticks(rows_down, [entry["title"] for entry in chosen])
     until = "" if scene.compare.target is None else f" until the error is {scene.compare.target:g}"
     axes.set_xlabel(f"% of the converged training's {base:,.0f} iterations{until}")

@@ -305,6 +305,13 @@ def _entry(scene: _C.Scene, row: Row, target: float | None) -> Entry:
     }
 
 
+def verdict(entry: Entry) -> str:
+    """Why a row saves nothing: it "fails", or its controller "warns"; else empty."""
+    if not entry["as_good"]:
+        return "fails"
+    return "warns" if entry["warning"] else ""
+
+
 def _as_good(entry: Entry, base: Entry) -> bool:
     """Whether a row ends as well as the converged one: at its target where both have one to reach, else
     within its spread. A tenth of the error counts as its spread where seeds show less."""

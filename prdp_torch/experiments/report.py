@@ -10,7 +10,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from prdp_torch.experiments import _C, charts, records, trajectory_charts
-from prdp_torch.experiments.compare import Entry, Row
+from prdp_torch.experiments.compare import Entry, Row, verdict
 from prdp_torch.experiments.trajectories import Trajectories
 
 
@@ -84,9 +84,7 @@ def cells(scene: _C.Scene, entry: Entry) -> list[str]:
 
 
 def _saving(entry: Entry, name: str) -> str:
-    if not entry["as_good"]:
-        return "fails"
-    return "warns" if entry["warning"] else f"{100 * entry[name]:.1f} %"
+    return verdict(entry) or f"{100 * entry[name]:.1f} %"
 
 
 def in_terminal(scene: _C.Scene) -> list[int]:

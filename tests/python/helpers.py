@@ -56,6 +56,10 @@ def as_toml(content):
     return "\n".join(lines) + "\n"
 
 
+def heat_step(max_iter=1, **options):
+    return prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(max_iter), **options)
+
+
 def statuses(info):
     return [prdp.SolveStatus(int(s)).name for s in info.status]
 

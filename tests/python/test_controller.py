@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from helpers import field, golden
+from helpers import field, golden, heat_step
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -214,10 +214,6 @@ def test_k_stops_at_the_largest_number():
 # ---- a tolerance tied to the error
 
 
-def heat_step(max_iter=1, **options):
-    return prdp.Heat((30,), 1e-3, 1.0, solver=prdp.Jacobi(max_iter), **options)
-
-
 @given(st.lists(st.floats(0, 10), max_size=30))
 def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(errors):
     heat = heat_step()
@@ -352,54 +348,3 @@ def test_without_a_ratio_the_steppers_own_adjoint_budget_stays():
     assert (heat.max_iter, heat.adjoint_max_iter) == (7, 4)
     with pytest.raises(ValueError, match="PRDPController: adjoint_ratio must be > 0 and <= 1, got 2"):
         prdp.PRDPController(adjoint_ratio=2)
-
-
-def test_a_controller_warns_while_the_residual_makes_up_the_error():
-    """K = 3 leaves a residual of about a fifth."""
-    heat = heat_step()
-    controller = prdp.LinearSchedule([heat], initial=3, increment=0, maximum=3)
-    heat(field((30,)))
-    residual = float(heat.info.residual.mean())
-    controller.step(error=0.3)
-    assert f"the solves stop at a residual of {residual:.1e} (K = 3), too far off" in controller.warning
-    heat.max_iter = 25
-    heat(field((30,)))
-    controller.step(error=0.3)
-    assert controller.warning is None
-
-
-def test_a_tolerance_that_was_asked_for_is_no_warning():
-    """Before its first step the controller asks for rtol = .1, whatever the error then is."""
-    heat = heat_step()
-    controller = prdp.ToleranceController([heat])
-    heat(field((30,)))
-    assert 1e-2 < heat.info.residual.mean() <= 0.1
-    controller.step(0.01)
-    assert controller.warning is None
-    controller.step(0.01)  # the solves still have the residual of then
-    assert "the solves stop at a residual of" in controller.warning
-
-
-def test_solves_that_take_no_iteration_are_told():
-    heat = prdp.Heat((30,), nu=1e-4, dt=1.0, solver=prdp.CG(100))
-    u = torch.randn(4, 1, 30, generator=torch.Generator().manual_seed(0)).cumsum(-1)
-    controller = prdp.ToleranceController([heat])
-    for start, told in (("state", True), ("zero", False)):
-        heat.start = start
-        heat(u)
-        controller.step(0.9)
-        assert (int(heat.info.iterations.max()) == 0) == told
-        assert ("took no iteration" in (controller.warning or "")) == told
-
-
-def test_without_an_error_prdp_warns_of_a_stalled_metric():
-    heat = heat_step()
-    controller = prdp.PRDPController([heat], delta=2, window=1)
-    heat(field((30,)))
-    for metric in (80.0, 40.0, 20.0):
-        controller.step(metric)
-    assert controller.warning is None  # it still falls
-    for _ in range(3):
-        controller.step(20.0)
-    assert "PRDPController: the solves stop at a residual of" in controller.warning
-    assert "the metric no longer falls" in controller.warning
