@@ -114,6 +114,56 @@ def test_headers_may_lie_in_a_folder_that_is_named(tmp_path):
     assert re.search(r"^eigen_INCLUDE_DIR:PATH=/", found, re.MULTILINE)  # there, or beside torch
 
 
+FINDS = 'read -r line; for header in {}; do [ "$line" = "#include <$header>" ] && exit; done; exit 1'
+
+
+def system_packages(folder, compiler, *wanted, refuses=False, **environment):
+    """What cmake/system-packages.sh does with this compiler: its status, messages and calls of apt-get."""
+    folder.mkdir()
+    calls = folder / "calls"
+    calls.touch()
+    commands = {"c++": compiler, "id": "echo 0", "apt-get": f'echo "$@" >> {calls}; exit {int(refuses)}'}
+    for name, body in commands.items():
+        command = folder / name
+        command.write_text(f"#!/bin/sh\n{body}\n")
+        command.chmod(0o755)
+    script = [ROOT / "cmake" / "system-packages.sh", *wanted]
+    alone = {"PATH": f"{folder}:/usr/bin:/bin", **environment}
+    done = subprocess.run(script, env=alone, capture_output=True, text=True)
+    return done.returncode, done.stderr, calls.read_text()
+
+
+def test_headers_that_the_compiler_does_not_find_are_installed(tmp_path):
+    all_but_one = "gtest/gtest.h toml++/toml.h nlohmann/json.hpp"
+    assert system_packages(tmp_path / "all", FINDS.format(f"{all_but_one} CLI/CLI.hpp")) == (0, "", "")
+    status, said, calls = system_packages(tmp_path / "none", FINDS.format("vector"))
+    assert (status, said) == (0, "")
+    packages = "libgtest-dev libtomlplusplus-dev nlohmann-json3-dev libcli11-dev"
+    assert calls.splitlines() == ["update -qq", f"install -y --no-install-recommends -qq {packages}"]
+    assert system_packages(tmp_path / "one", FINDS.format(all_but_one))[2].endswith("-qq libcli11-dev\n")
+    named = system_packages(tmp_path / "named", FINDS.format("toml++/toml.h"), "toml++/toml.h", "nlohmann/json.hpp")
+    assert named[2].endswith("-qq nlohmann-json3-dev\n")
+
+
+def test_headers_that_cannot_be_installed_are_named_in_one_sentence(tmp_path):
+    status, said, _ = system_packages(tmp_path / "offline", FINDS.format("gtest/gtest.h CLI/CLI.hpp"), refuses=True)
+    assert status == 1 and said.count("\n") == 1
+    assert "cannot be installed from here: libtomlplusplus-dev nlohmann-json3-dev; install them" in said
+    status, said, calls = system_packages(tmp_path / "no_compiler", "", CXX="nobodys-c++")
+    assert (status, calls) == (1, "") and "there is no C++ compiler nobodys-c++" in said
+
+
+def test_headers_in_a_folder_that_is_named_are_not_installed(tmp_path):
+    """As in `make cuda HEADERS=`, by a compiler that looks nowhere else."""
+    header = tmp_path / "headers" / "gtest" / "gtest.h"
+    header.parent.mkdir(parents=True)
+    header.touch()
+    compiler = 'exec /usr/bin/c++ -nostdinc "$@"'
+    there = system_packages(tmp_path / "there", compiler, "gtest/gtest.h", HEADERS=str(tmp_path / "headers"))
+    assert there == (0, "", "")
+    assert system_packages(tmp_path / "not_there", compiler, "gtest/gtest.h")[2].endswith("libgtest-dev\n")
+
+
 def cuda_packages(folder, python):
     """What `make cuda` installs into an environment beside this Python's packages, without a network."""
     command = [ROOT / "cmake" / "cuda-packages.sh", python, folder]
