@@ -75,16 +75,14 @@ SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
   return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
 }
 
-/// Whether all tensors of a call are plain.
-bool is_plain_call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
-  return is_plain(b) && all_plain(a.tensors) && all_plain(o.solver.preconditioner.spec().tensors) &&
-         (!x0.defined() || is_plain(x0));
+bool is_plain_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
+  return is_plain_call(b, a.tensors, o) && (!x0.defined() || is_plain(x0));
 }
 
 /// The op below autograd.
 SolveOutputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
-  if (!is_plain_call(b, a, o, x0)) return call_op(b, a, o, x0);
+  if (!is_plain_solve(b, a, o, x0)) return call_op(b, a, o, x0);
   return outputs_of(linear_solve_kernel(a, b, o, x0));
 }
 
@@ -115,7 +113,7 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
 
 /// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
 SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
-  if (!no_mode_but_a_profiler_is_on() || !is_plain_call(b, a, options, x0)) return call_op(b, a, options, x0);
+  if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
   RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
   return solve_and_record(b, a, options, x0);
 }

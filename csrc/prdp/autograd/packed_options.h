@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/solvers/solve.h"
 
 /// SolveOptions and results as they cross torch's dispatcher: the options packed into four lists at the end of an op's
@@ -136,6 +137,11 @@ inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArray
 /// A tensor that may be undefined, as an op takes it.
 using OptionalTensor = std::optional<at::Tensor>;
 inline OptionalTensor or_none(const at::Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; }
+
+/// Whether all tensors of a call are plain, so that it need not cross the dispatcher.
+inline bool is_plain_call(const at::Tensor& v, at::TensorList tensors, const SolveOptions& o) {
+  return is_plain(v) && all_plain(tensors) && all_plain(o.solver.preconditioner.spec().tensors);
+}
 
 /// Calls an op through the dispatcher with `o` behind its other arguments.
 template <class Op, class... Front>

@@ -6,9 +6,9 @@
 #include <algorithm>
 
 #include "prdp/autograd/detach_failed.h"
-#include "prdp/autograd/packed_options.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
+#include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/stepper.h"
 
 namespace prdp {
@@ -54,19 +54,23 @@ at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& b
   return transposed ? transposed(equation, bar) : bar;
 }
 
+SolveInfo joined(const SolveInfo& before, const SolveInfo& last) {
+  const auto worst = at::minimum(before.status, last.status);  // the least is the worst
+  return {before.iterations + last.iterations, last.residual, worst,
+          before.operator_applications + last.operator_applications, floor_of(last.floor, worst)};
+}
+
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
   check_memory(options, u);
   const auto b = equation_rhs(equation, u);
-  auto result = linear_solve(equation_operator(equation, u), b, options, start_of_step(options, u));
+  const auto solve_about = [&](const at::Tensor& winds) {
+    return linear_solve(equation_operator(equation, winds), b, options, start_of_step(options, winds));
+  };
+  auto result = solve_about(u);
   for (int64_t k = 1; k < equation.picard_steps; ++k) {
-    const auto last = std::move(result.info);
-    const auto winds = result.u;
-    result = linear_solve(equation_operator(equation, winds), b, options, start_of_step(options, winds));
-    auto& info = result.info;
-    info.iterations = info.iterations + last.iterations;
-    info.operator_applications = info.operator_applications + last.operator_applications;
-    info.status = at::minimum(info.status, last.status);  // the least is the worst
-    info.floor = floor_of(info.floor, info.status);
+    const auto before = std::move(result.info);
+    result = solve_about(result.u);
+    result.info = joined(before, result.info);
   }
   if (equation.picard_steps > 1 && options.on_failure == OnFailure::kZeroGrad)
     result.u = detach_failed(result.u, result.info.status);  // whichever of its solves failed
@@ -75,43 +79,39 @@ SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptio
 
 namespace {
 
-template <class... Options>
-SolveOutputs step_kernel(const at::Tensor& u, at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                         at::ArrayRef<double> parameters, int64_t picard_steps, Options... packed) {
-  const Equation equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
-  return outputs_of(step(equation, u, unpack(packed...)));
+template <class... Args>
+SolveOutputs step_kernel(const at::Tensor& u, Args... args) {
+  const auto kernel = [&](const Equation& equation, const auto&... packed) {
+    return outputs_of(step(equation, u, unpack(packed...)));
+  };
+  return with_equation(kernel, args...);
 }
-using StepSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                               at::ArrayRef<double>, int64_t)>;
+using StepSignature = WithOptions<WithEquation<SolveOutputs(const at::Tensor&)>>;
 
 at::Tensor rhs_op(const at::Tensor& u, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters) {
   return equation_rhs({std::string(kind), shape.vec(), parameters.vec(), {}}, u);
 }
 
-void check_equation_op(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                       at::ArrayRef<double> parameters, int64_t picard_steps) {
-  Equation{std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps}.check();
+template <class... Args>
+void check_equation_op(Args... args) {
+  with_equation([](const Equation& equation) { equation.check(); }, args...);
 }
+using CheckSignature = WithEquation<void()>;
 
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
-  m.def(
-      "step(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
-      "picard_steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor u_next, " PRDP_REPORT_SCHEMA ")",
-      static_cast<StepSignature*>(step_kernel));
+  m.def("step(Tensor u, " PRDP_EQUATION_SCHEMA ", " PRDP_OPTIONS_SCHEMA ") -> (Tensor u_next, " PRDP_REPORT_SCHEMA ")",
+        static_cast<StepSignature*>(step_kernel));
   m.def("rhs(Tensor u, str kind, int[] shape, float[] parameters) -> Tensor", rhs_op);
-  m.def(
-      "check_equation(Tensor[] tensors, str kind, int[] shape, float[] parameters, "
-      "int picard_steps) -> ()",
-      check_equation_op);
+  m.def("check_equation(" PRDP_EQUATION_SCHEMA ") -> ()", static_cast<CheckSignature*>(check_equation_op));
 }
 
 // torch.func.vmap goes through what they are made of.
 TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
   m.impl("step", static_cast<StepSignature*>(step_kernel));
   m.impl("rhs", rhs_op);
-  m.impl("check_equation", check_equation_op);
+  m.impl("check_equation", static_cast<CheckSignature*>(check_equation_op));
 }
 
 }  // namespace prdp

@@ -24,8 +24,11 @@ at::Tensor equation_rhs(const Equation& equation, const at::Tensor& u);
 /// The cotangent of u from that of b. b is linear in u, and this is its transpose.
 at::Tensor equation_rhs_transposed(const Equation& equation, const at::Tensor& bar);
 
+/// The report of two solves of a step, one behind the other: all iterations, the worst status, the last residual.
+SolveInfo joined(const SolveInfo& before, const SolveInfo& last);
+
 /// One step u → u_next, both (batch, channel, *shape). Also the torch op prdp::step. With Start::kState, later Picard
-/// steps start from the last solution. The info has all their iterations, the worst status and the last residual.
+/// steps start from the last solution. Their reports are joined().
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options);
 
 }  // namespace prdp

@@ -4,9 +4,9 @@
 #include <limits>
 
 #include "prdp/operators/kinds.h"
-#include "prdp/operators/plain_tensors.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/memory_check.h"
+#include "prdp/steppers/packed_equation.h"
 #include "prdp/steppers/rollout.h"
 #include "prdp/steppers/rollout_node.h"
 #include "prdp/steppers/stepper.h"
@@ -17,41 +17,23 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSolvesSchema =
-    "rollout_solves(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-    "SymInt solves, " PRDP_OPTIONS_SCHEMA ") -> (Tensor solutions, " PRDP_REPORT_SCHEMA ")";
+    "rollout_solves(Tensor u, " PRDP_EQUATION_SCHEMA ", SymInt solves, " PRDP_OPTIONS_SCHEMA
+    ") -> (Tensor solutions, " PRDP_REPORT_SCHEMA ")";
 constexpr const char* kVjpSchema =
-    "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, "
-    "Tensor? residual, int[] needed, Tensor[] tensors, str kind, int[] shape, float[] parameters, int "
-    "picard_steps, " PRDP_OPTIONS_SCHEMA ") -> Tensor[]";
+    "rollout_vjp(Tensor cotangent, Tensor? solutions, Tensor? iterations, Tensor? status, Tensor? residual, "
+    "int[] needed, " PRDP_EQUATION_SCHEMA ", " PRDP_OPTIONS_SCHEMA ") -> Tensor[]";
+constexpr const char* kRolloutSchema = "rollout(Tensor u, " PRDP_EQUATION_SCHEMA ", SymInt steps, " PRDP_OPTIONS_SCHEMA
+                                       ") -> (Tensor states, " PRDP_REPORT_SCHEMA ")";
 
-using SolvesSignature = WithOptions<SolveOutputs(const at::Tensor&, at::TensorList, c10::string_view, at::IntArrayRef,
-                                                 at::ArrayRef<double>, int64_t, c10::SymInt)>;
-using VjpSignature = WithOptions<std::vector<at::Tensor>(
-    const at::Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-    at::IntArrayRef, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t)>;
+using SolvesSignature = WithOptions<WithEquation<SolveOutputs(const at::Tensor&), c10::SymInt>>;  // of rollout, too
+using VjpSignature =
+    WithOptions<WithEquation<std::vector<at::Tensor>(const at::Tensor&, const OptionalTensor&, const OptionalTensor&,
+                                                     const OptionalTensor&, const OptionalTensor&, at::IntArrayRef)>>;
 
 SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& o) {
   static const auto op =
       c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_solves", "").typed<SolvesSignature>();
   return call_with_options(op, o, u, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps, solves);
-}
-
-/// The arguments of an op but u.
-struct Call {
-  Equation equation;
-  c10::SymInt count;  // of solves; of steps in the op rollout
-  SolveOptions options;
-};
-
-Equation equation_of(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape,
-                     at::ArrayRef<double> parameters, int64_t picard_steps) {
-  return {std::string(kind), shape.vec(), parameters.vec(), tensors.vec(), picard_steps};
-}
-
-template <class... Options>
-Call unpack_call(at::TensorList tensors, c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-                 int64_t picard_steps, c10::SymInt count, const Options&... packed) {
-  return {equation_of(tensors, kind, shape, parameters, picard_steps), std::move(count), unpack(packed...)};
 }
 
 void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
@@ -77,20 +59,12 @@ SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10:
   }));
 }
 
-/// The kernel of prdp::rollout_solves below autograd.
-template <class... Args>
-SolveOutputs solves_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);
-  return solve_all(call.equation, u, call.count, call.options);
-}
-
-template <class... Args>
-SolveOutputs fake_solves(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);
-  check(call.equation, u, call.count, call.options);
+SolveOutputs fake_solves(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+                         const SolveOptions& options) {
+  check(equation, u, solves, options);
   auto sizes = u.sym_sizes().vec();
-  sizes.insert(sizes.begin() + 1, call.count + 1);
-  return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), call.count})});
+  sizes.insert(sizes.begin() + 1, solves + 1);
+  return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), solves})});
 }
 
 /// The reverse of solve_all(): a gradient for each 1 in `needed`, zeros where there is none.
@@ -108,31 +82,34 @@ std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSo
   return gradients;
 }
 
-template <class... Options>
+template <class... Args>
 std::vector<at::Tensor> vjp_kernel(const at::Tensor& cotangent, const OptionalTensor& solutions,
                                    const OptionalTensor& iterations, const OptionalTensor& status,
-                                   const OptionalTensor& residual, at::IntArrayRef needed, at::TensorList tensors,
-                                   c10::string_view kind, at::IntArrayRef shape, at::ArrayRef<double> parameters,
-                                   int64_t picard_steps, Options... packed) {
-  const auto equation = equation_of(tensors, kind, shape, parameters, picard_steps);
-  equation.check_picard_steps();
+                                   const OptionalTensor& residual, at::IntArrayRef needed, Args... args) {
   const KeptSolves kept{solutions.value_or(at::Tensor()), iterations.value_or(at::Tensor()),
                         status.value_or(at::Tensor()), residual.value_or(at::Tensor())};
-  return solve_all_back(cotangent, kept, equation, unpack(packed...), needed);
+  const auto kernel = [&](const Equation& equation, const auto&... packed) {
+    equation.check_picard_steps();
+    return solve_all_back(cotangent, kept, equation, unpack(packed...), needed);
+  };
+  return with_equation(kernel, args...);
 }
 
-template <class... Options>
+template <class... Args>
 std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
-                                 const OptionalTensor&, const OptionalTensor&, at::IntArrayRef needed,
-                                 at::TensorList tensors, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
-                                 int64_t, Options...) {
-  std::vector<at::Tensor> gradients;
-  auto sizes = cotangent.sym_sizes().vec();
-  sizes.erase(sizes.begin() + 1);
-  if (needed[0]) gradients.push_back(at::empty_symint(sizes, cotangent.options()));
-  for (size_t i = 0; i < tensors.size(); ++i)
-    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
-  return gradients;
+                                 const OptionalTensor&, const OptionalTensor&, at::IntArrayRef needed, Args... args) {
+  const auto kernel = [&](const Equation& equation, const auto&...) {
+    std::vector<at::Tensor> gradients;
+    auto sizes = cotangent.sym_sizes().vec();
+    sizes.erase(sizes.begin() + 1);
+    if (needed[0]) gradients.push_back(at::empty_symint(sizes, cotangent.options()));
+    for (size_t i = 0; i < equation.tensors.size(); ++i) {
+      const auto& t = equation.tensors[i];
+      if (needed[i + 1]) gradients.push_back(at::empty_symint(t.sym_sizes(), t.options()));
+    }
+    return gradients;
+  };
+  return with_equation(kernel, args...);
 }
 
 std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& e,
@@ -142,17 +119,6 @@ std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const Kept
                            or_none(kept.residual), needed, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps);
 }
 
-/// Whether all tensors of a call are plain.
-bool is_plain_call(const Equation& e, const at::Tensor& v, const SolveOptions& o) {
-  return is_plain(v) && all_plain(e.tensors) && all_plain(o.solver.preconditioner.spec().tensors);
-}
-
-template <class... Args>
-SolveOutputs autograd_solves(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);
-  return record_rollout(call.equation, u, call.count, call.options);
-}
-
 /// A rollout as single steps, each of which has all derivatives.
 SolveResult step_by_step(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
   check(equation, u, steps * equation.picard_steps, options);
@@ -160,19 +126,30 @@ SolveResult step_by_step(const Equation& equation, const at::Tensor& u, int64_t 
   return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) { return step(equation, state, options); });
 }
 
-/// The reports of the steps out of those of their solves: the worst status, the last residual.
+/// The reports of the steps out of those of their solves.
 SolveInfo reports_of_steps(const SolveInfo& solves, const c10::SymInt& steps, int64_t picard) {
-  const auto by_step = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}); };
-  const auto last = [&](const at::Tensor& t) { return by_step(t).select(-1, picard - 1); };
-  const auto worst = by_step(solves.status).amin(-1);  // the least
-  return {by_step(solves.iterations).sum(-1), last(solves.residual), worst,
-          by_step(solves.operator_applications).sum(-1), floor_of(last(solves.floor), worst)};
+  const auto of_solve = [&](int64_t k) {
+    const auto part = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}).select(-1, k); };
+    return SolveInfo{part(solves.iterations), part(solves.residual), part(solves.status),
+                     part(solves.operator_applications), part(solves.floor)};
+  };
+  auto all = of_solve(0);
+  for (int64_t k = 1; k < picard; ++k) all = joined(all, of_solve(k));
+  return all;
 }
 
-template <class... Args>
-SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
-  const auto call = unpack_call(std::move(args)...);
-  return outputs_of(rollout(call.equation, u, call.count, call.options));
+SolveOutputs outputs_of_rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
+                                const SolveOptions& options) {
+  return outputs_of(rollout(equation, u, steps, options));
+}
+
+/// An op that calls `run`, whose arguments are those of rollout().
+template <auto run, class... Args>
+SolveOutputs op(const at::Tensor& u, Args... args) {
+  const auto kernel = [&](const Equation& equation, const c10::SymInt& count, const auto&... packed) {
+    return run(equation, u, count, unpack(packed...));
+  };
+  return with_equation(kernel, args...);
 }
 
 }  // namespace
@@ -180,12 +157,12 @@ SolveOutputs rollout_kernel(const at::Tensor& u, Args... args) {
 SolveOutputs rollout_below_autograd(const Equation& e, const at::Tensor& u, const c10::SymInt& solves,
                                     const SolveOptions& o) {
   const at::AutoDispatchBelowADInplaceOrView below;
-  return is_plain_call(e, u, o) ? solve_all(e, u, solves, o) : call_solves(e, u, solves, o);
+  return is_plain_call(u, e.tensors, o) ? solve_all(e, u, solves, o) : call_solves(e, u, solves, o);
 }
 
 std::vector<at::Tensor> rollout_vjp_below_autograd(const at::Tensor& cotangent, const KeptSolves& kept,
                                                    const Equation& e, const SolveOptions& o, at::IntArrayRef needed) {
-  return (is_plain_call(e, cotangent, o) ? solve_all_back : call_solves_back)(cotangent, kept, e, o, needed);
+  return (is_plain_call(cotangent, e.tensors, o) ? solve_all_back : call_solves_back)(cotangent, kept, e, o, needed);
 }
 
 SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
@@ -197,7 +174,7 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
   TORCH_CHECK_VALUE(
       steps.is_symbolic() || picard < 1 || steps.expect_int() <= std::numeric_limits<int64_t>::max() / picard,
       "rollout: steps times picard_steps must be below 2^63, got ", steps, " times ", picard);
-  const auto solve = no_mode_is_on() && is_plain_call(equation, u, options) ? record_rollout : call_solves;
+  const auto solve = no_mode_is_on() && is_plain_call(u, equation.tensors, options) ? record_rollout : call_solves;
   auto [solutions, info] = result_of(solve(equation, u, steps * picard, options));
   if (options.backward == Backward::kNone) solutions = from_state(u, solutions);
   if (picard == 1) return {solutions, info};
@@ -207,23 +184,20 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kSolvesSchema, {at::Tag::pt2_compliant_tag});
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
-  m.def(
-      "rollout(Tensor u, Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps, "
-      "SymInt steps, " PRDP_OPTIONS_SCHEMA ") -> (Tensor states, " PRDP_REPORT_SCHEMA ")",
-      static_cast<SolvesSignature*>(rollout_kernel));
+  m.def(kRolloutSchema, static_cast<SolvesSignature*>(op<outputs_of_rollout>));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
-  m.impl("rollout_solves", static_cast<SolvesSignature*>(solves_kernel));
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(op<solve_all>));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(vjp_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, Meta, m) {
-  m.impl("rollout_solves", static_cast<SolvesSignature*>(fake_solves));
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(op<fake_solves>));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(fake_vjp));
 }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("rollout_solves", static_cast<SolvesSignature*>(autograd_solves)); }
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("rollout_solves", static_cast<SolvesSignature*>(op<record_rollout>)); }
 
 TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
-  m.impl("rollout", static_cast<SolvesSignature*>(rollout_kernel));
+  m.impl("rollout", static_cast<SolvesSignature*>(op<outputs_of_rollout>));
 }
 
 }  // namespace prdp
