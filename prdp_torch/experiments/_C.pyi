@@ -4,7 +4,7 @@ import os
 import pathlib
 import torch
 import typing
-__all__: list[str] = ['Checkpoint', 'Compare', 'DARCY_SOURCE', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'find_device', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'without_mean_pressure', 'write_training', 'write_whole']
+__all__: list[str] = ['Checkpoint', 'Compare', 'DARCY_SOURCE', 'Data', 'Dataset', 'Failures', 'Field', 'FieldProblem', 'FolderLock', 'FreshData', 'MOST_COUNTED', 'Network', 'ParameterProblem', 'Physics', 'Saved', 'Scene', 'Training', 'all_trajectories', 'diffusion_stencil', 'find_device', 'fingerprint', 'half_mse', 'loss', 'make_dataset', 'make_field_problem', 'make_parameter_problem', 'normalised_mse', 'observed', 'pack_state', 'parse_scene', 'read_record', 'read_scene', 'read_training', 'read_weights', 'refuse_finished', 'relative_error', 'roughness', 'scene_keys', 'seal_record', 'settle_weights', 'validation_trajectories', 'why_lost', 'without_mean_pressure', 'write_training', 'write_whole']
 class Saved:
     """
     The named tensors of a file, each of which is asked for and checked.
@@ -355,6 +355,8 @@ def seal_record(object: str) -> str:
 def settle_weights(path: os.PathLike | str | bytes) -> None:
     ...
 def validation_trajectories(scene: Scene, steps: typing.SupportsInt | typing.SupportsIndex, on_progress: collections.abc.Callable[[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex], None] = None) -> torch.Tensor:
+    ...
+def why_lost(first: typing.SupportsFloat | typing.SupportsIndex, last: typing.SupportsFloat | typing.SupportsIndex) -> str:
     ...
 def without_mean_pressure(u: torch.Tensor) -> torch.Tensor:
     ...

@@ -92,18 +92,11 @@ class Row:
         return np.asarray((self.stack("metric") <= target).any(1))
 
 
-_LOST = 10  # an error so many times its own size, and that of before the training
-
-
 def why_lost(curves: Curves) -> str | None:
-    """Why a training is lost, or None: its numbers were no longer finite, or are so large that they say nothing else.
-    A loss that has overflowed in float32 is still finite in float64."""
+    """Why a training is lost, or None: its numbers are not finite, or so large that they say nothing else."""
     if "diverged" in curves:
         return curves["diverged"]
-    first, last = curves["error"][0], curves["error"][-1]
-    if last <= _LOST * max(1.0, first):
-        return None
-    return f"its relative error is {last:.1e} at the end, and was {first:.1e} before the first interval"
+    return _C.why_lost(curves["error"][0], curves["error"][-1]) or None
 
 
 def rows_of(scene: _C.Scene) -> list[Row]:

@@ -1,6 +1,8 @@
 """What the command `prdp` does not pass over in silence: trainings that are lost, and records that it replaces."""
 
 import json
+import subprocess
+from pathlib import Path
 
 import pytest
 from helpers import written
@@ -8,6 +10,8 @@ from typer.testing import CliRunner
 
 from prdp_torch.experiments import cli, compare, records, scenes
 from prdp_torch.experiments.refinement import Refinement
+
+TRAINER = Path(__file__).parents[2] / "build" / "prdp_train"
 
 
 def prdp(*arguments):
@@ -27,11 +31,14 @@ def prdp(*arguments):
 def test_a_training_that_ends_nowhere_is_exit_1_with_its_record(tmp_path, rate, why):
     changes = ("float32", "float64"), ("learning_rate = 1e-3", f"learning_rate = {rate}"), ("train = 200", "train = 20")
     scene = written(tmp_path, *changes)
-    status, said = prdp("train", scene, "--intervals", 2, "--out", tmp_path)
-    assert status == (0 if why is None else 1)
-    assert why is None or f"prdp: seed 0 diverged, {why}" in said
-    curves = json.loads((tmp_path / "auto/seed_0.json").read_text())["curves"]
-    assert why is None or curves["metric"][-1] is None or curves["metric"][-1] > 1e20
+    status, said = prdp("train", scene, "--intervals", 2, "--out", tmp_path / "python")
+    command = [TRAINER, scene, "--intervals", "2", "--out", tmp_path / "cpp"]
+    cpp = subprocess.run(command, capture_output=True, text=True)
+    assert status == cpp.returncode == (0 if why is None else 1)
+    assert why is None or (f"prdp: seed 0 diverged, {why}" in said and f"_train: seed 0 diverged, {why}" in cpp.stderr)
+    for language in ("python", "cpp"):
+        curves = json.loads((tmp_path / language / "auto/seed_0.json").read_text())["curves"]
+        assert why is None or curves["metric"][-1] is None or curves["metric"][-1] > 1e20
 
 
 def unfinished(scene, folder, intervals=4):

@@ -17,4 +17,5 @@ void bind_training(py::module_& m) {
   m.def("without_mean_pressure", &without_mean_pressure, py::arg("u"));
   m.def("half_mse", &half_mse, py::arg("u"), py::arg("reference"));
   m.def("relative_error", &relative_error, py::arg("theta"), py::arg("reference"));
+  m.def("why_lost", &why_lost, py::arg("first"), py::arg("last"));
 }

@@ -1,5 +1,8 @@
 #include "prdp_experiments/training/loss.h"
 
+#include <algorithm>
+#include <cstdio>
+
 namespace prdp {
 
 at::Tensor normalised_mse(const at::Tensor& u, const at::Tensor& reference) {
@@ -19,6 +22,15 @@ at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference) { return 0
 
 at::Tensor relative_error(const at::Tensor& theta, const at::Tensor& reference) {
   return (theta - reference).norm() / reference.norm();
+}
+
+std::string why_lost(double first, double last) {
+  constexpr double most = 10;  // times its own size, and times that of before
+  if (last <= most * std::max(1.0, first)) return {};
+  char text[128];
+  std::snprintf(text, sizeof text, "its relative error is %.1e at the end, and was %.1e before the first interval",
+                last, first);
+  return text;
 }
 
 }  // namespace prdp

@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <string>
 #include <string_view>
 
 namespace prdp {
@@ -17,5 +18,9 @@ at::Tensor half_mse(const at::Tensor& u, const at::Tensor& reference);
 
 /// ‖θ - reference‖ / ‖reference‖, the metric of the task "parameters".
 at::Tensor relative_error(const at::Tensor& theta, const at::Tensor& reference);
+
+/// Why a training is lost though its numbers are finite; empty if it is not. `first` and `last`: the relative errors
+/// before and after it. One that is many times its own size says nothing else.
+std::string why_lost(double first, double last);
 
 }  // namespace prdp

@@ -16,6 +16,7 @@
 #include "prdp_experiments/files/seal.h"
 #include "prdp_experiments/files/whole_files.h"
 #include "prdp_experiments/scenes/device.h"
+#include "prdp_experiments/training/loss.h"
 #include "prdp_experiments/training/training.h"
 
 namespace {
@@ -126,6 +127,11 @@ prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene&
   return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
 }
 
+/// Why a training is lost; empty if it is not.
+std::string why_lost(const prdp::train::Curves& curves) {
+  return curves.diverged.empty() ? prdp::why_lost(curves.error.front(), curves.error.back()) : curves.diverged;
+}
+
 /// Returns the exit status: 1 where a training diverged.
 int run(const Options& options, const std::string& command) {
   auto scene = prdp::read_scene(options.scene);
@@ -165,13 +171,13 @@ int run(const Options& options, const std::string& command) {
     const auto text = text_of(record(identity, refinement.label, seed, command, curves), 1);
     prdp::write_training(file, text, curves.weights);
     checkpoint.remove();
-    if (curves.diverged.empty()) {
+    if (curves.diverged.empty())
       std::printf("seed %ld  final metric %.4e  written to %s\n", seed, curves.metric.back(), file.c_str());
-      if (!curves.warning.empty())
-        std::fprintf(stderr, "prdp_train: warning: seed %ld, %s\n", seed, curves.warning.c_str());
-    } else {
+    if (!curves.warning.empty())
+      std::fprintf(stderr, "prdp_train: warning: seed %ld, %s\n", seed, curves.warning.c_str());
+    if (const auto why = why_lost(curves); !why.empty()) {
       ++diverged;
-      std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, curves.diverged.c_str());
+      std::fprintf(stderr, "prdp_train: seed %ld diverged, %s\n", seed, why.c_str());
     }
   }
   return diverged > 0 ? 1 : 0;
