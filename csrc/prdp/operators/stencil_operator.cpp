@@ -28,6 +28,22 @@ at::ArrayRef<int64_t> entries(const kernels::Offset& offset, int64_t dim) {
   return {offset.along + 3 - dim, static_cast<size_t>(dim)};
 }
 
+/// An offset out of one number per axis. Raises ValueError unless these are whole and at most kFarthest.
+kernels::Offset offset_of(at::ArrayRef<double> cells) {
+  const auto dim = static_cast<int64_t>(cells.size());
+  kernels::Offset offset{{0, 0, 0}};
+  for (int64_t d = 0; d < dim; ++d) {
+    constexpr double exact = 1LL << 53;  // whole numbers of which a double has each
+    TORCH_CHECK_VALUE(std::abs(cells[d]) <= exact && cells[d] == std::trunc(cells[d]),
+                      "Stencil: every entry of an offset must be a whole number, got ", cells[d]);
+    offset.along[3 - dim + d] = static_cast<int64_t>(cells[d]);
+  }
+  for (const int64_t along : offset.along)
+    TORCH_CHECK_VALUE(std::abs(along) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
+                      " cells along each axis, got ", as_tuple(entries(offset, dim)));
+  return offset;
+}
+
 /// The neighbours on the other side, which are those of the transpose.
 std::vector<kernels::Offset> turned(std::vector<kernels::Offset> offsets) {
   for (auto& offset : offsets)
@@ -79,27 +95,18 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
                     sizes);
   TORCH_CHECK_TYPE(coefficients_.scalar_type() == at::kFloat || coefficients_.scalar_type() == at::kDouble,
                    "Stencil: coefficients must be float32 or float64, got ", coefficients_.scalar_type());
-  const auto& p = spec.parameters;
+  const at::ArrayRef<double> p = spec.parameters;
   const auto axes = static_cast<size_t>(dim());
   TORCH_CHECK_VALUE(p.size() >= axes && p.size() % axes == 0, "Stencil: every offset must have ", dim(), " entries");
-  for (size_t d = 0; d < axes; ++d) {
+  for (int64_t d = 0; d < dim(); ++d) {
     TORCH_CHECK_VALUE(spec.shape[d] >= 1 && sizes[d + 2] == spec.shape[d],
                       "Stencil: coefficients must have shape (batch or 1, k, ", at::IntArrayRef(spec.shape),
                       ") with every extent >= 1, got ", sizes);
-    grid_.shape[3 - axes + d] = spec.shape[d];
-    grid_.periodic[3 - axes + d] = p[d] != 0.0;
+    grid_.shape[place(d)] = spec.shape[d];
+    grid_.periodic[place(d)] = p[d] != 0.0;
   }
   for (size_t at = axes; at < p.size(); at += axes) {
-    kernels::Offset offset{{0, 0, 0}};
-    for (size_t d = 0; d < axes; ++d) {
-      constexpr double exact = 1LL << 53;  // whole numbers of which a double has each
-      TORCH_CHECK_VALUE(std::abs(p[at + d]) <= exact && p[at + d] == std::trunc(p[at + d]),
-                        "Stencil: every entry of an offset must be a whole number, got ", p[at + d]);
-      offset.along[3 - axes + d] = static_cast<int64_t>(p[at + d]);
-    }
-    for (const int64_t cells : offset.along)
-      TORCH_CHECK_VALUE(std::abs(cells) <= kFarthest, "Stencil: offsets reach at most ", kFarthest,
-                        " cells along each axis, got ", as_tuple(entries(offset, dim())));
+    const auto offset = offset_of(p.slice(at, axes));
     TORCH_CHECK_VALUE(std::find(offsets_.begin(), offsets_.end(), offset) == offsets_.end(), "Stencil: the offset ",
                       as_tuple(entries(offset, dim())), " is there twice; add up its coefficients");
     offsets_.push_back(offset);
@@ -131,10 +138,10 @@ void StencilOperator::check_vector(const at::Tensor& b) const {
 at::Tensor StencilOperator::shifted(const at::Tensor& t, const kernels::Offset& offset, bool back) const {
   auto moved = t;
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    const int64_t cells = (back ? -1 : 1) * offset.along[3 - dim() + axis], n = extent(axis);
+    const int64_t cells = (back ? -1 : 1) * offset.along[place(axis)], n = extent(axis);
     const int64_t d = t.dim() - dim() + axis;
     if (cells == 0) continue;
-    if (grid_.periodic[3 - dim() + axis]) {
+    if (grid_.periodic[place(axis)]) {
       moved = at::roll(moved, -cells, d);
       continue;
     }
@@ -188,8 +195,8 @@ at::Tensor StencilOperator::solve_directly(const at::Tensor& b, bool transposed)
 }
 
 OperatorSpec StencilOperator::spec() const {
-  OperatorSpec spec{"stencil", {grid_.shape + 3 - dim(), grid_.shape + 3}, {}, {coefficients_}};
-  for (int64_t axis = 3 - dim(); axis < 3; ++axis) spec.parameters.push_back(grid_.periodic[axis]);
+  OperatorSpec spec{"stencil", {grid_.shape + place(0), grid_.shape + 3}, {}, {coefficients_}};
+  for (int64_t axis = 0; axis < dim(); ++axis) spec.parameters.push_back(grid_.periodic[place(axis)]);
   for (const auto& offset : offsets_)
     for (const int64_t cells : entries(offset, dim())) spec.parameters.push_back(static_cast<double>(cells));
   return spec;
@@ -212,7 +219,7 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
     if (!field.defined()) field = at::zeros_like(coefficients_.select(1, 0));
   const auto all = at::stack(fields, 1);
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    if (grid_.periodic[3 - dim() + axis]) continue;
+    if (grid_.periodic[place(axis)]) continue;
     all.select(1, 1 + 2 * axis).narrow(1 + axis, 0, 1).zero_();
     all.select(1, 2 + 2 * axis).narrow(1 + axis, extent(axis) - 1, 1).zero_();
   }
@@ -276,8 +283,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
 std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, bool transposed) const {
   std::ostringstream type;
   type << "Stencil<" << gpu::type_of(b.scalar_type()) << ", "
-       << gpu::grid_of({grid_.shape + 3 - dim(), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", "
-       << transposed;
+       << gpu::grid_of({grid_.shape + place(0), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", " << transposed;
   for (const bool periodic : grid_.periodic) type << ", " << periodic;
   for (const auto& offset : offsets_)
     type << ", Offset<" << offset.along[0] << ", " << offset.along[1] << ", " << offset.along[2] << ">";
@@ -289,7 +295,7 @@ std::optional<kernels::FactorKey> StencilOperator::key(bool transposed) const {
   if (coefficients_.size(0) != 1) return std::nullopt;
   kernels::FactorKeyMaker key;
   key.add(int64_t{transposed});
-  for (int64_t d = 3 - dim(); d < 3; ++d) key.add(grid_.shape[d]).add(int64_t{grid_.periodic[d]});
+  for (int64_t d = 0; d < dim(); ++d) key.add(extent(d)).add(int64_t{grid_.periodic[place(d)]});
   for (const auto& offset : offsets_) key.add(offset.along, 3);
   return add_numbers(key, coefficients_).key();
 }
