@@ -6,25 +6,29 @@ namespace prdp::kernels {
 
 namespace {
 
-/// Galerkin products along an axis at a coarse point, with one offset in the other axes: the coefficients of the fine
-/// points before it, there, and after it, with offset -1 (lower), 0 (centre) and 1 (upper) along the axis; the weights
-/// with which these take the coarse points; and those with which the coarse point takes them.
+/// The Galerkin product along an axis at one coarse point, for one offset in the other axes: the coarse coefficients
+/// that couple it to the coarse points to its left and right along the axis, and to itself. The coarse point lies on a
+/// fine one; of the fine points before and after that, either may be missing, and then has the weights set here.
 template <class T>
-struct CollapsedPoint {
+struct GalerkinPoint {
   T left, centre, right;
 
+  // The weights with which those fine points take the coarse points beside them, and the coarse point takes them.
+  T before_left = 1, before_right = 0, after_left = 0, after_right = 1;
+  T restrict_before = 0, restrict_after = 0;
+
+  /// What the three fine points have on the diagonal along the axis.
   void take_centres(T before, T here, T after) {
     left = restrict_before * before * before_left;
     centre = restrict_before * before * before_right + here + restrict_after * after * after_left;
     right = restrict_after * after * after_right;
   }
+  /// What couples the points before, here and after to their lower and upper neighbours along the axis.
   void take_sides(const T (&lower)[3], const T (&upper)[3]) {
     left += restrict_before * lower[0] + lower[1] * before_left;
     centre += restrict_before * upper[0] + lower[1] * before_right + upper[1] * after_left + restrict_after * lower[2];
     right += upper[1] * after_right + restrict_after * upper[2];
   }
-
-  T before_left, before_right, after_left, after_right, restrict_before, restrict_after;
 };
 
 }  // namespace

@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/kernels/collapsed_point.h"
+#include "prdp/kernels/galerkin_point.h"
 #include "prdp/kernels/vector_loops.h"
 
 /// The part of loops.cpp for transfers between grids and for coarse operators; included there only, and for the same
@@ -40,10 +40,10 @@ void add_merged(const T* first, const T* second, T* __restrict row, int64_t n) {
 
 /// Galerkin products with the same offset in the other axes, for points that lie `Step` apart.
 template <int Step, bool Sides, class T>
-void collapse_points(const GalerkinProduct<T>& c, int64_t n) {
+void galerkin_points(const GalerkinProduct<T>& c, int64_t n) {
   for (int64_t i = 0; i < n; ++i) {
     const int64_t f = Step * i;
-    CollapsedPoint<T> point;
+    GalerkinPoint<T> point;
     point.restrict_before = c.restrict_before[f];
     point.restrict_after = c.restrict_after[f];
     point.before_left = c.before_left[f];
@@ -63,8 +63,8 @@ void collapse_points(const GalerkinProduct<T>& c, int64_t n) {
 template <class T>
 void galerkin_product(const GalerkinProduct<T>& c, int64_t step, int64_t n) {
   const bool sides = c.lower_here != nullptr;
-  if (step == 1) return sides ? collapse_points<1, true>(c, n) : collapse_points<1, false>(c, n);
-  sides ? collapse_points<2, true>(c, n) : collapse_points<2, false>(c, n);
+  if (step == 1) return sides ? galerkin_points<1, true>(c, n) : galerkin_points<1, false>(c, n);
+  sides ? galerkin_points<2, true>(c, n) : galerkin_points<2, false>(c, n);
 }
 
 }  // namespace

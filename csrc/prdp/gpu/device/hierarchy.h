@@ -4,7 +4,7 @@
 #include "prdp/gpu/device/pseudo_inverse.h"
 #include "prdp/gpu/device/team.h"
 #include "prdp/gpu/device/upwind.h"
-#include "prdp/kernels/collapsed_point.h"
+#include "prdp/kernels/galerkin_point.h"
 
 /// The coarse grids of multigrid with their operators, as kernels/hierarchy.cpp and kernels/galerkin.cpp make them on
 /// the CPU: one launch for all samples, each by a team that sees nothing of the others.
@@ -42,6 +42,7 @@ class HierarchyMaker {
   }
 
  private:
+  /// How many grids there are; 0 if some number is not finite, or too many points are left.
   int64_t make_grids(A& a) {
     if (!scale_operator<T>(team_, a)) return 0;
     Stencil stencil = finest(a);
@@ -68,6 +69,7 @@ class HierarchyMaker {
     return 0;
   }
 
+  /// The next n of the numbers of this sample.
   T* take(int64_t n) {
     T* const taken = numbers_ + used_;
     used_ += n;
@@ -75,6 +77,7 @@ class HierarchyMaker {
   }
   static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
 
+  /// The coefficients of A itself.
   PRDP_ONCE Stencil finest(const A& a) {
     Stencil made{nullptr, {A::Points::kZ, A::Points::kY, A::Points::kX}};
     constexpr int n = A::Points::kPoints;
@@ -152,7 +155,7 @@ class HierarchyMaker {
     T* const to = take(int64_t{kOffsets} * coarse.points());
     coarse.coefficients = to;
     team_.meet();
-    team_.for_each(coarse.points(), [&](int i) { collapse_point(a, line, axis, weights, i, coarse.points(), to); });
+    team_.for_each(coarse.points(), [&](int i) { galerkin_point(a, line, axis, weights, i, coarse.points(), to); });
     team_.meet();
     return coarse;
   }
@@ -187,52 +190,68 @@ class HierarchyMaker {
     });
   }
 
-  /// All coefficients of a coarse point.
-  void collapse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
+  /// f(place, offset) for each offset in the axes other than `axis`.
+  template <class F>
+  static void for_each_column(int axis, const F& f) {
+    const auto reach = [axis](int d) { return d != axis && d >= kFirstAxis ? 1 : 0; };
+    for (int dz = -reach(0); dz <= reach(0); ++dz)
+      for (int dy = -reach(1); dy <= reach(1); ++dy)
+        for (int dx = -reach(2); dx <= reach(2); ++dx) f(Stencil::place(dz, dy, dx), {dz, dy, dx});
+  }
+
+  /// The index of the weights of point `between`, in the column at this offset from a fine point; -1 beyond the grid.
+  static int weight_of_column(const Stencil& a, const CoarsenedAxis& line, int axis, int fine, const int (&offset)[3],
+                              int between) {
+    const int point[3] = {fine / (a.shape[1] * a.shape[2]), fine / a.shape[2] % a.shape[1], fine % a.shape[2]};
+    int index = 0;
+    for (int d = 0; d < 3; ++d) {
+      const int at = d == axis ? between : moved(point[d], offset[d], a.shape[d], A::periodic(d));
+      if (at < 0) return -1;
+      index = index * (d == axis ? line.between() : a.shape[d]) + at;
+    }
+    return index;
+  }
+
+  /// All coefficients of coarse point i: R A P, for each column of neighbours.
+  void galerkin_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
                       T* to) const {
-    const int n = a.points(), inner = line.inner, step = Stencil::step(axis), extent = line.n;
-    const int row = i / inner, j = row % line.coarse, o = row / line.coarse;
-    const int here = line.of_coarse(j), before = line.before(j), after = line.after(j);
-    const auto fine = [&](int at) { return (o * extent + (at + extent) % extent) * inner + i % inner; };
-    const int at[3] = {fine(here - 1), fine(here), fine(here + 1)};
+    const int n = a.points(), inner = line.inner, row = i / inner, j = row % line.coarse, o = row / line.coarse;
+    const auto fine = [&](int cells) {  // that many from the fine point where the coarse one lies
+      return (o * line.n + (line.of_coarse(j) + cells + line.n) % line.n) * inner + i % inner;
+    };
+    const int before = line.before(j), after = line.after(j), at[3] = {fine(-1), fine(0), fine(1)};
     const auto entry = shared(a.coefficients);
     const auto weight = shared(weights);
-    const int of_field = line.weights(), restriction = symmetric_ ? 0 : 2 * of_field;
-    // Of the column at an offset in the other axes: nothing is taken from beyond the grid.
-    const auto of_column = [&](int field, int between, int dz, int dy, int dx) {
-      const int fine_point = at[1];
-      int place[3] = {fine_point / (a.shape[1] * a.shape[2]), fine_point / a.shape[2] % a.shape[1],
-                      fine_point % a.shape[2]};
-      const int offset[3] = {dz, dy, dx};
-      int shape[3];
-      for (int d = 0; d < 3; ++d) {
-        shape[d] = d == axis ? line.between() : a.shape[d];
-        place[d] = d == axis ? between : moved(place[d], offset[d], a.shape[d], A::periodic(d));
-        if (place[d] < 0) return T(0);
-      }
-      return weight[field * of_field + (place[0] * shape[1] + place[1]) * shape[2] + place[2]];
+    const int of_left = 0, of_right = line.weights(), restriction = symmetric_ ? 0 : 2 * line.weights();
+    const auto restrict_by = [&](int field, int between) {
+      return weight[restriction + field + (o * line.between() + between) * inner + i % inner];
     };
-    for (int dz = axis != 0 && S::kDim > 2 ? -1 : 0; dz <= (axis != 0 && S::kDim > 2 ? 1 : 0); ++dz)
-      for (int dy = axis != 1 && S::kDim > 1 ? -1 : 0; dy <= (axis != 1 && S::kDim > 1 ? 1 : 0); ++dy)
-        for (int dx = axis != 2 ? -1 : 0; dx <= (axis != 2 ? 1 : 0); ++dx) {
-          const int centre = Stencil::place(dz, dy, dx);
-          const auto coefficient = [&](int d, int p) { return entry[(centre + d * step) * n + at[p]]; };
-          kernels::CollapsedPoint<T> made;
-          made.before_left = before >= 0 ? of_column(0, before, dz, dy, dx) : T(1);
-          made.before_right = before >= 0 ? of_column(1, before, dz, dy, dx) : T(0);
-          made.after_left = after >= 0 ? of_column(0, after, dz, dy, dx) : T(0);
-          made.after_right = after >= 0 ? of_column(1, after, dz, dy, dx) : T(1);
-          const int first = o * line.between() * inner + i % inner;
-          made.restrict_before = before >= 0 ? weight[restriction + of_field + first + before * inner] : T(0);
-          made.restrict_after = after >= 0 ? weight[restriction + first + after * inner] : T(0);
-          made.take_centres(coefficient(0, 0), coefficient(0, 1), coefficient(0, 2));
-          made.take_sides({coefficient(-1, 0), coefficient(-1, 1), coefficient(-1, 2)},
-                          {coefficient(1, 0), coefficient(1, 1), coefficient(1, 2)});
-          const bool is_alone = line.periodic && line.coarse == 1;  // and its own neighbour
-          to[(centre - step) * points + i] = is_alone ? T(0) : made.left;
-          to[centre * points + i] = is_alone ? made.centre + made.left + made.right : made.centre;
-          to[(centre + step) * points + i] = is_alone ? T(0) : made.right;
-        }
+    for_each_column(axis, [&](int centre, const int (&offset)[3]) {
+      const auto interpolate_by = [&](int field, int between) {
+        const int index = weight_of_column(a, line, axis, at[1], offset, between);
+        return index < 0 ? T(0) : weight[field + index];
+      };
+      kernels::GalerkinPoint<T> made;
+      if (before >= 0) {
+        made.before_left = interpolate_by(of_left, before);
+        made.before_right = interpolate_by(of_right, before);
+        made.restrict_before = restrict_by(of_right, before);
+      }
+      if (after >= 0) {
+        made.after_left = interpolate_by(of_left, after);
+        made.after_right = interpolate_by(of_right, after);
+        made.restrict_after = restrict_by(of_left, after);
+      }
+      const int lower = centre - Stencil::step(axis), upper = centre + Stencil::step(axis);
+      const auto coefficient = [&](int place, int p) { return entry[place * n + at[p]]; };
+      made.take_centres(coefficient(centre, 0), coefficient(centre, 1), coefficient(centre, 2));
+      made.take_sides({coefficient(lower, 0), coefficient(lower, 1), coefficient(lower, 2)},
+                      {coefficient(upper, 0), coefficient(upper, 1), coefficient(upper, 2)});
+      const bool is_alone = line.periodic && line.coarse == 1;  // and its own neighbour
+      to[lower * points + i] = is_alone ? T(0) : made.left;
+      to[centre * points + i] = is_alone ? made.centre + made.left + made.right : made.centre;
+      to[upper * points + i] = is_alone ? T(0) : made.right;
+    });
     keep_vanishing_diagonal(entry[kCentre * n + at[1]], i, points, to);
   }
   /// See kernels::kVanishing.
@@ -246,6 +265,7 @@ class HierarchyMaker {
     if (is_alone || size <= static_cast<T>(kernels::kVanishing) * rounding * std::abs(fine)) diagonal = fine;
   }
 
+  /// Whether it could be inverted, or where it is singular within the nullity, pseudo-inverted.
   PRDP_ONCE bool invert_coarsest(const Stencil& a) {
     const int n = a.points();
     if (n > kMostOfCoarsest) return false;
@@ -272,7 +292,7 @@ class HierarchyMaker {
   int nullity_;
   double* work_;
   int64_t used_ = 0;
-  bool symmetric_ = true;
+  bool symmetric_ = true;  // the operator; interpolation and restriction then have the same weights
 };
 
 /// The body of a kernel: each team takes one sample after the other.
