@@ -127,6 +127,22 @@ def test_singular_systems_and_their_least_solution():
     assert (info.status == prdp.SolveStatus.INCONSISTENT).all()
 
 
+@pytest.mark.parametrize("gap", [1e-8, 1e-6])
+@pytest.mark.parametrize("method", [prdp.MINRES, prdp.CG])
+def test_where_rounding_takes_over_an_earlier_iterate_is_returned(method, gap):
+    """In float32, near a null space, recursive residuals fall while the true ones grow past that of zero; and CG on an
+    indefinite matrix breaks down far above it."""
+    q, _ = torch.linalg.qr(noise(100, 100, seed=3))
+    values = torch.linspace(-2, -0.05, 49, dtype=F64), torch.linspace(0.05, 3, 50, dtype=F64), torch.tensor([gap])
+    a, b = (q * torch.cat(values)) @ q.T, noise(2, 100, seed=4).float()
+    a = ((a + a.T) / 2).float()
+    for k in (50, 100, 200, 300, 475, 1000):
+        u, info = prdp.linear_solve(a, b, method(k, 1e-7), on_failure="return")
+        residual = (b.double() - u.double() @ a.double()).norm(dim=1) / b.double().norm(dim=1)
+        torch.testing.assert_close(info.residual.double(), residual, rtol=2e-2, atol=1e-6)
+        assert not info.solved.any() and (residual <= (0.3 if method is prdp.MINRES else 1)).all(), (k, residual)
+
+
 def test_a_matrix_that_is_not_symmetric_makes_nothing_worse():
     a, b = 3 * torch.eye(N, dtype=F64) + noise(N, N, seed=2), noise(3, N)
     u, info = prdp.linear_solve(a, b, prdp.MINRES(50, 1e-8), on_failure="return")

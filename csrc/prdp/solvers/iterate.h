@@ -122,6 +122,48 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   return all_last;
 }
 
+/// Runs the samples again that are not to hand out their last iterate, for as many iterations as `wanted` says. The
+/// others stay at zero.
+template <class Space, class Method, class Wanted>
+void run_again(Space& space, Method& method, typename Space::States& states, double rtol, bool track,
+               const Wanted& wanted) {
+  for (size_t i = 0; i < states.size(); ++i) states[i].rewind(states[i].answer == Answer::kLast ? 0 : wanted(i));
+  space.reset();
+  run(space, method, states, rtol, track);
+}
+
+/// Where the iterate of least recursive residual has a true one above ‖b‖: of those after half as many iterations, a
+/// quarter and so on, takes the one of least true residual, or zero.
+template <class Space, class Method>
+void take_least_of_halves(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+  const auto is_worse = [&](const SampleState& s) {
+    return s.answer == Answer::kBestOrZero && is_above_b(s, space.epsilon());
+  };
+  if (std::none_of(states.begin(), states.end(), is_worse)) return;
+  const auto whole = states;
+  auto least = states;
+  for (auto& s : least) {
+    if (!is_worse(s)) continue;
+    s.iterations = 0;
+    s.residual2 = s.b2;
+  }
+  bool goes_on = true;
+  for (int halvings = 1; goes_on; ++halvings) {
+    run_again(space, method, states, rtol, track,
+              [&](size_t i) { return whole[i].iterations >> (is_worse(whole[i]) ? halvings : 0); });
+    conclude(space, method, states, rtol);
+    goes_on = false;
+    for (size_t i = 0; i < states.size(); ++i) {
+      if (!is_worse(whole[i])) continue;
+      const bool falls = states[i].residual2 < least[i].residual2;
+      if (falls) least[i] = states[i];
+      goes_on = goes_on || (states[i].iterations > 1 && (falls || least[i].iterations == 0));
+    }
+  }
+  run_again(space, method, states, rtol, track, [&](size_t i) { return least[i].iterations; });
+  conclude(space, method, states, rtol);
+}
+
 /// Makes the iterates that are to be handed out in place of the last ones, by the same steps as before: a
 /// method that went on from its true residual does so again. Where no residual was looked at, a pass that watches them
 /// finds the best one, or the iteration that broke down. The other samples keep what they have. The cold path.
@@ -129,30 +171,15 @@ template <class Space, class Method>
 void replay(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto first = states;
   const auto kept = method.x;
-  const auto another_pass = [&](bool watch, const auto& wanted) {
-    for (size_t i = 0; i < states.size(); ++i) states[i].rewind(states[i].answer == Answer::kLast ? 0 : wanted(i));
-    space.reset();
-    run(space, method, states, rtol, watch);
-  };
-  if (!track) another_pass(/*watch=*/true, [&](size_t i) { return first[i].cap; });
+  if (!track) run_again(space, method, states, rtol, /*track=*/true, [&](size_t i) { return first[i].cap; });
   const auto watched = states;
-  another_pass(track, [&](size_t i) {
+  run_again(space, method, states, rtol, track, [&](size_t i) {
     if (watched[i].answer == Answer::kZero) return int64_t{0};
     return watched[i].answer == Answer::kBeforeBreakdown ? watched[i].iterations : watched[i].best;
   });
   conclude(space, method, states, rtol);
+  take_least_of_halves(space, method, states, rtol, track);
 
-  const auto remade = states;
-  bool any_zero = false;  // a recursive residual had said otherwise
-  for (auto& s : states) {
-    if (s.answer != Answer::kBestOrZero || !is_above_b(s, space.epsilon())) continue;
-    s.answer = Answer::kZero;
-    any_zero = true;
-  }
-  if (any_zero) {
-    another_pass(track, [&](size_t i) { return states[i].answer == Answer::kZero ? 0 : remade[i].iterations; });
-    conclude(space, method, states, rtol);
-  }
   const auto is_remade = space.map(states, [](const SampleState& s) { return s.answer != Answer::kLast; });
   for (size_t i = 0; i < states.size(); ++i) {
     if (is_remade[i]) states[i].status = first[i].status;

@@ -13,7 +13,8 @@ namespace prdp {
 /// directions w = (z/γ - α₂ w₋ - α₃ w₋₋)/α₁ with z = M⁻¹ v. Memory does not grow. M must be positive definite; then
 /// the norm of r in M⁻¹, |η|, never grows. (The notation is that of Elman, Silvester and Wathen 2014, algorithm 4.1.)
 ///
-/// It breaks down where α₁ is rounding: A is singular there, and b lies outside its range.
+/// It breaks down where v·M⁻¹ v < 0: M is not positive definite. And it does where α₁ is rounding: A is singular there,
+/// and b lies outside its range.
 template <KrylovSpace Space>
 class MinresMethod {
  public:
@@ -48,10 +49,11 @@ class MinresMethod {
     turn(v_, last_v_);
     const Vector& z = space_.is_preconditioned() ? z_ : last_v_;
     const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, next_z_) : space_.dot(v_, v_);
-    space_.break_down_unless_positive(square + space_.is_zero(square), rr_);
-    const Scalar gamma = root(square);
+    const Scalar zero = space_.is_zero(square), holds = space_.is_larger(square, square * 0) + zero;
+    space_.break_down_unless_positive(square + zero, rr_);
+    const Scalar gamma = root(square * holds);
     const Scalar a0 = c_ * delta - last_c_ * s_ * coupling_, a2 = s_ * delta + last_c_ * c_ * coupling_;
-    const Scalar a3 = last_s_ * coupling_, a1 = root(a0 * a0 + square);
+    const Scalar a3 = last_s_ * coupling_, a1 = root(a0 * a0 + square * holds);
     const Scalar row2 = delta * delta + coupling_ * coupling_ + square;
     space_.break_down_unless_positive(one_ - space_.breaks_down(a1, 100 * row2, one_, rr_), rr_);
     last_c_ = c_;
@@ -61,7 +63,7 @@ class MinresMethod {
     combine(z, inverse * space_.ratio(one_, a1), w_, -space_.ratio(a2, a1), last_w_, -space_.ratio(a3, a1));
     turn(w_, last_w_);
     parts_[0] = w_;
-    weights_[0] = c_ * eta_;
+    weights_[0] = c_ * eta_ * holds;
     space_.add_combination(weights_.data(), parts_, 1, x);
     eta_ = -s_ * eta_;
     last_gamma_ = gamma_;

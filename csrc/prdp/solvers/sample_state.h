@@ -13,7 +13,7 @@ enum class Answer {
   kLast,
   kBeforeBreakdown,  // the one before an iteration that broke down where nobody looked
   kBest,             // the one of least residual: b's own rounding was reached and lost again
-  kBestOrZero,       // the same, or zero where that is the better answer: the last ran away, or is worse than zero
+  kBestOrZero,       // the same, or an earlier one or zero where that is better: the last ran away, or is above ‖b‖
   kZero,             // none, but zero: what is there is the rounding of a singular A
 };
 

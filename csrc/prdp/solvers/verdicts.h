@@ -8,7 +8,7 @@
 
 /// What may happen to a sample: each rule that gives it a status, in the CPU loops, in tensors and in kernels of GPUs.
 /// What takes products to tell is in observe.h and energy.h. A `Flow` refuses samples before it solves
-/// (steppers/flow/limits.cpp).
+/// (steppers/flow/limits.cpp, gpu/device/flow.h).
 namespace prdp {
 
 // ---- while it is iterated
