@@ -91,7 +91,7 @@ sanitize-cuda:
 	for tool in memcheck racecheck synccheck; do \
 	  PRDP_BUILD_DIR=build-cuda PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool $$tool --error-exitcode 1 \
 	    $(CUDA)/python -m pytest -q -m cuda tests/python/test_cuda.py \
-	    -k 'test_kernels_solve_as_the_loops_of_the_cpu and (heat or diffusion) and (CG or GMRES)' || exit 1; \
+	    -k 'test_kernels_solve_as_the_loops_of_the_cpu and (heat or diffusion) and (CG or GMRES) or team_of_blocks or flows_and_fields' || exit 1; \
 	done
 
 wheel: $(STAMPS)/configure $(STAMPS)/wheel

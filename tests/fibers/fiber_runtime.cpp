@@ -32,6 +32,7 @@ struct Settings {
   int order = 0;  // of fibers::Order
   int left_out = 0;  // the line of the barrier that is left out; 0: none
   bool poisons = true;  // memory of a block
+  bool captures = false;  // a graph, on all streams
   int64_t most_blocks = 0;  // that are at work at the same time; 0: as many as there are
 };
 Settings settings;
@@ -98,6 +99,7 @@ class FiberKernel final : public prdp::gpu::Kernel {
     run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));
   }
   int64_t teams() const override { return 2; }
+  bool may_wait() const override { return !settings.captures; }
   void launch(int64_t teams, const void* arguments) const override {
     constexpr long spare = 64;
     ++launches;
@@ -153,9 +155,9 @@ struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::
 
 /// From here on, kernels serve tensors of the CPU; and no longer.
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
-                                  int left_out, bool poisons, int64_t most_blocks) {
+                                  int left_out, bool poisons, bool captures, int64_t most_blocks) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, most_blocks};
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, captures, most_blocks};
   asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }

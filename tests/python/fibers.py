@@ -49,19 +49,27 @@ class Kernel(NamedTuple):
 
 class Fibers:
     """A device whose blocks have so much memory, and teams of one block for so many unknowns; with `most_blocks`, teams
-    have no more. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
+    have no more. `captures`: its streams capture a graph. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
     `poison` is False."""
 
     def __init__(
-        self, block_memory=96 << 10, cells=16384, threads=64, order=FORWARD, left_out=0, most_blocks=0, poison=True
+        self,
+        block_memory=96 << 10,
+        cells=16384,
+        threads=64,
+        order=FORWARD,
+        left_out=0,
+        most_blocks=0,
+        poison=True,
+        captures=False,
     ):
-        self.settings = (block_memory, cells, threads, order, left_out, poison, most_blocks)
+        self.settings = (block_memory, cells, threads, order, left_out, poison, captures, most_blocks)
         self.poison = poison
 
     @staticmethod
     def library():
         library = ctypes.CDLL(str(BUILD / "libprdp_fibers.so"))
-        library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool, ctypes.c_int64]
+        library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool] * 2 + [ctypes.c_int64]
         library.prdp_fibers_launches.restype = ctypes.c_int64
         library.prdp_fibers_kernels.restype = ctypes.c_int64
         library.prdp_text_of.argtypes = library.prdp_block_memory_of.argtypes = [ctypes.c_int64]

@@ -5,8 +5,9 @@ import contextlib
 import warnings
 
 import pytest
+import test_gpu_multigrid as multigrid
 import torch
-from fibers import Fibers
+from fibers import SHUFFLED, Fibers
 from test_gpu_kernels import CASES as OF_KERNELS
 from test_gpu_kernels import OPERATORS as WITH_KERNELS
 from test_gpu_kernels import agree, right_hand_sides
@@ -118,9 +119,14 @@ def test_a_solve_that_nobody_reads_does_not_wait(name, solver):
     expected, gradients, _ = solve_and_gradients("cpu", name, SILENT[solver])
     make, g = OPERATORS[name]
     leaves = [g.to(DEVICE).requires_grad_(), noise(3, 1, *SHAPE).to(DEVICE).requires_grad_()]
-    with no_waiting():
+
+    def solve_and_back():
         u, info = prdp.linear_solve(make(leaves[0]), leaves[1], SILENT[solver], **options)
-        found = torch.autograd.grad(u.square().sum(), leaves)
+        return u, info, torch.autograd.grad(u.square().sum(), leaves)
+
+    solve_and_back()  # the first results of a kernel are looked at
+    with no_waiting():
+        u, info, found = solve_and_back()
     torch.testing.assert_close(u.cpu(), expected, rtol=1e-7, atol=1e-9)
     for mine, other in zip(found, gradients, strict=True):
         torch.testing.assert_close(mine.cpu(), other, rtol=1e-6, atol=1e-8)
@@ -185,19 +191,63 @@ def test_kernels_solve_as_the_loops_of_the_cpu(name, method, dtype, monkeypatch)
     assert torch.equal(again, u)
 
 
+def assert_the_bits_of_fibers(run):
+    """`run(device)` gives tensors that are made by the same text in the same order, without what a library of
+    mathematics rounds as it likes: on a card as by fibers, and there in any order of threads."""
+    with Fibers(threads=1024):
+        expected = run("cpu")
+    if CUDA:
+        found = run(DEVICE)
+    else:
+        with Fibers(threads=1024, order=SHUFFLED):
+            found = run("cpu")
+    for mine, other in zip(found, expected, strict=True):
+        assert torch.equal(mine.cpu(), other)
+
+
+def solved(a, b, of):
+    def run(device):
+        on_it = a if device == "cpu" else there(a)
+        u, info = prdp.linear_solve(on_it, b.to(device), of, on_failure="return")
+        return u, info.residual
+
+    return run
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize(("name", "method"), OF_KERNELS)
 def test_kernels_give_the_bits_of_the_fibers(name, method, dtype):
-    """As many iterations, without what a library of mathematics rounds as it likes: the same text, the same order."""
     a, b = WITH_KERNELS[name](dtype), right_hand_sides(name, dtype)
-    of = solver_of(method, rtol=0.0, max_iter=3)
-    with Fibers():
-        expected, report = prdp.linear_solve(a, b, of, on_failure="return")
-        if not CUDA:
-            u, info = prdp.linear_solve(a, b, of, on_failure="return")
-    if CUDA:
-        u, info = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")
-    assert torch.equal(u.cpu(), expected) and torch.equal(info.residual.cpu(), report.residual)
+    assert_the_bits_of_fibers(solved(a, b, solver_of(method, rtol=0.0, max_iter=3)))
+
+
+@pytest.mark.parametrize(("name", "method", "dtype"), multigrid.CASES)
+def test_cycles_give_the_bits_of_the_fibers(name, method, dtype):
+    a, b = multigrid.OPERATORS[name][0](dtype), multigrid.right_hand_sides(name, dtype)
+    assert_the_bits_of_fibers(solved(a, b, multigrid.with_cycles(method, max_iter=2, rtol=0.0)))
+
+
+@pytest.mark.parametrize("solver", [prdp.CG(3, 0.0), prdp.BiCGStab(2, 0.0, preconditioner="diagonal")])
+def test_a_team_of_blocks_gives_the_bits_of_the_fibers(solver):
+    size = 132  # more cells than a block of a card takes alone
+    assert_the_bits_of_fibers(solved(operators.Heat((size, size), 1e-2, 1.0), noise(2, 1, size, size), solver))
+
+
+def test_flows_and_fields_give_the_bits_of_the_fibers():
+    """Forward and back."""
+
+    def run(device):
+        step = prdp.Flow((9, 10), nu=0.05, dt=0.01, solver=prdp.CG(3, 0.0), on_failure="return").to(device)
+        u = noise(2, 2, 9, 10).to(device).requires_grad_()
+        kappa = noise(2, 9, 10, seed=1).exp().to(device).requires_grad_()
+        state = step(u)
+        solution, _ = prdp.linear_solve(
+            operators.Diffusion(kappa, 1.0), noise(2, 1, 9, 10, seed=2).to(device), prdp.CG(3, 0.0), on_failure="return"
+        )
+        squares = state.square().sum() + solution.square().sum()
+        return state.detach(), solution.detach(), *torch.autograd.grad(squares, (u, kappa))
+
+    assert_the_bits_of_fibers(run)
 
 
 def test_a_solve_with_a_tolerance_in_a_cuda_graph():

@@ -152,6 +152,32 @@ def test_a_solve_is_one_launch_and_at_most_five_operations_of_torch(name, device
         assert len(names) <= (6 if name == "sparse matrices" else 5) and set(names) <= MEMORY, names
 
 
+@pytest.mark.parametrize("captures", [False, True])
+def test_a_first_result_is_looked_at_unless_a_graph_is_captured(captures):
+    """A look would wait for the device, which nobody may do meanwhile; it is taken later."""
+    a, b = operators.Heat((5, 3 + captures), 1e-2, 1.0), noise(3, 1, 5, 3 + captures)  # kernels that nobody has tried
+
+    def looks(**device):
+        with Fibers(poison=False, **device), torch.autograd.profiler.profile() as profiler:
+            prdp.linear_solve(a, b, prdp.CG(max_iter=9, rtol=1e-8), on_failure="return")
+        return "aten::_local_scalar_dense" in {event.name for event in profiler.function_events}
+
+    assert looks(captures=captures) == (not captures)
+    assert looks() == captures and not looks()
+
+
+def test_errors_that_raise_take_one_look():
+    a, b = operators.Heat(SHAPE, 1e-2, 1.0), noise(3, 1, *SHAPE)
+    copies = []
+    with Fibers(poison=False):
+        for on_failure in ("raise", "raise", "return"):
+            with torch.autograd.profiler.profile() as profiler:
+                prdp.linear_solve(a, b, prdp.BiCGStab(max_iter=50, rtol=1e-8), on_failure=on_failure)
+            names = [event.name for event in profiler.function_events]
+            copies.append(sum(name in ("aten::_to_copy", "aten::_local_scalar_dense", "aten::item") for name in names))
+    assert copies[1:] == [1, 0]
+
+
 def test_the_parts_of_a_report_share_memory_but_for_an_op_of_torch():
     """Which may not return tensors that do: compiled graphs say so."""
     a, b, solver = operators.Heat(SHAPE, 1e-2, 1.0), noise(3, 1, *SHAPE), prdp.BiCGStab(max_iter=50, rtol=1e-8)

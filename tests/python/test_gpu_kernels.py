@@ -116,7 +116,7 @@ def solve(a, b, solver, device=None, **options):
 def agree(mine, other, dtype, slack=300.0):
     (u, info), (v, report) = mine, other
     assert info.status.tolist() == report.status.tolist()
-    assert (info.iterations - report.iterations).abs().max() <= 1
+    assert (info.iterations - report.iterations).abs().max() <= 1 + report.iterations.max() // 20
     scale = v.flatten(1).norm(dim=1).clamp(min=torch.finfo(dtype).tiny)
     assert ((u - v).flatten(1).norm(dim=1) <= slack * torch.finfo(dtype).eps * scale).all()
 

@@ -34,6 +34,13 @@ void* stream_of(c10::Device device) {
   return c10::impl::VirtualGuardImpl(device.type()).getStream(device).native_handle();
 }
 
+bool is_capturing(c10::Device device) {
+  const auto& driver = CudaDriver::get();
+  int capturing = 0;
+  driver.check(driver.is_capturing(stream_of(device), &capturing), "no stream");
+  return capturing != 0;
+}
+
 /// While it lives, the device is this thread's, and so is its context: a thread of autograd may have none.
 class OnDevice {
  public:
@@ -56,9 +63,7 @@ class CudaKernel final : public Kernel {
  public:
   CudaKernel(c10::Device device, const KernelSource& source) : device_(device), source_(source) {
     const auto& driver = CudaDriver::get();
-    int capturing = 0;
-    driver.check(driver.is_capturing(stream_of(device), &capturing), "no stream");
-    TORCH_CHECK(!capturing,
+    TORCH_CHECK(!is_capturing(device),
                 "prdp: a kernel is to be compiled while a CUDA graph is captured; call prdp.warm_up() before");
     const int capability = 10 * attribute(kCapabilityMajor, device) + attribute(kCapabilityMinor, device);
     const auto binary = nvrtc::compile(source.text, capability);
@@ -74,6 +79,7 @@ class CudaKernel final : public Kernel {
     if (teams_ == 0) throw Unavailable("a sample of this size needs more blocks than the device runs at the same time");
   }
   int64_t teams() const override { return teams_; }
+  bool may_wait() const override { return !is_capturing(device_); }
   void launch(int64_t teams, const void* arguments) const override {
     const auto& driver = CudaDriver::get();
     const OnDevice here(device_);

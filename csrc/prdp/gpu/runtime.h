@@ -40,6 +40,8 @@ class Kernel {
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
   virtual int64_t teams() const = 0;
+  /// Whether the host may wait for the device's current stream: no graph is being captured.
+  virtual bool may_wait() const = 0;
   /// On the device's current stream. `arguments` are what its text calls Arguments.
   virtual void launch(int64_t teams, const void* arguments) const = 0;
 };

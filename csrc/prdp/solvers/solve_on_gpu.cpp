@@ -148,7 +148,9 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
     if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     auto found = run(*prepared, rhs, request);
     constexpr int few = 3;  // a look waits for the device, and there may be nothing to judge, as where b is 0
-    if (trust == Trust::kUnknown && request.guarded && prepared->kernel->looks++ < few) {
+    const bool looks = trust == Trust::kUnknown && request.guarded && prepared->kernel->looks < few;
+    if (looks && prepared->kernel->may_wait()) {
+      ++prepared->kernel->looks;
       trust = trust_by(a, rhs, request, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     }
