@@ -6,6 +6,7 @@
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/products_by_kernel.h"
 
 namespace prdp {
@@ -27,6 +28,15 @@ void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t 
 }
 
 at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
+  const bool is_shared = matrix.dim() == 2 || matrix.sym_size(0) == 1;
+  if (is_shared && v.dim() == 2 && v.is_cpu() && is_plain(matrix) && is_plain(v)) {
+    // On CPUs torch multiplies a batch by a matrix that it repeats, at several times the cost of products one by one. A
+    // product of two matrices would give a sample bits that depend on its neighbours.
+    std::vector<at::Tensor> products;
+    for (const auto& sample : v.unbind())
+      products.push_back(at::mv(matrix.dim() == 2 ? matrix : matrix.squeeze(0), sample));
+    return products.empty() ? at::zeros_like(v) : at::stack(products);
+  }
   return at::matmul(matrix, v.unsqueeze(-1)).squeeze(-1);
 }
 
