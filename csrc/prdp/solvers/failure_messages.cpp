@@ -115,8 +115,9 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
   if (solver.preconditioner.is_operator() && !is_finite(*make_operator(solver.preconditioner.spec())))
     return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
   if (solver.preconditioner && traits(solver.method).made_for == MadeFor::kSymmetric)
-    return "a number left the range of its dtype: its preconditioner may not be positive definite, as multigrid is not "
-           "where A is not; take MINRES without it";
+    return std::string("a number left the range of its dtype: its preconditioner may not be positive definite") +
+           (solver.preconditioner.is_multigrid() ? ", as multigrid is not where A is not" : "") +
+           "; take MINRES without it";
   const bool single = b.scalar_type() == at::kFloat;
   const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
   const bool known = norm > 0.0;  // not of a function
@@ -167,13 +168,19 @@ std::string in_vain(const Solver& solver) {
   return "take more iterations, a preconditioner, GMRES or Direct";
 }
 
+/// Whether the method solves systems whose diagonal has zeros, or both signs.
+bool takes_any_diagonal(Method method) {
+  const auto made_for = traits(method).made_for;
+  return made_for == MadeFor::kAny || made_for == MadeFor::kSymmetric;
+}
+
 std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const bool has_zero = a.diagonal().expand_as(b).select(0, sample).eq(0).any().item<bool>();
   const std::string why = operator_kind(role.a.kind).has_pressure ? "the pressure rows have a zero diagonal"
                           : has_zero ? "it divides by the diagonal of A, which has a zero there"
                                      : "multigrid finds no coarse grid for A: a diagonal vanishes, or a number leaves "
                                        "the range of the dtype, on one of them";
-  return why + (role.solver.preconditioner.is_diagonal() && traits(role.solver.method).made_for == MadeFor::kAny
+  return why + (role.solver.preconditioner.is_diagonal() && takes_any_diagonal(role.solver.method)
                     ? "; take " + std::string(traits(role.solver.method).label) + " without it"
                     : "; take GMRES");
 }

@@ -141,8 +141,8 @@ void warn_of_vain_iterations(const SolveRole& role, const Operator& a, const at:
          << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
              : role.x0.defined()   ? "its start"
                                    : "zero")
-         << " at relative residual " << residual[first] << ", as none of the " << role.solver.max_iter
-         << " iterates came nearer, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
+         << " at relative residual " << residual[first] << ", as the last of " << role.solver.max_iter
+         << " iterates was worse, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
   });
 }
 
@@ -195,6 +195,13 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
   raise_or_warn(text.str(), on_failure);
+}
+
+void warn_of_constant_cycles() {
+  warn_once("constant cycles", [](std::ostream& text) {
+    text << "backward=\"unrolled\": the gradient of A leaves out how the cycles of multigrid depend on A, which is all "
+            "of it after one iteration; take backward=\"implicit\"";
+  });
 }
 
 void raise_or_warn(const std::string& text, OnFailure on_failure) {

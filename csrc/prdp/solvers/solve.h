@@ -103,6 +103,9 @@ struct SolveRole {
 void report_failures(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                      OnFailure on_failure);
 
+/// Says once that an unrolled gradient of A takes the cycles of multigrid for constants.
+void warn_of_constant_cycles();
+
 /// While it exists, reports on this thread name this step of a rollout, counted from 1.
 class FailuresOfStep {
  public:

@@ -179,15 +179,13 @@ TensorSpace::Scalar TensorSpace::guarded_quotient(const Scalar& num, const Scala
   }
   // The rules of SampleNumbers; the inner where keeps 0/0 out of the derivative.
   const auto nothing_left = num.detach() < negligible_;
-  const auto unknown = w2.detach().isfinite().logical_not();
+  const auto divisor = at::add(den, w2.detach(), 0.0);  // NaN where w2 is not finite: then nothing is known
   // v2 may overflow for a long direction of M⁻¹; then only den = 0 is a breakdown.
   const auto bound = rounding_of(v2, w2).nan_to_num(0.0, 0.0, 0.0);
-  const auto breaks = den.detach().abs().le(bound).logical_and(nothing_left.logical_or(unknown).logical_not());
+  const auto breaks = divisor.detach().abs().le(bound).logical_and(nothing_left.logical_not());
   note_broken(breaks);
   const auto none = nothing_left.logical_or(breaks);
-  const auto quotient = num / at::where(none.logical_or(unknown), at::ones_like(den), den);
-  const auto unless_unknown = at::add(quotient, w2.detach(), 0.0);  // NaN where w2 is
-  return at::where(none, at::zeros_like(num), unless_unknown);
+  return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), divisor));
 }
 
 TensorSpace::Scalar TensorSpace::breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2,
