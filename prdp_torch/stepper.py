@@ -13,12 +13,12 @@ from torch import Tensor
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.batching import outlive_transforms
 from prdp_torch.calls import between_graphs, forgets_if_it_raises
+from prdp_torch.kept_objects import Kept
 from prdp_torch.operators.base import full_precision
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import AdjointLog, AdjointLogs, SolveInfo
 from prdp_torch.solvers import (
     GMRES,
-    Kept,
     PackedOptions,
     Preconditioner,
     Solver,
