@@ -116,26 +116,7 @@ def train(
     Exit 1 if one diverges: a number is not finite, or the error ends above ten times its size and its first value.
     """
     loaded = _load(scene, device, backward, intervals)
-    chosen = [
-        name
-        for name, given in (
-            ("--auto", auto),
-            ("--prdp", prdp),
-            ("--constant", constant is not None),
-            ("--schedule", schedule is not None),
-            ("--direct", direct),
-        )
-        if given
-    ]
-    if len(chosen) > 1:
-        raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
-    refinement = Refinement.prdp(loaded) if prdp else Refinement.auto()
-    if constant is not None:
-        refinement = Refinement.constant(constant)
-    elif direct:
-        refinement = Refinement.exact()
-    elif schedule is not None:
-        refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
+    refinement = _refinement(loaded, auto, prdp, constant, schedule, direct)
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment(loaded.device)
     diverged: dict[int, str] = {}
@@ -320,6 +301,32 @@ def _load(scene: str, device: str | None, backward: str | None = None, intervals
     if intervals is not None:
         loaded.training.intervals = intervals
     return loaded
+
+
+def _refinement(
+    scene: _C.Scene, auto: bool, prdp: bool, constant: int | None, schedule: str | None, direct: bool
+) -> Refinement:
+    """The one way of choosing K that the options name, the default where they name none."""
+    chosen = [
+        name
+        for name, given in (
+            ("--auto", auto),
+            ("--prdp", prdp),
+            ("--constant", constant is not None),
+            ("--schedule", schedule is not None),
+            ("--direct", direct),
+        )
+        if given
+    ]
+    if len(chosen) > 1:
+        raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
+    if prdp:
+        return Refinement.prdp(scene)
+    if constant is not None:
+        return Refinement.constant(constant)
+    if schedule is not None:
+        return Refinement.schedule(*_schedule(schedule), scene.max_iter)
+    return Refinement.exact() if direct else Refinement.auto()
 
 
 def _schedule(text: str) -> tuple[int, int]:
