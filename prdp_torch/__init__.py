@@ -14,7 +14,8 @@ from prdp_torch import _load
 _load.load_library()
 
 from prdp_torch import _C, fields, operators  # noqa: E402
-from prdp_torch.advice import Advice, advise  # noqa: E402
+from prdp_torch.advice import advise  # noqa: E402
+from prdp_torch.advice_text import Advice  # noqa: E402
 from prdp_torch.controller import LinearSchedule, PRDPController, ToleranceController  # noqa: E402
 from prdp_torch.flow import Flow  # noqa: E402
 from prdp_torch.gpu import warm_up  # noqa: E402

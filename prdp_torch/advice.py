@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check
+from prdp_torch.advice_text import Advice, call_of, dtype_name, listed, milliseconds, percent, power
 from prdp_torch.flow import Flow
 from prdp_torch.operators.base import full_precision
 from prdp_torch.solver_trials import (
@@ -20,10 +21,9 @@ from prdp_torch.solver_trials import (
     measure_one_iteration,
     measure_with_start,
     now,
-    preconditioner_of,
     seconds_of_parts,
 )
-from prdp_torch.solvers import GMRES, Direct, Solver
+from prdp_torch.solvers import Direct
 from prdp_torch.stepper import Stepper
 from prdp_torch.steppers import EquationStepper
 
@@ -32,40 +32,6 @@ WORTH_TELLING = 0.1  # of the seconds of a solve
 WORTH_A_START = 0.1  # of the products of a solve
 NOISE = 0.1  # of the seconds of a solve
 MOST_ERROR = 0.1  # of u at the loosest tolerance: what a network is off by when a controller asks for that one
-
-
-@dataclass
-class Advice:
-    """What `advise` found. `str(advice)` is the table, the notes and the recommendation."""
-
-    rows: list[Row]
-    notes: list[str]
-    recommendation: str
-
-    def table(self) -> str:
-        """The rows as lines of aligned text; the error is that of u."""
-        lines: list[tuple[str, ...]] = [("solver", "rtol", "products", "ms", "adjoint", "ms", "error", "status")]
-        for before, row in zip([None, *self.rows], self.rows, strict=False):
-            if before is not None and before.dtype != row.dtype:
-                lines.append((f"in {_name(row.dtype)}:", *[""] * (len(lines[0]) - 1)))
-            costs = ["", ""] * 2
-            for i, solve in enumerate(row.solves):
-                costs[2 * i : 2 * i + 2] = str(solve.products), _short(1e3 * solve.seconds)
-            error = "" if row.error is None else _power(row.error) if row.error else "0"
-            status = "time limit" if row.may_go_on else row.status
-            lines.append((row.name, _power(row.rtol), *costs, error, status))
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        align = (str.ljust,) * 2 + (str.rjust,) * 5 + (str.ljust,)
-        lines.insert(1, tuple("─" * width for width in widths))
-        cells = ([put(cell, width) for put, cell, width in zip(align, line, widths, strict=True)] for line in lines)
-        return "\n".join("  ".join(line).rstrip() for line in cells)
-
-    def words(self) -> str:
-        """What stands below the table."""
-        return "\n".join([*self.notes, "", self.recommendation])
-
-    def __str__(self) -> str:
-        return f"{self.table()}\n\n{self.words()}"
 
 
 @dataclass
@@ -87,7 +53,7 @@ class Update:
 
     def share(self, physics: float) -> str:
         whole = physics + self.network
-        return f"{_percent(physics / whole)} of an update: {milliseconds(physics)} of {milliseconds(whole)}"
+        return f"{percent(physics / whole)} of an update: {milliseconds(physics)} of {milliseconds(whole)}"
 
     def fastest(self, rows: Sequence[Row], rtol: float) -> Row | None:
         return min((row for row in rows if row.rtol == rtol and row.solved), key=self.physics, default=None)
@@ -199,7 +165,7 @@ def advise_on(
     rows, sentences = measure(step, sample, candidates(step), seconds)
     best = update.choice(rows, TOLERANCES[-1])
     where = f"; threads: {torch.get_num_threads()}" if sample.is_cpu else f" on {sample.device}"
-    notes = [f"Batch of {len(sample)} in {_name(sample.dtype)}{where}.", *update.notes, *sentences]
+    notes = [f"Batch of {len(sample)} in {dtype_name(sample.dtype)}{where}.", *update.notes, *sentences]
     notes += _misleading(rows)
     others = []
     for other in other_dtypes:
@@ -207,17 +173,16 @@ def advise_on(
             trials = candidates(step) if best is None else [best.solver]
             others += measure(copy.deepcopy(step).to(other), sample.to(other), trials, seconds)[0]
         except (ValueError, TypeError, RuntimeError) as error:
-            notes.append(f"{_name(other)} was not tried: {_C.sentence(str(error))}.")
+            notes.append(f"{dtype_name(other)} was not tried: {_C.sentence(str(error))}.")
     twin = update.fastest(others, TOLERANCES[-1])
     if best is not None and twin is not None:
         ratio = update.physics(twin) / update.physics(best)
-        notes.append(
-            f"{best.name} in {_name(twin.dtype)} takes {ratio:.2f} times the seconds of {_name(sample.dtype)}."
-        )
+        names = dtype_name(twin.dtype), dtype_name(sample.dtype)
+        notes.append(f"{best.name} in {names[0]} takes {ratio:.2f} times the seconds of {names[1]}.")
     at_rounding = best is not None and any(solve.status == "STAGNATED" for solve in best.solves)
     if best is not None and at_rounding:
         notes.append(
-            f"At {_power(TOLERANCES[-1])} the residual of {best.name} is the rounding of {_name(best.dtype)}. "
+            f"At {power(TOLERANCES[-1])} the residual of {best.name} is the rounding of {dtype_name(best.dtype)}. "
             "The error of u may be far smaller; a smaller residual needs float64."
         )
     if (best is None or at_rounding) and not other_dtypes and not is_built_in(step):
@@ -245,7 +210,7 @@ def _beside_solves(parts: float, best: Row) -> list[str]:
 
 
 def _start_gain(zero: Row, state: Row) -> str:
-    products = f"{state.forward.products} products to {_power(zero.rtol)} in place of {zero.forward.products}"
+    products = f"{state.forward.products} products to {power(zero.rtol)} in place of {zero.forward.products}"
     fewer = state.forward.products < (1 - WORTH_A_START) * zero.forward.products
     worth = fewer and state.forward.status != "MAX_ITER"
     advice = 'pass start="state"' if worth else "keep the start from zero"
@@ -260,10 +225,10 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     if isinstance(best.solver, Direct):
         chosen, choice = best, "Use the direct solver, Direct()"
     elif saving < WORTH_REFINING:
-        chosen, choice = best, f"Use converged solves with {_call(best.solver, 2 * _most(best), best.rtol)}"
+        chosen, choice = best, f"Use converged solves with {call_of(best.solver, 2 * _most(best), best.rtol)}"
     else:
         chosen, choice = refined, f"Refine {refined.name} with a controller, up to K = {_most(refined)}"
-    loosest, finest = (_power(rtol) for rtol in TOLERANCES)
+    loosest, finest = (power(rtol) for rtol in TOLERANCES)
     cost = (
         f"physics is {update.share(physics)}"
         if update.network
@@ -274,7 +239,7 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
         why = f"it is {fastest} to {finest}, and {cost}"
     else:
         why = f"it is the fastest to {loosest}. With {best.name}, the fastest to {finest}, {cost}"
-    most = f"{_percent(saving)} of {update.whole}, as {cheapest} takes"
+    most = f"{percent(saving)} of {update.whole}, as {cheapest} takes"
     return f"{choice}: {why}. {_limit(saving, f'{most} {milliseconds(least)}', best)}"
 
 
@@ -285,7 +250,7 @@ def _limit(saving: float, most: str, best: Row) -> str:
         return f"Refinement has little to save: at most {most}."
     if _most(best) == 1 and not isinstance(best.solver, Direct):
         return "Refinement has nothing to save: one iteration is enough."
-    return f"Refinement has nothing to save: no solver is faster to {_power(TOLERANCES[0])}."
+    return f"Refinement has nothing to save: no solver is faster to {power(TOLERANCES[0])}."
 
 
 def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, update: Update) -> tuple[Row, float, str]:
@@ -298,7 +263,7 @@ def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, upd
         own = best if isinstance(best.solver, Direct) else solved.get((best.name, loosest), best)
         if update.physics(rough) < (1 - NOISE) * update.physics(own):
             refined = solved.get((rough.name, finest), rough)
-            return refined, update.physics(rough), f"{rough.name} to {_power(loosest)}"
+            return refined, update.physics(rough), f"{rough.name} to {power(loosest)}"
     if isinstance(best.solver, Direct) or _most(best) == 1:
         return best, update.physics(best), ""
     return best, update.physics(measure_one_iteration(step, sample, best.solver)), "a single iteration"
@@ -316,15 +281,10 @@ def _misleading(rows: Sequence[Row]) -> list[str]:
         return []
     worst = max(row.error or 0.0 for row in wrong)
     return [
-        f"At {_power(loosest)}, {_listed([row.name for row in wrong])} leave u off by up to {_percent(worst)}: b is "
+        f"At {power(loosest)}, {listed([row.name for row in wrong])} leave u off by up to {percent(worst)}: b is "
         "mostly what does not change u, such as values on the sides, or A is ill-conditioned. Solve for the change of "
         "u, or take a finer rtol; a controller cannot tell."
     ]
-
-
-def _listed(names: Sequence[str]) -> str:
-    """ "A", "A and B", "A, B and C"."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _most(row: Row) -> int:
@@ -333,9 +293,9 @@ def _most(row: Row) -> int:
 
 def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:
     """The recommendation where no solver reaches the finest tolerance in the dtype of the sample."""
-    rough, fine = (_power(rtol) for rtol in TOLERANCES)
+    rough, fine = (power(rtol) for rtol in TOLERANCES)
     if twin is not None:
-        return f"Use {_name(twin.dtype)} with {twin.name}: no solver reaches {fine} in the dtype of the sample."
+        return f"Use {dtype_name(twin.dtype)} with {twin.name}: no solver reaches {fine} in the dtype of the sample."
     best = update.fastest(rows, TOLERANCES[0])
     if best is not None:
         return f"Use {best.name} with rtol={rough}, the fastest to it: no solver reaches {fine} within {seconds:g} s."
@@ -345,35 +305,8 @@ def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: flo
     )
 
 
-def _call(solver: Solver, max_iter: int, rtol: float) -> str:
-    extra = f", restart={solver.restart}" if isinstance(solver, GMRES) else ""
-    if preconditioner_of(solver) is not None:
-        extra += f", preconditioner={solver.preconditioner!r}"
-    return f"{type(solver).__name__}(max_iter={max_iter}, rtol={_power(rtol)}{extra})"
-
-
 def checked_limit(seconds: float) -> float:
     """The limit for each solver, checked."""
     if not 0 < _check.real("advise", "seconds", seconds) < float("inf"):
         raise ValueError(f"advise: seconds must be a number > 0, got {seconds}")
     return float(seconds)
-
-
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
-def _short(ms: float) -> str:
-    return f"{ms:.3g}" if ms < 1000 else f"{ms:.0f}"
-
-
-def milliseconds(seconds: float) -> str:
-    return f"{_short(1e3 * seconds)} ms"
-
-
-def _percent(share: float) -> str:
-    return f"{share:.1%}" if share < 0.01 else f"{share:.0%}"
-
-
-def _power(rtol: float) -> str:
-    return f"{rtol:.0e}".replace("e-0", "e-")

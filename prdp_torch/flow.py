@@ -11,8 +11,9 @@ from prdp_torch import _C, _check, flow_walls
 from prdp_torch.calls import forgets_if_it_raises, not_in_graphs
 from prdp_torch.flow_walls import Side, WallVelocity
 from prdp_torch.held_tensors import HoldsTensors
+from prdp_torch.kept_objects import Kept
 from prdp_torch.operators.base import full_precision, real_tensor
-from prdp_torch.solvers import CG, Kept, Solver
+from prdp_torch.solvers import CG, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
 

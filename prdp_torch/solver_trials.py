@@ -11,9 +11,9 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from prdp_torch import _C, operators, torch_private
+from prdp_torch import _C, torch_private
 from prdp_torch.flow import Flow
-from prdp_torch.operators.matrix import as_operator
+from prdp_torch.operator_probes import is_renewed, is_symmetric, operator_of, random_cotangent
 from prdp_torch.solve import AdjointLog, SolveInfo, SolveStatus
 from prdp_torch.solvers import (
     CG,
@@ -146,7 +146,7 @@ def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: f
     copied(sample)  # what does not fit is refused here
     trial = trial_of(copied, sample)
     run(trial, any_solver)  # the first backward pass of a process starts its threads
-    symmetric = _symmetric(trial)
+    symmetric = is_symmetric(copied, sample, trial.cotangent)
     rows, refused = [], []
     for solver in solvers:
         try:
@@ -218,18 +218,6 @@ def measure_with_start(step: Stepper, sample: Tensor, row: Row) -> Row:
 def trial_of(step: Stepper, sample: Tensor) -> Trial:
     cotangent = random_cotangent(step, sample)
     return Trial(step, sample, cotangent, is_renewed(step, sample, cotangent))
-
-
-def is_renewed(step: Stepper, sample: Tensor, v: Tensor) -> bool:
-    """Whether A depends on the state or is trained: whether its tensors have a gradient, or A v changes with u."""
-    if isinstance(step, Flow):
-        return False
-    with torch.enable_grad():
-        a = _operator(step, sample)
-    if any(t.requires_grad for t in a.tensors):
-        return True
-    with torch.no_grad():
-        return not torch.equal(a.apply(v), _operator(step, 0.99 * sample).apply(v))
 
 
 def _measure_one(trial: Trial, solver: Solver, seconds: float) -> list[Row]:
@@ -310,7 +298,7 @@ def _check_direct(trial: Trial, seconds: float) -> None:
         n = math.prod(step.shape)
         most, cheap = MOST_UNKNOWNS["sparse"], step.obstacle is None  # transforms along the axes
     else:
-        a = _operator(step, sample)
+        a = operator_of(step, sample)
         if a.kind in ("poisson", "heat") or (a.kind == "burgers" and len(a.shape) == 1):
             return
         most = MOST_UNKNOWNS["dense" if a.kind in ("dense", "function") else "sparse"]
@@ -331,21 +319,6 @@ def _check_direct(trial: Trial, seconds: float) -> None:
         raise ValueError(f"the batch takes some {2 * whole:.2g} s forward and adjoint, more than {seconds:g} s")
 
 
-def _operator(step: Stepper, sample: Tensor) -> operators.Operator:
-    return as_operator("advise", "operator(u)", step.operator(sample))
-
-
-def _symmetric(trial: Trial) -> bool:
-    """Whether A v and Aᵀ v agree to rounding, entry by entry."""
-    if isinstance(trial.step, Flow):
-        return True
-    v = trial.cotangent
-    with torch.no_grad():
-        a = _operator(trial.step, trial.sample)
-        product, transposed = a.apply(v), a.apply_transpose(v)
-    return float((product - transposed).abs().max()) <= _rounding(product)
-
-
 def seconds_of_parts(step: Stepper, sample: Tensor) -> float:
     """What a step takes beside its solves, forward and backward: to make A(u) and b(u), such as by a network."""
     times = []
@@ -353,34 +326,13 @@ def seconds_of_parts(step: Stepper, sample: Tensor) -> float:
         u = sample.clone().requires_grad_()
         started = now(u)
         with torch.enable_grad():
-            made = [step.rhs(u), *_operator(step, u).tensors]
+            made = [step.rhs(u), *operator_of(step, u).tensors]
         made = [t for t in made if t.grad_fn is not None]
         if made:
             leaves = {leaf for t in made for leaf in torch_private.leaves_of(t)}
             torch.autograd.grad(made, list(leaves), [torch.ones_like(t) for t in made], retain_graph=True)
         times.append(now(u) - started)
     return median(times[1:])
-
-
-def random_cotangent(step: Stepper, sample: Tensor) -> Tensor:
-    """Random, without the mean of a channel whose constants A maps to zero, such as a pressure."""
-    c = torch.randn(sample.shape, generator=torch.Generator().manual_seed(0), dtype=sample.dtype).to(sample.device)
-    if isinstance(step, Flow):
-        return c
-    with torch.no_grad():
-        a = _operator(step, sample)
-        rounding = _rounding(a.apply(c))
-        for channel in range(c.shape[1]) if c.dim() > 2 else (slice(None),):
-            constant = torch.zeros_like(c)
-            constant[:, channel] = 1.0
-            if float(a.apply(constant).abs().max()) <= rounding:
-                part = c[:, channel]
-                part -= part.flatten(1).mean(1).view(-1, *[1] * (part.dim() - 1))
-    return c
-
-
-def _rounding(v: Tensor) -> float:
-    return 100 * torch.finfo(v.dtype).eps * float(v.abs().max())
 
 
 def now(u: Tensor) -> float:

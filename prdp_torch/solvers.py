@@ -6,9 +6,8 @@ Arguments out of range raise ValueError.
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,7 +18,6 @@ from prdp_torch.types import CheckpointEvery
 
 Preconditioner: TypeAlias = 'Literal["diagonal", "multigrid"] | Operator | Multigrid | None'
 PackedOptions: TypeAlias = tuple[list[str], list[int], list[float], list[Tensor]]
-Made = TypeVar("Made")
 
 
 @dataclass
@@ -256,27 +254,6 @@ class Direct(Solver):
     max_iter: int = 1
 
     method: ClassVar[str] = "direct"
-
-
-class Kept(Generic[Made]):
-    """An object of the compiled library, made anew by `make` where the values that it is made of have changed.
-    Copies and pickles begin without one."""
-
-    def __init__(self, make: Callable[..., Made]) -> None:
-        self.make = make
-        self._last: tuple[tuple[Any, ...], Made] | None = None
-
-    def of(self, *values: Any) -> Made:
-        last = self._last
-        if last is None or last[0] != values:
-            last = self._last = values, self.make(*values)
-        return last[1]
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Kept[Made]":
-        return Kept(self.make)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Kept, (self.make,)
 
 
 def solve_options(

@@ -9,8 +9,9 @@ from torch import Tensor
 from prdp_torch import _C, _check, operators, torch_private
 from prdp_torch.calls import forgets_if_it_raises
 from prdp_torch.held_tensors import HoldsTensors
+from prdp_torch.kept_objects import Kept
 from prdp_torch.operators.base import real_tensor
-from prdp_torch.solvers import Kept, Solver
+from prdp_torch.solvers import Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, StepOptions
 

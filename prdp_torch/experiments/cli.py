@@ -13,18 +13,7 @@ from typing import IO, Annotated, Any, cast
 
 import torch
 import typer
-from rich import box
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
+from rich.progress import TaskID
 
 from prdp_torch import data_parallel
 from prdp_torch._C import VERSION, sentence
@@ -33,6 +22,7 @@ from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.tensorboard import TensorBoard
+from prdp_torch.experiments.terminal import console, counted_bar, print_table, progress_bars
 from prdp_torch.experiments.training import Callback, Interval
 
 app = typer.Typer(
@@ -41,8 +31,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Train through PDE solves that stop early, and see what it saves.",
 )
-console = Console(highlight=False, markup=False, emoji=False)  # paths and titles are printed as they are
-
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name (see `prdp scenes`) or path of a .toml file.")]
 COUNT: dict[str, Any] = {"min": 1, "max": _C.MOST_COUNTED}
 Seeds = Annotated[int | None, typer.Option(**COUNT, help="How many seeds, counted from 0.")]
@@ -128,31 +116,12 @@ def train(
     Exit 1 if one diverges: a number is not finite, or the error ends above ten times its size and its first value.
     """
     loaded = _load(scene, device, backward, intervals)
-    chosen = [
-        name
-        for name, given in (
-            ("--auto", auto),
-            ("--prdp", prdp),
-            ("--constant", constant is not None),
-            ("--schedule", schedule is not None),
-            ("--direct", direct),
-        )
-        if given
-    ]
-    if len(chosen) > 1:
-        raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
-    refinement = Refinement.prdp(loaded) if prdp else Refinement.auto()
-    if constant is not None:
-        refinement = Refinement.constant(constant)
-    elif direct:
-        refinement = Refinement.exact()
-    elif schedule is not None:
-        refinement = Refinement.schedule(*_schedule(schedule), loaded.max_iter)
+    refinement = _refinement(loaded, auto, prdp, constant, schedule, direct)
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment(loaded.device)
     diverged: dict[int, str] = {}
     warnings: dict[int, str] = {}
-    with records.alone_in([folder / refinement.label]), _progress() as progress:
+    with records.alone_in([folder / refinement.label]), progress_bars() as progress:
         comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment, resume)
         for seed in range(seeds or 1):
             task = progress.add_task(f"seed {seed}", total=loaded.training.intervals, note="")
@@ -174,7 +143,7 @@ def train(
                 environment,
                 resume,
                 callbacks,
-                _bar(progress, "data, steps"),
+                counted_bar(progress, "data, steps"),
             )
             progress.update(task, completed=loaded.training.intervals, note=f"metric {curves['metric'][-1]:.3e}")
             if (why := comparison.why_lost(curves)) is not None:
@@ -204,7 +173,7 @@ def compare(
     loaded = _load(scene, device, backward, intervals)
     folder = records.prepare_folder(out or Path("runs") / loaded.name)
     seeds = seeds or loaded.compare.seeds
-    with _progress() as progress:
+    with progress_bars() as progress:
         trainings = len(comparison.rows_of(loaded)) * seeds
         task = progress.add_task("", total=trainings * loaded.training.intervals, note="")
         finished: dict[tuple[str, int], int] = {}
@@ -213,15 +182,15 @@ def compare(
             finished[row.label, seed] = done
             progress.update(task, completed=sum(finished.values()), description=f"{row.title}, seed {seed}")
 
-        rows = comparison.run(loaded, seeds, folder, resume, show, _bar(progress, "data, steps"))
+        rows = comparison.run(loaded, seeds, folder, resume, show, counted_bar(progress, "data, steps"))
         table = comparison.summarise(loaded, rows)
         records.write(
             folder / "summary.json",
             {"settings": records.settings(loaded), **records.environment(loaded.device), "seeds": seeds, "rows": table},
         )
-        shown = trajectories.collect(loaded, rows, folder, _bar(progress, "pictures, steps"))
+        shown = trajectories.collect(loaded, rows, folder, counted_bar(progress, "pictures, steps"))
     report.write(loaded, rows, table, shown, folder)
-    _print_table(loaded, table)
+    print_table(loaded, table)
     said = [report.headline(loaded, table), *report.failures(loaded, table), f"report: {folder / 'report.html'}"]
     console.print("\n" + "\n".join(said), soft_wrap=True)
 
@@ -239,8 +208,8 @@ def export(
     path = out or Path(f"{loaded.name}.h5")
     array_files.check_name(path)
     records.prepare_folder(path.parent)
-    with _progress() as progress:
-        samples, states, *_ = datasets.export(loaded, path, steps, _bar(progress, "data, steps"))
+    with progress_bars() as progress:
+        samples, states, *_ = datasets.export(loaded, path, steps, counted_bar(progress, "data, steps"))
     console.print(f"{samples} trajectories of {states} states: {path}", soft_wrap=True)
 
 
@@ -334,51 +303,38 @@ def _load(scene: str, device: str | None, backward: str | None = None, intervals
     return loaded
 
 
+def _refinement(
+    scene: _C.Scene, auto: bool, prdp: bool, constant: int | None, schedule: str | None, direct: bool
+) -> Refinement:
+    """The one way of choosing K that the options name, the default where they name none."""
+    chosen = [
+        name
+        for name, given in (
+            ("--auto", auto),
+            ("--prdp", prdp),
+            ("--constant", constant is not None),
+            ("--schedule", schedule is not None),
+            ("--direct", direct),
+        )
+        if given
+    ]
+    if len(chosen) > 1:
+        raise ValueError(f"give one of --auto, --prdp, --constant, --schedule and --direct, not {' and '.join(chosen)}")
+    if prdp:
+        return Refinement.prdp(scene)
+    if constant is not None:
+        return Refinement.constant(constant)
+    if schedule is not None:
+        return Refinement.schedule(*_schedule(schedule), scene.max_iter)
+    return Refinement.exact() if direct else Refinement.auto()
+
+
 def _schedule(text: str) -> tuple[int, int]:
     parts = text.split(":")
     most = _C.MOST_COUNTED
     if len(parts) != 2 or not all(part.isdecimal() and len(part) < 20 and int(part) <= most for part in parts):
         raise ValueError(f"--schedule: expected START:STEP, two whole numbers up to {most}, got '{text}'")
     return int(parts[0]), int(parts[1])
-
-
-def _progress() -> Progress:
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
-    return Progress(*columns, console=console)
-
-
-def _bar(progress: Progress, name: str) -> Callable[[int, int], None]:
-    """A callback (done, total) that has a bar of its own from its first call on."""
-    task: TaskID | None = None
-
-    def show(done: int, total: int) -> None:
-        nonlocal task
-        if task is None:
-            task = progress.add_task(name, total=total, note="")
-        progress.update(task, completed=done)
-
-    return show
-
-
-def _print_table(scene: _C.Scene, table: list[comparison.Entry]) -> None:
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    names = [column.short for column in report.columns(scene)]
-    kept = report.in_terminal(scene)  # the report has the others
-    for i in kept:
-        shown.add_column(names[i], justify="right" if i else "left", no_wrap=True)
-    for entry in table:
-        row = report.cells(scene, entry)
-        shown.add_row(*(row[i] for i in kept), style="bold" if entry["kind"] in ("auto", "prdp") else None)
-    console.print(shown)
-    console.print(report.notes(scene, kept))
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 import torch
 
-from prdp_torch.advice import Advice, Update, advise_on, checked_limit, milliseconds, network_seconds
+from prdp_torch.advice import Update, advise_on, checked_limit, network_seconds
+from prdp_torch.advice_text import Advice, milliseconds
 from prdp_torch.experiments import _C, datasets, field_task
 from prdp_torch.experiments.networks import make_network
 from prdp_torch.experiments.scenes import make_solver, make_stepper

@@ -10,7 +10,8 @@ from helpers import field
 import prdp_torch as prdp
 from prdp_torch import _C, operators, solver_trials
 from prdp_torch import advice as module
-from prdp_torch.solver_trials import Row, Solve, measure_with_start, random_cotangent
+from prdp_torch.operator_probes import random_cotangent
+from prdp_torch.solver_trials import Row, Solve, measure_with_start
 
 
 def advise(step, sample, seconds=1.0, **options):

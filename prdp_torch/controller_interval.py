@@ -1,0 +1,63 @@
+"""What controllers decide by after an interval: how its solves ended, and numbers that all processes agree on."""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import torch
+
+from prdp_torch import _C, data_parallel
+from prdp_torch.types import Refinable
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
+
+
+class Ended(NamedTuple):
+    """How the last solves of the steppers ended, on the host."""
+
+    residuals: list[tuple[float, float]]  # of each stepper, the sum over its samples, and their number
+    idle: float  # the share of solves that took no iteration, though their residual is not small; the largest
+
+    @classmethod
+    def of(cls, steppers: list[Refinable]) -> Self:
+        residuals, idle = [], [0.0]
+        for info in (getattr(stepper, "info", None) for stepper in steppers):
+            if info is None:
+                residuals.append((0.0, 0.0))
+                continue
+            parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations)])
+            residual, floor, iterations = parts.cpu()  # one copy of a device
+            residual = residual.masked_fill(floor > 0, 0.0)  # it is rounding alone
+            residuals.append((float(residual.sum()), float(residual.numel())))
+            is_idle = ((iterations == 0) & (residual > _C.SMALL_RESIDUAL)).double()
+            idle.append(float(is_idle.mean()) if is_idle.numel() else 0.0)
+        return cls(residuals, max(idle))
+
+
+class Interval(NamedTuple):
+    """What a controller decides by: the arguments of `_C.Controller._step`, the same in every process."""
+
+    metric: float  # the mean over the processes, as `error` and `idle` are
+    converged: bool  # in all processes
+    residual: float | None  # where the last solves ended: the mean over the samples, of several steppers the largest
+    error: float | None
+    idle: float
+
+    @classmethod
+    def of_processes(
+        cls, metric: float, converged: bool, error: float | None, ended: Ended, group: "ProcessGroup | None"
+    ) -> Self:
+        residuals, idle = ended
+        processes = data_parallel.count(group)
+        if processes > 1:
+            # A number that is refused must be refused in every process.
+            numbers = [math.nan if x < 0 else x for x in (metric, 0.0 if error is None else error)]
+            numbers += [converged, error is not None, idle]
+            metric_sum, error_sum, agree, known, idle_sum, *flat = data_parallel.sums(
+                [*numbers, *(number for pair in residuals for number in pair)], group
+            )
+            metric, converged, idle = metric_sum / processes, agree == processes, idle_sum / processes
+            error = error_sum / processes if known == processes else None
+            residuals = list(zip(flat[::2], flat[1::2], strict=True))
+        means = [total / samples for total, samples in residuals if samples]
+        return cls(metric, converged, max((m for m in means if math.isfinite(m)), default=None), error, idle)
