@@ -217,12 +217,13 @@ class GMRES(Solver):
 class Multigrid(Solver):
     """Multigrid, as a method and as a preconditioner: the number of iterations does not grow with the grid.
 
-    An iteration is one V-cycle. It is for `Heat`, `Poisson`, `Burgers`, and for `Stencil` with neighbours at most one
-    cell away, in one to three dimensions, of any size and with any coefficients. As a preconditioner of `CG`, or of
-    `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust; there, `max_iter` and `rtol`
-    have no influence.
+    An iteration is one V-cycle. It is for `Heat`, `Poisson`, `Burgers`, `Diffusion`, and for `Stencil` with neighbours
+    at most one cell away, in one to three dimensions, of any size and with any coefficients. As a preconditioner of
+    `CG`, or of `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust; there,
+    `max_iter` and `rtol` have no influence. Unrolled gradients of A take the cycles for constants.
 
     Args:
+        max_iter, rtol: as those of every `Solver`; a cycle counts as an iteration.
         smoothing: >= 1, the smoothing steps before and after each coarse grid.
 
     Examples:

@@ -49,8 +49,8 @@ class Kernel(NamedTuple):
 
 class Fibers:
     """A device whose blocks have so much memory, and teams of one block for so many unknowns; with `most_blocks`, teams
-    have no more. `captures`: its streams capture a graph. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
-    `poison` is False."""
+    have no more. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
+    `poison` is False. With `captures`, its streams capture a graph."""
 
     def __init__(
         self,
@@ -69,7 +69,9 @@ class Fibers:
     @staticmethod
     def library():
         library = ctypes.CDLL(str(BUILD / "libprdp_fibers.so"))
-        library.prdp_fibers_begin.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool] * 2 + [ctypes.c_int64]
+        library.prdp_fibers_begin.argtypes = (
+            [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool] * 2 + [ctypes.c_int64]
+        )
         library.prdp_fibers_launches.restype = ctypes.c_int64
         library.prdp_fibers_kernels.restype = ctypes.c_int64
         library.prdp_text_of.argtypes = library.prdp_block_memory_of.argtypes = [ctypes.c_int64]

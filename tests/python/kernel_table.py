@@ -9,10 +9,13 @@ import test_gpu_multigrid as multigrid
 import test_gpu_products as products
 import torch
 from fibers import Fibers
-from test_gpu_kernels import CASES, OPERATORS, right_hand_sides, solve, solver
+from test_gpu_kernels import CASES, DIVIDED, OPERATORS, noise, right_hand_sides, solve, solver
+
+import prdp_torch as prdp
 
 CAPABILITIES = 80, 90, 120
-DEVICE = {"threads": 1024}
+DEVICE = {"threads": 1024}  # the grids of the tests, of some 60 cells, take 64 of them
+SIZES = {"64²": 64, "132², a team of two blocks": 132}
 
 
 def kernels_of_solves(dtype):
@@ -26,6 +29,25 @@ def kernels_of_solves(dtype):
         coarse_grids, cycles = Fibers().kernels()
         yield f"coarse grids of {name}", [coarse_grids]
         yield f"{method.__name__}, multigrid of {name}", [cycles]
+
+    for name, method in DIVIDED:
+        of = solver(method, max_iter=1, preconditioner="diagonal")
+        solve(OPERATORS[name](dtype), right_hand_sides(name, dtype), of, DEVICE)
+        yield f"{method.__name__}, diagonal of {name}", Fibers().kernels()
+
+
+def kernels_of_sizes(dtype):
+    """Of grids that fill a block, and more."""
+    for label, n in SIZES.items():
+        a, b = prdp.operators.Diffusion(torch.ones(1, n, n, dtype=dtype), 1.0), noise(1, 1, n, n, dtype=dtype)
+        for name, of in {
+            "CG": prdp.CG(1),
+            "GMRES(20)": prdp.GMRES(1),
+            "CG, multigrid": prdp.CG(1, preconditioner="multigrid"),
+        }.items():
+            solve(a, b, of, DEVICE)
+            for kernel in Fibers().kernels():
+                yield f"{name} of diffusion, {label}", [kernel]
 
 
 def kernels_of_loops(dtype):
@@ -61,7 +83,7 @@ def main():
     print("|---|---|---|---|---|---|---|---|---|")
     seen = set()
     for dtype in (torch.float32, torch.float64):
-        for kernels_of in (kernels_of_solves, kernels_of_loops):
+        for kernels_of in (kernels_of_solves, kernels_of_sizes, kernels_of_loops):
             for label, kernels in kernels_of(dtype):
                 for kernel in kernels:
                     if kernel in seen:

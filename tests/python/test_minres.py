@@ -104,6 +104,29 @@ def test_gradients_are_those_of_finite_differences(backward):
     assert torch.autograd.gradcheck(u, (kappa, b), atol=1e-6, rtol=1e-4)
 
 
+@pytest.mark.parametrize("as_tensors", [False, True])
+def test_a_diagonal_of_both_signs_breaks_down_and_says_so(as_tensors):
+    """Before it takes a square root of what is negative: it is no number that has left its range."""
+    kappa = torch.rand(1, 5, 6, dtype=F64, generator=torch.Generator().manual_seed(3)) + 0.3
+    a, b = operators.Diffusion(kappa, shift=-60.0), noise(1, 1, 5, 6)
+    assert a.diagonal().min() < 0 < a.diagonal().max()
+    solver = prdp.MINRES(300, 1e-11, preconditioner="diagonal")
+    if as_tensors:
+        d = a.diagonal()
+        solver = prdp.MINRES(300, 1e-11, preconditioner=operators.Function(lambda r: r / d, symmetric=True))
+    with pytest.raises(torch.linalg.LinAlgError, match=r"BREAKDOWN.*preconditioner is not positive definite"):
+        prdp.linear_solve(a, b, solver)
+    u, info = prdp.linear_solve(a, b, solver, on_failure="return")
+    assert u.isfinite().all() and info.residual.item() <= 1
+
+
+def test_a_zero_on_the_diagonal_names_what_needs_none():
+    a = torch.tensor([[2.0, 1.0], [1.0, 0.0]], dtype=F64)
+    with pytest.raises(torch.linalg.LinAlgError, match="take MINRES without it"):
+        prdp.linear_solve(a, noise(1, 2), prdp.MINRES(9, preconditioner="diagonal"))
+    assert prdp.linear_solve(a, noise(1, 2), prdp.MINRES(9))[1].solved.all()
+
+
 def test_samples_fail_alone():
     a = torch.stack([MATRICES["indefinite"], torch.zeros(N, N, dtype=F64), MATRICES["indefinite"], torch.eye(N)])
     b = noise(4, N)

@@ -1,5 +1,8 @@
 """Multigrid as a preconditioner and as a method: iterations, dense truth, both derivatives, threads, failures."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -200,6 +203,25 @@ def test_truncated_cycles_are_a_linear_map_whose_transpose_is_as_many_cycles():
         u, _ = prdp.linear_solve(a, b, prdp.Multigrid(2, rtol=0.0), backward)
         (b_bar,) = torch.autograd.grad((u * cotangent).sum(), b)
         torch.testing.assert_close((b_bar * b).sum(), (cotangent * u).sum(), rtol=1e-11, atol=0.0)
+
+
+WARNED = """
+import sys, warnings, torch, prdp_torch as prdp
+kappa, b = torch.ones(1, 8, 8, requires_grad=True), torch.ones(1, 1, 8, 8, requires_grad=True)
+for backward, solver in [("implicit", prdp.Multigrid(1)), ("unrolled", prdp.CG(3)), ("unrolled", prdp.Multigrid(1)),
+                         ("unrolled", prdp.CG(3, preconditioner="multigrid"))]:
+    for inputs in (b, (b, kappa)):
+        print(backward, solver.method, len(inputs), flush=True, file=sys.stderr)
+        u, _ = prdp.linear_solve(prdp.operators.Diffusion(kappa, 1.0), b, solver, backward=backward)
+        torch.autograd.grad(u.sum(), inputs)
+"""
+
+
+def test_cycles_that_count_as_constants_are_told_once():
+    """Where a gradient of A is asked for, which they make zero after one cycle."""
+    done = subprocess.run([sys.executable, "-c", WARNED], capture_output=True, text=True, check=True)
+    before, *told = done.stderr.split("leaves out how the cycles of multigrid depend on A")
+    assert len(told) == 1 and 'backward="implicit"' in told[0] and "unrolled multigrid 2" in before, done.stderr
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
