@@ -104,7 +104,7 @@ void take_bits(const c10::SymInt& bits, Number& tolerance, c10::SymInt& traced) 
 
 }  // namespace detail
 
-/// Raises ValueError for names that do not exist, and for lists that are too short.
+/// Raises ValueError for names that do not exist, and for lists of another length.
 inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArrayRef counts,
                            at::ArrayRef<double> numbers, at::TensorList preconditioner) {
   using namespace packed;
@@ -150,8 +150,8 @@ auto call_with_options(const Op& op, const SolveOptions& o, const Front&... fron
   return op.call(front..., packed.names, packed.counts, packed.numbers, packed.preconditioner);
 }
 
-/// A solve but its right-hand side, as the ops take it that solve or differentiate one: behind their own arguments, the
-/// operator, the start and the options.
+/// The operator, the options and the start of a solve, without b: what ops that solve or differentiate one take behind
+/// arguments of their own.
 struct SolveCall {
   OperatorSpec a;
   SolveOptions options;

@@ -39,7 +39,31 @@ std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotan
 }
 
 /// The derivatives of a batch, sample by sample: classify, differentiate, retry, report.
-struct SampleVjps {
+class SampleVjps {
+ public:
+  SampleVjps(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec, const SolveOptions& options,
+             at::IntArrayRef needed, OfIterations of_iterations, decltype(linear_solve)& any_solve)
+      : cotangent_(cotangent),
+        solved_(solved),
+        spec_(spec),
+        options_(options),
+        needed_(needed),
+        of_iterations_(of_iterations),
+        any_solve_(any_solve) {}
+
+  SolveVjp find() {
+    classify();
+    differentiate(rows_);
+    retry_implicitly();
+    if (zero_grad_) leave_out_failed_adjoints();
+    if (!needed_[0]) gradients_[0] = at::Tensor();
+    for (size_t i = 0; i < needed_.size(); ++i)
+      if (needed_[i] && !gradients_[i].defined())
+        gradients_[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
+    return {std::move(gradients_), report()};
+  }
+
+ private:
   const at::Tensor& cotangent_;
   const Solved& solved_;
   const OperatorSpec& spec_;
@@ -52,7 +76,7 @@ struct SampleVjps {
   const std::unique_ptr<Operator> a_ = make_operator(spec_);
   const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);  // and the status, of the solve
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
-  const bool for_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
+  const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
   const std::vector<int64_t> wanted_ = wanted();                            // needed_, and what that looks at
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
@@ -66,22 +90,10 @@ struct SampleVjps {
 
   std::vector<int64_t> wanted() const {
     auto all = needed_.vec();
-    if (for_a_ && may_mislead_) all[0] = 1;
+    if (needs_gradient_of_a_ && may_mislead_) all[0] = 1;
     return all;
   }
   SolveStatus status(int64_t i) const { return static_cast<SolveStatus>(statuses_[i]); }
-
-  SolveVjp find() {
-    classify();
-    differentiate(rows_);
-    retry_implicitly();
-    if (zero_grad_) leave_out_failed_adjoints();
-    if (!needed_[0]) gradients_[0] = at::Tensor();
-    for (size_t i = 0; i < needed_.size(); ++i)
-      if (needed_[i] && !gradients_[i].defined())
-        gradients_[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
-    return {std::move(gradients_), report()};
-  }
 
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
@@ -105,10 +117,10 @@ struct SampleVjps {
 
   std::vector<at::Tensor> take_iterations_back(const Rows& rows) {
     auto caps = at::zeros({batch_}, at::kLong);
-    const bool of_none = !any(rows);  // what the iterations make of no cotangent, finite or not
+    const bool for_no_sample = !any(rows);  // what the iterations make of no cotangent, finite or not
     for (int64_t i = 0; i < batch_; ++i) {
       outcomes_[i] = {status(i), counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
-      if ((rows[i] || of_none) && derivatives_[i] == Derivative::kOfIterations)
+      if ((rows[i] || for_no_sample) && derivatives_[i] == Derivative::kOfIterations)
         caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
     }
     if (!caps.any().item<bool>()) return std::vector<at::Tensor>(wanted_.size());
@@ -126,7 +138,7 @@ struct SampleVjps {
     implicit.checkpoint_every = implicit.adjoint_log = 0;
     implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
     implicit.adjoint_rtol = std::min(asked_, kRoundings / 2 * epsilon_of(solved_.b));
-    const auto u = for_a_ ? solution() : at::Tensor();
+    const auto u = needs_gradient_of_a_ ? solution() : at::Tensor();
     const auto found = implicit_vjp(only(bar_, rows), u, spec_, implicit, wanted_, any_solve_);
     for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
     const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
@@ -154,27 +166,27 @@ struct SampleVjps {
     }
     if (!any(solved)) return;
     const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
-    Rows far(batch_), near(batch_);
+    Rows misleading(batch_), to_look_at(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
-      far[i] = solved[i] && residual[i] > 1.0;
-      near[i] = solved[i] && !far[i];
+      misleading[i] = solved[i] && residual[i] > 1.0;
+      to_look_at[i] = solved[i] && !misleading[i];
     }
-    if (for_a_ && any(near)) add_far_from_product_rule(near, far);
-    if (!any(far)) return;
+    if (needs_gradient_of_a_ && any(to_look_at)) add_misleading_gradients_of_a(to_look_at, misleading);
+    if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
-      if (far[i]) derivatives_[i] = Derivative::kOfSolution;
+      if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
     differentiate(rows_);
   }
 
   /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that share a
   /// tensor of A are looked at together: it has the sum of their gradients.
-  void add_far_from_product_rule(const Rows& rows, Rows& far) {
-    bool alone = true;
+  void add_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
+    bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
-      alone = alone && (rows[i] || !rows_[i] || derivatives_[i] == Derivative::kNone);
-    const auto said = outcomes_;
-    const auto found = alone ? gradients_ : take_iterations_back(rows);
-    outcomes_ = said;
+      no_other_contributes = no_other_contributes && (rows[i] || !rows_[i] || derivatives_[i] == Derivative::kNone);
+    const auto outcomes_before = outcomes_;
+    const auto found = no_other_contributes ? gradients_ : take_iterations_back(rows);
+    outcomes_ = outcomes_before;
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
     const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);
@@ -187,7 +199,7 @@ struct SampleVjps {
         return to_host<double>(norm.contiguous(), batch_);
       };
       const auto error = norms(off), whole = norms(right);
-      for (int64_t i = 0; i < batch_; ++i) far[i] = far[i] || (rows[i] && error[i] > whole[i]);
+      for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && error[i] > whole[i]);
     }
   }
 
@@ -195,9 +207,9 @@ struct SampleVjps {
     auto good = rows_;
     for (int64_t i = 0; i < batch_; ++i) good[i] = rows_[i] && !adjoint_failed(i);
     if (good == rows_) return;
-    const auto said = outcomes_;
+    const auto outcomes_before = outcomes_;
     differentiate(good);
-    outcomes_ = said;
+    outcomes_ = outcomes_before;
   }
   bool adjoint_failed(int64_t i) const {
     return derivatives_[i] == Derivative::kOfSolution && is_failure(outcomes_[i].status);
@@ -236,7 +248,7 @@ SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const
                         decltype(linear_solve)& any_solve) {
   const bool of_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   if (of_a && options.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
-  return SampleVjps{cotangent, solved, spec, options, needed, of_iterations, any_solve}.find();
+  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).find();
 }
 
 }  // namespace prdp

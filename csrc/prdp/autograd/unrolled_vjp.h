@@ -9,12 +9,14 @@
 namespace prdp {
 
 /// The product of the cotangent of u with the derivative of the map (b, tensors of A) → u that a solve ran. It is the
-/// torch op prdp::unrolled_vjp, which runs the iterations again. There are four kinds of samples:
+/// torch op prdp::unrolled_vjp, which runs the iterations again. There are these kinds of samples:
 ///   its cotangent or its gradient is not finite     fails with NONFINITE_INPUT or OVERFLOW
 ///   solved to rounding                              gets the implicit derivative, because its last iterations, or
 ///                                                   those that it no longer needed, say nothing about that of u
-///   solved, but ‖ū - Aᵀ b̄‖ > ‖ū‖                    the same: b excites few eigenvectors, and the derivative of the
-///                                                   iterations is one in those directions alone
+///   solved by a method that is no polynomial in A, but b̄ or Ā is further from the implicit one than zero is
+///                                                   the same: b excites few eigenvectors, and the derivative of the
+///                                                   iterations is one in those directions alone, or rounding
+///   failed, with on_failure="zero_grad"             get none
 ///   all others                                      get the derivative of exactly their iterations
 /// The report of a sample with the implicit derivative is that of its adjoint solve. For the last kind it has the
 /// iterations and the status of the forward solve, and NaN as residual, because no system is solved.

@@ -102,8 +102,8 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
     TORCH_CHECK_VALUE(spec.shape[d] >= 1 && sizes[d + 2] == spec.shape[d],
                       "Stencil: coefficients must have shape (batch or 1, k, ", at::IntArrayRef(spec.shape),
                       ") with every extent >= 1, got ", sizes);
-    grid_.shape[place(d)] = spec.shape[d];
-    grid_.periodic[place(d)] = p[d] != 0.0;
+    grid_.shape[zyx(d)] = spec.shape[d];
+    grid_.periodic[zyx(d)] = p[d] != 0.0;
   }
   for (size_t at = axes; at < p.size(); at += axes) {
     const auto offset = offset_of(p.slice(at, axes));
@@ -138,10 +138,10 @@ void StencilOperator::check_vector(const at::Tensor& b) const {
 at::Tensor StencilOperator::shifted(const at::Tensor& t, const kernels::Offset& offset, bool back) const {
   auto moved = t;
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    const int64_t cells = (back ? -1 : 1) * offset.along[place(axis)], n = extent(axis);
+    const int64_t cells = (back ? -1 : 1) * offset.along[zyx(axis)], n = extent(axis);
     const int64_t d = t.dim() - dim() + axis;
     if (cells == 0) continue;
-    if (grid_.periodic[place(axis)]) {
+    if (grid_.periodic[zyx(axis)]) {
       moved = at::roll(moved, -cells, d);
       continue;
     }
@@ -195,8 +195,8 @@ at::Tensor StencilOperator::solve_directly(const at::Tensor& b, bool transposed)
 }
 
 OperatorSpec StencilOperator::spec() const {
-  OperatorSpec spec{"stencil", {grid_.shape + place(0), grid_.shape + 3}, {}, {coefficients_}};
-  for (int64_t axis = 0; axis < dim(); ++axis) spec.parameters.push_back(grid_.periodic[place(axis)]);
+  OperatorSpec spec{"stencil", {grid_.shape + zyx(0), grid_.shape + 3}, {}, {coefficients_}};
+  for (int64_t axis = 0; axis < dim(); ++axis) spec.parameters.push_back(grid_.periodic[zyx(axis)]);
   for (const auto& offset : offsets_)
     for (const int64_t cells : entries(offset, dim())) spec.parameters.push_back(static_cast<double>(cells));
   return spec;
@@ -219,7 +219,7 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
     if (!field.defined()) field = at::zeros_like(coefficients_.select(1, 0));
   const auto all = at::stack(fields, 1);
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    if (grid_.periodic[place(axis)]) continue;
+    if (grid_.periodic[zyx(axis)]) continue;
     all.select(1, 1 + 2 * axis).narrow(1 + axis, 0, 1).zero_();
     all.select(1, 2 + 2 * axis).narrow(1 + axis, extent(axis) - 1, 1).zero_();
   }
@@ -283,7 +283,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
 std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, bool transposed) const {
   std::ostringstream type;
   type << "Stencil<" << gpu::type_of(b.scalar_type()) << ", "
-       << gpu::grid_of({grid_.shape + place(0), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", " << transposed;
+       << gpu::grid_of({grid_.shape + zyx(0), static_cast<size_t>(dim())}) << ", " << b.size(1) << ", " << transposed;
   for (const bool periodic : grid_.periodic) type << ", " << periodic;
   for (const auto& offset : offsets_)
     type << ", Offset<" << offset.along[0] << ", " << offset.along[1] << ", " << offset.along[2] << ">";
@@ -295,7 +295,7 @@ std::optional<kernels::FactorKey> StencilOperator::key(bool transposed) const {
   if (coefficients_.size(0) != 1) return std::nullopt;
   kernels::FactorKeyMaker key;
   key.add(int64_t{transposed});
-  for (int64_t d = 0; d < dim(); ++d) key.add(extent(d)).add(int64_t{grid_.periodic[place(d)]});
+  for (int64_t d = 0; d < dim(); ++d) key.add(extent(d)).add(int64_t{grid_.periodic[zyx(d)]});
   for (const auto& offset : offsets_) key.add(offset.along, 3);
   return add_numbers(key, coefficients_).key();
 }

@@ -55,9 +55,9 @@ class StencilOperator final : public Operator {
                                                      const at::Tensor& held) const;
   int64_t dim() const { return grid_.dim; }
   int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
-  /// An axis among z, y, x, which the grid always has.
-  int64_t place(int64_t axis) const { return 3 - dim() + axis; }
-  int64_t extent(int64_t axis) const { return grid_.shape[place(axis)]; }
+  /// The place of an axis among z, y and x, which the grid always has.
+  int64_t zyx(int64_t axis) const { return 3 - dim() + axis; }
+  int64_t extent(int64_t axis) const { return grid_.shape[zyx(axis)]; }
   /// Coefficient k, (batch or 1, 1, *shape).
   at::Tensor coefficient(int64_t k) const { return coefficients_.narrow(1, k, 1); }
   /// t[i + offset], or t[i - offset], for the last dim() axes of t.

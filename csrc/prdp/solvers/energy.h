@@ -28,12 +28,14 @@ inline bool energy_falls(const Energies& e, double epsilon) {
   return symmetric && definite && nearer && not_rounding;
 }
 
-/// Of the samples that ended above ‖b‖: where the energy falls, the last iterate is handed out, unless the method broke
-/// down: then A is not definite, and its energy says nothing. Else the sample is DIVERGED. For a method whose residual
-/// is the true one. One product of the whole batch, which counts for these samples alone.
+/// Of the samples that ended above ‖b‖: where the energy falls, the last iterate is handed out; else the sample is
+/// DIVERGED. One that broke down is left alone: its A is not definite, and the energy says nothing. For a method whose
+/// residual is the true one. One product of the whole batch, which counts for these samples alone.
 template <class Space, class Method>
 void excuse_by_energy(Space& space, Method& method, typename Space::States& states) {
-  const auto is_above = [](const SampleState& s) { return s.answer != Answer::kLast; };
+  const auto is_above = [](const SampleState& s) {
+    return s.answer != Answer::kLast && s.status != SolveStatus::kBreakdown;
+  };
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto before = states;
   space.freeze_unless(states, [](const SampleState&) { return true; });
@@ -52,9 +54,9 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
       s.applications = before[i].applications;
       continue;
     }
+    s.answer = Answer::kLast;
     const Energies e{xb[i], xr[i], rb[i], rr[i], bb[i], x_ar[i], r_ar[i], xx[i], ar2[i]};
     if (!energy_falls(e, space.epsilon())) s.status = SolveStatus::kDiverged;
-    else if (s.status != SolveStatus::kBreakdown) s.answer = Answer::kLast;
   }
 }
 

@@ -87,7 +87,7 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
 }
 
 /// For direct methods: zero replaces u where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖ and the residual exceeds
-/// 1e-2 ‖b‖, as A is singular to the dtype there.
+/// 1e-2 ‖b‖, as A is singular to the dtype there. That, and a residual above ‖b‖, is a breakdown.
 template <class Space, class Method>
 void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
@@ -106,8 +106,10 @@ void refuse_rounding(Space& space, const Method& method, typename Space::States&
 /// Which iterate each sample is to hand out; returns whether all hand out their last.
 template <class Space, class Method>
 bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
-  for (auto& s : states)
-    s.answer = is_unsolved(s.status) && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
+  for (auto& s : states) {
+    const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
+    s.answer = may_be_worse && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
+  }
   if constexpr (kIsExact<Method>) refuse_rounding(space, method, states);
   if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
   bool all_last = true;
@@ -140,8 +142,8 @@ void take_least_of_halves(Space& space, Method& method, typename Space::States& 
     return s.answer == Answer::kBestOrZero && is_above_b(s, space.epsilon());
   };
   if (std::none_of(states.begin(), states.end(), is_worse)) return;
-  const auto whole = states;
-  auto least = states;
+  const auto full_run = states;
+  auto least = states;  // of true residual, so far; at first that of zero
   for (auto& s : least) {
     if (!is_worse(s)) continue;
     s.iterations = 0;
@@ -150,14 +152,14 @@ void take_least_of_halves(Space& space, Method& method, typename Space::States& 
   bool goes_on = true;
   for (int halvings = 1; goes_on; ++halvings) {
     run_again(space, method, states, rtol, track,
-              [&](size_t i) { return whole[i].iterations >> (is_worse(whole[i]) ? halvings : 0); });
+              [&](size_t i) { return full_run[i].iterations >> (is_worse(full_run[i]) ? halvings : 0); });
     conclude(space, method, states, rtol);
     goes_on = false;
     for (size_t i = 0; i < states.size(); ++i) {
-      if (!is_worse(whole[i])) continue;
-      const bool falls = states[i].residual2 < least[i].residual2;
-      if (falls) least[i] = states[i];
-      goes_on = goes_on || (states[i].iterations > 1 && (falls || least[i].iterations == 0));
+      if (!is_worse(full_run[i])) continue;
+      const bool is_new_least = states[i].residual2 < least[i].residual2;
+      if (is_new_least) least[i] = states[i];
+      goes_on = goes_on || (states[i].iterations > 1 && (is_new_least || least[i].iterations == 0));
     }
   }
   run_again(space, method, states, rtol, track, [&](size_t i) { return least[i].iterations; });
@@ -191,8 +193,8 @@ void replay(Space& space, Method& method, typename Space::States& states, double
 }  // namespace detail
 
 /// Solves every sample that `states` holds active, from zero or the space's start. The result is method.x, to which the
-/// caller adds the start. With `guarded`, a sample that overflows or diverges, or ends worse than zero without an
-/// excuse, is run again for as many iterations as gave its smallest residual.
+/// caller adds the start. With `guarded`, a sample whose last iterate is of no use is run again, to the iterate that
+/// its Answer names.
 template <LoopSpace Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   const bool track = rtol > 0.0;

@@ -40,10 +40,11 @@ bool is_idle(const SampleState& s) {
   return (kTakesStrides<Method> || kContracts<Method>) && s.active && s.iterations - s.best > patience;
 }
 
-/// Stops those of the `doubtful` samples whose residual is rounding, floor = ε ‖A‖ ‖u‖: one that is no larger, or up to
-/// eight times as large where rtol lies below the floor. An exhausted space is judged with more slack. A floor near ‖b‖
-/// says nothing, nor does a residual near it: there u is garbage. Nor does one far above ε ‖|A| |u|‖, which is what a
-/// product rounds: where columns of A differ much in size, ‖A‖ ‖u‖ overstates that rounding.
+/// Stops those of the `doubtful` samples whose residual is rounding, which is
+///   at most slack · floor, with floor = ε ‖A‖ ‖u‖; the slack is 1, or 8 where rtol lies below the floor, or 100 where
+///   a space is exhausted at most slack · 64 ε ‖|A| |u|‖, what a product rounds: the floor overstates it where columns
+///   of A differ in size
+/// A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {

@@ -13,9 +13,10 @@
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample on the CPU (sample_space.h) or a GPU (gpu/device/block_space.h), or a batch of plain tensors
-/// (tensor_space.h). An operation that writes to a vector leaves the samples alone that the loop around the method has
-/// frozen. A new method needs none of them but those that it calls. A new space needs the operations of each group;
-/// those of SpaceDefaults it may leave to that class, until fusing them is worth its lines.
+/// (tensor_space.h). The iterate, the residual and the directions of samples that the loop around the method has frozen
+/// keep their values; results such as that of apply() may be overwritten. A new method needs none of them but those
+/// that it calls. A new space needs the operations of each group; those of SpaceDefaults it may leave to that class,
+/// until fusing them is worth its lines.
 namespace prdp {
 
 /// A few numbers or handles of vectors that a method keeps beside its vectors, as array<X>() of the space gives them.
@@ -67,8 +68,7 @@ concept FusedOperations =
       { s.xpby_with_square(x, beta, y) } -> std::same_as<typename S::Scalar>;
       /// y = A x; returns x·y and ‖y‖².
       { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-      /// y = A x; returns p·y and, for a guarded_quotient() whose step the next update_iterate_and_residual() takes,
-      /// ‖y‖².
+      /// y = A x; returns p·y and ‖y‖², both for the guarded_quotient() that makes the next step.
       { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
       /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
       s.correct(x, y);
@@ -82,10 +82,10 @@ concept NumberOperations =
              typename S::Scalar active, typename S::Scalar where, double factor) {
       /// b = a
       s.assign(a, b);
-      /// num/den for a step, where den = v·w, and v2 = ‖v‖² and w2 = ‖w‖². 0 where num is negligible; 0 and a breakdown
-      /// of the sample where den is rounding, |den| <= ε ‖v‖ ‖w‖.
+      /// num/den for a step, where den = v·w, and v2 = ‖v‖² and w2 = ‖w‖². 0 where num is negligible or negative; NaN
+      /// where w2 is not finite; 0 and a breakdown of the sample where den is rounding, |den| <= ε ‖v‖ ‖w‖.
       { s.guarded_quotient(num, den, v2, w2) } -> std::same_as<typename S::Scalar>;
-      /// 1 where guarded_quotient() would break down and `active` is not zero, else 0; for restore() alone.
+      /// 1 where guarded_quotient() would break down and `active` is not zero, else 0.
       { s.breaks_down(den, v2, w2, active) } -> std::same_as<typename S::Scalar>;
       /// num/den for den >= 0; 0 where den is negligible.
       { s.ratio(num, den) } -> std::same_as<typename S::Scalar>;
@@ -128,7 +128,7 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
   { s.sweeps_contract() } -> std::same_as<bool>;
 };
 
-/// What GMRES needs beside: a basis, and numbers that may vanish.
+/// What GMRES and MINRES need beside: a basis, and numbers that may vanish.
 template <class S>
 concept KrylovSpace =
     VectorSpace<S> &&
@@ -183,11 +183,11 @@ concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept,
   s.operator_norm();
   /// ‖u‖², where u is x and the start.
   { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-  /// ‖A v‖² for u with its signs changed without a pattern: about ‖|A| |u|‖², as the terms of a product do not cancel.
+  /// ‖A v‖², v being u with signs that have no pattern, so that terms do not cancel: about ‖|A| |u|‖².
   { s.terms2(x) } -> std::same_as<typename S::Scalar>;
   /// A vector that the next operation may overwrite.
   { s.scratch() } -> std::convertible_to<typename S::Vector>;
-  /// From here on, operations write to the samples alone that are wanted.
+  /// From here on, the samples that are not wanted are frozen.
   s.freeze_unless(states, wanted);
   /// wanted(state) of each sample, as values_of() are.
   s.map(states, wanted);

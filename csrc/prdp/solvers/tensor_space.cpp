@@ -209,21 +209,21 @@ TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) c
 
 void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale,
                        const Scalar& keep, Scalar* y) const {
-  // argmin ‖[R; ε s I] y - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it: the factorisation stays
-  // regular.
+  // argmin ‖[R; ε s I] y - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it, so that the stacked
+  // matrix has full rank.
   const auto wanted = keep.detach().eq(0);
   if (!wanted.any().item<bool>()) return;
   const int64_t batch = b_.size(0);
-  auto a = at::zeros({batch, 2 * n, n}, b_.options());
+  auto stacked = at::zeros({batch, 2 * n, n}, b_.options());
   auto rhs = at::zeros({batch, 2 * n, 1}, b_.options());
   const auto number = [batch](const Scalar& s) { return s.detach().reshape(-1).expand(batch); };
   const auto safe = [&](const Scalar& s) { return at::where(number(wanted), number(s), at::zeros({}, s.options())); };
   for (int64_t j = 0; j < n; ++j) {
-    for (int64_t i = 0; i <= j; ++i) a.select(1, i).select(1, j).copy_(safe(r[j * stride + i]));
-    a.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
+    for (int64_t i = 0; i <= j; ++i) stacked.select(1, i).select(1, j).copy_(safe(r[j * stride + i]));
+    stacked.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
     rhs.select(1, j).select(1, 0).copy_(safe(g[j]));
   }
-  const auto [q, upper] = at::linalg_qr(a);
+  const auto [q, upper] = at::linalg_qr(stacked);
   const auto found = at::linalg_solve_triangular(upper, at::matmul(q.mT(), rhs), /*upper=*/true);
   for (int64_t j = 0; j < n; ++j) y[j] = at::where(wanted, found.select(1, j).view_as(wanted), y[j]);
 }

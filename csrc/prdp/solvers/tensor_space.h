@@ -28,20 +28,20 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
 
   // ---- the system
 
-  /// A and the preconditioner (undefined `inverse`: the diagonal). The first product with each sets a power of two per
-  /// sample that keeps later products in range.
+  /// A and the preconditioner (undefined `inverse`: the diagonal). The first apply() and precondition() set a power of
+  /// two per sample that keeps later products in range.
   struct System {
     const Operator& a;
     const Preconditioner& preconditioner;
     TensorPreconditioner inverse{};
-    at::Tensor scale_of_a{}, scale_of_inverse{};  // (batch, 1, …); undefined before the first product
+    at::Tensor scale_of_a{}, scale_of_inverse{};  // (batch, 1, …); undefined before that
   };
   /// b must be finite and scaled to the order of one, or zero. While autograd is `recording`, nothing but torch's own
   /// operations is used.
   TensorSpace(System& system, at::Tensor b, States& states, bool recording = false);
   /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
   void start_from(at::Tensor x, at::Tensor r);
-  /// Not on the CPU, and not recording: each operation of torch is a launch.
+  /// Whether each operation of torch is a launch: not on the CPU, and not recorded.
   bool is_on_device() const { return !b_.is_cpu() && !recording_; }
   /// Squared norms below this are zero to the dtype.
   double negligible() const { return negligible_; }
@@ -148,7 +148,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   std::vector<double> values_of(const Scalar& value) const;
   std::vector<bool> broken() const;
   std::vector<double> operator_norm() const;
-  /// u, which is x and the start where A is not scaled.
+  /// u = start + scale_of_a x: the solution for the A that is not scaled.
   Vector solution(const Vector& x) const;
   Scalar solution2(const Vector& x) const {
     const auto u = solution(x);

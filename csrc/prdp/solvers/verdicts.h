@@ -7,7 +7,7 @@
 #include "prdp/solvers/sample_state.h"
 
 /// What may happen to a sample: each rule that gives it a status, in the CPU loops, in tensors and in kernels of GPUs.
-/// What takes products to tell is in observe.h and energy.h. A `Flow` refuses samples before it solves
+/// What takes products to tell is in observe.h, energy.h and iterate.h. A `Flow` refuses samples before it solves
 /// (steppers/flow/limits.cpp, gpu/device/flow.h).
 namespace prdp {
 
@@ -15,7 +15,7 @@ namespace prdp {
 
 inline constexpr double kDivergenceBound = 1e13;
 
-/// Whether a residual asks to be confirmed by the true one.
+/// Whether ‖r‖ <= rtol ‖b‖, from their squares.
 inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
 
 /// Statuses that follow from a true residual. `rtol` = 0 asks for an exact zero.

@@ -36,7 +36,8 @@ SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymI
   return call_with_options(op, o, u, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps, solves);
 }
 
-void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves, const SolveOptions& options) {
+void check_rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
+                   const SolveOptions& options) {
   equation.check_picard_steps();
   options.check(equation.kind.c_str());
   check_memory(options, u);
@@ -49,7 +50,7 @@ void check(const Equation& equation, const at::Tensor& u, const c10::SymInt& sol
 
 SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
                        const SolveOptions& options) {
-  check(equation, u, solves, options);
+  check_rollout(equation, u, solves, options);
   const int64_t picard = equation.picard_steps, unknowns = u.numel();
   at::Tensor b;
   return outputs_of(solve_by_solve(u, solves.expect_int(), picard, [&](const at::Tensor& last, int64_t s) {
@@ -61,7 +62,7 @@ SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10:
 
 SolveOutputs fake_solves(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
                          const SolveOptions& options) {
-  check(equation, u, solves, options);
+  check_rollout(equation, u, solves, options);
   auto sizes = u.sym_sizes().vec();
   sizes.insert(sizes.begin() + 1, solves + 1);
   return outputs_of({at::empty_symint(sizes, u.options()), empty_info(u, {u.sym_size(0), solves})});
@@ -112,8 +113,8 @@ std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTens
   return with_equation(kernel, args...);
 }
 
-std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& e,
-                                         const SolveOptions& o, at::IntArrayRef needed) {
+std::vector<at::Tensor> call_vjp(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& e,
+                                 const SolveOptions& o, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::rollout_vjp", "").typed<VjpSignature>();
   return call_with_options(op, o, cotangent, or_none(kept.solutions), or_none(kept.iterations), or_none(kept.status),
                            or_none(kept.residual), needed, e.tensors, e.kind, e.shape, e.parameters, e.picard_steps);
@@ -121,12 +122,12 @@ std::vector<at::Tensor> call_solves_back(const at::Tensor& cotangent, const Kept
 
 /// A rollout as single steps, each of which has all derivatives.
 SolveResult step_by_step(const Equation& equation, const at::Tensor& u, int64_t steps, SolveOptions options) {
-  check(equation, u, steps * equation.picard_steps, options);
+  check_rollout(equation, u, steps * equation.picard_steps, options);
   options.adjoint_log = 0;  // it would hold the first step's alone
   return solve_by_solve(u, steps, 1, [&](const at::Tensor& state, int64_t) { return step(equation, state, options); });
 }
 
-/// The reports of the steps out of those of their solves.
+/// Combines the reports of the solves of each step.
 SolveInfo reports_of_steps(const SolveInfo& solves, const c10::SymInt& steps, int64_t picard) {
   const auto of_solve = [&](int64_t k) {
     const auto part = [&](const at::Tensor& t) { return t.unflatten_symint(1, {steps, picard}).select(-1, k); };
@@ -145,7 +146,7 @@ SolveOutputs outputs_of_rollout(const Equation& equation, const at::Tensor& u, c
 
 /// An op that calls `run`, whose arguments are those of rollout().
 template <auto run, class... Args>
-SolveOutputs op(const at::Tensor& u, Args... args) {
+SolveOutputs packed_op(const at::Tensor& u, Args... args) {
   const auto kernel = [&](const Equation& equation, const c10::SymInt& count, const auto&... packed) {
     return run(equation, u, count, unpack(packed...));
   };
@@ -162,7 +163,7 @@ SolveOutputs rollout_below_autograd(const Equation& e, const at::Tensor& u, cons
 
 std::vector<at::Tensor> rollout_vjp_below_autograd(const at::Tensor& cotangent, const KeptSolves& kept,
                                                    const Equation& e, const SolveOptions& o, at::IntArrayRef needed) {
-  return (is_plain_call(cotangent, e.tensors, o) ? solve_all_back : call_solves_back)(cotangent, kept, e, o, needed);
+  return (is_plain_call(cotangent, e.tensors, o) ? solve_all_back : call_vjp)(cotangent, kept, e, o, needed);
 }
 
 SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& steps,
@@ -184,20 +185,22 @@ SolveResult rollout(const Equation& equation, const at::Tensor& u, const c10::Sy
 TORCH_LIBRARY_FRAGMENT(prdp, m) {
   m.def(kSolvesSchema, {at::Tag::pt2_compliant_tag});
   m.def(kVjpSchema, {at::Tag::pt2_compliant_tag});
-  m.def(kRolloutSchema, static_cast<SolvesSignature*>(op<outputs_of_rollout>));
+  m.def(kRolloutSchema, static_cast<SolvesSignature*>(packed_op<outputs_of_rollout>));
 }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) {
-  m.impl("rollout_solves", static_cast<SolvesSignature*>(op<solve_all>));
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(packed_op<solve_all>));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(vjp_kernel));
 }
 TORCH_LIBRARY_IMPL(prdp, Meta, m) {
-  m.impl("rollout_solves", static_cast<SolvesSignature*>(op<fake_solves>));
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(packed_op<fake_solves>));
   m.impl("rollout_vjp", static_cast<VjpSignature*>(fake_vjp));
 }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("rollout_solves", static_cast<SolvesSignature*>(op<record_rollout>)); }
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) {
+  m.impl("rollout_solves", static_cast<SolvesSignature*>(packed_op<record_rollout>));
+}
 
 TORCH_LIBRARY_IMPL(prdp, FuncTorchBatchedDecomposition, m) {
-  m.impl("rollout", static_cast<SolvesSignature*>(op<outputs_of_rollout>));
+  m.impl("rollout", static_cast<SolvesSignature*>(packed_op<outputs_of_rollout>));
 }
 
 }  // namespace prdp

@@ -30,7 +30,7 @@ struct CycleSetting {
   static constexpr int kDim = dimensions;
   static constexpr int kVectors = vectors;    // of a sample, that the preconditioner keeps
   static constexpr int kInBlock = in_block;   // numbers of coarse grids in shared memory
-  static constexpr int64_t kBeyond = beyond;  // numbers of coarse grids in global memory: those that do not fit
+  static constexpr int64_t kBeyond = beyond;  // numbers of coarse grids in global memory, at most
   template <class S>
   using Of = Cycle<S, typename S::A::Cycled>;
 };
@@ -168,7 +168,7 @@ struct Cycle {
 
     // ---- on a grid
 
-    /// x = M b with `from_zero`; else it continues from x. y is scratch.
+    /// Steps towards A x = b, from x = 0 with `from_zero`, else from x. y is scratch.
     PRDP_ONCE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
       for (int64_t s = 0; s < cycle.hierarchy.smoothing; ++s) {
@@ -181,7 +181,7 @@ struct Cycle {
         }
       }
     }
-    /// x = q D⁻¹ b, and y = 0.
+    /// x = q D⁻¹ b, and y = 0, the iterate before it.
     PRDP_ONCE void begin(int level, T q) {
       const T *const b = right_hand_side(level), *const diagonal = diagonals(level);
       T *const x = vectors.x, *const y = vectors.y;
@@ -260,7 +260,8 @@ struct Cycle {
     const T* diagonals(int level) const {
       return cycle.numbers(grid(level).coefficients) + int64_t{Stencil::kCentre} * grid(level).points();
     }
-    /// The vectors of a coarse grid, which lie behind those of the grids above it.
+    /// The vectors of a coarse grid, which lie behind those of the grids above it, in the memory of the block as long
+    /// as they fit. Either memory is indexed as if it held all of them.
     Vectors vectors_of(int level) const {
       int64_t place = 0;
       for (int above = 1; above < level; ++above) place += 3 * entries(above);

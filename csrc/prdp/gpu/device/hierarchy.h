@@ -42,7 +42,7 @@ class HierarchyMaker {
   }
 
  private:
-  /// How many grids there are; 0 if some number is not finite, or too many points are left.
+  /// How many grids there are; 0 if some number is not finite, or the coarsest grid has too many points or no inverse.
   int64_t make_grids(A& a) {
     if (!scale_operator<T>(team_, a)) return 0;
     Stencil stencil = finest(a);
@@ -118,7 +118,7 @@ class HierarchyMaker {
     }));
   }
 
-  /// Estimated from some 4,096 of the points.
+  /// Estimated from at most 8,191 of the points, an odd number apart, so that no axis shows the same places alone.
   PRDP_ONCE kernels::Axes axes_to_coarsen(const Stencil& a) {
     const int n = a.points(), step = (n / 4096 > 1 ? n / 4096 : 1) | 1;
     const auto entry = shared(a.coefficients);
@@ -155,7 +155,7 @@ class HierarchyMaker {
     T* const to = take(int64_t{kOffsets} * coarse.points());
     coarse.coefficients = to;
     team_.meet();
-    team_.for_each(coarse.points(), [&](int i) { galerkin_point(a, line, axis, weights, i, coarse.points(), to); });
+    team_.for_each(coarse.points(), [&](int i) { make_coarse_point(a, line, axis, weights, i, coarse.points(), to); });
     team_.meet();
     return coarse;
   }
@@ -213,8 +213,8 @@ class HierarchyMaker {
   }
 
   /// All coefficients of coarse point i: R A P, for each column of neighbours.
-  void galerkin_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
-                      T* to) const {
+  void make_coarse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
+                         T* to) const {
     const int n = a.points(), inner = line.inner, row = i / inner, j = row % line.coarse, o = row / line.coarse;
     const auto fine = [&](int cells) {  // that many from the fine point where the coarse one lies
       return (o * line.n + (line.of_coarse(j) + cells + line.n) % line.n) * inner + i % inner;
