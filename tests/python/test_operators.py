@@ -63,6 +63,22 @@ def test_heat_operator_equals_the_published_code(name, shape):
     np.testing.assert_allclose(product.flatten(1), g["matvec"], rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("n", [9, 19, 20, 63, 100])
+def test_a_shared_matrix_as_preconditioner_gives_a_sample_its_own_bits(n):
+    a = spd_matrices(1, n)[0]
+    inverse = torch.linalg.inv(a + 0.1 * torch.eye(n, dtype=torch.float64))
+    solver = prdp.CG(3, 0.0, preconditioner=operators.Matrix(inverse))
+    b = torch.randn(5, n, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    u, info = prdp.linear_solve(a, b, solver, backward="unrolled")
+    assert info.residual.max() < 0.1
+    torch.testing.assert_close(b @ torch.linalg.inv(a), u, rtol=0.1, atol=0.1 * u.abs().max().item())
+    for some in (slice(1), slice(3, 5)):
+        assert torch.equal(prdp.linear_solve(a, b[some], solver)[0], u[some])
+    (gradient,) = torch.autograd.grad(u.sum(), b)
+    (alone,) = torch.autograd.grad(prdp.linear_solve(a, b[:1], solver, backward="unrolled")[0].sum(), b)
+    torch.testing.assert_close(gradient[0], alone[0], rtol=1e-9, atol=1e-12)
+
+
 def test_apply_differentiates_with_respect_to_field_and_viscosity():
     nu = torch.tensor(3e-3, dtype=torch.float64, requires_grad=True)
     v = field((4, 3)).requires_grad_()
