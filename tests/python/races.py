@@ -24,9 +24,6 @@ def main():
         a, b = multigrid.OPERATORS[name][0](torch.float32), multigrid.right_hand_sides(name, torch.float32)
         with Fibers(left_out=int(sys.argv[1]), block_memory=0):
             prdp.linear_solve(a, b, multigrid.with_cycles(prdp.GMRES, max_iter=1, rtol=0.0), on_failure="return")
-    a, b = OPERATORS["heat 2D"](torch.float32), right_hand_sides("heat 2D", torch.float32)
-    with Fibers(left_out=int(sys.argv[1]), cells=16):  # a team of blocks
-        prdp.linear_solve(a, b, solver(prdp.CG, rtol=0.0, max_iter=2), on_failure="return")
     flow = prdp.Flow((5, 6), nu=0.1, dt=0.01, solver=prdp.CG(2, 0.0), on_failure="return")
     with Fibers(left_out=int(sys.argv[1])):
         u = torch.randn(2, 2, 5, 6, requires_grad=True)

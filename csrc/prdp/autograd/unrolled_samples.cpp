@@ -21,7 +21,7 @@ namespace {
 enum class Derivative {
   kOfIterations,
   kOfSolution,
-  kNone,     // its solve failed
+  kNone,     // its solve failed, with on_failure="zero_grad"
   kRefused,  // none: its cotangent is not finite
 };
 
@@ -80,10 +80,11 @@ class SampleVjps {
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
   const std::vector<int64_t> wanted_ = wanted();                            // needed_, and what that looks at
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
-  const double asked_ = options_.adjoint_rtol.value_or(options_.solver.rtol);  // tolerance of adjoint solves
+  const double judged_rtol_ =
+      options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
   std::vector<Derivative> derivatives_{};
   Rows rows_ = finite_rows(cotangent_);        // whose gradients are finite
-  at::Tensor bar_ = only(cotangent_, rows_);   // the cotangent of samples that are not refused
+  at::Tensor finite_cotangent_ = only(cotangent_, rows_);   // the cotangent of samples that are not refused
   std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
   std::vector<at::Tensor> gradients_{};
   at::Tensor u_{};
@@ -107,7 +108,10 @@ class SampleVjps {
   /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`.
   void differentiate(Rows& rows) {
     gradients_ = finite_sum(rows, [this](const Rows& some) {
-      auto sum = take_iterations_back(some);
+      auto [sum, applications] = take_iterations_back(some);
+      const auto products = to_host<int64_t>(applications, batch_);
+      for (int64_t i = 0; i < batch_; ++i)
+        outcomes_[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
       auto implicit = some;
       for (int64_t i = 0; i < batch_; ++i) implicit[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
       if (any(implicit)) add_adjoint_solves(implicit, sum);
@@ -115,21 +119,16 @@ class SampleVjps {
     });
   }
 
-  std::vector<at::Tensor> take_iterations_back(const Rows& rows) {
+  UnrolledVjp take_iterations_back(const Rows& rows) const {
     auto caps = at::zeros({batch_}, at::kLong);
     const bool for_no_sample = !any(rows);  // what the iterations make of no cotangent, finite or not
-    for (int64_t i = 0; i < batch_; ++i) {
-      outcomes_[i] = {status(i), counts_[i], 0, std::numeric_limits<double>::quiet_NaN()};
+    for (int64_t i = 0; i < batch_; ++i)
       if ((rows[i] || for_no_sample) && derivatives_[i] == Derivative::kOfIterations)
         caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
-    }
-    if (!caps.any().item<bool>()) return std::vector<at::Tensor>(wanted_.size());
-    auto found = of_iterations_(
-        only(bar_, rows), solved_.b,
+    if (!caps.any().item<bool>()) return {std::vector<at::Tensor>(wanted_.size()), at::zeros({batch_}, at::kLong)};
+    return of_iterations_(
+        only(finite_cotangent_, rows), solved_.b,
         {spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()), options_.checkpoint_every}, wanted_);
-    const auto applications = to_host<int64_t>(found.operator_applications, batch_);
-    for (int64_t i = 0; i < batch_; ++i) outcomes_[i].applications = applications[i];
-    return std::move(found.gradients);
   }
 
   void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum) {
@@ -137,9 +136,9 @@ class SampleVjps {
     implicit.backward = Backward::kImplicit;
     implicit.checkpoint_every = implicit.adjoint_log = 0;
     implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
-    implicit.adjoint_rtol = std::min(asked_, kRoundings / 2 * epsilon_of(solved_.b));
+    implicit.adjoint_rtol = std::min(judged_rtol_, kRoundings / 2 * epsilon_of(solved_.b));
     const auto u = needs_gradient_of_a_ ? solution() : at::Tensor();
-    const auto found = implicit_vjp(only(bar_, rows), u, spec_, implicit, wanted_, any_solve_);
+    const auto found = implicit_vjp(only(finite_cotangent_, rows), u, spec_, implicit, wanted_, any_solve_);
     for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
     const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
     const auto residual = to_host<double>(found.info.residual, batch_);
@@ -149,14 +148,13 @@ class SampleVjps {
       if (!rows[i]) continue;
       const auto said = static_cast<SolveStatus>(status[i]);
       const bool has_none = is_refused(said) || said == SolveStatus::kOverflow;  // no gradient, whatever its residual
-      const bool good = status[i] < 0 && !has_none && residual[i] <= asked_;
+      const bool good = status[i] < 0 && !has_none && residual[i] <= judged_rtol_;
       outcomes_[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
     }
   }
 
-  /// The solved samples whose iterations say little about the derivative of the solution: b̄ is one in few directions,
-  /// and Ā may be rounding that recurrences amplify. So where b̄ or Ā is worse than zero, the solution's takes its
-  /// place.
+  /// For solved samples. Iterations excite few eigenvectors, so their b̄ may be far from the solution's; their Ā may be
+  /// amplified rounding. Where either is further from the implicit gradient than zero is, that takes its place.
   void retry_implicitly() {
     if (!may_mislead_ || !gradients_[0].defined()) return;
     Rows solved(batch_);
@@ -165,7 +163,7 @@ class SampleVjps {
       solved[i] = ended && derivatives_[i] == Derivative::kOfIterations && rows_[i];
     }
     if (!any(solved)) return;
-    const auto residual = adjoint_residuals(*a_, bar_, gradients_[0]);
+    const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
     Rows misleading(batch_), to_look_at(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
       misleading[i] = solved[i] && residual[i] > 1.0;
@@ -184,9 +182,7 @@ class SampleVjps {
     bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
       no_other_contributes = no_other_contributes && (rows[i] || !rows_[i] || derivatives_[i] == Derivative::kNone);
-    const auto outcomes_before = outcomes_;
-    const auto found = no_other_contributes ? gradients_ : take_iterations_back(rows);
-    outcomes_ = outcomes_before;
+    const auto found = no_other_contributes ? gradients_ : take_iterations_back(rows).gradients;
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
     const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);

@@ -14,7 +14,8 @@ template <class T>
 struct GalerkinPoint {
   T left, centre, right;
 
-  // The weights with which those fine points take the coarse points beside them, and the coarse point takes them.
+  // Of interpolation, to the fine points before and after, from the coarse points left and right of each; and of
+  // restriction, from them to this coarse point.
   T before_left = 1, before_right = 0, after_left = 0, after_right = 1;
   T restrict_before = 0, restrict_after = 0;
 

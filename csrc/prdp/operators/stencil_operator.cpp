@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <sstream>
 
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/given_stencil.h"
@@ -105,8 +106,8 @@ StencilOperator::StencilOperator(const OperatorSpec& spec) : grid_{0, {1, 1, 1},
     grid_.shape[zyx(d)] = spec.shape[d];
     grid_.periodic[zyx(d)] = p[d] != 0.0;
   }
-  for (size_t at = axes; at < p.size(); at += axes) {
-    const auto offset = offset_of(p.slice(at, axes));
+  for (size_t start = axes; start < p.size(); start += axes) {
+    const auto offset = offset_of(p.slice(start, axes));
     TORCH_CHECK_VALUE(std::find(offsets_.begin(), offsets_.end(), offset) == offsets_.end(), "Stencil: the offset ",
                       as_tuple(entries(offset, dim())), " is there twice; add up its coefficients");
     offsets_.push_back(offset);
@@ -261,7 +262,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_by_differences(
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Tensor& b, bool transposed,
                                                                     const at::Tensor& held) const {
   const auto offsets = transposed ? turned(offsets_) : offsets_;
-  const auto of_samples =
+  const auto make_batch =
       [transposed, held, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
        pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
@@ -277,7 +278,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
       batch.product = [c, given, channels](int64_t s, const T* v, T* out) { given.apply(s, channels, v, out); };
     return batch;
   };
-  return kernels::make_kernels(b.scalar_type() == at::kFloat, of_samples);
+  return kernels::make_kernels(b.scalar_type() == at::kFloat, make_batch);
 }
 
 std::optional<gpu::OperatorView> StencilOperator::gpu_view(const at::Tensor& b, bool transposed) const {

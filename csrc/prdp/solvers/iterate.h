@@ -60,7 +60,7 @@ void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& 
   if constexpr (kLeastResidual<Method>) method.residual2();
 }
 
-/// Recomputes the residual of what is not settled and gives it its final status.
+/// Recomputes the residual of each sample that is not concluded, and sets its status.
 template <class Space, class Method>
 PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto open = [](const SampleState& s) { return !s.concluded; };

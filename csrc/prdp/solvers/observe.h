@@ -40,11 +40,11 @@ bool is_idle(const SampleState& s) {
   return (kTakesStrides<Method> || kContracts<Method>) && s.active && s.iterations - s.best > patience;
 }
 
-/// Stops those of the `doubtful` samples whose residual is rounding, which is
-///   at most slack · floor, with floor = ε ‖A‖ ‖u‖; the slack is 1, or 8 where rtol lies below the floor, or 100 where
-///   a space is exhausted at most slack · 64 ε ‖|A| |u|‖, what a product rounds: the floor overstates it where columns
-///   of A differ in size
-/// A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage.
+/// Stops those of the `doubtful` samples whose residual is rounding: at most slack · floor, with floor = ε ‖A‖ ‖u‖. The
+/// slack is 1, or 8 where rtol lies below the floor, or 100 where a space is exhausted. As the floor overstates the
+/// rounding where columns of A differ in size, the residual must also be at most slack · 64 ε ‖|A| |u|‖, which terms2()
+/// estimates: that is what a product rounds. A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there
+/// u is garbage.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {
@@ -67,8 +67,8 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
   const auto terms2 = space.values_of(space.terms2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double of_product = far * space.epsilon() * std::sqrt(terms2[i]);
-    if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * of_product)) continue;
+    const double rounding_of_product = far * space.epsilon() * std::sqrt(terms2[i]);
+    if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) continue;
     s.stop(SolveStatus::kStagnated);
     s.floor2 = floors[i] * floors[i];
   }
@@ -115,11 +115,11 @@ PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& sta
   if (!any_claims) return;
 
   space.freeze_unless(states, [](const SampleState& s) { return s.candidate; });
-  const auto true2 = space.values_of(method.recompute_residual());
+  const auto true_residual2 = space.values_of(method.recompute_residual());
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (!s.candidate) continue;
-    s.residual2 = true2[i];
+    s.residual2 = true_residual2[i];
     judge(s, rtol);
     if (s.active && has_drifted(s, rtol)) s.stop(SolveStatus::kStagnated);
     if constexpr (kLeastResidual<Method>) {

@@ -16,7 +16,7 @@
 namespace prdp {
 
 /// A whole batch as a space for iterate(), in plain tensor operations: it serves every device,
-/// operators without CPU loops, and, run under autograd, the derivative of the iterations. Nothing
+/// operators without CPU loops, and, run under autograd, the derivative of the iterations. No vector
 /// is written in place but by batch_loops. A frozen sample keeps its values by at::where.
 ///
 /// The operations stand in the groups of space.h, which says what each does.
@@ -210,7 +210,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
-  bool recording_, in_loops_;
+  bool recording_;  // autograd records: torch's own operations alone
+  bool in_loops_;   // batch_loops do the work
 };
 
 }  // namespace prdp

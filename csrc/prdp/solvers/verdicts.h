@@ -18,7 +18,8 @@ inline constexpr double kDivergenceBound = 1e13;
 /// Whether ‖r‖ <= rtol ‖b‖, from their squares.
 inline bool is_within(double residual2, double rtol, double b2) { return residual2 <= rtol * rtol * b2; }
 
-/// Statuses that follow from a true residual. `rtol` = 0 asks for an exact zero.
+/// Statuses that follow from a residual; from a recursive one, kConverged is only a claim, which observe() confirms.
+/// `rtol` = 0 asks for an exact zero.
 inline void judge(SampleState& s, double rtol) {
   if (!std::isfinite(s.residual2)) return s.stop(SolveStatus::kOverflow);
   if (s.residual2 > kDivergenceBound * kDivergenceBound * s.b2) return s.stop(SolveStatus::kDiverged);

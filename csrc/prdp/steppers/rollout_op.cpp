@@ -144,7 +144,7 @@ SolveOutputs outputs_of_rollout(const Equation& equation, const at::Tensor& u, c
   return outputs_of(rollout(equation, u, steps, options));
 }
 
-/// An op that calls `run`, whose arguments are those of rollout().
+/// The kernel of an op: calls run(equation, u, count, options), where `count` is of solves, or of steps.
 template <auto run, class... Args>
 SolveOutputs packed_op(const at::Tensor& u, Args... args) {
   const auto kernel = [&](const Equation& equation, const c10::SymInt& count, const auto&... packed) {

@@ -41,7 +41,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   using Vectors::scratch;
   using Vectors::xpby_with_square;
 
-  /// `in_block`: memory of the block for the first vectors; `beyond`: of the device for the others, and for damping.
+  /// `in_block`: memory of the block, for coarse grids and then the first vectors. `beyond`: of the device, for the
+  /// other vectors, for damping, and for coarse grids that do not fit.
   BlockSpace(TeamOfSample& team, const A& a, const SolveArguments<T>& of, int64_t sample, T* in_block, T* beyond)
       : Vectors(team, in_block + S::Cycles::kInBlock, beyond),
         a_(a),

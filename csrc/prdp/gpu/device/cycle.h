@@ -28,7 +28,7 @@ template <int dimensions, int vectors, int in_block, int64_t beyond>
 struct CycleSetting {
   static constexpr bool kAny = true;
   static constexpr int kDim = dimensions;
-  static constexpr int kVectors = vectors;    // of a sample, that the preconditioner keeps
+  static constexpr int kVectors = vectors;    // of scratch that the preconditioner takes on the finest grid
   static constexpr int kInBlock = in_block;   // numbers of coarse grids in shared memory
   static constexpr int64_t kBeyond = beyond;  // numbers of coarse grids in global memory, at most
   template <class S>

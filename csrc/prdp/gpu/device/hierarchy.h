@@ -42,7 +42,8 @@ class HierarchyMaker {
   }
 
  private:
-  /// How many grids there are; 0 if some number is not finite, or the coarsest grid has too many points or no inverse.
+  /// How many grids there are; 0 if a number is not finite, a diagonal is zero, there are too many grids, or the
+  /// coarsest has too many points or no inverse.
   int64_t make_grids(A& a) {
     if (!scale_operator<T>(team_, a)) return 0;
     Stencil stencil = finest(a);
@@ -215,20 +216,20 @@ class HierarchyMaker {
   /// All coefficients of coarse point i: R A P, for each column of neighbours.
   void make_coarse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
                          T* to) const {
-    const int n = a.points(), inner = line.inner, row = i / inner, j = row % line.coarse, o = row / line.coarse;
+    const int n = a.points(), inner = line.inner, row = i / inner, j = row % line.coarse, outer = row / line.coarse;
     const auto fine = [&](int cells) {  // that many from the fine point where the coarse one lies
-      return (o * line.n + (line.of_coarse(j) + cells + line.n) % line.n) * inner + i % inner;
+      return (outer * line.n + (line.of_coarse(j) + cells + line.n) % line.n) * inner + i % inner;
     };
-    const int before = line.before(j), after = line.after(j), at[3] = {fine(-1), fine(0), fine(1)};
+    const int before = line.before(j), after = line.after(j), fine_points[3] = {fine(-1), fine(0), fine(1)};
     const auto entry = shared(a.coefficients);
     const auto weight = shared(weights);
     const int of_left = 0, of_right = line.weights(), restriction = symmetric_ ? 0 : 2 * line.weights();
     const auto restrict_by = [&](int field, int between) {
-      return weight[restriction + field + (o * line.between() + between) * inner + i % inner];
+      return weight[restriction + field + (outer * line.between() + between) * inner + i % inner];
     };
     for_each_column(axis, [&](int centre, const int (&offset)[3]) {
       const auto interpolate_by = [&](int field, int between) {
-        const int index = weight_of_column(a, line, axis, at[1], offset, between);
+        const int index = weight_of_column(a, line, axis, fine_points[1], offset, between);
         return index < 0 ? T(0) : weight[field + index];
       };
       kernels::GalerkinPoint<T> made;
@@ -243,7 +244,7 @@ class HierarchyMaker {
         made.restrict_after = restrict_by(of_left, after);
       }
       const int lower = centre - Stencil::step(axis), upper = centre + Stencil::step(axis);
-      const auto coefficient = [&](int place, int p) { return entry[place * n + at[p]]; };
+      const auto coefficient = [&](int place, int p) { return entry[place * n + fine_points[p]]; };
       made.take_centres(coefficient(centre, 0), coefficient(centre, 1), coefficient(centre, 2));
       made.take_sides({coefficient(lower, 0), coefficient(lower, 1), coefficient(lower, 2)},
                       {coefficient(upper, 0), coefficient(upper, 1), coefficient(upper, 2)});
@@ -252,7 +253,7 @@ class HierarchyMaker {
       to[centre * points + i] = is_alone ? made.centre + made.left + made.right : made.centre;
       to[upper * points + i] = is_alone ? T(0) : made.right;
     });
-    keep_vanishing_diagonal(entry[kCentre * n + at[1]], i, points, to);
+    keep_vanishing_diagonal(entry[kCentre * n + fine_points[1]], i, points, to);
   }
   /// See kernels::kVanishing.
   static void keep_vanishing_diagonal(T fine, int i, int points, T* to) {
