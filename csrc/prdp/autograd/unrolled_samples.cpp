@@ -52,6 +52,7 @@ class SampleVjps {
         any_solve_(any_solve) {}
 
   SolveVjp find() {
+    if (needs_gradient_of_a_ && options_.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
     classify();
     differentiate(rows_);
     retry_implicitly();
@@ -242,8 +243,6 @@ class SampleVjps {
 SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
                         const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
                         decltype(linear_solve)& any_solve) {
-  const bool of_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
-  if (of_a && options.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
   return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).find();
 }
 
