@@ -186,7 +186,13 @@ def test_kernels_solve_as_the_loops_of_the_cpu(name, method, dtype, monkeypatch)
     of = solver_of(method, rtol=rtol)
     u, info = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")
     found = u.cpu(), info.__class__(*(part.cpu() if isinstance(part, torch.Tensor) else part for part in info))
-    agree(found, prdp.linear_solve(a, b, of, on_failure="return"), dtype, slack=5 * rtol / torch.finfo(dtype).eps)
+    agree(
+        found,
+        prdp.linear_solve(a, b, of, on_failure="return"),
+        dtype,
+        slack=5 * rtol / torch.finfo(dtype).eps,
+        method=method,
+    )
     again = prdp.linear_solve(there(a), b.to(DEVICE), of, on_failure="return")[0]
     assert torch.equal(again, u)
 

@@ -113,10 +113,12 @@ def solve(a, b, solver, device=None, **options):
         return prdp.linear_solve(a, b, solver=solver, on_failure="return", **options)
 
 
-def agree(mine, other, dtype, slack=300.0):
+def agree(mine, other, dtype, slack=300.0, method=None):
     (u, info), (v, report) = mine, other
     assert info.status.tolist() == report.status.tolist()
-    assert (info.iterations - report.iterations).abs().max() <= 1 + report.iterations.max() // 20
+    # The residual of BiCGStab is no smooth sequence, and where it crosses rtol depends on the order of sums.
+    erratic = report.iterations.max() // 20 if method is prdp.BiCGStab else 0
+    assert (info.iterations - report.iterations).abs().max() <= 1 + erratic
     scale = v.flatten(1).norm(dim=1).clamp(min=torch.finfo(dtype).tiny)
     assert ((u - v).flatten(1).norm(dim=1) <= slack * torch.finfo(dtype).eps * scale).all()
 
@@ -136,7 +138,7 @@ def test_methods_and_operators_are_those_of_the_cpu(name, method, dtype):
     a, b = OPERATORS[name](dtype), right_hand_sides(name, dtype)
     rtol = 1e-5 if dtype == F32 else 1e-12
     mine, other = (solve(a, b, solver(method, rtol=rtol), device) for device in ({}, None))
-    agree(mine, other, dtype, slack=5 * rtol / torch.finfo(dtype).eps)
+    agree(mine, other, dtype, slack=5 * rtol / torch.finfo(dtype).eps, method=method)
     if dtype == F64:  # with a team of blocks, after as many iterations as are asked for
         few = solver(method, rtol=0.0, max_iter=3)
         agree(solve(a, b, few, TEAMS), solve(a, b, few), dtype, slack=1e4)

@@ -159,10 +159,10 @@ def test_a_device_that_is_not_looked_at_says_the_same(method):
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "direct"])  # which takes no singular matrix at any scale
 def test_where_nobody_named_the_null_space_nothing_fails_either(method, dtype):
     """The mean of b is its rounding, and what is left of the residual is that mean. With nine bits, float32's at the
-    next exponent, a solve may also stop far above rtol, which depends on the order of sums."""
+    last exponent, CG may also stop far above rtol, which depends on the order of sums."""
     n = 16
     a = insulated(n, dtype)
-    for seed in range(3):
+    for seed in range(3 if dtype == F32 and method.startswith("cg") else 4):
         exponent = NORMAL[dtype] - 4 * seed - 2
         b = consistent((1, n, n), dtype, exponent, seed)
         u, info = prdp.linear_solve(a, b, METHODS[method](300, 1e-6))
