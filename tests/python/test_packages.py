@@ -62,10 +62,26 @@ def test_the_examples_build_with_the_installed_package_and_run(installed, tmp_pa
     # The error of its last line, without torch's stack trace.
     assert gradient.stderr == "heat_gradient: Heat: expected (batch, 1, 30), got (4, 30)\n"
 
+    found = [[float(x) for x in line] for line in re.findall(
+        r"loss (\S+), error of kappa (\S+)", run(tmp_path / "own_equation").stdout)]  # fmt: skip
+    assert len(found) == 3 and found[-1][0] < 1e-2 * found[0][0] and found[-1][1] < 0.1 < found[0][1], found
+
     trained = run(tmp_path / "train_network").stdout
     epochs = [(float(error), int(k)) for error, k in re.findall(r"error (\S+), K = (\d+)", trained)]
     assert len(epochs) == 7 and epochs[0][1] == 1 and epochs[-1][1] > 1
     assert epochs[-1][0] < 0.3 * epochs[0][0] and [k for _, k in epochs] == sorted(k for _, k in epochs)
+
+
+def test_the_package_refuses_another_release_of_torch(installed, tmp_path):
+    torch_folder = tmp_path / "share" / "cmake" / "Torch"
+    torch_folder.mkdir(parents=True)
+    (torch_folder / "TorchConfig.cmake").touch()
+    (torch_folder / "TorchConfigVersion.cmake").write_text("set(PACKAGE_VERSION 2.99.1)")
+    refused = run(CMAKE, "-S", ROOT / "examples" / "cpp", "-B", tmp_path / "build", "-G", "Ninja",
+                  f"-DCMAKE_PREFIX_PATH={installed};{tmp_path}", status=1)  # fmt: skip
+    here = ".".join(torch.__version__.split(".")[:2])
+    said = " ".join(refused.stderr.split())
+    assert f"prdp: was built with PyTorch {here}, found 2.99 in {torch_folder}" in said, said
 
 
 def shown_symbols(library):

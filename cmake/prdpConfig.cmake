@@ -1,2 +1,0 @@
-include("${CMAKE_CURRENT_LIST_DIR}/prdpTorch.cmake")
-include("${CMAKE_CURRENT_LIST_DIR}/prdpTargets.cmake")
