@@ -37,6 +37,9 @@ struct Constants {
   explicit Constants(int64_t n) : zeros(n, T(0)), ones(n, T(1)) {}
 };
 
+/// Offsets -1, 0 and 1 along the axis.
+enum Along { kLower, kCentre, kUpper };
+
 /// The coarse coefficients with one offset in the other axes, and what they are made of.
 template <class T>
 class CoarseCoefficients {
@@ -52,7 +55,7 @@ class CoarseCoefficients {
         offset_(StencilFields<T>::offset(centre)) {
     for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[place(centre, d)];
   }
-  bool is_empty() const { return !fine_[0] && !fine_[1] && !fine_[2]; }
+  bool is_empty() const { return !fine_[kLower] && !fine_[kCentre] && !fine_[kUpper]; }
   /// Adds those with offset -1, 0 and 1 along the axis to a coarse operator, for make() to fill.
   void add_to(StencilFields<T>& coarse, int centre) {
     for (int d = 0; d < 3; ++d) coarse_[d] = coarse.add(place(centre, d));
@@ -61,11 +64,11 @@ class CoarseCoefficients {
   void make(const CoarseRun& run) const {
     const auto [before, here, after, has_before, has_after] = around(run);
     const T *const zeros = constants_.zeros.data(), *const ones = constants_.ones.data();
-    const auto coefficient = [&](int d, const Point& p) {
+    const auto coefficient = [&](Along d, const Point& p) {
       return fine_[d] ? fine_[d] + (p[0] * a_.grid.shape[1] + p[1]) * a_.grid.shape[2] + p[2] : zeros;
     };
-    const bool has_sides = fine_[0] || fine_[2];
-    const auto side = [&](int d, const Point& p) { return has_sides ? coefficient(d, p) : nullptr; };
+    const bool has_sides = fine_[kLower] || fine_[kUpper];
+    const auto side = [&](Along d, const Point& p) { return has_sides ? coefficient(d, p) : nullptr; };
     const auto weight_of_row = [&](const Field<T>& weights, const Point& p) {
       return weights.data() + ringed_.at(p[0], p[1], p[2]);
     };
@@ -76,24 +79,24 @@ class CoarseCoefficients {
     };
     const auto& [interpolation, restriction] = transfer_;
     const int64_t to = run.row.first + run.first;
-    const GalerkinProduct<T> product{.lower_before = side(0, before),
-                                     .lower_here = side(0, here),
-                                     .lower_after = side(0, after),
-                                     .centre_before = coefficient(1, before),
-                                     .centre_here = coefficient(1, here),
-                                     .centre_after = coefficient(1, after),
-                                     .upper_before = side(2, before),
-                                     .upper_here = side(2, here),
-                                     .upper_after = side(2, after),
+    const GalerkinProduct<T> product{.lower_before = side(kLower, before),
+                                     .lower_here = side(kLower, here),
+                                     .lower_after = side(kLower, after),
+                                     .centre_before = coefficient(kCentre, before),
+                                     .centre_here = coefficient(kCentre, here),
+                                     .centre_after = coefficient(kCentre, after),
+                                     .upper_before = side(kUpper, before),
+                                     .upper_here = side(kUpper, here),
+                                     .upper_after = side(kUpper, after),
                                      .before_left = has_before ? weight_of_column(interpolation.left, before) : ones,
                                      .before_right = has_before ? weight_of_column(interpolation.right, before) : zeros,
                                      .after_left = has_after ? weight_of_column(interpolation.left, after) : zeros,
                                      .after_right = has_after ? weight_of_column(interpolation.right, after) : ones,
                                      .restrict_before = has_before ? weight_of_row(restriction.right, before) : zeros,
                                      .restrict_after = has_after ? weight_of_row(restriction.left, after) : zeros,
-                                     .left = coarse_[0] + to,
-                                     .centre = coarse_[1] + to,
-                                     .right = coarse_[2] + to};
+                                     .left = coarse_[kLower] + to,
+                                     .centre = coarse_[kCentre] + to,
+                                     .right = coarse_[kUpper] + to};
     loops<T>().galerkin_product(product, /*step=*/axis_ == 2 ? 2 : 1, run.count);
   }
 
@@ -112,7 +115,7 @@ class CoarseCoefficients {
     // by zeros with an even number: the last point is coarse.
     return {fine(here - 1), fine(here), fine(here + 1), here > 0 || (periodic && extent % 2 == 0), here + 1 < extent};
   }
-  /// With offset d - 1 along the axis.
+  /// Of a coefficient in a stencil.
   int place(int centre, int d) const { return centre + (d - 1) * (axis_ == 0 ? 9 : axis_ == 1 ? 3 : 1); }
 
   const StencilFields<T>& a_;
@@ -120,8 +123,8 @@ class CoarseCoefficients {
   const AxisTransfer<T>& transfer_;
   const Constants<T>& constants_;
   RingedGrid ringed_;
-  Offset offset_;        // in the other axes
-  const T* fine_[3];     // with offset -1, 0, 1 along the axis; null: there are none
+  Offset offset_;     // in the other axes
+  const T* fine_[3];  // of each Along; null: there are none
   T* coarse_[3] = {};
 };
 

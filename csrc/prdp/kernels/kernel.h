@@ -105,8 +105,8 @@ class Kernel {
   }
   /// Whether A maps a null space that somebody named to zero up to rounding only. Then products are to be projected:
   /// what is left there would add up in the residuals that a method carries on.
-  bool needs_projection() const { return leaks_; }
-  void set_leaks() { leaks_ = true; }
+  bool needs_projection() const { return needs_projection_; }
+  void set_needs_projection() { needs_projection_ = true; }
 
  protected:
   const WholeVectors<T> vectors_{};
@@ -115,7 +115,7 @@ class Kernel {
   Layout<T> layout_;
   T factor_;
   std::optional<NullSpace<T>> null_space_, left_null_space_;
-  bool leaks_ = false;
+  bool needs_projection_ = false;
 };
 
 template <class T>

@@ -263,7 +263,7 @@ std::shared_ptr<const kernels::Kernels> SingularOperator::kernels(const at::Tens
           const auto& layout = a->layout();
           const int64_t fields = layout.planes, span = spans_channels ? fields : 1;
           a->set_null_spaces({layout, 0, fields, *right, span}, {layout, 0, fields, *left, span});
-          a->set_leaks();
+          a->set_needs_projection();
           return a;
         };
         return std::make_shared<const kernels::Kernels>(

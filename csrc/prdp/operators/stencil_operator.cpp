@@ -16,6 +16,7 @@ namespace prdp {
 namespace {
 
 constexpr int64_t kFarthest = 2;
+constexpr int64_t kItself = 0;  // the place of the point itself in StencilSparsity::offsets
 
 /// "(0, -1)", or "(3,)" for one number.
 std::string as_tuple(at::ArrayRef<int64_t> values) {
@@ -171,7 +172,7 @@ at::Tensor StencilOperator::diagonal() const {
   const kernels::StencilSparsity pattern(grid_, offsets_);
   at::Tensor sum;
   for (int64_t k = 0; k < count(); ++k)
-    if (pattern.places[k] == 0) add_to(sum, coefficient(k));
+    if (pattern.places[k] == kItself) add_to(sum, coefficient(k));
   return sum.defined() ? sum : at::zeros_like(coefficient(0));
 }
 
@@ -212,8 +213,8 @@ at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
     const int64_t place = pattern.places[k];
     if (place < 0) continue;
     const auto given = coefficients_.select(1, k);
-    const int64_t axis = dim() - 1 - (place - 1) / 2;  // the pattern has x first
-    add_to(fields[place == 0 ? 0 : 1 + 2 * axis + (place - 1) % 2],
+    const int64_t axis = dim() - 1 - (place - 1) / 2;  // the neighbours along x come first
+    add_to(fields[place == kItself ? 0 : 1 + 2 * axis + (place - 1) % 2],
            transposed ? shifted(given, offsets_[k], /*back=*/true) : given);
   }
   for (auto& field : fields)

@@ -55,12 +55,12 @@ class StencilOperator final : public Operator {
                                                      const at::Tensor& held) const;
   int64_t dim() const { return grid_.dim; }
   int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
-  /// The place of an axis among z, y and x, which the grid always has.
+  /// The index of an axis among (z, y, x): the last dim() of them are this operator's.
   int64_t zyx(int64_t axis) const { return 3 - dim() + axis; }
   int64_t extent(int64_t axis) const { return grid_.shape[zyx(axis)]; }
   /// Coefficient k, (batch or 1, 1, *shape).
   at::Tensor coefficient(int64_t k) const { return coefficients_.narrow(1, k, 1); }
-  /// t[i + offset], or t[i - offset], for the last dim() axes of t.
+  /// t[i + offset], with `back` t[i - offset], along the last dim() axes of t: zero or periodic beyond the ends.
   at::Tensor shifted(const at::Tensor& t, const kernels::Offset& offset, bool back = false) const;
 
   kernels::StencilGrid grid_;

@@ -74,15 +74,21 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
   }
 }
 
-/// Takes the residuals that the method knows. Freezes what diverged, overflowed or broke down, and
-/// confirms what seems converged by the true residual: a recursive one may have drifted from it.
+/// Of each sample, whether the space of a method of least residuals is exhausted; nothing for other methods.
 template <class Space, class Method>
-PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
+auto exhausted_of(Space& space, const Method& method) {
+  if constexpr (kLeastResidual<Method>) return space.values_of(method.exhausted());
+  else return 0;
+}
+
+/// Judges each active sample by the residual that the method knows. Stops what diverged, overflowed or broke down;
+/// samples that seem converged go on as candidates. Returns whether there are any.
+template <class Space, class Method, class Exhausted>
+bool judge_known_residuals(Space& space, Method& method, typename Space::States& states, double rtol,
+                           [[maybe_unused]] const Exhausted& exhausted) {
   const auto residual2 = space.values_of(method.residual2());
   const auto broken = space.broken();
-  [[maybe_unused]] decltype(space.values_of(method.residual2())) exhausted{};
-  if constexpr (kLeastResidual<Method>) exhausted = space.values_of(method.exhausted());
-  bool any_claims = false;
+  bool any_candidates = false;
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     s.candidate = false;
@@ -102,8 +108,14 @@ PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& sta
     s.status = SolveStatus::kMaxIter;  // only a claim so far; with rtol = 0 nothing stops early
     s.active = true;
     s.candidate = rtol > 0.0;
-    any_claims = any_claims || s.candidate;
+    any_candidates = any_candidates || s.candidate;
   }
+  return any_candidates;
+}
+
+/// Stops the samples whose residual is rounding though they claim nothing.
+template <class Space, class Method>
+void stop_what_idles(Space& space, const Method& method, typename Space::States& states, double rtol) {
   // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
   if constexpr (kTakesStrides<Method> || kContracts<Method>) {
     stop_at_rounding_floor(space, method, states, rtol,
@@ -112,8 +124,12 @@ PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& sta
   if constexpr (kLeastResidual<Method>)
     stop_at_rounding_floor(space, method, states, rtol,
                            [](const SampleState& s) { return s.active && !s.candidate && s.still > 0; });
-  if (!any_claims) return;
+}
 
+/// Judges the candidates by their true residual, as a recursive one may have drifted from it.
+template <class Space, class Method, class Exhausted>
+void confirm_candidates(Space& space, Method& method, typename Space::States& states, double rtol,
+                        [[maybe_unused]] const Exhausted& exhausted) {
   space.freeze_unless(states, [](const SampleState& s) { return s.candidate; });
   const auto true_residual2 = space.values_of(method.recompute_residual());
   for (size_t i = 0; i < states.size(); ++i) {
@@ -130,6 +146,15 @@ PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& sta
   stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) { return s.candidate && s.active; });
   for (auto& s : states)
     if (s.candidate) s.concluded = !s.active;
+}
+
+/// Looks at the residuals of the active samples, and stops those that are done or lost.
+template <class Space, class Method>
+PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
+  const auto exhausted = exhausted_of(space, method);
+  const bool any_candidates = judge_known_residuals(space, method, states, rtol, exhausted);
+  stop_what_idles(space, method, states, rtol);
+  if (any_candidates) confirm_candidates(space, method, states, rtol, exhausted);
 }
 
 }  // namespace prdp::detail

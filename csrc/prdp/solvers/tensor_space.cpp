@@ -158,12 +158,9 @@ TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {
   const auto solution = system_.a.solve_directly(r, /*transposed=*/false);
-  const auto finite = solution.isfinite().all(/*dim=*/1, /*keepdim=*/true);
-  auto every = finite;
-  for (int64_t axis = 2; axis < b_.dim(); ++axis) every = every.all(axis, true);
-  const auto singular = every.logical_not();
-  note_broken(singular);
-  d = laid_out(at::where(every, solution, at::zeros_like(solution)));
+  const auto finite = per_sample(solution.isfinite().flatten(1).all(1), solution);
+  note_broken(finite.logical_not());
+  d = laid_out(at::where(finite, solution, at::zeros_like(solution)));
 }
 
 at::Tensor TensorSpace::rounding_of(const Scalar& v2, const Scalar& w2) const {

@@ -49,7 +49,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
         cycle_{of.hierarchy, sample, in_block, beyond + Vectors::kCyclesAt},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
-        leaks_(of.needs_projection != 0) {}
+        needs_projection_(of.needs_projection != 0) {}
 
   // ---- a sample (solve_sample.h)
   void begin(SampleState& state) {
@@ -102,16 +102,16 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
            s += next.second * next.second;
          });
     const T rr = team_.sum(s);
-    if (!leaks_) return rr;
+    if (!needs_projection_) return rr;
     project(r);  // no product takes away what rounding leaves there
     return dot(r, r);
   }
   PRDP_ONCE void apply(const T* v, Vector out) {
     product(v, [&](int i, T value) { out[i] = value; });
-    if (leaks_) project(out);
+    if (needs_projection_) project(out);
   }
   PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    if (leaks_) {
+    if (needs_projection_) {
       apply(v, out);
       return {dot(v, out), dot(out, out)};
     }
@@ -277,7 +277,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   typename S::Cycles::template Of<S> cycle_;
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>&null_space_, &left_null_space_;
-  bool leaks_;
+  bool needs_projection_;
   T factor_ = 1, b2_ = 0;
   double norm_ = 0;
   bool started_ = false;

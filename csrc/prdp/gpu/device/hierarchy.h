@@ -161,15 +161,19 @@ class HierarchyMaker {
     return coarse;
   }
 
+  /// The fine point of weight w: it lies between two coarse ones.
+  static int point_of_weight(const CoarsenedAxis& line, int w) {
+    const int row = w / line.inner, at = line.of_between(row % line.between());
+    return (row / line.between() * line.n + at) * line.inner + w % line.inner;
+  }
+
   /// Of a symmetric operator, interpolation and restriction are the same; else interpolation comes from the symmetric
   /// part and restriction from the transpose (Dendy 1983).
   PRDP_ONCE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
     const int n = a.points(), weights = line.weights();
     const auto entry = shared(a.coefficients);
     team_.for_each(weights, [&](int w) {
-      const int row = w / line.inner;
-      const int at = line.of_between(row % line.between());
-      const int i = (row / line.between() * line.n + at) * line.inner + w % line.inner;
+      const int i = point_of_weight(line, w);
       T own[3] = {}, of_transpose[3] = {};
       a.for_each_neighbour(i, [&](int k, int there) {
         const int d = k / Stencil::step(axis) % 3;
