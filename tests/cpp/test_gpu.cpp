@@ -7,7 +7,7 @@
 #include "prdp/solvers/solve.h"
 
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
-                                  int left_out, bool poisons, bool captures, int64_t most_blocks);
+                                  int left_out, bool poisons, bool captures, int64_t most_blocks, bool from_ptx);
 extern "C" void prdp_fibers_end();
 extern "C" int64_t prdp_fibers_launches();
 
@@ -24,7 +24,7 @@ TEST(Gpu, ASolveWithItsGradientIsTwoLaunchesWithoutPython) {
   const auto leaf = b.clone().requires_grad_();
 
   setenv("PRDP_GPU", "required", 1);
-  prdp_fibers_begin(96 << 10, 16384, 64, 0, 0, true, false, 0);
+  prdp_fibers_begin(96 << 10, 16384, 64, 0, 0, true, false, 0, false);
   const auto before = prdp_fibers_launches();
   const auto u = prdp::linear_solve(heat, leaf, {prdp::CG{.max_iter = 100, .rtol = 1e-12}}).u;
   EXPECT_STREQ(prdp::way_of_last_solve(), "kernel");

@@ -34,6 +34,7 @@ struct Settings {
   bool poisons = true;  // memory of a block
   bool captures = false;  // a graph, on all streams
   int64_t most_blocks = 0;  // that are at work at the same time; 0: as many as there are
+  bool from_ptx = false;  // the fibers run what NVRTC makes of the text
 };
 Settings settings;
 std::vector<KernelSource> asked_for;  // since kernels serve the CPU, each once
@@ -47,7 +48,9 @@ std::string read(const fs::path& file) {
 /// Where compiled kernels are kept: a folder for each version of the text that they include.
 const fs::path& folder() {
   static const fs::path made = [] {
-    std::string text = read(fs::path(PRDP_FIBERS) / "fibers.h");
+    std::string text;
+    for (const char* file : {"fibers.h", "ptx.h", "ptx.py", "ptx_instructions.py"})
+      text += read(fs::path(PRDP_FIBERS) / file);
     for (const char* part : {"prdp/gpu/device", "prdp/solvers", "prdp/kernels"})
       for (const auto& file : fs::directory_iterator(fs::path(PRDP_CSRC) / part))
         if (file.path().extension() == ".h") text += read(file);
@@ -75,7 +78,9 @@ void compile(const std::string& arguments, const fs::path& result) {
 std::string compiled(const std::string& text) {
   const auto header = folder() / "fibers.h",
              source = folder() / (std::to_string(std::hash<std::string>()(text)) + ".cpp");
-  if (!fs::exists(header)) fs::copy_file(fs::path(PRDP_FIBERS) / "fibers.h", header, fs::copy_options::skip_existing);
+  for (const char* file : {"fibers.h", "ptx.h"})
+    if (!fs::exists(folder() / file))
+      fs::copy_file(fs::path(PRDP_FIBERS) / file, folder() / file, fs::copy_options::skip_existing);
   compile("-x c++-header " + header.string(), header.string() + ".gch");
   std::ofstream(source) << text;
   const auto library = source.string() + ".so";
@@ -83,17 +88,35 @@ std::string compiled(const std::string& text) {
   return library;
 }
 
+/// PTX of the newest device that NVRTC knows, which compiles on to that one's binary, as C++ (ptx.py).
+std::string ptx_as_cpp(const std::string& text) {
+  constexpr int beyond_all = 999;
+  const auto name = (folder() / std::to_string(std::hash<std::string>()(text + "PTX"))).string(),
+             part = name + "." + std::to_string(getpid());
+  std::ofstream(part) << prdp::gpu::nvrtc::compile(text, beyond_all);
+  const std::string command =
+      std::string("python3 ") + PRDP_FIBERS + "/ptx.py " + part + " " + name + " 2> " + name + ".log";
+  const int failed = std::system(command.c_str());
+  fs::remove(part);
+  if (failed) throw Unavailable("ptx.py fails: " + read(name + ".log"));
+  return read(name);
+}
+
+/// The text itself, with a function that launches its kernel.
+std::string with_entry(const std::string& text) {
+  return "#include \"fibers.h\"\n" + text +
+         "extern \"C\" int run(const void* arguments, int blocks, int threads, long memory, int order, int "
+         "left_out, bool poisons) {\n"
+         "  fibers::left_out = left_out;\n"
+         "  fibers::poisons = poisons;\n"
+         "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
+         "    prdp_kernel(*static_cast<const Arguments*>(arguments)); });\n}\n";
+}
+
 class FiberKernel final : public prdp::gpu::Kernel {
  public:
   explicit FiberKernel(const KernelSource& source) : source_(source) {
-    const auto text =
-        "#include \"fibers.h\"\n" + source.text +
-        "extern \"C\" int run(const void* arguments, int blocks, int threads, long memory, int order, int "
-        "left_out, bool poisons) {\n"
-        "  fibers::left_out = left_out;\n"
-        "  fibers::poisons = poisons;\n"
-        "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
-        "    prdp_kernel(*static_cast<const Arguments*>(arguments)); });\n}\n";
+    const auto text = settings.from_ptx ? ptx_as_cpp(source.text) : with_entry(source.text);
     void* const library = dlopen(compiled(text).c_str(), RTLD_NOW);
     if (!library) throw Unavailable(dlerror());
     run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));
@@ -122,14 +145,14 @@ class FiberRuntime final : public prdp::gpu::Runtime {
     if (std::ranges::find(asked_for, source.text, &KernelSource::text) == asked_for.end()) asked_for.push_back(source);
     if (settings.most_blocks > 0 && source.blocks_of_team > settings.most_blocks)
       throw Unavailable("a sample of this size needs more blocks than the device runs at the same time");
-    auto& kernel = kernels_[source.text];
+    auto& kernel = kernels_[{source.text, settings.from_ptx}];
     if (!kernel) kernel = std::make_shared<FiberKernel>(source);
     return kernel;
   }
 
  private:
   std::mutex mutex_;
-  std::map<std::string, std::shared_ptr<const prdp::gpu::Kernel>> kernels_;
+  std::map<std::pair<std::string, bool>, std::shared_ptr<const prdp::gpu::Kernel>> kernels_;
 };
 
 /// What `run` raises, in words; nothing where it does not.
@@ -155,9 +178,9 @@ struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::
 
 /// From here on, kernels serve tensors of the CPU; and no longer.
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
-                                  int left_out, bool poisons, bool captures, int64_t most_blocks) {
+                                  int left_out, bool poisons, bool captures, int64_t most_blocks, bool from_ptx) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, captures, most_blocks};
+  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, captures, most_blocks, from_ptx};
   asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }

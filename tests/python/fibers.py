@@ -50,7 +50,8 @@ class Kernel(NamedTuple):
 class Fibers:
     """A device whose blocks have so much memory, and teams of one block for so many unknowns; with `most_blocks`, teams
     have no more. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
-    `poison` is False. With `captures`, its streams capture a graph."""
+    `poison` is False. With `captures`, its streams capture a graph. With `from_ptx` the fibers run the PTX that NVRTC
+    makes of the text, instruction by instruction, in place of the text (tests/fibers/ptx.py)."""
 
     def __init__(
         self,
@@ -62,15 +63,16 @@ class Fibers:
         most_blocks=0,
         poison=True,
         captures=False,
+        from_ptx=False,
     ):
-        self.settings = (block_memory, cells, threads, order, left_out, poison, captures, most_blocks)
+        self.settings = (block_memory, cells, threads, order, left_out, poison, captures, most_blocks, from_ptx)
         self.poison = poison
 
     @staticmethod
     def library():
         library = ctypes.CDLL(str(BUILD / "libprdp_fibers.so"))
         library.prdp_fibers_begin.argtypes = (
-            [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool] * 2 + [ctypes.c_int64]
+            [ctypes.c_int64] * 3 + [ctypes.c_int] * 2 + [ctypes.c_bool] * 2 + [ctypes.c_int64, ctypes.c_bool]
         )
         library.prdp_fibers_launches.restype = ctypes.c_int64
         library.prdp_fibers_kernels.restype = ctypes.c_int64

@@ -1,4 +1,5 @@
 #pragma once
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 
@@ -8,6 +9,15 @@ namespace prdp {
 
 /// Numbers that solve_damped() works with.
 constexpr int64_t numbers_of_solve_damped(int64_t n) { return n * (n + 2); }
+
+/// √(a² + b²), with the same bits on every device, which std::hypot() does not promise.
+template <class T>
+T hypotenuse(T a, T b) {
+  const T larger = std::max(std::abs(a), std::abs(b)), smaller = std::min(std::abs(a), std::abs(b));
+  if (larger == T(0)) return T(0);
+  const T ratio = smaller / larger;
+  return larger * std::sqrt(1 + ratio * ratio);
+}
 
 /// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of r, which lie `stride` entries
 /// apart: the rows of τ I are rotated into R, one by one.
@@ -23,7 +33,7 @@ void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y
     row[k] = tau;
     T of_row = 0;
     PRDP_ROLLED for (int64_t i = k; i < n; ++i) {
-      const T length = std::hypot(a[i * n + i], row[i]);
+      const T length = hypotenuse(a[i * n + i], row[i]);
       if (length == T(0)) continue;
       const T cos = a[i * n + i] / length, sin = row[i] / length;
       const auto rotate = [&](T& upper, T& lower) {

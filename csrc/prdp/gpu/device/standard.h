@@ -18,7 +18,7 @@ using uint64_t = unsigned long;
 namespace std {
 
 using ::abs;
-using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::hypot, ::ilogb, ::ldexp;
+using ::cos, ::sin, ::sqrt, ::log, ::ceil, ::ilogb, ::ldexp;
 using ::int32_t;
 using ::int64_t;
 using ::size_t;
