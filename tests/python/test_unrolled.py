@@ -307,6 +307,33 @@ def test_rounding_that_recurrences_amplify_is_no_gradient_of_a_solved_sample(sol
     assert (found - truth).norm() < 0.1 * truth.norm()
 
 
+@pytest.mark.parametrize("solver", [prdp.CG(50), prdp.MINRES(50)], ids=repr)
+@pytest.mark.parametrize("kind", ["csr", "function"])
+def test_a_gradient_of_rounding_is_found_beside_any_neighbour(kind, solver):
+    """Each sample has its own values: one of them is off by 400 %, which a neighbour's larger gradient would hide."""
+    generator = torch.Generator().manual_seed(17)
+    size, n = 6, 10
+    square = torch.randn(size, n, n, generator=generator, dtype=torch.float64) * 0.3 + 2 * torch.eye(n)
+    matrices, b = square @ square.mT, torch.randn(size, n, generator=generator, dtype=torch.float64)
+
+    def gradient(rows):
+        values = matrices[rows].flatten(1).clone().requires_grad_()
+        if kind == "csr":
+            pattern = torch.arange(0, n * n + 1, n), torch.arange(n).repeat(n)
+            a = operators.Matrix.csr(*pattern, values, (len(rows), n, n))
+        else:
+            a = operators.Function(lambda v, w: (w.unflatten(1, (n, n)) @ v[..., None])[..., 0], tensors=(values,))
+        u, info = prdp.linear_solve(a, b[rows], solver, backward="unrolled")
+        assert info.solved.all()
+        return torch.autograd.grad(u.sin().sum(), values)[0]
+
+    leaves = matrices.clone().requires_grad_()
+    (truth,) = torch.autograd.grad(torch.linalg.solve(leaves, b).sin().sum(), leaves)
+    for rows in ([0], [0, 5], list(range(size))):
+        error = (gradient(rows) - truth[rows].flatten(1)).norm(dim=1)
+        assert (error < 0.1 * truth[rows].flatten(1).norm(dim=1)).all()
+
+
 def test_truncated_iterations_keep_their_own_derivative():
     a, b = operators.Poisson((30,)), torch.ones(1, 1, 30, dtype=torch.float64, requires_grad=True)
     u, info = prdp.linear_solve(a, b, prdp.CG(3, rtol=0.0), backward="unrolled")

@@ -8,6 +8,7 @@
 #include "prdp/autograd/solved_to_rounding.h"
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/function_operator.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -177,6 +178,13 @@ class SampleVjps {
     differentiate(rows_);
   }
 
+  /// Whether tensor k of A has a row for each sample. Those of a function are taken to have one where they may.
+  bool is_of_samples(size_t k) const {
+    const auto& t = spec_.tensors[k];
+    const auto axes = batched_axes(spec_.kind, static_cast<int64_t>(spec_.shape.size()), spec_.tensors.size());
+    return t.dim() > 0 && t.size(0) == batch_ && (!axes || (*axes)[k] == t.dim());
+  }
+
   /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that share a
   /// tensor of A are looked at together: it has the sum of their gradients.
   void add_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
@@ -190,13 +198,14 @@ class SampleVjps {
     for (size_t k = 0; k < of_solution.size(); ++k) {
       if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
       const auto right = of_solution[k].to(at::kDouble), off = found[k + 1].detach() + right;
-      const bool of_samples = right.dim() > 2 && right.size(0) == batch_ && !is_function(spec_);
-      const auto norms = [&](const at::Tensor& t) {
-        const auto norm = of_samples ? t.flatten(1).norm(2, 1) : t.norm().expand({batch_});
-        return to_host<double>(norm.contiguous(), batch_);
+      const bool of_samples = is_of_samples(k);
+      const auto differs = [&](const auto& norm) {
+        const auto is_misleading = norm(off).gt(norm(right)).expand({batch_}).contiguous();
+        const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch_);
+        for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
       };
-      const auto error = norms(off), whole = norms(right);
-      for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && error[i] > whole[i]);
+      if (of_samples) differs([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
+      if (!of_samples || is_function(spec_)) differs([](const at::Tensor& t) { return t.norm(); });
     }
   }
 

@@ -45,7 +45,7 @@ UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b
 UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
                               at::IntArrayRef needed) {
   // Partial derivatives: b and the tensors may be one tensor, or depend on each other further back.
-  const auto rhs = at::alias(b);
+  const auto rhs = needed[0] && !b.requires_grad() ? b.detach().requires_grad_() : at::alias(b);
   auto a = solve.a;
   for (auto& t : a.tensors) t = at::alias(t);
   const auto [u, applications] = solve_recorded(*make_operator(a), rhs, solve.x0, solve.solver, solve.iterations);
@@ -64,9 +64,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   auto [a, options, x0] = unpack_solve(args...);
   for (auto& t : a.tensors) t = t.detach();
   make_operator(a)->check_parameters(checks_of(options.on_failure));
-  auto with_b = needed.vec();  // b̄ tells whether the derivative is one of the solution
-  if (!traits(options.solver.method).is_polynomial) with_b[0] = 1;
-  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, with_b,
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
                                     run_iterations_back, linear_solve_kernel);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
