@@ -241,7 +241,7 @@ class ToleranceController(_C.ToleranceController, _Attached):
     Args:
         steppers: the steppers whose `rtol`, `adjoint_rtol`, `max_iter` and `adjoint_max_iter` are set, now and
             after every step. It may be empty; then read `.rtol`, `.adjoint_rtol` and `.max_iter` yourself.
-        ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1).
+        ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1); 1e-3 before the first `step`.
         adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
             ⌈adjoint_ratio·K⌉; in (0, 1].
         floor: the smallest rtol; > 0. In float32 solves reach about 1e-5.

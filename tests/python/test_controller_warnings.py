@@ -21,9 +21,10 @@ def test_a_controller_warns_while_the_residual_makes_up_the_error():
 
 
 def test_a_tolerance_that_was_asked_for_is_no_warning():
-    """Before its first step the controller asks for rtol = .1, whatever the error then is."""
+    """For an error of 1 the controller asks for rtol = .1, whatever the error then is."""
     heat = heat_step()
     controller = prdp.ToleranceController([heat])
+    controller.step(1.0)
     heat(field((30,)))
     assert 1e-2 < heat.info.residual.mean() <= 0.1
     controller.step(0.01)
@@ -36,6 +37,7 @@ def test_solves_that_take_no_iteration_are_told():
     heat = prdp.Heat((30,), nu=1e-4, dt=1.0, solver=prdp.CG(100))
     u = torch.randn(4, 1, 30, generator=torch.Generator().manual_seed(0)).cumsum(-1)
     controller = prdp.ToleranceController([heat])
+    controller.step(1.0)
     for start, told in (("state", True), ("zero", False)):
         heat.start = start
         heat(u)
@@ -55,3 +57,19 @@ def test_without_an_error_prdp_warns_of_a_stalled_metric():
         controller.step(20.0)
     assert "PRDPController: the solves stop at a residual of" in controller.warning
     assert "the metric no longer falls" in controller.warning
+
+
+def test_an_error_that_never_falls_names_loose_adjoint_solves():
+    controller = prdp.ToleranceController()
+    for _ in range(19):
+        controller.step(0.95)
+        assert controller.warning is None
+    controller.step(0.94)
+    assert "has not fallen in 20 calls, and adjoint solves to 0.5" in controller.warning
+    assert controller.warning.endswith("take adjoint_ratio=1")
+    controller.step(0.5)
+    assert controller.warning is None
+    exact = prdp.ToleranceController(adjoint_ratio=1)
+    for _ in range(25):
+        exact.step(0.95)
+    assert exact.warning is None

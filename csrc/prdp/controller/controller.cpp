@@ -26,10 +26,11 @@ bool is_size(double x) { return std::isfinite(x) && x >= 0.0; }
 }  // namespace
 
 std::optional<std::string> Controller::warning() const {
-  auto text = about_metric();
-  const auto residual = about_residual();
-  if (!text.empty() && !residual.empty()) text += ". ";
-  text += residual;
+  std::string text;
+  for (const auto& sentence : {about_metric(), about_residual(), about_adjoint()}) {
+    if (!text.empty() && !sentence.empty()) text += ". ";
+    text += sentence;
+  }
   return text.empty() ? std::nullopt : std::optional(text);
 }
 

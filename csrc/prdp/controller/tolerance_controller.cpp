@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <sstream>
 
 namespace prdp {
 
@@ -20,7 +21,8 @@ ToleranceController::ToleranceController(ToleranceSettings settings)
 }
 
 double ToleranceController::rtol_for(double smallest) const {
-  return std::max(settings_.floor, settings_.ratio * std::min(1.0, smallest));
+  constexpr double before_any = 1e-3;
+  return std::max(settings_.floor, std::isinf(smallest) ? before_any : settings_.ratio * std::min(1.0, smallest));
 }
 
 double ToleranceController::adjoint_rtol() const {
@@ -46,6 +48,20 @@ bool ToleranceController::step(double error, const Solves& solves) {
 double ToleranceController::asked_for() const {
   const auto& history = state_.history;
   return rtol_for(history.size() > 1 ? history[history.size() - 2].smoothed : std::numeric_limits<double>::infinity());
+}
+
+std::string ToleranceController::about_adjoint() const {
+  // As after sparse sensors, or of an indefinite A: with adjoint solves to 0.5, gradients were seen at more than a
+  // right angle to the exact one, and no error fell to tighten them.
+  constexpr size_t patience = 20;
+  constexpr double loose = 0.1, fallen = 0.9;
+  const auto& history = state_.history;
+  if (history.size() < patience || adjoint_rtol() <= loose || state_.checkpoint < fallen * history.front().metric)
+    return {};
+  std::ostringstream text;
+  text << name() << ": the error has not fallen in " << history.size() << " calls, and adjoint solves to "
+       << adjoint_rtol() << " may have a gradient that points uphill; take adjoint_ratio=1";
+  return text.str();
 }
 
 void ToleranceController::load_state(State state) {

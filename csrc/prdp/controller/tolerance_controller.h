@@ -12,7 +12,7 @@ struct ToleranceSettings {
 };
 
 /// Ties the tolerance of the solves to the error of what is trained:
-///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far, 1 before the first
+///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far; 1e-3 before the first
 ///   adjoint_rtol = rtol / adjoint_ratio, but at most 1/2 and at least adjoint_floor
 /// A tolerance of 1 would be no solve, hence 1/2. The floor is there because the cotangent shrinks with the error, and
 /// gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
@@ -24,7 +24,7 @@ class ToleranceController final : public Controller {
   explicit ToleranceController(ToleranceSettings settings = {});
 
   double rtol() const { return rtol_for(state_.checkpoint); }
-  /// The rtol for this smallest error so far.
+  /// The rtol for this smallest error so far; infinite: none is known, and loose solves might spoil a good start.
   double rtol_for(double smallest) const;
   double adjoint_rtol() const;
   Budget budget() const override;
@@ -43,6 +43,7 @@ class ToleranceController final : public Controller {
   }
   bool stalled() const override { return true; }  // not used: its metric is the error
   double asked_for() const override;
+  std::string about_adjoint() const override;
 
   ToleranceSettings settings_;
 };
