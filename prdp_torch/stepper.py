@@ -172,6 +172,9 @@ class Stepper(HasSettings):
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
         u = full_precision(u)
+        blocks = self.on_failure != "raise" and not compiling and u.requires_grad
+        if blocks:
+            u = u.view_as(u)  # whose gradient is this step's alone
         a = as_operator(who, "operator(u)", self.operator(u))
         b = self.rhs(u)
         if not compiling:
@@ -188,6 +191,8 @@ class Stepper(HasSettings):
                 b, a.tensors, a.kind, a.shape, a.parameters, self._options_kept(), self._max_iter, log.number, x0
             )
             if found is not None:
+                if blocks:
+                    _C.block_gradients_of_lost(u, found[3], self.on_failure)
                 return found
         solution: Solution = torch.ops.prdp.linear_solve(
             b, a.tensors, a.kind, a.shape, a.parameters, False, x0, *self._packed_options(log)

@@ -2,6 +2,7 @@
 
 #include "bindings.h"
 #include "prdp/autograd/adjoint_log.h"
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/gpu/fall_back.h"
 #include "prdp/gpu/runtime.h"
 #include "prdp/kernels/factor_cache.h"
@@ -204,6 +205,13 @@ void bind_solvers(py::module_& m) {
   m.def("way_of_last_solve", &way_of_last_solve,
         "How this thread's last solve was computed: kernel, loops or tensors.");
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
+  m.def(
+      "block_gradients_of_lost",
+      [](const at::Tensor& u, const at::Tensor& status, const std::string& on_failure) {
+        block_gradients_of_lost(u, status, on_failure_from_name(on_failure));
+      },
+      py::arg("u"), py::arg("status"), py::arg("on_failure"),
+      "No gradient passes through a state u from here on, for samples whose solve has none.");
   m.def("count_factorisations", &factor_cache::count_made, "How many sparse factorisations were made so far.");
   m.def("bytes_of_factorisations", &factor_cache::bytes_kept, "The memory of those that are kept for later solves.");
   m.def("clear_factorisations", &factor_cache::clear, "Frees those that are kept for later solves.");

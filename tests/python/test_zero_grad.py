@@ -215,6 +215,32 @@ def test_detach_failed_leaves_the_healthy_samples_of_a_rollout_alone(backward):
     torch.testing.assert_close(found, nu.grad, rtol=1e-12, atol=0.0)
 
 
+@pytest.mark.parametrize("on_failure", ["zero_grad", "return"])
+@pytest.mark.parametrize("part", ["rhs", "operator"])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_an_infinite_derivative_of_the_parts_of_a_step_reaches_no_weight(part, steps, on_failure):
+    """The zero cotangent of a refused sample, times the derivative of exp(u) = Inf, is NaN in what made its state."""
+    torch.manual_seed(0)
+    network = torch.nn.Linear(16, 16).double()
+    x = torch.randn(4, 1, 16, dtype=torch.float64)
+    x[2] *= 1e5
+    if part == "rhs":
+        a, rhs = operators.Heat((16,), 1e-2, 0.1), lambda u: u + 0.1 * torch.exp(u)
+    else:
+        a, rhs = (lambda u: operators.Diffusion(torch.exp(u[:, 0]), 1.0)), None
+    step = prdp.ImplicitStep(a, rhs, prdp.CG(400), on_failure=on_failure)
+
+    def gradient(rows):
+        network.zero_grad()
+        states = step.rollout(network(x[rows]), steps)[:, 1:]
+        (states * torch.tensor([[0.0] if r == 2 else [1.0] for r in rows])[..., None, None]).square().sum().backward()
+        return network.weight.grad
+
+    found = gradient([0, 1, 2, 3])
+    assert step.info.failed[2].any() and not step.info.failed[[0, 1, 3]].any()
+    torch.testing.assert_close(found, gradient([0, 1, 3]), rtol=1e-6, atol=1e-9)
+
+
 def test_detach_failed_checks_its_shapes():
     heat = prdp.Heat((5,), 1e-3, 1.0, prdp.Jacobi(3))
     u = heat(field((5,)))

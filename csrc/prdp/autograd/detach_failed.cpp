@@ -3,6 +3,8 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <torch/library.h>
 
+#include "prdp/autograd/solve_vjp.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/status.h"
 
@@ -20,6 +22,11 @@ at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status) {
   if (!at::isTensorSubclassLike(failed) && !failed.any().item<bool>()) return u;
   if (rollout) failed = at::constant_pad_nd(failed.cumsum(1), {1, 0}).gt(0);
   return at::where(per_sample(failed, u), u.detach(), u);
+}
+
+void block_gradients_of_lost(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure) {
+  if (on_failure == OnFailure::kRaise || !u.requires_grad() || in_torch_func()) return;
+  u.register_hook([status, on_failure](const at::Tensor& u_bar) { return without_lost(u_bar, status, on_failure); });
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def("detach_failed(Tensor u, Tensor status) -> Tensor", detach_failed); }

@@ -1,5 +1,5 @@
 #pragma once
-#include <ATen/ATen.h>
+#include "prdp/autograd/linear_solve.h"
 
 namespace prdp {
 
@@ -9,5 +9,10 @@ namespace prdp {
 /// Of a solve, u is (batch, …) and status (batch,). Of a rollout, u is (batch, steps + 1, …) and status (batch, steps);
 /// there a sample is constant from its first failed step on. Raises ValueError for other shapes.
 at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status);
+
+/// From here on no gradient passes through a state u that A(u) and b(u) were made of, for samples whose solve has none:
+/// their zero cotangent times an infinite derivative of A or b would be NaN, which weights are shared by. Nothing with
+/// kRaise.
+void block_gradients_of_lost(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure);
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #include "prdp/steppers/implicit_step.h"
 
+#include "prdp/autograd/detach_failed.h"
 #include "prdp/solvers/solve.h"
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/rollout_vjp.h"
@@ -17,8 +18,10 @@ ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, Solver solver, Backward back
 ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward backward)
     : ImplicitStep([a = std::move(a)](const at::Tensor&) { return a; }, std::move(rhs), std::move(solver), backward) {}
 
-SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
-  TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());
+SolveResult ImplicitStep::solve(const at::Tensor& given, int64_t adjoint_log) const {
+  TORCH_CHECK_VALUE(given.dim() >= 2, who_, ": u must have shape (batch, ...), got ", given.sizes());
+  const bool blocks = options_.on_failure != OnFailure::kRaise;
+  const auto u = blocks ? at::alias(given) : given;  // whose gradient is this step's alone
   check_memory(options_, u);
   const auto a = operator_(u);
   const auto b = rhs(u);
@@ -27,7 +30,9 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
                     ", got ", b.sizes(), " in ", b.scalar_type());
   auto options = options_;
   options.adjoint_log = adjoint_log;
-  return linear_solve(a, b, options, start_of_step(options, u));
+  auto result = linear_solve(a, b, options, start_of_step(options, u));
+  block_gradients_of_lost(u, result.info.status, options.on_failure);
+  return result;
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {
