@@ -1,7 +1,6 @@
 """`linear_solve`, and the reports of solves."""
 
 import math
-import warnings
 from collections import Counter
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -109,35 +108,15 @@ class SolveInfo(NamedTuple):
     def adjoint(self) -> "SolveInfo | None":
         """The report of the adjoint solve, or None before `backward()`.
 
-        Unrolled mode has no adjoint solve. Its report then has the iterations and the status of the solve itself,
-        NaN as the residual, and the number of products in the whole backward pass."""
+        Unrolled mode has one only for samples that get the implicit derivative, as those solved to rounding. The
+        report of the others has the iterations and the status of the solve itself, NaN as the residual, and the
+        number of products in the whole backward pass."""
         return None if self.log is None else self.log.read()
 
 
 def _range(name: str, values: list[float]) -> str:
     known = [value for value in values if not math.isnan(value)]
     return f"{name} {min(known):g} to {max(known):g}" if known else f"{name} not measured"
-
-
-_warned_of: set[tuple[str, str]] = set()
-
-
-def _warn_of_large_residuals(info: SolveInfo, solver: Solver, kind: str) -> None:
-    """Say once of a method and an operator that max_iter left a residual above ‖b‖: that is no failure, as an error may
-    fall where its residual grows, but whoever asked for a tolerance did not mean it."""
-    if not len(info.residual) or not float(info.residual.max()) > 1 or (solver.method, kind) in _warned_of:
-        return
-    open_ones = (info.status == SolveStatus.MAX_ITER) & (info.residual > 1)
-    if not open_ones.any():
-        return
-    _warned_of.add((solver.method, kind))
-    worst = int(info.residual.masked_fill(~open_ones, 0).argmax())
-    warnings.warn(
-        f"linear_solve: {int(open_ones.sum())} of {len(open_ones)} samples stopped at max_iter = {solver.max_iter}, "
-        f"with a residual above ‖b‖: sample {worst} at {float(info.residual[worst]):.1e}, where rtol = {solver.rtol:g} "
-        "was asked for; take more iterations or a preconditioner, or rtol=0 where this is meant. This is said once",
-        stacklevel=3,
-    )
 
 
 def detach_failed(u: Tensor, info: SolveInfo) -> Tensor:
@@ -238,8 +217,6 @@ def linear_solve(
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )
-        if found is not None and b.is_cpu and solver.rtol > 0 and on_failure in ("raise", "warn"):
-            _warn_of_large_residuals(SolveInfo(*found[1:]), solver, A.kind)
     if found is None:
         parts = solver.method, solver.max_iter, solver.rtol, solver.restart, solver.preconditioner
         packed = packed_options(*parts, *settings, adjoint_log=0 if log is None else log.number)

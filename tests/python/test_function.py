@@ -51,6 +51,19 @@ def test_solutions_equal_the_dense_ones(solver, dtype, rtol, close):
     np.testing.assert_allclose(a.apply_transpose(b), (dense(k, s).mT @ b.double()[..., None])[..., 0], atol=close)
 
 
+def test_what_rounding_leaves_of_an_operator_of_unknown_norm_is_no_failure():
+    """I + U Vᵀ of condition 1e4 in float32: an iterate as exact as the dtype allows exhausts the space of GMRES."""
+    n, generator = 200, torch.Generator().manual_seed(0)
+    left, right = (torch.randn(n, 3, generator=generator) / n**0.5 for _ in "UV")
+    a = operators.Function(lambda v, u, w: v + 300 * (v @ w) @ u.T, tensors=(left, right))
+    b = torch.randn(8, n, generator=generator)
+    u, info = prdp.linear_solve(a, b, prdp.GMRES(30))
+    assert info.solved.all() and (info.status == prdp.SolveStatus.STAGNATED).any()
+    matrix = torch.eye(n, dtype=torch.float64) + 300 * left.double() @ right.double().T
+    truth = torch.linalg.solve(matrix, b.double().T).T
+    assert ((u - truth).norm(dim=1) < 1e-4 * truth.norm(dim=1)).all()
+
+
 @pytest.mark.parametrize("backward", ["implicit", "unrolled"])
 @pytest.mark.parametrize("solver", [prdp.GMRES(3, restart=6, rtol=0.0), prdp.Direct()], ids=["gmres", "direct"])
 def test_derivatives(solver, backward):

@@ -167,9 +167,10 @@ def test_where_rounding_takes_over_an_earlier_iterate_is_returned(method, gap):
         assert (residual < 1)[info.failed if method is prdp.CG else slice(None)].all(), (k, residual)
 
 
-def test_a_matrix_that_is_not_symmetric_makes_nothing_worse():
+def test_a_matrix_that_is_not_symmetric_makes_nothing_worse_and_is_named():
     a, b = 3 * torch.eye(N, dtype=F64) + noise(N, N, seed=2), noise(3, N)
-    u, info = prdp.linear_solve(a, b, prdp.MINRES(50, 1e-8), on_failure="return")
+    with pytest.warns(UserWarning, match="MINRES on Matrix: A is not symmetric .* take GMRES"):
+        u, info = prdp.linear_solve(a, b, prdp.MINRES(50, 1e-8))
     assert not info.solved.any() and (info.residual <= 1).all()
     torch.testing.assert_close((b - u @ a.T).norm(dim=1) / b.norm(dim=1), info.residual, rtol=1e-6, atol=1e-9)
 

@@ -7,6 +7,7 @@
 #include <sstream>
 
 #include "prdp/operators/kinds.h"
+#include "prdp/operators/probes.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
@@ -41,7 +42,7 @@ double value_of_sample(const at::Tensor& t, int64_t sample) {
 
 /// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample.
 double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
-  const auto v = at::arange(1, b.numel() / b.size(0) + 1, b.options()).square().sin().view_as(b[0]).expand_as(b);
+  const auto v = without_structure(b);
   const auto product = a.apply(v).select(0, sample), other = a.apply_transpose(v).select(0, sample);
   return norm_of(product - other) / norm_of(product);
 }
@@ -81,13 +82,18 @@ bool holds_within_rounding(const Operator& a, const at::Tensor& b, int64_t sampl
   return held > 0.0 && held <= 64.0 * epsilon_of(b) * value_of_sample(a.norm(), sample);
 }
 
+/// Where A is not symmetric: that, in words. Else empty.
+std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const double share = asymmetry(a, b, sample);
+  if (!(share > 100.0 * epsilon_of(b))) return {};
+  return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
+}
+
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
   if (b.scalar_type() == at::kFloat && holds_within_rounding(a, b, sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
-  const double share = asymmetry(a, b, sample);
-  if (share > 100.0 * epsilon_of(b))
-    return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
+  if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
   return "A is symmetric but not definite; take MINRES";
 }
 
@@ -95,8 +101,7 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
 std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (solver.preconditioner)
     return "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is singular";
-  const double share = asymmetry(a, b, sample);
-  if (share > 100.0 * epsilon_of(b)) return not_definite(a, b, sample);
+  if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
   return "A is singular, and b lies outside its range; take a b without that part";
 }
 
@@ -160,8 +165,11 @@ std::string stagnated(const Solver& solver, const at::Tensor& b) {
          ", or scale A and b so that their rows are of one size";
 }
 
-/// Why iterations were in vain.
-std::string in_vain(const Solver& solver) {
+/// Why max_iter left a large residual.
+std::string stopped(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto made_for = traits(solver.method).made_for;
+  if (made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric)
+    if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
   if (solver.preconditioner.is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";
@@ -230,7 +238,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       case SolveStatus::kStagnated: return stagnated(role.solver, b);
-      case SolveStatus::kMaxIter: return in_vain(role.solver);
+      case SolveStatus::kMaxIter: return stopped(role.solver, a, b, sample);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

@@ -123,8 +123,30 @@ bool was_in_vain(const Solver& solver, SolveStatus status, int64_t iterations, d
   return max_iter > 0 && (iterations == 0 || (max_iter >= many && iterations < max_iter / 2));
 }
 
-/// Warns of those, where a tolerance was asked for.
-void warn_of_vain_iterations(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info) {
+/// Warns of those that max_iter left with a residual above ‖b‖. That is no failure, as an error may fall where its
+/// residual grows, but whoever asked for a tolerance did not mean it.
+void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& b, const std::vector<int64_t>& status,
+                    const std::vector<double>& residual) {
+  const auto has_grown = [&](int64_t i) {
+    return static_cast<SolveStatus>(status[i]) == SolveStatus::kMaxIter && residual[i] > 1.0;
+  };
+  int64_t many = 0, worst = -1;
+  for (int64_t i = 0; i < b.size(0); ++i) {
+    if (!has_grown(i)) continue;
+    ++many;
+    if (worst < 0 || residual[i] > residual[worst]) worst = i;
+  }
+  if (many == 0) return;
+  warn_once("grown: " + (name_of(role) + std::string(name(role.solver.method)) + role.a.kind), [&](std::ostream& text) {
+    text << name_of(role) << ": " << many << " of " << b.size(0)
+         << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
+         << " at " << residual[worst] << ", where rtol = " << role.solver.rtol
+         << " was asked for; take rtol=0 if this is meant, " << diagnosis(role, a, b, SolveStatus::kMaxIter, worst);
+  });
+}
+
+/// Warns of samples that max_iter stopped, where a tolerance was asked for.
+void warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info) {
   if (!(role.solver.rtol > 0.0)) return;
   const auto iterations = to_host<int64_t>(info.iterations, b.size(0)),
              status = to_host<int64_t>(info.status, b.size(0));
@@ -132,7 +154,7 @@ void warn_of_vain_iterations(const SolveRole& role, const Operator& a, const at:
   std::vector<int64_t> vain;
   for (int64_t i = 0; i < b.size(0); ++i)
     if (was_in_vain(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i])) vain.push_back(i);
-  if (vain.empty()) return;
+  if (vain.empty()) return warn_of_growth(role, a, b, status, residual);
   const char* cycles = role.solver.preconditioner.is_multigrid() ? " with multigrid" : "";
   const std::string key = name_of(role) + std::string(name(role.solver.method)) + cycles + role.a.kind;
   warn_once("in vain: " + key, [&, first = vain.front()](std::ostream& text) {
@@ -172,7 +194,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     if (what == SolveStatus::kStagnated) stagnated.push_back(i);
   }
   if (failed.empty()) {
-    if (any_open) warn_of_vain_iterations(role, a, b, info);
+    if (any_open) warn_of_stopped(role, a, b, info);
     return warn_of_stagnation(role, a, b, info, stagnated);
   }
   const auto is_of_a = [&](int64_t i) {

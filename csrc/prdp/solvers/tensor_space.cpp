@@ -1,7 +1,9 @@
 #include "prdp/solvers/tensor_space.h"
 
+#include <algorithm>
 #include <utility>
 
+#include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/prepared_batch.h"
 
@@ -121,28 +123,6 @@ TensorSpace::Scalar TensorSpace::measured_sweep(const Vector& c, const Vector& x
   return dot(r, r);
 }
 
-void TensorSpace::dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w,
-                       Scalar* h) const {
-  if (in_loops_) return batch_loops::dots(v, count, factor, w, h);
-  const auto scaled = factor * w.detach();
-  for (int64_t i = 0; i < count; ++i) h[i] = dot(v[i].detach(), scaled);
-}
-
-TensorSpace::Scalar TensorSpace::subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count,
-                                                      const Scalar& factor, Vector& w) const {
-  if (in_loops_) return batch_loops::combine(-1.0, h, v, count, &factor, w, {});
-  w = factor * w;
-  for (int64_t i = 0; i < count; ++i) w = at::addcmul(w, h[i], v[i], -1);
-  return dot(w.detach(), w.detach());
-}
-
-void TensorSpace::add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x) {
-  if (in_loops_) return void(batch_loops::combine(1.0, y, v, count, nullptr, x, active_));
-  auto sum = x;
-  for (int64_t i = 0; i < count; ++i) sum = at::addcmul(sum, y[i], v[i]);
-  x = keep_frozen(sum, x);
-}
-
 TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
   const auto from_zero = system_.scale_of_a.defined() ? x * system_.scale_of_a : x;
   return started() ? start_ + from_zero : from_zero;
@@ -199,32 +179,6 @@ TensorSpace::Scalar TensorSpace::ratio(const Scalar& num, const Scalar& den) {
   return at::where(none, at::zeros_like(num), num / at::where(none, at::ones_like(den), den));
 }
 
-TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) const {
-  const auto vanishing = a.le(16 * limits_of(b_).epsilon * scale.abs()).logical_or(a.lt(negligible_));
-  return at::where(vanishing, at::zeros_like(a), 1 / a);
-}
-
-void TensorSpace::damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale,
-                       const Scalar& keep, Scalar* y) const {
-  // argmin ‖[R; ε s I] y - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it, so that the stacked
-  // matrix has full rank.
-  const auto wanted = keep.detach().eq(0);
-  if (!wanted.any().item<bool>()) return;
-  const int64_t batch = b_.size(0);
-  auto stacked = at::zeros({batch, 2 * n, n}, b_.options());
-  auto rhs = at::zeros({batch, 2 * n, 1}, b_.options());
-  const auto number = [batch](const Scalar& s) { return s.detach().reshape(-1).expand(batch); };
-  const auto safe = [&](const Scalar& s) { return at::where(number(wanted), number(s), at::zeros({}, s.options())); };
-  for (int64_t j = 0; j < n; ++j) {
-    for (int64_t i = 0; i <= j; ++i) stacked.select(1, i).select(1, j).copy_(safe(r[j * stride + i]));
-    stacked.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
-    rhs.select(1, j).select(1, 0).copy_(safe(g[j]));
-  }
-  const auto [q, upper] = at::linalg_qr(stacked);
-  const auto found = at::linalg_solve_triangular(upper, at::matmul(q.mT(), rhs), /*upper=*/true);
-  for (int64_t j = 0; j < n; ++j) y[j] = at::where(wanted, found.select(1, j).view_as(wanted), y[j]);
-}
-
 std::vector<double> TensorSpace::values_of(const Scalar& value) const {
   return to_host<double>(value, static_cast<int64_t>(states_.size()));
 }
@@ -238,12 +192,14 @@ std::vector<bool> TensorSpace::broken() const {
 }
 
 std::vector<double> TensorSpace::operator_norm() const {
-  return to_host<double>(system_.a.norm(), static_cast<int64_t>(states_.size()));
+  const auto batch = static_cast<int64_t>(states_.size());
+  auto norms = to_host<double>(system_.a.norm(), batch);
+  const bool known = std::any_of(norms.begin(), norms.end(), [](double norm) { return norm > 0.0; });
+  return known ? norms : to_host<double>(estimated_norm(system_.a, b_), batch);
 }
 
-TensorSpace::Vector TensorSpace::select(const std::vector<bool>& remade_rows, const Vector& kept,
-                                        const Vector& remade) const {
-  return at::where(mask_of(remade_rows), remade, kept);
+TensorSpace::Vector TensorSpace::select(const std::vector<bool>& wanted, const Vector& kept, const Vector& x) const {
+  return at::where(mask_of(wanted), x, kept);
 }
 
 void TensorSpace::note_broken(const at::Tensor& rows) {

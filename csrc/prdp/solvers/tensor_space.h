@@ -90,8 +90,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2);
   Scalar breaks_down(const Scalar& den, const Scalar& v2, const Scalar& w2, const Scalar& active) const;
   Scalar ratio(const Scalar& num, const Scalar& den);
-  void break_down_unless_positive(const Scalar& a, const Scalar& r2) {
-    note_broken(a.detach().gt(0).logical_or(r2.detach().lt(negligible_)).logical_not());
+  void break_down_unless_positive(const Scalar& a, const Scalar& v2) {
+    note_broken(a.detach().gt(0).logical_or(v2.detach().lt(negligible_)).logical_not());
   }
   Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) {
     return in_loops_ ? batch_loops::sum_of_squares(v2, a, w2) : v2 + a * a * w2;
@@ -100,7 +100,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     return is_larger(v2.detach().sqrt() * w2.detach().sqrt() * factor, a.detach().abs());
   }
   Scalar unless_zero(const Scalar& a, const Scalar& b, const Scalar& active) {
-    return a * (is_not_zero(b) * is_not_zero(active));
+    return at::where(b.ne(0).logical_and(active.ne(0)), a, at::zeros_like(a));
   }
   Scalar is_zero(const Scalar& a) const { return a.eq(0).to(b_.scalar_type()); }
   Scalar is_not_zero(const Scalar& a) const { return a.ne(0).to(b_.scalar_type()); }
@@ -123,17 +123,17 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar radius2() const { return system_.a.jacobi_radius().square(); }
   static constexpr bool sweeps_contract() { return false; }  // not known of the operator
 
-  // ---- GMRES
+  // ---- GMRES and MINRES (tensor_space_basis.cpp)
 
   void dots(const std::vector<Vector>& v, int64_t count, const Scalar& factor, const Vector& w, Scalar* h) const;
   Scalar subtract_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, const Scalar& factor,
                               Vector& w) const;
-  void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector& x);
+  void add_combination(const Scalar* h, const std::vector<Vector>& v, int64_t count, Vector& x);
   bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& a, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
-  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
-            Scalar* y) const;
+  void damp(const Scalar* R, int64_t m, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
+            Scalar* h) const;
   bool surely_all(const Scalar&) const { return false; }  // the basis goes on with zeros
   Scalar constant(const Scalar& a) const { return a.detach(); }
   int derivatives() const { return recording_ ? 2 : 0; }
@@ -166,7 +166,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     for (const auto& s : states) values.push_back(f(s));
     return values;
   }
-  Vector select(const std::vector<bool>& remade_rows, const Vector& kept, const Vector& remade) const;
+  Vector select(const std::vector<bool>& wanted, const Vector& kept, const Vector& x) const;
   void reset();
 
  private:
