@@ -113,7 +113,8 @@ def train(
 ) -> None:
     """Train a scene with one way of choosing K, over seeds; write a record each.
 
-    Exit 1 if one diverges: a number is not finite, or the error ends above ten times its size and its first value.
+    Exit 1 if one diverges: a number is not finite, or the relative error ends above 10 and above ten times its
+    first value.
     """
     loaded = _load(scene, device, backward, intervals)
     refinement = _refinement(loaded, auto, prdp, constant, schedule, direct)

@@ -32,17 +32,15 @@ SILENT = ["return", "zero_grad"]
 
 
 class Run:
-    """A solve and its backward pass on the stand-in, and how often the host waited in each."""
+    """A solve and its backward pass on the stand-in, and how often the host waited for the solve."""
 
     def __init__(self, make, g, b, solver, **options):
         self.device = device = StandIn()
         with device:
             leaves = [device.send(t).requires_grad_() for t in (g, b)]
             u, self.info = prdp.linear_solve(make(leaves[0]), leaves[1], solver, **options)
-            self.forward = device.copies_to_host
+            self.looks = device.copies_to_host
             gradients = torch.autograd.grad(u.square().sum(), leaves)
-            self.backward = device.copies_to_host - self.forward
-            self.from_host = device.copies_from_host
         self.u, self.gradients = device.fetch(u), [device.fetch(t) for t in gradients]
 
 
@@ -66,7 +64,7 @@ def test_solutions_gradients_and_reports_are_those_of_the_cpu(name, solver, on_f
             torch.testing.assert_close(run.device.fetch(mine), other, rtol=1e-2, atol=1e-14)
 
 
-def ill_assorted():
+def one_of_each_end():
     """A regular sample, one of another sign, one with p·Ap = 0, and one with a NaN."""
     coefficients = torch.zeros(4, 1, 8, dtype=F64)
     signs = torch.tensor([1.0, -1.0] * 4, dtype=F64)
@@ -78,7 +76,7 @@ def ill_assorted():
 @pytest.mark.parametrize("dtype", [F32, F64])
 def test_a_failed_sample_says_so_and_has_no_gradient(on_failure, dtype):
     b = torch.ones(4, 1, 8, dtype=dtype)
-    run = Run(lambda c: operators.Stencil(c, [(0,)], "zero"), ill_assorted().to(dtype), b, prdp.CG(3, 0.0),
+    run = Run(lambda c: operators.Stencil(c, [(0,)], "zero"), one_of_each_end().to(dtype), b, prdp.CG(3, 0.0),
               on_failure=on_failure)  # fmt: skip
     names = [prdp.SolveStatus(s).name for s in run.device.fetch(run.info.status).tolist()]
     assert names == ["CONVERGED", "CONVERGED", "BREAKDOWN", "NONFINITE_OPERATOR"]
@@ -127,7 +125,7 @@ def test_cycles_run_on_the_host_whose_grids_are_kept(solver):
         before = _C.count_factorisations()
         run = Run(make, scale * c, b, solver(k, 0.0), on_failure="return")
         assert _C.count_factorisations() == before + new
-        looks.append(run.forward)
+        looks.append(run.looks)
         u, info = prdp.linear_solve(make(scale * c), b, solver(k, 0.0), on_failure="return")
         torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
         assert torch.equal(run.device.fetch(run.info.status), info.status)

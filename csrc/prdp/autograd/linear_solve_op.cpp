@@ -80,7 +80,8 @@ bool is_plain_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptio
 }
 
 /// The op below autograd.
-SolveOutputs call_below(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
+SolveOutputs call_op_below_autograd(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o,
+                                    const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
   if (!is_plain_solve(b, a, o, x0)) return call_op(b, a, o, x0);
   return outputs_of(linear_solve_kernel(a, b, o, x0));
@@ -102,7 +103,7 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
-  const auto out = call_below(b, a, node ? node->options() : options, x0);
+  const auto out = call_op_below_autograd(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
   const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
   if (reverse) torch::autograd::set_history(u, node);
@@ -111,8 +112,9 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
   return out;
 }
 
-/// The op; its autograd kernel at once, where nothing lies between. The dispatcher would take the arguments apart.
-SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options, const at::Tensor& x0) {
+/// Records at once where nothing lies between, as the dispatcher would take the arguments apart; else calls the op.
+SolveOutputs record_or_call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                               const at::Tensor& x0) {
   if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
   RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
   return solve_and_record(b, a, options, x0);
@@ -120,9 +122,9 @@ SolveOutputs call(const at::Tensor& b, const OperatorSpec& a, const SolveOptions
 
 /// A function pointer with the op's signature out of a template over its arguments.
 template <class>
-struct Kernels;
+struct OpKernels;
 template <class... Args>
-struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
+struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
   static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel(b, args...); }
   static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
@@ -136,8 +138,8 @@ struct Kernels<SolveOutputs(const at::Tensor&, Args...)> {
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
-  if (!lone_vector) return result_of(call(b, a, options, x0));
-  auto result = result_of(call(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
+  if (!lone_vector) return result_of(record_or_call_op(b, a, options, x0));
+  auto result = result_of(record_or_call_op(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
   result.u = result.u.squeeze(0);
   return result;
 }
@@ -175,8 +177,8 @@ OperatorSpec matrix(const at::Tensor& values) {
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", Kernels<Signature>::solve); }
-TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", Kernels<Signature>::fake); }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", Kernels<Signature>::autograd); }
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", OpKernels<Signature>::solve); }
+TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", OpKernels<Signature>::fake); }
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", OpKernels<Signature>::autograd); }
 
 }  // namespace prdp

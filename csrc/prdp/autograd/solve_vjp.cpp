@@ -38,14 +38,15 @@ at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
   return largest(lambda) * largest(u) > 1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
 }
 
-/// The report where ḡ of the samples that are not in `rows` left the range of the dtype.
-void report_overflow(SolveInfo& info, const Rows& rows, const OperatorSpec& transpose, const at::Tensor& cotangent,
+/// The report where ḡ of the samples that are not `finite` left the range of the dtype.
+void report_overflow(SolveInfo& info, const Rows& finite, const OperatorSpec& transpose, const at::Tensor& cotangent,
                      const SolveOptions& options) {
   info.status = info.status.to(at::kCPU, /*non_blocking=*/false, /*copy=*/true);
   auto* status = info.status.mutable_data_ptr<int64_t>();
-  for (size_t i = 0; i < rows.size(); ++i)
-    if (!rows[i] && !is_failure(static_cast<SolveStatus>(status[i])))
+  for (size_t i = 0; i < finite.size(); ++i)
+    if (!finite[i] && !is_failure(static_cast<SolveStatus>(status[i])))
       status[i] = static_cast<int64_t>(SolveStatus::kOverflow);
+  info.status = info.status.to(cotangent.device());
   if (options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({transpose, options.solver, /*adjoint=*/true}, *make_operator(transpose), cotangent, info,
                   options.on_failure);
@@ -76,23 +77,24 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
+  // Where the host does not look, what may overflow is left out beforehand. Else it is summed first, and looked at.
   if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
-    const auto rows = may_overflow(lambda, u);
-    lambda = lambda.masked_fill(per_sample(rows, lambda), 0.0);
+    const auto overflowing = may_overflow(lambda, u);
+    lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
     if (needed[0]) found.gradients[0] = lambda;
     auto& status = found.info.status;
-    status = status.masked_fill(rows & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
+    status = status.masked_fill(overflowing & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
                                 static_cast<int64_t>(SolveStatus::kOverflow));
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
     products = of_tensors(lambda);
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
     products = of_tensors(lambda);
   } else {
-    Rows rows(cotangent.size(0), true);
-    products = finite_sum(rows, [&](const Rows& some) { return of_tensors(only(lambda, some)); });
-    if (!all(rows)) {
-      if (needed[0]) found.gradients[0] = only(lambda, rows);
-      report_overflow(found.info, rows, transpose, cotangent, o);
+    Rows finite(cotangent.size(0), true);
+    products = finite_sum(finite, [&](const Rows& some) { return of_tensors(only(lambda, some)); });
+    if (!all(finite)) {
+      if (needed[0]) found.gradients[0] = only(lambda, finite);
+      report_overflow(found.info, finite, transpose, cotangent, o);
     }
   }
   std::copy(products.begin(), products.end(), found.gradients.begin() + 1);

@@ -165,11 +165,11 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
       coarse = galerkin_product(fine, axis, weights);
     }
     if (axes.empty()) break;
-    if (h->levels_.size() > 1 && !h->symmetric_) h->raw_.push_back(std::move(a));
+    if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
     a = std::move(coarse);
   }
   if (!h->invert_coarsest(a, nullity)) return nullptr;
-  if (h->levels_.size() > 1 && !h->symmetric_) h->raw_.push_back(std::move(a));
+  if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
   h->transposed_.resize(h->rows_.size());
   return h;
 }
@@ -193,7 +193,7 @@ std::shared_ptr<const PackedStencil<T>> Hierarchy<T>::rows(size_t l, bool transp
   if (!transposed || symmetric_) return rows_[l - 1];
   const std::lock_guard lock(mutex_);
   auto& rows = transposed_[l - 1];
-  if (!rows) rows = rows_of(raw_[l - 1], true);
+  if (!rows) rows = rows_of(fields_[l - 1], true);
   return rows;
 }
 
@@ -202,7 +202,8 @@ int64_t Hierarchy<T>::bytes() const {
   int64_t sum = static_cast<int64_t>(coarsest_inverse_.size() * sizeof(T));
   for (const auto& level : levels_)
     for (const auto& transfer : level.transfers) sum += transfer.bytes();
-  for (const auto& rows : rows_) sum += (symmetric_ ? 1 : 3) * rows->bytes();  // with the raw and the transposed ones
+  for (const auto& rows : rows_)
+    sum += (symmetric_ ? 1 : 3) * rows->bytes();  // with their fields and the transposed rows
   return sum;
 }
 

@@ -39,7 +39,7 @@ class Hierarchy {
   bool symmetric_ = true;
   std::vector<Level> levels_;
   std::vector<std::shared_ptr<const PackedStencil<T>>> rows_;  // of the levels from 1 on
-  std::vector<StencilFields<T>> raw_;                           // the same, where Aᵀ is another operator
+  std::vector<StencilFields<T>> fields_;  // their fields, of which Aᵀ is packed; empty if A is symmetric
   mutable std::mutex mutex_;
   mutable std::vector<std::shared_ptr<const PackedStencil<T>>> transposed_;
   std::vector<T> coarsest_inverse_;

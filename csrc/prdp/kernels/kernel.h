@@ -66,7 +66,7 @@ class Kernel {
   /// c = D⁻¹ b
   virtual void divide_by_diagonal(const T* b, T* c) const = 0;
   /// n Jacobi sweeps x ← x + D⁻¹(b - A x) with c = D⁻¹ b; y is memory that they use. With omega, one for each sweep,
-  /// Chebyshev's x ← y + omega (that - y), where y holds the iterate before x, before and after; only where the
+  /// Chebyshev's x ← y + omega (that - y): y holds the iterate before x, on entry and on return; only where the
   /// spectral radius is known.
   virtual void jacobi_sweeps(const T* c, T*& x, T*& y, int64_t n, const T* omega) const = 0;
   /// One of them, from x to y; returns ‖b - A x‖².
@@ -74,9 +74,10 @@ class Kernel {
   /// The spectral radius of I - D⁻¹A, which is symmetric there; nothing if it is not known.
   virtual std::optional<double> radius() const { return std::nullopt; }
 
-  /// A smoothing step y = x + p (x - y) + q D⁻¹(b - A x); On entry y is the iterate before x,
-  /// on return the one after it. And r = b - A x. Only for a grid_operator().
+  /// A smoothing step, y = x + p (x - y) + q D⁻¹(b - A x): on entry y is the iterate before x, on return the one after
+  /// it. Only for a grid_operator(), as residual().
   virtual void smooth(const T* b, const T* x, T* y, T p, T q) const;
+  /// r = b - A x
   virtual void residual(const T* b, const T* x, T* r) const;
   /// What multigrid makes its coarse grids of; nothing if the operator is not of that kind.
   virtual std::optional<GridOperator<T>> grid_operator() const { return std::nullopt; }

@@ -21,8 +21,8 @@ void upwind_row(T advection, T diffusion, const T* before, const T* here, const 
   }
 }
 
-/// Number i of n rows, or planes, round the ends; -n <= i < 2n.
-inline int64_t round(int64_t i, int64_t n) { return i < 0 ? i + n : i < n ? i : i - n; }
+/// i wrapped into [0, n), for -n <= i < 2n: rows and planes beyond an end come from the other one.
+inline int64_t wrapped_index(int64_t i, int64_t n) { return i < 0 ? i + n : i < n ? i : i - n; }
 
 /// Goes along a row register by register, with the ones before and after for the neighbours. What these
 /// hold beyond the ends of the row meets weights of zero.
@@ -57,10 +57,10 @@ struct NeighbourRow {
         w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
         own(Differences ? a.held + (z * a.ny + j) * a.held_step : w),
         ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
-        below(field + (z * a.ny + round(j - 1, a.ny)) * row),
-        above(field + (z * a.ny + round(j + 1, a.ny)) * row),
-        back(field + (round(z - 1, a.nz) * a.ny + j) * row),
-        front(field + (round(z + 1, a.nz) * a.ny + j) * row),
+        below(field + (z * a.ny + wrapped_index(j - 1, a.ny)) * row),
+        above(field + (z * a.ny + wrapped_index(j + 1, a.ny)) * row),
+        back(field + (wrapped_index(z - 1, a.nz) * a.ny + j) * row),
+        front(field + (wrapped_index(z + 1, a.nz) * a.ny + j) * row),
         line(field + (z * a.ny + j) * row) {}
 
   /// A v at register i, but for the ends.
@@ -123,7 +123,8 @@ void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body&
                                                                     a.wrap_values + line * a.wrap_count;
     for (int64_t k = 0; k < a.count; ++k) {
       const auto& o = a.offsets[k].along;
-      from[k] = v + (round(line / a.ny + o[0], a.nz) * a.ny + round(line % a.ny + o[1], a.ny)) * a.row + o[2];
+      from[k] =
+          v + (wrapped_index(line / a.ny + o[0], a.nz) * a.ny + wrapped_index(line % a.ny + o[1], a.ny)) * a.row + o[2];
     }
     for_each_block<most>(0, a.row / kWidth<T>, [&](int64_t first, auto size) {
       const int64_t begin = first * kWidth<T>, end = begin + size.value * kWidth<T>;
@@ -275,7 +276,7 @@ void apply_staggered(const StaggeredStencil<T>& a, Lines lines, const T* v, T* o
   for (int64_t j = lines.begin; j < lines.end; ++j, out1 += row, out2 += row, divergence += row) {
     NeighbourRow<2, T> u1(a.velocity[0], 0, j, v), u2(a.velocity[1], 0, j, v + field);
     Line<T> p(v + 2 * field + j * row);
-    const T* p_below = v + 2 * field + round(j - 1, grid.ny) * row;
+    const T* p_below = v + 2 * field + wrapped_index(j - 1, grid.ny) * row;
     for (int64_t i = 0; i < row; i += kWidth<T>) {
       p.step_to(i);
       Register<T> c1 = u1.product(i), c2 = u2.product(i);

@@ -84,8 +84,8 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
   auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
   auto z = a.project_solution(y);
   if (a.needs_projection()) {
-    takes_product =
-        takes_product.logical_and(leaves_rounding(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
+    takes_product = takes_product.logical_and(
+        only_rounding_is_left(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
     z = at::where(takes_product, z, at::zeros_like(z));
   }
   const auto [product, scale] = of_order_one(a.project(a.apply(z)));
@@ -103,7 +103,7 @@ TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor&
       norm = (dot_in_order(of_b, of_b) / b2).sqrt().nan_to_num(0.0);
     }
     const auto size = norm * (scale * alpha).abs() * dot_in_order(z, z).sqrt();
-    better = better & (much | outdoes_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
+    better = better & (much | start_gains_more_than_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
   }
   return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(), takes_product};
 }

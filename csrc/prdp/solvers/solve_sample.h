@@ -39,7 +39,7 @@ void start_from(Space& space, const typename Space::Scalar* x0) {
   if (space.is_singular()) {
     const T whole2 = space.dot(x, x);
     space.project_solution(x);
-    if (leaves_rounding(space.dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
+    if (only_rounding_is_left(space.dot(x, x), whole2, std::numeric_limits<T>::epsilon())) return;
   }
   space.apply(x, product);
   space.project(product);
@@ -55,8 +55,8 @@ void start_from(Space& space, const typename Space::Scalar* x0) {
     const T left2 = space.dot(r, r), b2 = space.b2();
     bool better = left2 < b2 && std::isfinite(space.largest_magnitude(x));
     if (better && left2 > b2 / 4)  // less is no rounding's doing
-      better =
-          outdoes_rounding<double>(b2, left2, space.epsilon() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
+      better = start_gains_more_than_rounding<double>(
+          b2, left2, space.epsilon() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
     if (better) space.start_here(left2);
   }
   space.fill_zero(product);

@@ -93,7 +93,7 @@ concept NumberOperations =
       s.break_down_unless_positive(a, v2);
       /// v2 + a² w2, which is ‖v + a w‖² for orthogonal v and w, for guarded_quotient() alone.
       { s.sum_of_squares(v2, a, w2) } -> std::same_as<typename S::Scalar>;
-      /// 1 where a = v·w is smaller than factor ‖v‖ ‖w‖, else 0; for restore() alone.
+      /// 1 where |a|, a = v·w, is smaller than factor ‖v‖ ‖w‖, else 0; for restore() alone.
       { s.is_rounding(a, v2, w2, factor) } -> std::same_as<typename S::Scalar>;
       /// a where b and `active` are not zero, else 0.
       { s.unless_zero(a, b, active) } -> std::same_as<typename S::Scalar>;
@@ -173,29 +173,30 @@ concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, 
 template <class S>
 concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S>;
 
-/// What the loop around the methods needs (iterate.h).
+/// What the loop around the methods needs beside (iterate.h).
 template <class S>
-concept LoopSpace = requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
-                             typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
-  /// One number per sample, on the host: a; whether it broke down; ‖A‖.
-  s.values_of(a);
-  s.broken();
-  s.operator_norm();
-  /// ‖u‖², where u is x and the start.
-  { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-  /// ‖A v‖², v being u with signs that have no pattern, so that terms do not cancel: about ‖|A| |u|‖².
-  { s.terms2(x) } -> std::same_as<typename S::Scalar>;
-  /// A vector that the next operation may overwrite.
-  { s.scratch() } -> std::convertible_to<typename S::Vector>;
-  /// From here on, the samples that are not wanted are frozen.
-  s.freeze_unless(states, wanted);
-  /// wanted(state) of each sample, as values_of() are.
-  s.map(states, wanted);
-  /// x of the samples that are wanted, `kept` of the others.
-  { s.select(s.map(states, wanted), kept, x) } -> std::convertible_to<typename S::Vector>;
-  /// Forgets breakdowns and frozen samples, before the iterations run again.
-  s.reset();
-};
+concept LoopSpace =
+    Primitives<S> && requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
+                              typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
+      /// One number per sample, on the host: a; whether it broke down; ‖A‖.
+      s.values_of(a);
+      s.broken();
+      s.operator_norm();
+      /// ‖u‖², where u is x and the start.
+      { s.solution2(x) } -> std::same_as<typename S::Scalar>;
+      /// ‖A v‖², v being u with signs that have no pattern, so that terms do not cancel: about ‖|A| |u|‖².
+      { s.terms2(x) } -> std::same_as<typename S::Scalar>;
+      /// A vector that the next operation may overwrite.
+      { s.scratch() } -> std::convertible_to<typename S::Vector>;
+      /// From here on, the samples that are not wanted are frozen.
+      s.freeze_unless(states, wanted);
+      /// wanted(state) of each sample, as values_of() are.
+      s.map(states, wanted);
+      /// x of the samples that are wanted, `kept` of the others.
+      { s.select(s.map(states, wanted), kept, x) } -> std::convertible_to<typename S::Vector>;
+      /// Forgets breakdowns and frozen samples, before the iterations run again.
+      s.reset();
+    };
 
 /// The fused operations, one after the other. A space derives from it, and defines anew what it does in one pass.
 template <class Space>

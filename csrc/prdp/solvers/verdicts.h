@@ -88,8 +88,8 @@ T consistency_bound(double rtol) {
   return static_cast<T>(std::max(rtol, 64.0 * static_cast<double>(std::numeric_limits<T>::epsilon())));
 }
 
-/// The norm of what rounding to the least numbers of the dtype can leave in a vector of so many unknowns that was
-/// multiplied by `scale`: one of them in each, as twice a half.
+/// How far, in norm, rounding to denormal numbers may have moved a vector of so many unknowns that was then multiplied
+/// by `scale`: half a denorm_min for each entry, doubled.
 template <class T>
 double rounding_of_least_numbers(double scale, int64_t unknowns) {
   return static_cast<double>(std::numeric_limits<T>::denorm_min()) * scale * std::sqrt(static_cast<double>(unknowns));
@@ -97,13 +97,14 @@ double rounding_of_least_numbers(double scale, int64_t unknowns) {
 
 /// Whether a start is rounding alone once its part in the null space is taken off. Squared norms: after, before.
 template <class Number>
-auto leaves_rounding(const Number& left2, const Number& whole2, double epsilon) {
+auto only_rounding_is_left(const Number& left2, const Number& whole2, double epsilon) {
   return left2 <= whole2 * (64.0 * epsilon * (64.0 * epsilon));
 }
-/// Whether what a start takes off b, by the squares of the norms before and then, is more than the rounding of its
-/// product, ε ‖A‖ ‖x‖: a start that A maps to zero, or nearly so, is large and worse than none.
+
+/// Whether what a start takes off b, by b2 = ‖b‖² and left2 = ‖b - A x‖², is more than the rounding of its product,
+/// ε ‖A‖ ‖x‖: a start that A maps to zero, or nearly so, is large and worse than none.
 template <class Number>
-auto outdoes_rounding(const Number& b2, const Number& left2, const Number& rounding) {
+auto start_gains_more_than_rounding(const Number& b2, const Number& left2, const Number& rounding) {
   using std::sqrt;
   return sqrt(b2) - sqrt(left2) > 4.0 * rounding;
 }

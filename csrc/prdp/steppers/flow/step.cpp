@@ -155,14 +155,14 @@ struct ImplicitBack {
     if (is_implicit(e)) operators = diffusion_operators(e, cotangent);
   }
 
-  /// The way forth, for the gradient of ν.
-  void go_again(const at::Tensor& change) {
-    CombinedInfo unseen;
-    const auto balanced = balance(e, change, options, unseen);
+  /// Balances and diffuses again: the gradient of ν needs what came of it.
+  void run_forward(const at::Tensor& change) {
+    CombinedInfo not_reported;
+    const auto balanced = balance(e, change, options, not_reported);
     part = {.change = change,
             .balanced = balanced.u,
             .potential = balanced.potential,
-            .diffused = diffuse(e, operators, balanced.u, options, unseen),
+            .diffused = diffuse(e, operators, balanced.u, options, not_reported),
             .of_potential = of_potential,
             .largest_nu = largest_viscosity(e)};
   }
@@ -190,9 +190,9 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   const auto diffused =
       is_implicit(e) ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info) : FlowParts{change};
   const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
-  const bool none = looks && !refused.mask.defined();
+  const bool none_refused = looks && !refused.mask.defined();
   return {cleared(next, beginning.mask()), cleared(potential, beginning.mask()),
-          info.info(none ? at::Tensor() : beginning.status())};
+          info.info(none_refused ? at::Tensor() : beginning.status())};
 }
 
 std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
@@ -208,10 +208,11 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
   ImplicitBack implicit(e, velocity_bar.on_free_faces, of_potential, options);
   if (is_implicit(e)) {
-    if (needed[1]) implicit.go_again(explicit_part(e, beginning).change);
+    if (needed[1]) implicit.run_forward(explicit_part(e, beginning).change);
     back = implicit.back(/*of_nu=*/!beginning.of_kernels, adjoint);
   }
   info = adjoint.info();
+  // Back through the explicit part: by kernels, which add the share of ν; where none can be made, by autograd.
   if (beginning.of_kernels) {
     auto found =
         flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
@@ -219,6 +220,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
     if (is_implicit(e)) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
+  // On the CPU by loops, else by autograd.
   const auto by_loops = flow_has_loops(u);
   return (by_loops ? explicit_vjp_by_loops : explicit_vjp_by_autograd)(equation, u, refused, velocity_bar.u, back,
                                                                        needed);
