@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'batched_axes', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_refused', 'batched_axes', 'block_gradients_of_lost', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
 class RegisteredProducts:
     def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable) -> None:
         ...
@@ -108,9 +108,17 @@ class LinearSchedule(Controller):
     @property
     def settings(self) -> dict:
         ...
+def any_refused(status: torch.Tensor) -> bool:
+    """
+    Whether a sample was refused for a NaN or Inf in b or A.
+    """
 def batched_axes(kind: str, axes: typing.SupportsInt | typing.SupportsIndex, tensors: typing.SupportsInt | typing.SupportsIndex) -> list[int] | None:
     """
     The number of axes of each of so many tensors of an operator where it has one for the batch, on a grid of so many axes: 0 if all samples share it. None if that is not known.
+    """
+def block_gradients_of_lost(u: torch.Tensor, status: torch.Tensor, on_failure: str) -> None:
+    """
+    No gradient passes through a state u from here on, for samples whose solve has none.
     """
 def bytes_of_factorisations() -> int:
     """

@@ -183,7 +183,7 @@ def advise_on(
     if best is not None and at_rounding:
         notes.append(
             f"At {power(TOLERANCES[-1])} the residual of {best.name} is the rounding of {dtype_name(best.dtype)}. "
-            "The error of u may be far smaller; a smaller residual needs float64."
+            "The error of u may be far smaller, or larger where A is ill-conditioned: solve it in float64 once to see."
         )
     if (best is None or at_rounding) and not other_dtypes and not is_built_in(step):
         notes.append(
@@ -299,9 +299,12 @@ def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: flo
     best = update.fastest(rows, TOLERANCES[0])
     if best is not None:
         return f"Use {best.name} with rtol={rough}, the fastest to it: no solver reaches {fine} within {seconds:g} s."
+    is_single = rows[0].dtype == torch.float32
+    stalled = [row.name for row in rows if is_single and row.status in ("STAGNATED", "BREAKDOWN")]
+    other = f"try float64, as {listed(stalled)} stop at the rounding of float32; or " if stalled else ""
     return (
-        f"No solver reaches {rough} within {seconds:g} s: take a shorter time step or a smaller grid, or look for a "
-        "mistake with prdp.check_operator."
+        f"No solver reaches {rough} within {seconds:g} s: {other}take a shorter time step or a smaller grid, or look "
+        "for a mistake with prdp.check_operator."
     )
 
 

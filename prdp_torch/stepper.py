@@ -172,9 +172,19 @@ class Stepper(HasSettings):
         if not compiling and _check.dense(who, "u", u).dim() < 2:
             raise ValueError(f"{who}: u must have shape (batch, ...), got {tuple(u.shape)}")
         u = full_precision(u)
-        blocks = self.on_failure != "raise" and not compiling and u.requires_grad
-        if blocks:
-            u = u.view_as(u)  # whose gradient is this step's alone
+        may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
+        if not may_lose or u.is_cpu:
+            found = self._solve_from(u, log)
+            if not may_lose or not _C.any_refused(found[3]):
+                return found
+        # On the CPU not before a sample is refused: gradients that go through a view are summed in another order.
+        state = u.view_as(u)
+        found = self._solve_from(state, log)
+        _C.block_gradients_of_lost(state, found[3], self.on_failure)
+        return found
+
+    def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
+        who, compiling = type(self).__name__, torch.compiler.is_compiling()
         a = as_operator(who, "operator(u)", self.operator(u))
         b = self.rhs(u)
         if not compiling:
@@ -191,8 +201,6 @@ class Stepper(HasSettings):
                 b, a.tensors, a.kind, a.shape, a.parameters, self._options_kept(), self._max_iter, log.number, x0
             )
             if found is not None:
-                if blocks:
-                    _C.block_gradients_of_lost(u, found[3], self.on_failure)
                 return found
         solution: Solution = torch.ops.prdp.linear_solve(
             b, a.tensors, a.kind, a.shape, a.parameters, False, x0, *self._packed_options(log)

@@ -205,6 +205,7 @@ void bind_solvers(py::module_& m) {
   m.def("way_of_last_solve", &way_of_last_solve,
         "How this thread's last solve was computed: kernel, loops or tensors.");
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
+  m.def("any_refused", &any_refused, py::arg("status"), "Whether a sample was refused for a NaN or Inf in b or A.");
   m.def(
       "block_gradients_of_lost",
       [](const at::Tensor& u, const at::Tensor& status, const std::string& on_failure) {

@@ -33,6 +33,22 @@ TEST(ImplicitStep, WithTheHeatOperatorIsHeatToTheLastBit) {
   }
 }
 
+TEST(ImplicitStep, ARefusedSampleGivesNoNanToItsState) {
+  const auto rhs = [](const at::Tensor& u) { return u.exp(); };
+  const prdp::SolveOptions options{.solver = prdp::CG{.max_iter = 100}, .on_failure = prdp::OnFailure::kZeroGrad};
+  auto step = prdp::ImplicitStep(
+      [](const at::Tensor&) { return prdp::OperatorSpec{"heat", {8}, {0.1}, {at::scalar_tensor(1e-2)}}; }, rhs,
+      options);
+  const auto weight = at::ones({}, at::kDouble).requires_grad_();
+  auto u = random_field({8}, 3);
+  u[1] += 1e4;  // whose exponential is infinite
+  step(weight * u).square().sum().backward();
+  EXPECT_TRUE(std::isfinite(weight.grad().item<double>()));
+  EXPECT_NE(weight.grad().item<double>(), 0.0);
+  const auto status = step.info()->status;
+  EXPECT_EQ(status[1].item<int64_t>(), static_cast<int64_t>(prdp::SolveStatus::kNonfiniteInput));
+}
+
 TEST(ImplicitStep, SolvesANonlinearRightHandSideWithItsGradient) {
   const auto reaction = at::scalar_tensor(0.7, at::kDouble).requires_grad_();
   auto step = prdp::ImplicitStep(

@@ -9,16 +9,16 @@
 /// of what type they are.
 namespace {
 
-/// The bits of a register as a number of type T. Those of a wider one are cut.
+/// The bits of a register as a T: the pattern of a float, or an integer cut to T.
 template <class T, class R>
 T as(R bits) {
   if constexpr (std::is_same_v<T, R>) return bits;
   else if constexpr (std::is_floating_point_v<T> && sizeof(T) == sizeof(R)) return std::bit_cast<T>(bits);
   else return static_cast<T>(bits);
 }
-/// A number of type T in a register of type R; one with a sign keeps it in a wider one.
+/// A T as the bits of a register R; integers with a sign are extended.
 template <class R, class T>
-R in(T value) {
+R to_register(T value) {
   if constexpr (std::is_floating_point_v<T> && !std::is_same_v<T, R>) return std::bit_cast<R>(value);
   else return static_cast<R>(value);
 }
@@ -73,10 +73,13 @@ T most(T a, T b) {
   if constexpr (std::is_floating_point_v<T>) return std::fmax(a, b);
   else return a > b ? a : b;
 }
-/// A number becomes an integer as on a GPU: NaN 0, and beyond the ends the last one.
+/// A number becomes an integer as on a GPU: beyond the ends the last one; NaN zero, or where one of the two has 64
+/// bits, the highest bit alone.
 template <class To, class From>
-To whole(From v) {
-  if (std::isnan(v)) return 0;
+To to_integer(From v) {
+  if (std::isnan(v))
+    return sizeof(From) < 8 && sizeof(To) < 8 ? To(0)
+                                              : static_cast<To>(std::make_unsigned_t<To>(1) << (8 * sizeof(To) - 1));
   if (v <= static_cast<From>(std::numeric_limits<To>::min())) return std::numeric_limits<To>::min();
   if (v >= static_cast<From>(std::numeric_limits<To>::max())) return std::numeric_limits<To>::max();
   return static_cast<To>(v);

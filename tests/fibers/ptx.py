@@ -28,7 +28,8 @@ extern "C" int run(const void* arguments, int blocks, int threads, long memory, 
 
 
 def statements(text):
-    """(line, text) of what ends by a semicolon, a brace or a colon."""
+    """(line, text) of each statement, which ends by a semicolon, a brace or the colon of a label. Braces of
+    initialisers and of lists of registers stay within it."""
     text = re.sub(r"//[^\n]*", "", text)
     found, pending, depth, line, first = [], "", 0, 1, 1
     for letter in text:
@@ -78,6 +79,8 @@ def place_of(name):
 
 
 class Function:
+    """A function while it is read: take() gets its statements, text() is its C++."""
+
     def __init__(self, module, name, result, parameters):
         self.module, self.name, self.depth = module, name, 1
         self.kinds, self.registers, self.memory, self.code = {}, {}, [], []
@@ -95,7 +98,7 @@ class Function:
         return "\n".join([*lines, "}"])
 
     def take(self, statement):
-        """Whether the function goes on after it."""
+        """Translates a statement of the body; returns whether the function goes on."""
         if statement in "{}":
             self.depth += 1 if statement == "{" else -1
             if self.depth == 0:

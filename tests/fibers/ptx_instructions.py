@@ -37,7 +37,9 @@ OF_MORE = {
     "bfe": "bits_of({}, {}, {})",
     "prmt": "permuted({}, {}, {})",
 }
-NOT_AT_HAND = ("volatile", "cg", "cv", "relaxed", "acquire")  # loads of what other blocks may have written
+OF_OTHERS = ("volatile", "cg", "cv", "relaxed", "acquire")  # loads of what other blocks may have written
+
+UNKNOWN = {"approx", "ftz", "full", "sat", "rz", "rm", "rp", "warp", "f4e", "b4e", "rc8", "ecl", "ecr", "rc16"}
 
 
 class Unknown(Exception):
@@ -88,11 +90,11 @@ class Instructions:
         operation, _, rest = text.partition(" ")
         parts, args = operation.split("."), split(rest)
         kinds = [part for part in parts if part in TYPES]
-        of_its_own = getattr(self, f"_{parts[0]}", None)
-        if of_its_own is not None:
-            return of_its_own(parts, kinds, args)
+        translate = getattr(self, f"_{parts[0]}", None)
+        if translate is not None and not UNKNOWN & set(parts):
+            return translate(parts, kinds, args)
         # Of log(), which says when to look next, and of nothing that a result is made of.
-        if operation != "rcp.approx.ftz.f64" and {"approx", "ftz", "full", "sat"} & set(parts):
+        if operation != "rcp.approx.ftz.f64" and UNKNOWN & set(parts):
             raise Unknown(operation)
         return self._arithmetic(parts, kinds, args)
 
@@ -129,7 +131,7 @@ class Instructions:
         if register == "_":
             return f"(void)({expression});"
         own = self.kinds.get(register) or self.kinds[re.match(r"%?[a-zA-Z]+", register)[0]]
-        return f"{register_name(register)} = in<{TYPES[own]}>(static_cast<{TYPES[kind]}>({expression}));"
+        return f"{register_name(register)} = to_register<{TYPES[own]}>(static_cast<{TYPES[kind]}>({expression}));"
 
     # ---- arithmetic
 
@@ -163,7 +165,8 @@ class Instructions:
         a, b = self.values(args[1:3], kind)
         if high:
             wide = "unsigned __int128" if kind[0] == "u" else "__int128"
-            return self.put(args[0], kind, f"(static_cast<{wide}>({a}) * {b}) >> {kind[1:]}")
+            added = f" + {self.value(args[3], kind)}" if name == "mad" else ""
+            return self.put(args[0], kind, f"((static_cast<{wide}>({a}) * {b}) >> {kind[1:]}){added}")
         wide = kind[0] + str(2 * int(kind[1:]))
         added = f" + {self.value(args[3], wide)}" if name == "mad" else ""
         return self.put(args[0], wide, f"static_cast<{TYPES[wide]}>({a}) * {b}{added}")
@@ -214,7 +217,7 @@ class Instructions:
         if source[0] == "f" and rounding:
             x = f"std::{rounding}({x})"
             if to[0] != "f":
-                x = f"whole<{TYPES[to]}>({x})"
+                x = f"to_integer<{TYPES[to]}>({x})"
         return self.put(args[0], to, x)
 
     # ---- choices
@@ -264,7 +267,7 @@ class Instructions:
 
     def _ld(self, parts, kinds, args):
         t, registers = TYPES[kinds[0]], split(args[0].strip("{} "))
-        read = "load_of_others" if "shared" not in parts and set(NOT_AT_HAND) & set(parts) else "load"
+        read = "load_of_others" if "shared" not in parts and set(OF_OTHERS) & set(parts) else "load"
         size, address = int(kinds[0][1:]) // 8, self.address(args[1])
         loads = [f"const auto l{k} = {read}<{t}>({address} + {k * size});" for k in range(len(registers))]
         return "{ " + " ".join(loads + [self.put(r, kinds[0], f"l{k}") for k, r in enumerate(registers)]) + " }"
@@ -287,6 +290,8 @@ class Instructions:
     # ---- the order of threads
 
     def _bar(self, parts, kinds, args):
+        if "sync" not in parts or len(args) > 1:
+            raise Unknown(".".join(parts))
         return "fibers::meet(1);"  # a compiler may copy a barrier, so its place is no matter
 
     _barrier = _bar

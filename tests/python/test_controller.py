@@ -214,7 +214,7 @@ def test_k_stops_at_the_largest_number():
 # ---- a tolerance tied to the error
 
 
-@pytest.mark.filterwarnings("ignore:ToleranceController. the error has not fallen")
+@pytest.mark.filterwarnings("ignore:ToleranceController. the error has not fallen", "ignore:.*the metric grows")
 @given(st.lists(st.floats(0, 10), max_size=30))
 def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(errors):
     heat = heat_step()

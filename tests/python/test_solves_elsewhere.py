@@ -54,14 +54,14 @@ def test_solutions_gradients_and_reports_are_those_of_the_cpu(name, solver, on_f
     leaves = [g.clone().requires_grad_(), b.clone().requires_grad_()]
     u, info = prdp.linear_solve(make(leaves[0]), leaves[1], SOLVERS[solver])
     torch.testing.assert_close(run.u, u, rtol=1e-10, atol=1e-12)
-    for mine, other in zip(run.gradients, torch.autograd.grad(u.square().sum(), leaves), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-10)
+    for found, expected in zip(run.gradients, torch.autograd.grad(u.square().sum(), leaves), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
     with run.device:
         assert run.info.status.device.type != "cpu"
         reports = [(run.info, info), (run.info.adjoint, info.adjoint)]
     for there, here in reports:
-        for mine, other in zip(there[:5], here[:5], strict=True):
-            torch.testing.assert_close(run.device.fetch(mine), other, rtol=1e-2, atol=1e-14)
+        for found, expected in zip(there[:5], here[:5], strict=True):
+            torch.testing.assert_close(run.device.fetch(found), expected, rtol=1e-2, atol=1e-14)
 
 
 def one_of_each_end():
@@ -88,7 +88,7 @@ def test_a_failed_sample_says_so_and_has_no_gradient(on_failure, dtype):
 
 
 @pytest.mark.parametrize("solver", [prdp.Jacobi(60, 0.0), prdp.CG(60, 0.0), prdp.SteepestDescent(60, 0.0)])
-def test_iterations_that_run_away_leave_zero_and_say_so(solver):
+def test_iterations_that_run_away_hand_out_nothing_worse_than_zero(solver):
     """Jacobi diverges where the diagonal is small, CG and steepest descent where A is not definite."""
     c = torch.cat([five_points(4.3), five_points(-1.0)]).to(F32)
     c[1, 1:3] = 0.3
@@ -149,8 +149,8 @@ def test_cycles_know_the_winds_of_the_device(name):
     leaves = [winds.clone().requires_grad_(), b.clone().requires_grad_()]
     u, _ = prdp.linear_solve(make(leaves[0]), leaves[1], prdp.Direct())
     torch.testing.assert_close(run.u, u, rtol=1e-7, atol=1e-9)
-    for mine, other in zip(run.gradients, torch.autograd.grad(u.square().sum(), leaves), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-8)
+    for found, expected in zip(run.gradients, torch.autograd.grad(u.square().sum(), leaves), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", [(6, 5, 9), (8, 7, 6), (11, 10), (5, 12), (13,), (10,)])

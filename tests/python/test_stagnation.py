@@ -91,6 +91,27 @@ def test_what_is_told_may_be_wrong_altogether():
     assert len(words) == 1 and "Direct, or float64. This is said once" in words[0]
 
 
+def test_a_residual_above_b_is_told_of_steps_and_of_adjoint_solves():
+    """A kernel of the exponential of squares, of condition 1e7: CG may go far from b before it comes near."""
+    n, generator = 120, torch.Generator().manual_seed(0)
+    x = torch.linspace(0, 1, n, dtype=F64)
+    a = torch.exp(-((x[:, None] - x) ** 2) / 0.02) + 1e-6 * torch.eye(n, dtype=F64)
+    rough = torch.randn(1, n, dtype=F64, generator=generator)
+    step = prdp.ImplicitStep(prdp.operators.Matrix(a), None, prdp.CG(30))
+    with told("above ‖b‖") as words:
+        step(rough)
+        step(rough)
+    assert float(step.info.residual) > 1 and "linear_solve: 1 of 1 samples stopped at max_iter = 30" in words[0]
+    assert words[0].endswith("take more iterations, a preconditioner, GMRES or Direct; or rtol=0 if this is meant. "
+                             "This is said once")  # fmt: skip
+    b = (a @ torch.sin(3 * x)).requires_grad_()
+    u, info = prdp.linear_solve(a, b, prdp.CG(30, rtol=1e-3))
+    with told("above ‖b‖") as words:
+        torch.autograd.grad(u @ rough[0], b)
+    assert info.solved.all() and float(info.adjoint.residual) > 1
+    assert len(words) == 1 and words[0].startswith("adjoint solve: 1 of 1 samples stopped at max_iter = 30")
+
+
 def test_an_adjoint_solve_is_told_by_its_own_name():
     b = torch.zeros(1, 8, dtype=F64, requires_grad=True)  # solved at once
     with told() as words:

@@ -24,6 +24,11 @@ at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status) {
   return at::where(per_sample(failed, u), u.detach(), u);
 }
 
+bool any_refused(const at::Tensor& status) {
+  if (!status.is_cpu() || at::isTensorSubclassLike(status)) return false;
+  return status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)).any().item<bool>();
+}
+
 void block_gradients_of_lost(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure) {
   if (on_failure == OnFailure::kRaise || !u.requires_grad() || in_torch_func()) return;
   u.register_hook([status, on_failure](const at::Tensor& u_bar) { return without_lost(u_bar, status, on_failure); });

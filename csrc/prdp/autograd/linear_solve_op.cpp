@@ -62,14 +62,14 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 }
 
 template <class... Args>
-SolveOutputs solve_kernel(const at::Tensor& b, const Args&... args) {
+SolveOutputs solve_op(const at::Tensor& b, const Args&... args) {
   const auto [a, options, x0] = unpack_op(args...);
   return outputs_of(linear_solve_kernel(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
-SolveOutputs fake_kernel(const at::Tensor& b, const Args&... args) {
+SolveOutputs fake_op(const at::Tensor& b, const Args&... args) {
   const auto [a, options, x0] = unpack_op(args...);
   checked_operator(a, b, options, x0);
   return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
@@ -112,7 +112,8 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
   return out;
 }
 
-/// Records at once where nothing lies between, as the dispatcher would take the arguments apart; else calls the op.
+/// Records without the dispatcher, which would pack and unpack the options, where no mode or subclass is to see the op;
+/// else calls the op.
 SolveOutputs record_or_call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                                const at::Tensor& x0) {
   if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
@@ -125,8 +126,8 @@ template <class>
 struct OpKernels;
 template <class... Args>
 struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
-  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_kernel(b, args...); }
-  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_kernel(b, args...); }
+  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_op(b, args...); }
+  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_op(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
     const auto [a, options, x0] = unpack_op(args...);
     return solve_and_record(b, a, options, x0);
@@ -154,7 +155,13 @@ SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, c
   // No u has a part in a null space that was named, so the cotangent's there has no influence.
   const auto rhs = spec.transposed && is_singular(spec) ? a->project(b) : b;
   const bool may_wait = waits_for_report(options);
-  auto result = solve(*a, rhs, {s, {}, true, x0, may_wait, checks, options.report_apart, options.hierarchy.get()});
+  auto result = solve(*a, rhs,
+                      {.solver = s,
+                       .x0 = x0,
+                       .may_wait = may_wait,
+                       .checks = checks,
+                       .report_apart = options.report_apart,
+                       .hierarchy = options.hierarchy.get()});
   auto& info = result.info;
   if (spec.transposed && options.adjoint_log != 0) adjoint_log::write(options.adjoint_log, info);
   report_failures({spec, s, spec.transposed, x0}, *a, b, info, options.on_failure);

@@ -61,6 +61,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   auto o = options;
   o.solver.max_iter = o.adjoint_max_iter.value_or(o.solver.max_iter);
   o.solver.rtol = o.adjoint_rtol.value_or(o.solver.rtol);
+  // Without a tolerance of its own, the adjoint solve keeps the traced one of the solve.
   if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
   o.solver.preconditioner = o.solver.preconditioner.transposed();
   auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
@@ -77,7 +78,8 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
-  // Where the host does not look, what may overflow is left out beforehand. Else it is summed first, and looked at.
+  // Where the host does not look, what may overflow is left out beforehand. Subclasses have no numbers to look at.
+  // Else: sum, look, and sum again without what overflowed.
   if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
     const auto overflowing = may_overflow(lambda, u);
     lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
@@ -87,7 +89,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
                                 static_cast<int64_t>(SolveStatus::kOverflow));
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
     products = of_tensors(lambda);
-  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
+  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {
     products = of_tensors(lambda);
   } else {
     Rows finite(cotangent.size(0), true);
@@ -110,7 +112,8 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
   // torch.func need it.
   bool recorded = at::GradMode::is_enabled() && !in_torch_func() && !has_tangent(cotangent) && !has_tangent(solved.b) &&
                   !any_tangent(a.tensors);
-  for (size_t i = 0; i < needed.size(); ++i)  // not where they did so in a transform that has ended
+  // An input that no longer requires a gradient did so in a transform that has ended: nothing to record.
+  for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) recorded = recorded && (i == 0 ? solved.b : a.tensors[i - 1]).requires_grad();
   const auto vjp = recorded ? unrolled_vjp_recorded : unrolled_vjp;
   return vjp(cotangent, solved, a, options, needed);

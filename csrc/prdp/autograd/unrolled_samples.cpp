@@ -76,17 +76,18 @@ class SampleVjps {
 
   const int64_t batch_ = solved_.b.size(0);
   const std::unique_ptr<Operator> a_ = make_operator(spec_);
-  const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);  // and the status, of the solve
+  const std::vector<int64_t> counts_ =
+      to_host<int64_t>(solved_.iterations, batch_);  // of the forward solve, as statuses_
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
-  const std::vector<int64_t> wanted_ = wanted();                            // needed_, and what that looks at
+  const std::vector<int64_t> wanted_ = wanted();  // needed_, and b̄ where retry_implicitly() looks at it
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double judged_rtol_ =
       options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
   std::vector<Derivative> derivatives_{};
-  Rows rows_ = finite_rows(cotangent_);        // whose gradients are finite
-  at::Tensor finite_cotangent_ = only(cotangent_, rows_);   // the cotangent of samples that are not refused
+  Rows rows_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
+  at::Tensor finite_cotangent_ = only(cotangent_, rows_);  // the cotangent of samples that are not refused
   std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
   std::vector<at::Tensor> gradients_{};
   at::Tensor u_{};
@@ -123,7 +124,8 @@ class SampleVjps {
 
   UnrolledVjp take_iterations_back(const Rows& rows) const {
     auto caps = at::zeros({batch_}, at::kLong);
-    const bool for_no_sample = !any(rows);  // what the iterations make of no cotangent, finite or not
+    // finite_sum() may ask for the share of no sample: all iterations, with a cotangent of zero.
+    const bool for_no_sample = !any(rows);
     for (int64_t i = 0; i < batch_; ++i)
       if ((rows[i] || for_no_sample) && derivatives_[i] == Derivative::kOfIterations)
         caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
@@ -185,8 +187,8 @@ class SampleVjps {
     return t.dim() > 0 && t.size(0) == batch_ && (!axes || (*axes)[k] == t.dim());
   }
 
-  /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that share a
-  /// tensor of A are looked at together: it has the sum of their gradients.
+  /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that
+  /// share a tensor of A are looked at together: it has the sum of their gradients.
   void add_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
     bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
@@ -199,13 +201,13 @@ class SampleVjps {
       if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
       const auto right = of_solution[k].to(at::kDouble), off = found[k + 1].detach() + right;
       const bool of_samples = is_of_samples(k);
-      const auto differs = [&](const auto& norm) {
+      const auto mark_misleading = [&](const auto& norm) {
         const auto is_misleading = norm(off).gt(norm(right)).expand({batch_}).contiguous();
         const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch_);
         for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
       };
-      if (of_samples) differs([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
-      if (!of_samples || is_function(spec_)) differs([](const at::Tensor& t) { return t.norm(); });
+      if (of_samples) mark_misleading([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
+      if (!of_samples || is_function(spec_)) mark_misleading([](const at::Tensor& t) { return t.norm(); });
     }
   }
 

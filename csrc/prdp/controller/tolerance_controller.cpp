@@ -17,7 +17,7 @@ ToleranceController::ToleranceController(ToleranceSettings settings)
   TORCH_CHECK_VALUE(s.adjoint_floor > 0.0 && s.adjoint_floor < 1.0,
                     "ToleranceController: adjoint_floor must be > 0 and < 1, got ", s.adjoint_floor);
   TORCH_CHECK_VALUE(s.maximum >= 1, "ToleranceController: maximum must be >= 1, got ", s.maximum);
-  budget();
+  budget();  // refuses an adjoint_ratio outside (0, 1]
 }
 
 double ToleranceController::rtol_for(double smallest) const {

@@ -27,7 +27,7 @@ double radius_of(const StencilFields<T>& a) {
   return std::isfinite(largest) ? static_cast<double>(largest) : std::numeric_limits<double>::infinity();
 }
 
-/// By a sample of the points.
+/// The axes along which to coarsen (coarsening.h), by a sample of the points, an odd number apart.
 template <class T>
 Axes axes_to_coarsen(const StencilFields<T>& a) {
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
@@ -62,13 +62,13 @@ Axes axes_to_coarsen(const StencilFields<T>& a) {
 }
 
 template <class T>
-std::shared_ptr<const PackedStencil<T>> rows_of(const StencilFields<T>& a, bool transposed) {
+std::shared_ptr<const PackedStencil<T>> pack(const StencilFields<T>& a, bool transposed) {
   std::vector<Offset> offsets;
   std::vector<const T*> fields;
   for (int k = 0; k < 27; ++k)
     if (a.coefficients[k]) {
       fields.push_back(a.coefficients[k]);
-      offsets.push_back(StencilFields<T>::offset(transposed ? 26 - k : k));
+      offsets.push_back(StencilFields<T>::offset(transposed ? 26 - k : k));  // 26 - k: the opposite one
     }
   const auto pattern = std::make_shared<StencilSparsity>(a.grid, offsets);
   return std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, T(1), transposed));
@@ -155,7 +155,7 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
     const double radius = radius_of(a);
     if (!std::isfinite(radius) || !all_finite(a)) return nullptr;
     h->levels_.push_back({a.grid, radius, {}});
-    if (h->levels_.size() > 1) h->rows_.push_back(rows_of(a, false));
+    if (h->levels_.size() > 1) h->packed_.push_back(pack(a, false));
     const auto axes = axes_to_coarsen(a);
     StencilFields<T> coarse(a.grid);
     for (const int axis : axes) {
@@ -170,13 +170,13 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
   }
   if (!h->invert_coarsest(a, nullity)) return nullptr;
   if (h->levels_.size() > 1 && !h->symmetric_) h->fields_.push_back(std::move(a));
-  h->transposed_.resize(h->rows_.size());
+  h->transposed_.resize(h->packed_.size());
   return h;
 }
 
 template <class T>
 bool Hierarchy<T>::invert_coarsest(const StencilFields<T>& a, int64_t nullity) {
-  const auto rows = rows_of(a, false);
+  const auto rows = pack(a, false);
   const int64_t n = a.points();
   MatrixXd m = MatrixXd::Zero(n, n);
   rows->for_each_entry([&](int64_t i, int64_t j, double value) { m(i, j) += value; });
@@ -189,11 +189,11 @@ bool Hierarchy<T>::invert_coarsest(const StencilFields<T>& a, int64_t nullity) {
 }
 
 template <class T>
-std::shared_ptr<const PackedStencil<T>> Hierarchy<T>::rows(size_t l, bool transposed) const {
-  if (!transposed || symmetric_) return rows_[l - 1];
+std::shared_ptr<const PackedStencil<T>> Hierarchy<T>::packed(size_t l, bool transposed) const {
+  if (!transposed || symmetric_) return packed_[l - 1];
   const std::lock_guard lock(mutex_);
   auto& rows = transposed_[l - 1];
-  if (!rows) rows = rows_of(fields_[l - 1], true);
+  if (!rows) rows = pack(fields_[l - 1], true);
   return rows;
 }
 
@@ -202,7 +202,7 @@ int64_t Hierarchy<T>::bytes() const {
   int64_t sum = static_cast<int64_t>(coarsest_inverse_.size() * sizeof(T));
   for (const auto& level : levels_)
     for (const auto& transfer : level.transfers) sum += transfer.bytes();
-  for (const auto& rows : rows_)
+  for (const auto& rows : packed_)
     sum += (symmetric_ ? 1 : 3) * rows->bytes();  // with their fields and the transposed rows
   return sum;
 }

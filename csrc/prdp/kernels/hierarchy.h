@@ -27,7 +27,7 @@ class Hierarchy {
 
   const std::vector<Level>& levels() const { return levels_; }
   /// A, or Aᵀ, on level `l` >= 1.
-  std::shared_ptr<const PackedStencil<T>> rows(size_t l, bool transposed) const;
+  std::shared_ptr<const PackedStencil<T>> packed(size_t l, bool transposed) const;
   /// (n, n): the inverse on the last level; of a singular matrix the pseudo-inverse.
   const std::vector<T>& coarsest_inverse() const { return coarsest_inverse_; }
   int64_t bytes() const;
@@ -38,7 +38,7 @@ class Hierarchy {
 
   bool symmetric_ = true;
   std::vector<Level> levels_;
-  std::vector<std::shared_ptr<const PackedStencil<T>>> rows_;  // of the levels from 1 on
+  std::vector<std::shared_ptr<const PackedStencil<T>>> packed_;  // of the levels from 1 on
   std::vector<StencilFields<T>> fields_;  // their fields, of which Aᵀ is packed; empty if A is symmetric
   mutable std::mutex mutex_;
   mutable std::vector<std::shared_ptr<const PackedStencil<T>>> transposed_;

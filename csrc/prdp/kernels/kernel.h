@@ -27,7 +27,7 @@ class Factors {
 template <class T>
 struct GridOperator {
   std::function<std::optional<StencilFields<T>>()> make;  // not transposed; nothing if neighbours lie far away
-  FactorKey key;                                       // tells it from others
+  FactorKey key;  // under which its factors and coarse grids are kept (factor_cache.h)
   bool transposed;
 };
 
@@ -90,7 +90,7 @@ class Kernel {
 
   /// From here on it refers to no memory that it was made of. It has no grid_operator() then.
   virtual void leave_source() {}
-  /// Of memory, about.
+  /// Bytes that it holds, about: here of one vector and of the null spaces, to which others add their coefficients.
   virtual int64_t bytes() const {
     const int64_t vectors =
         1 + (null_space_ ? null_space_->count_in_one_field() + left_null_space_->count_in_one_field() : 0);

@@ -35,9 +35,9 @@ Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Ker
   const int64_t fields = channels ? a.layout().planes : 1;
   levels_[0].grid = PaddedGrid::of(a.layout(), hierarchy_->levels()[0].grid, channels);
   for (size_t l = 1; l < hierarchy_->levels().size(); ++l) {
-    auto own = std::make_unique<Stencil<T>>(hierarchy_->rows(l, transposed), fields, T(1));
+    auto own = std::make_unique<Stencil<T>>(hierarchy_->packed(l, transposed), fields, T(1));
     std::unique_ptr<Kernel<T>> own_transpose;
-    if (transpose) own_transpose = std::make_unique<Stencil<T>>(hierarchy_->rows(l, !transposed), fields, T(1));
+    if (transpose) own_transpose = std::make_unique<Stencil<T>>(hierarchy_->packed(l, !transposed), fields, T(1));
     add_level(l, *own, own_transpose.get(), smoothing);
     levels_[l].own = std::move(own);
     levels_[l].own_transpose = std::move(own_transpose);

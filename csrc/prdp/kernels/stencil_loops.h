@@ -7,6 +7,8 @@ namespace prdp::kernels {
 
 namespace {
 
+/// Adds the coefficients of upwind differences along one axis to a row; the wind at a face is the mean of its two
+/// points. lower and upper belong to this axis, centre is the sum over all axes.
 template <class T>
 void upwind_row(T advection, T diffusion, const T* before, const T* here, const T* after, T* __restrict lower,
                 T* __restrict upper, T* __restrict centre, int64_t n) {
@@ -47,7 +49,8 @@ template <int Dim, class T, bool Differences = false>
 struct NeighbourRow {
   const NeighbourStencil<T>& a;
   int64_t row, last;  // its padded length; where its last register starts
-  const T *w, *own, *ends, *below, *above, *back, *front;  // own: what the point itself is multiplied by
+  // own: what the point itself is multiplied by; ends: what couples the two ends of a periodic row, null where none do
+  const T *w, *own, *ends, *below, *above, *back, *front;
   Line<T> line;
 
   NeighbourRow(const NeighbourStencil<T>& stencil, int64_t z, int64_t j, const T* field)
@@ -266,6 +269,8 @@ void residual_offsets(const OffsetStencil<T>& a, Lines lines, const T* b, const 
   for_each_register(a, lines, x, body);
 }
 
+/// out = A v on these rows of the three fields. What couples the pressure and the divergence across the ends of a
+/// periodic row is added last.
 template <class T>
 void apply_staggered(const StaggeredStencil<T>& a, Lines lines, const T* v, T* out) {
   const auto& grid = a.velocity[0];

@@ -115,7 +115,7 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
   TORCH_CHECK_VALUE(std::find(extents.begin(), extents.end(), 0) == extents.end(),
                     "Function: every extent of a vector must be >= 1, got ", b.sizes());
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
-                   "Function: expected float32 or float64, got ", b.scalar_type());
+                   "Function: expected a vector in float32 or float64, got ", b.scalar_type());
   vectors_ = b.sizes().vec();
 }
 

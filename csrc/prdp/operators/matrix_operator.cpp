@@ -20,7 +20,7 @@ void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t 
   TORCH_CHECK_VALUE(!batched || b.size(0) == values.size(0), "linear_solve: A holds ", values.size(0),
                     " matrices, b holds ", b.size(0), " right-hand sides");
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,
-                   "linear_solve: expected float32 or float64, got ", b.scalar_type());
+                   "linear_solve: expected b in float32 or float64, got ", b.scalar_type());
   TORCH_CHECK_TYPE(b.scalar_type() == values.scalar_type(), "linear_solve: A is ", values.scalar_type(), " but b is ",
                    b.scalar_type());
   TORCH_CHECK_VALUE(b.device() == values.device(), "linear_solve: A is on ", values.device(), " but b is on ",

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <iomanip>
+#include <limits>
 #include <sstream>
 
 #include "prdp/operators/kinds.h"
@@ -40,11 +41,13 @@ double value_of_sample(const at::Tensor& t, int64_t sample) {
   return (t.dim() == 0 || t.size(0) == 1 ? t.reshape({-1})[0] : t.reshape({-1})[sample]).to(at::kDouble).item<double>();
 }
 
-/// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample.
-double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) {
+/// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample; NaN for a function without a transpose.
+double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
   const auto v = without_structure(b);
   const auto product = a.apply(v).select(0, sample), other = a.apply_transpose(v).select(0, sample);
   return norm_of(product - other) / norm_of(product);
+} catch (const std::exception&) {  // it has nothing to add to a message
+  return std::numeric_limits<double>::quiet_NaN();
 }
 
 /// Whether the null space of A is known: somebody named it, or it is that of a pressure.
@@ -195,13 +198,14 @@ std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Te
 
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!knows_null_space(role))
-    return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which A cannot reach, as " +
-           (role.adjoint ? "A" : "Aᵀ") + " maps the constant to zero; " +
-           (role.adjoint ? "" : "take the mean off b, and ") + "give nullspace=\"constant\" to the operator";
+    return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
+           (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
+           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") +
+           "give nullspace=\"constant\" to the operator";
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure)
-    return share + "b lies in the null space of A; take a b without that part";
+    return share + "b lies outside the range of A; take a b without that part";
   if (role.adjoint)
     return share +
            "the cotangent is the mean of its pressure, which the step leaves free; take the mean off the "

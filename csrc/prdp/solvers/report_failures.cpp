@@ -140,8 +140,8 @@ void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
   warn_once("grown: " + (name_of(role) + std::string(name(role.solver.method)) + role.a.kind), [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
-         << " at " << residual[worst] << ", where rtol = " << role.solver.rtol
-         << " was asked for; take rtol=0 if this is meant, " << diagnosis(role, a, b, SolveStatus::kMaxIter, worst);
+         << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
+         << diagnosis(role, a, b, SolveStatus::kMaxIter, worst) << "; or rtol=0 if this is meant";
   });
 }
 

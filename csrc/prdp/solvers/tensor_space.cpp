@@ -18,7 +18,7 @@ TensorSpace::TensorSpace(System& system, at::Tensor b, States& states, bool reco
 
 void TensorSpace::start_from(at::Tensor x, at::Tensor r) {
   start_ = std::move(x);
-  whole_b_ = std::exchange(b_, laid_out(r));
+  given_b_ = std::exchange(b_, laid_out(r));
   b2_ = dot(b_, b_);
 }
 
@@ -88,7 +88,7 @@ std::array<TensorSpace::Scalar, 2> TensorSpace::apply_along(const Vector& v, con
 
 TensorSpace::Scalar TensorSpace::residual(const Vector& x, Vector& r) {
   const auto ax = product(solution(x));
-  r = keep_frozen(system_.a.project((started() ? whole_b_ : b_) - ax), r);
+  r = keep_frozen(system_.a.project((started() ? given_b_ : b_) - ax), r);
   return dot(r, r);
 }
 

@@ -204,14 +204,15 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
 
   System& system_;
   at::Tensor b_, b2_, diagonal_;
-  at::Tensor start_, whole_b_;  // undefined: from zero
+  at::Tensor start_, given_b_;  // undefined: from zero
   States& states_;
   std::vector<bool> active_;
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
-  bool recording_;  // autograd records: torch's own operations alone
-  bool in_loops_;   // batch_loops do the work
+  // Who computes: torch's operations, which autograd records, or batch_loops, or torch's operations unrecorded.
+  bool recording_;
+  bool in_loops_;
 };
 
 }  // namespace prdp

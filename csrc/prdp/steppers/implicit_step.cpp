@@ -18,11 +18,22 @@ ImplicitStep::ImplicitStep(OperatorAt a, RhsAt rhs, Solver solver, Backward back
 ImplicitStep::ImplicitStep(OperatorSpec a, RhsAt rhs, Solver solver, Backward backward)
     : ImplicitStep([a = std::move(a)](const at::Tensor&) { return a; }, std::move(rhs), std::move(solver), backward) {}
 
-SolveResult ImplicitStep::solve(const at::Tensor& given, int64_t adjoint_log) const {
-  TORCH_CHECK_VALUE(given.dim() >= 2, who_, ": u must have shape (batch, ...), got ", given.sizes());
-  const bool blocks = options_.on_failure != OnFailure::kRaise;
-  const auto u = blocks ? at::alias(given) : given;  // whose gradient is this step's alone
+SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const {
+  TORCH_CHECK_VALUE(u.dim() >= 2, who_, ": u must have shape (batch, ...), got ", u.sizes());
   check_memory(options_, u);
+  const bool may_lose = options_.on_failure != OnFailure::kRaise && u.requires_grad();
+  if (!may_lose || u.is_cpu()) {
+    auto result = solve_from(u, adjoint_log);
+    if (!may_lose || !any_refused(result.info.status)) return result;
+  }
+  // On the CPU not before a sample is refused: gradients that go through a view are summed in another order.
+  const auto state = at::alias(u);
+  auto result = solve_from(state, adjoint_log);
+  block_gradients_of_lost(state, result.info.status, options_.on_failure);
+  return result;
+}
+
+SolveResult ImplicitStep::solve_from(const at::Tensor& u, int64_t adjoint_log) const {
   const auto a = operator_(u);
   const auto b = rhs(u);
   TORCH_CHECK_VALUE(b.sizes() == u.sizes() && b.scalar_type() == u.scalar_type(), who_,
@@ -30,9 +41,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& given, int64_t adjoint_log) co
                     ", got ", b.sizes(), " in ", b.scalar_type());
   auto options = options_;
   options.adjoint_log = adjoint_log;
-  auto result = linear_solve(a, b, options, start_of_step(options, u));
-  block_gradients_of_lost(u, result.info.status, options.on_failure);
-  return result;
+  return linear_solve(a, b, options, start_of_step(options, u));
 }
 
 at::Tensor ImplicitStep::operator()(const at::Tensor& u) {

@@ -35,7 +35,8 @@ class ImplicitStep : public StepperBase {
   at::Tensor rhs(const at::Tensor& u) const { return rhs_ ? rhs_(u) : u; }
 
  private:
-  SolveResult solve(const at::Tensor& given, int64_t adjoint_log) const;
+  SolveResult solve(const at::Tensor& u, int64_t adjoint_log) const;
+  SolveResult solve_from(const at::Tensor& u, int64_t adjoint_log) const;
 
   OperatorAt operator_;
   RhsAt rhs_;

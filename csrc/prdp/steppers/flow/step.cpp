@@ -18,6 +18,7 @@ namespace prdp {
 
 namespace {
 
+/// t with zeros in these samples; either may be undefined.
 at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
   return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
 }
@@ -114,10 +115,8 @@ std::vector<at::Tensor> explicit_vjp_by_autograd(const FlowEquation& equation, c
                    /*create_graph=*/false);
 }
 
-/// Those that are needed, of the sizes of what they belong to; `nu` is added to that of ν.
-std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::Tensor> all, const at::Tensor& nu,
-                                 at::IntArrayRef needed) {
-  add_to(all[1], nu);
+/// Those that are needed, of the sizes and options of what they belong to.
+std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::Tensor> all, at::IntArrayRef needed) {
   const auto given = equation.tensors();
   for (size_t i = 0; i < all.size(); ++i) {
     if (!needed[i]) all[i] = at::Tensor();
@@ -138,7 +137,7 @@ std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, cons
   add_to(of_boundary.inflow, found.inflow);
   std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
   all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
-  return as_given(equation, std::move(all), {}, needed);
+  return as_given(equation, std::move(all), needed);
 }
 
 /// The way back through the diffusion and the balance.
@@ -166,6 +165,7 @@ struct ImplicitBack {
             .of_potential = of_potential,
             .largest_nu = largest_viscosity(e)};
   }
+  /// The cotangents of the change and, with `of_nu`, of ν, for which run_forward() comes first.
   DiffuseVjp back(bool of_nu, CombinedInfo& info) {
     auto found = diffuse_vjp(e, operators, cotangent, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
     part.lambda = found.change;
@@ -216,7 +216,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   if (beginning.of_kernels) {
     auto found =
         flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
-    if (found) return as_given(equation, *std::move(found), {}, needed);
+    if (found) return as_given(equation, *std::move(found), needed);
     if (is_implicit(e)) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
