@@ -1,5 +1,8 @@
 """`Direct` on sparse matrices: one factorisation for all samples, steps and adjoint solves of one matrix."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from helpers import statuses
@@ -151,6 +154,27 @@ def test_matrices_that_are_used_again_late_stay():
     assert update(0) > 16
     assert [update(16), update(16)] == [16, 0]
     assert _C.bytes_of_factorisations() <= 512 << 20
+
+
+SMALL = """
+import torch, prdp_torch as prdp
+from prdp_torch import _C
+offsets = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+resident = lambda: int(open("/proc/self/statm").read().split()[1]) * 4096
+b = torch.ones(1, 1, 8, 8, dtype=torch.float64)
+for solves in (20, 400):
+    before, kept = resident(), _C.bytes_of_factorisations()
+    for _ in range(solves):
+        c = torch.rand(1, 5, 8, 8, dtype=torch.float64)
+        c[:, 0] += 5
+        prdp.linear_solve(prdp.operators.Stencil(c, offsets), b, prdp.Direct())
+print((resident() - before) / (_C.bytes_of_factorisations() - kept))
+"""
+
+
+def test_small_factors_are_counted_with_what_lies_beside_them():
+    done = subprocess.run([sys.executable, "-c", SMALL], capture_output=True, text=True, check=True, timeout=120)
+    assert 0.3 < float(done.stdout) < 1.6  # it was four
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
