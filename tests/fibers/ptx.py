@@ -12,6 +12,7 @@ from pathlib import Path
 from ptx_instructions import TYPES, Instructions, Unknown, bits_of_literal, in_cpp, label, register_name, split
 
 RESULT = "func_retval0"
+# What stands before a brace that opens a list of registers or an initialiser.
 OPENS_LIST = re.compile(r"\s*(?:@!?%\w+\s+)?(?:mov|ld|st)\.|[^;]*=\s*$")
 ARRAY = re.compile(r"\.align (\d+) \.b8 ([\w$]+)\[(\d*)\](?: = \{(.*)\})?")
 SCALAR = re.compile(r"\.([busf]\d+) ([\w$]+)(?:\[(\d*)\])?(?: = (.*))?")
@@ -99,7 +100,7 @@ class Function:
 
     def take(self, statement):
         """Translates a statement of the body; returns whether the function goes on."""
-        if statement in "{}":
+        if statement in ("{", "}"):
             self.depth += 1 if statement == "{" else -1
             if self.depth == 0:
                 return False
@@ -143,7 +144,7 @@ class Module:
                 elif not function.take(statement):
                     self.functions.append(function.text())
                     function = None
-            except (Unknown, KeyError, IndexError, TypeError) as error:
+            except (Unknown, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
                 raise SystemExit(f"line {line}: {statement[:200]}: {type(error).__name__} {error}") from error
 
     def declare(self, statement):

@@ -21,7 +21,7 @@ COMPARISONS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": "
 COMPARISONS["hs"] = ">="
 ROUNDINGS = {"rni": "nearbyint", "rzi": "trunc", "rmi": "floor", "rpi": "ceil"}
 # Functions of ptx.h and of the standard library of one argument, and of more, of the instruction's type T.
-OF_ONE = {
+UNARY = {
     "abs": "magnitude<T>({})",
     "neg": "-{}",
     "not": "~{}",
@@ -30,16 +30,17 @@ OF_ONE = {
     "clz": "std::countl_zero(static_cast<std::make_unsigned_t<T>>({}))",
     "popc": "std::popcount(static_cast<std::make_unsigned_t<T>>({}))",
 }
-OF_MORE = {
+OTHERS = {
     "fma": "std::fma({}, {}, {})",
     "min": "least<T>({}, {})",
     "max": "most<T>({}, {})",
     "bfe": "bits_of({}, {}, {})",
     "prmt": "permuted({}, {}, {})",
 }
-OF_OTHERS = ("volatile", "cg", "cv", "relaxed", "acquire")  # loads of what other blocks may have written
+SHARED_READS = ("volatile", "cg", "cv", "relaxed", "acquire")  # loads of what other blocks may have written
 
-UNKNOWN = {"approx", "ftz", "full", "sat", "rz", "rm", "rp", "warp", "f4e", "b4e", "rc8", "ecl", "ecr", "rc16"}
+# Modifiers that change bits and are not translated.
+REFUSED = {"NaN", "approx", "ftz", "full", "sat", "rz", "rm", "rp", "warp", "f4e", "b4e", "rc8", "ecl", "ecr", "rc16"}
 
 
 class Unknown(Exception):
@@ -91,10 +92,10 @@ class Instructions:
         parts, args = operation.split("."), split(rest)
         kinds = [part for part in parts if part in TYPES]
         translate = getattr(self, f"_{parts[0]}", None)
-        if translate is not None and not UNKNOWN & set(parts):
+        if translate is not None and not REFUSED & set(parts):
             return translate(parts, kinds, args)
-        # Of log(), which says when to look next, and of nothing that a result is made of.
-        if operation != "rcp.approx.ftz.f64" and UNKNOWN & set(parts):
+        # 1/x in log(), whose result only says when to look next: exact here.
+        if operation != "rcp.approx.ftz.f64" and REFUSED & set(parts):
             raise Unknown(operation)
         return self._arithmetic(parts, kinds, args)
 
@@ -151,12 +152,12 @@ class Instructions:
             return self.put(args[0], kind, f"{given[0]} {INFIX[name]} {given[1]}")
         if name == "not" and kind == "pred":
             return self.put(args[0], kind, f"!{given[0]}")
-        if name in OF_ONE:
-            expression = OF_ONE[name].replace("<T>", f"<{t}>").replace("T(", f"{t}(").format(*given)
+        if name in UNARY:
+            expression = UNARY[name].replace("<T>", f"<{t}>").replace("T(", f"{t}(").format(*given)
             return self.put(args[0], "u32" if name in ("clz", "popc") else kind, expression)
-        if name in OF_MORE and (name != "bfe" or kind == "u32"):
+        if name in OTHERS and (name != "bfe" or kind == "u32"):
             kind = "u32" if name == "prmt" else kind
-            expression = OF_MORE[name].replace("<T>", f"<{t}>").format(*self.values(args[1:], kind))
+            expression = OTHERS[name].replace("<T>", f"<{t}>").format(*self.values(args[1:], kind))
             return self.put(args[0], kind, expression)
         raise Unknown(".".join(parts))
 
@@ -267,7 +268,7 @@ class Instructions:
 
     def _ld(self, parts, kinds, args):
         t, registers = TYPES[kinds[0]], split(args[0].strip("{} "))
-        read = "load_of_others" if "shared" not in parts and set(OF_OTHERS) & set(parts) else "load"
+        read = "load_of_others" if "shared" not in parts and set(SHARED_READS) & set(parts) else "load"
         size, address = int(kinds[0][1:]) // 8, self.address(args[1])
         loads = [f"const auto l{k} = {read}<{t}>({address} + {k * size});" for k in range(len(registers))]
         return "{ " + " ".join(loads + [self.put(r, kinds[0], f"l{k}") for k, r in enumerate(registers)]) + " }"

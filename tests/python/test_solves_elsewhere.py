@@ -94,15 +94,14 @@ def test_iterations_that_run_away_hand_out_nothing_worse_than_zero(solver):
     c[1, 1:3] = 0.3
     run = Run(lambda c: operators.Stencil(c, OFFSETS, "periodic"), c, noise(2, 1, *SHAPE).to(F32), solver,
               on_failure="return")  # fmt: skip
-    info = [run.device.fetch(t) for t in run.info[:5]]
-    residual = info[1]
+    iterations, residual = [run.device.fetch(t) for t in run.info[:2]]
     assert residual[0] < 1 and residual[1] <= 1 and run.u.isfinite().all()
     if (run.u[1] == 0).all():
-        assert info[0][1] == 0 and residual[1] == 1
+        assert iterations[1] == 0 and residual[1] == 1
 
 
-def test_a_constant_that_a_cannot_reach_is_found_there():
-    """As on the host: after so many products, A without a named null space is looked at."""
+def test_a_constant_outside_the_range_is_found_there():
+    """As on the host: A without a named null space is tested for a constant that it maps to zero."""
     b = noise(2, 1, *SHAPE) + 2.0
     b[1] -= b[1].mean()
     run = Run(lambda c: operators.Stencil(c, OFFSETS, "periodic"), five_points(4.0), b, prdp.Jacobi(40, 0.0),

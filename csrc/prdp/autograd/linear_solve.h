@@ -22,8 +22,8 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
                          const at::Tensor& x0 = {});
 
 /// The same without autograd and the dispatcher, for the kernels of torch ops. It solves, logs and reports failures.
-SolveResult linear_solve_kernel(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
-                                const at::Tensor& x0 = {});
+SolveResult linear_solve_unrecorded(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
+                                    const at::Tensor& x0 = {});
 
 /// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes.
 OperatorSpec matrix(const at::Tensor& values);

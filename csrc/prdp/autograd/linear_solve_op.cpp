@@ -25,7 +25,8 @@ SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOpti
   return call_with_solve(op, a, x0, o, b);
 }
 
-/// The op's arguments; a compiled graph takes no results that share their memory.
+/// The op's arguments. Each part of the report gets memory of its own, as a compiled graph refuses results that share
+/// it.
 template <class... Args>
 SolveCall unpack_op(const Args&... args) {
   auto call = unpack_solve(args...);
@@ -64,7 +65,7 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 template <class... Args>
 SolveOutputs solve_op(const at::Tensor& b, const Args&... args) {
   const auto [a, options, x0] = unpack_op(args...);
-  return outputs_of(linear_solve_kernel(a, b, options, x0));
+  return outputs_of(linear_solve_unrecorded(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
@@ -84,7 +85,7 @@ SolveOutputs call_op_below_autograd(const at::Tensor& b, const OperatorSpec& a, 
                                     const at::Tensor& x0) {
   const at::AutoDispatchBelowADInplaceOrView below;
   if (!is_plain_solve(b, a, o, x0)) return call_op(b, a, o, x0);
-  return outputs_of(linear_solve_kernel(a, b, o, x0));
+  return outputs_of(linear_solve_unrecorded(a, b, o, x0));
 }
 
 /// A start is a constant of the derivatives.
@@ -145,8 +146,8 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
   return result;
 }
 
-SolveResult linear_solve_kernel(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
-                                const at::Tensor& x0) {
+SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& b, const SolveOptions& options,
+                                    const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
   const auto checks = checks_of(options.on_failure);
   a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);

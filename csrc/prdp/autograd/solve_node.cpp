@@ -67,7 +67,8 @@ variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& so
   for (size_t i = 0; i < needed.size(); ++i) needed[i] = task_should_compute_output(i);
   const bool by_kernel = !at::GradMode::is_enabled() && is_plain(cotangent) && all_plain(a.tensors) &&
                          !has_tangent(cotangent) && !any_tangent(a.tensors);
-  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_kernel : linear_solve).gradients;
+  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_unrecorded : linear_solve)
+      .gradients;
 }
 
 }  // namespace prdp

@@ -78,9 +78,9 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
     return products;
   };
   std::vector<at::Tensor> products;
-  // Where the host does not look, what may overflow is left out beforehand. Subclasses have no numbers to look at.
-  // Else: sum, look, and sum again without what overflowed.
-  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
+  // An overflow of ḡ must stay with its sample.
+  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) &&
+      !in_torch_func()) {  // the host does not look: what may overflow is left out
     const auto overflowing = may_overflow(lambda, u);
     lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
     if (needed[0]) found.gradients[0] = lambda;
@@ -89,9 +89,9 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
                                 static_cast<int64_t>(SolveStatus::kOverflow));
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
     products = of_tensors(lambda);
-  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {
+  } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
     products = of_tensors(lambda);
-  } else {
+  } else {  // sum, look, and sum again without what overflowed
     Rows finite(cotangent.size(0), true);
     products = finite_sum(finite, [&](const Rows& some) { return of_tensors(only(lambda, some)); });
     if (!all(finite)) {

@@ -55,7 +55,7 @@ class SampleVjps {
   SolveVjp find() {
     if (needs_gradient_of_a_ && options_.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
     classify();
-    differentiate(rows_);
+    differentiate(finite_);
     retry_implicitly();
     if (zero_grad_) leave_out_failed_adjoints();
     if (!needed_[0]) gradients_[0] = at::Tensor();
@@ -86,8 +86,8 @@ class SampleVjps {
   const double judged_rtol_ =
       options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
   std::vector<Derivative> derivatives_{};
-  Rows rows_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
-  at::Tensor finite_cotangent_ = only(cotangent_, rows_);  // the cotangent of samples that are not refused
+  Rows finite_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
+  at::Tensor finite_cotangent_ = only(cotangent_, finite_);  // the cotangent of samples that are not refused
   std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
   std::vector<at::Tensor> gradients_{};
   at::Tensor u_{};
@@ -102,13 +102,14 @@ class SampleVjps {
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
     for (int64_t i = 0; i < batch_; ++i)
-      derivatives_.push_back(!rows_[i]                             ? Derivative::kRefused
+      derivatives_.push_back(!finite_[i]                           ? Derivative::kRefused
                              : exact[i]                            ? Derivative::kOfSolution
                              : zero_grad_ && is_failure(status(i)) ? Derivative::kNone
                                                                    : Derivative::kOfIterations);
   }
 
-  /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`.
+  /// Sums the gradients of these samples, and notes their outcomes; those whose gradient is not finite leave `rows`.
+  /// finite_sum() may ask for fewer samples in between, and last for those that stay, so that outcomes_ ends as theirs.
   void differentiate(Rows& rows) {
     gradients_ = finite_sum(rows, [this](const Rows& some) {
       auto [sum, applications] = take_iterations_back(some);
@@ -164,7 +165,7 @@ class SampleVjps {
     Rows solved(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
       const bool ended = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      solved[i] = ended && derivatives_[i] == Derivative::kOfIterations && rows_[i];
+      solved[i] = ended && derivatives_[i] == Derivative::kOfIterations && finite_[i];
     }
     if (!any(solved)) return;
     const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
@@ -177,7 +178,7 @@ class SampleVjps {
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
       if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
-    differentiate(rows_);
+    differentiate(finite_);
   }
 
   /// Whether tensor k of A has a row for each sample. Those of a function are taken to have one where they may.
@@ -192,7 +193,7 @@ class SampleVjps {
   void add_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
     bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
-      no_other_contributes = no_other_contributes && (rows[i] || !rows_[i] || derivatives_[i] == Derivative::kNone);
+      no_other_contributes = no_other_contributes && (rows[i] || !finite_[i] || derivatives_[i] == Derivative::kNone);
     const auto found = no_other_contributes ? gradients_ : take_iterations_back(rows).gradients;
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
@@ -212,9 +213,9 @@ class SampleVjps {
   }
 
   void leave_out_failed_adjoints() {
-    auto good = rows_;
-    for (int64_t i = 0; i < batch_; ++i) good[i] = rows_[i] && !adjoint_failed(i);
-    if (good == rows_) return;
+    auto good = finite_;
+    for (int64_t i = 0; i < batch_; ++i) good[i] = finite_[i] && !adjoint_failed(i);
+    if (good == finite_) return;
     const auto outcomes_before = outcomes_;
     differentiate(good);
     outcomes_ = outcomes_before;
@@ -225,12 +226,12 @@ class SampleVjps {
 
   SolveInfo report() {
     for (int64_t i = 0; i < batch_; ++i)
-      if (!rows_[i])
+      if (!finite_[i])
         outcomes_[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
                                                                             : SolveStatus::kOverflow);
     auto failures = outcomes_;
     for (int64_t i = 0; i < batch_; ++i)
-      if (rows_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
+      if (finite_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
     auto info = info_of(outcomes_, solved_.b.scalar_type());
     if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
     report_failures({spec_, options_.solver, /*adjoint=*/true}, *a_, cotangent_,

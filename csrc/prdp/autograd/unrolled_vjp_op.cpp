@@ -65,7 +65,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   for (auto& t : a.tensors) t = t.detach();
   make_operator(a)->check_parameters(checks_of(options.on_failure));
   const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
-                                    run_iterations_back, linear_solve_kernel);
+                                    run_iterations_back, linear_solve_unrecorded);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);

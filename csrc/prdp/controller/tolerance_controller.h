@@ -5,15 +5,15 @@ namespace prdp {
 
 struct ToleranceSettings {
   double ratio = 0.1;          // tolerance / error; in (0, 1)
-  double adjoint_ratio = 0.1;  // tolerance / tolerance of the adjoint solve, and its K / K; in (0, 1]
+  double adjoint_ratio = 0.1;  // rtol / adjoint_rtol, and K of the adjoint solve / K; in (0, 1]
   double floor = 1e-5;         // the smallest tolerance; in (0, 1)
   double adjoint_floor = 1e-2; // the smallest tolerance of the adjoint solve; in (0, 1)
   int64_t maximum = 10000;     // K, only a limit; >= 1
 };
 
 /// Ties the tolerance of the solves to the error of what is trained:
-///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far; 1e-3 before the first
-///   adjoint_rtol = rtol / adjoint_ratio, at least adjoint_floor and at most 1/2, but never below rtol
+///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far; max(floor, 1e-3)
+///   before the first adjoint_rtol = rtol / adjoint_ratio, at least adjoint_floor and at most 1/2, but never below rtol
 /// A tolerance of 1 would be no solve, hence 1/2. The floor is there because the cotangent shrinks with the error, and
 /// gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
 /// Source: the forcing term of inexact Newton methods (Eisenstat and Walker 1996) and of optimisation with

@@ -17,8 +17,8 @@ namespace {
 /// z, y and x.
 using Point = std::array<int64_t, 3>;
 
-/// Coarse points that one call of the loops takes: the whole row or, where the axis is x, so many points of it that all
-/// have both neighbours, or the one at an end, which may lack one.
+/// Coarse points that one call of the loops takes: a whole row. But where the axis is x, the inner points, which all
+/// have both neighbours, or one end alone, which may lack one.
 struct CoarseRun {
   GridRow row;  // of the coarse grid
   int64_t first, count;
@@ -38,7 +38,7 @@ struct Constants {
 };
 
 /// Offsets -1, 0 and 1 along the axis.
-enum Along { kLower, kCentre, kUpper };
+enum Along { kLower, kHere, kUpper };
 
 /// The coarse coefficients with one offset in the other axes, and what they are made of.
 template <class T>
@@ -55,7 +55,7 @@ class CoarseCoefficients {
         offset_(StencilFields<T>::offset(centre)) {
     for (int d = 0; d < 3; ++d) fine_[d] = a.coefficients[place(centre, d)];
   }
-  bool is_empty() const { return !fine_[kLower] && !fine_[kCentre] && !fine_[kUpper]; }
+  bool is_empty() const { return !fine_[kLower] && !fine_[kHere] && !fine_[kUpper]; }
   /// Adds those with offset -1, 0 and 1 along the axis to a coarse operator, for make() to fill.
   void add_to(StencilFields<T>& coarse, int centre) {
     for (int d = 0; d < 3; ++d) coarse_[d] = coarse.add(place(centre, d));
@@ -82,9 +82,9 @@ class CoarseCoefficients {
     const GalerkinProduct<T> product{.lower_before = side(kLower, before),
                                      .lower_here = side(kLower, here),
                                      .lower_after = side(kLower, after),
-                                     .centre_before = coefficient(kCentre, before),
-                                     .centre_here = coefficient(kCentre, here),
-                                     .centre_after = coefficient(kCentre, after),
+                                     .centre_before = coefficient(kHere, before),
+                                     .centre_here = coefficient(kHere, here),
+                                     .centre_after = coefficient(kHere, after),
                                      .upper_before = side(kUpper, before),
                                      .upper_here = side(kUpper, here),
                                      .upper_after = side(kUpper, after),
@@ -95,7 +95,7 @@ class CoarseCoefficients {
                                      .restrict_before = has_before ? weight_of_row(restriction.right, before) : zeros,
                                      .restrict_after = has_after ? weight_of_row(restriction.left, after) : zeros,
                                      .left = coarse_[kLower] + to,
-                                     .centre = coarse_[kCentre] + to,
+                                     .centre = coarse_[kHere] + to,
                                      .right = coarse_[kUpper] + to};
     loops<T>().galerkin_product(product, /*step=*/axis_ == 2 ? 2 : 1, run.count);
   }

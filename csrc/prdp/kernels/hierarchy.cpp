@@ -29,7 +29,7 @@ double radius_of(const StencilFields<T>& a) {
 
 /// The axes along which to coarsen (coarsening.h), by a sample of the points, an odd number apart.
 template <class T>
-Axes axes_to_coarsen(const StencilFields<T>& a) {
+Axes choose_axes(const StencilFields<T>& a) {
   const int64_t n = a.points(), step = std::max<int64_t>(n / 4096, 1) | 1;
   Couplings couplings;
   for (int k = 0; k < 27; ++k) {
@@ -40,7 +40,7 @@ Axes axes_to_coarsen(const StencilFields<T>& a) {
       if (StencilFields<T>::offset(k).along[d] != 0) couplings.along[d] += sum;
   }
   const auto& [nz, ny, nx] = a.grid.shape;
-  if (!may_need_one_point(a.grid.shape, 3)) return kernels::axes_to_coarsen(a.grid.shape, 3, couplings);
+  if (!may_need_one_point(a.grid.shape, 3)) return axes_to_coarsen(a.grid.shape, 3, couplings);
   for (int64_t i = 0; i < n; i += step) {
     const int64_t at[3] = {i / (ny * nx), i / nx % ny, i % nx};
     double net[3][2] = {}, row = 0;
@@ -58,7 +58,7 @@ Axes axes_to_coarsen(const StencilFields<T>& a) {
     for (int d = 0; d < 3; ++d) couplings.net[d] += std::abs(net[d][0]) + std::abs(net[d][1]);
     couplings.rows += std::abs(row);
   }
-  return kernels::axes_to_coarsen(a.grid.shape, 3, couplings);
+  return axes_to_coarsen(a.grid.shape, 3, couplings);
 }
 
 template <class T>
@@ -156,7 +156,7 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
     if (!std::isfinite(radius) || !all_finite(a)) return nullptr;
     h->levels_.push_back({a.grid, radius, {}});
     if (h->levels_.size() > 1) h->packed_.push_back(pack(a, false));
-    const auto axes = axes_to_coarsen(a);
+    const auto axes = choose_axes(a);
     StencilFields<T> coarse(a.grid);
     for (const int axis : axes) {
       const auto& fine = axis == axes.front() ? a : coarse;

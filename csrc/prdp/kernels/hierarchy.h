@@ -17,7 +17,7 @@ class Hierarchy {
  public:
   struct Level {
     StencilGrid grid;
-    double radius;                       // of D⁻¹A, by the rows' sums
+    double radius;                       // at least that of D⁻¹A: the largest sum of a row
     std::vector<Transfer<T>> transfers;  // to the next level, one axis after the other; empty on the last
   };
 

@@ -167,17 +167,17 @@ void take_least_of_halves(Space& space, Method& method, typename Space::States& 
 }
 
 /// Makes the iterates that are to be handed out in place of the last ones, by the same steps as before: a
-/// method that went on from its true residual does so again. Where no residual was looked at, a pass that watches them
+/// method that went on from its true residual does so again. Where no residual was looked at, a pass that tracks them
 /// finds the best one, or the iteration that broke down. The other samples keep what they have. The cold path.
 template <class Space, class Method>
 void replay(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto first = states;
   const auto kept = method.x;
   if (!track) run_again(space, method, states, rtol, /*track=*/true, [&](size_t i) { return first[i].cap; });
-  const auto watched = states;
+  const auto tracked = states;
   run_again(space, method, states, rtol, track, [&](size_t i) {
-    if (watched[i].answer == Answer::kZero) return int64_t{0};
-    return watched[i].answer == Answer::kBeforeBreakdown ? watched[i].iterations : watched[i].best;
+    if (tracked[i].answer == Answer::kZero) return int64_t{0};
+    return tracked[i].answer == Answer::kBeforeBreakdown ? tracked[i].iterations : tracked[i].best;
   });
   conclude(space, method, states, rtol);
   take_least_of_halves(space, method, states, rtol, track);

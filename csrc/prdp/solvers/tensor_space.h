@@ -41,8 +41,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   TensorSpace(System& system, at::Tensor b, States& states, bool recording = false);
   /// Starts from x, which leaves r of b: from here on b() is r, and what the method looks for is added to x.
   void start_from(at::Tensor x, at::Tensor r);
-  /// Whether each operation of torch is a launch: not on the CPU, and not recorded.
-  bool is_on_device() const { return !b_.is_cpu() && !recording_; }
+  /// Whether the tensors lie on a device and autograd records nothing.
+  bool is_unrecorded_on_device() const { return !b_.is_cpu() && !recording_; }
   /// Squared norms below this are zero to the dtype.
   double negligible() const { return negligible_; }
 
@@ -147,7 +147,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
 
   std::vector<double> values_of(const Scalar& value) const;
   std::vector<bool> broken() const;
-  std::vector<double> operator_norm() const;
+  const std::vector<double>& operator_norm();
   /// u = start + scale_of_a x: the solution for the A that is not scaled.
   Vector solution(const Vector& x) const;
   Scalar solution2(const Vector& x) const {
@@ -197,7 +197,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Vector swept(const Vector& x, const Vector& change, const Vector& before, const Scalar* omega) const;
   /// A CPU scalar in a solve on another device, such as the diagonal of a plain nu. It is passed as a number: as a
   /// tensor, torch would refuse or copy it.
-  bool is_number_of_host(const at::Tensor& t) const { return is_on_device() && t.is_cpu() && t.dim() == 0; }
+  bool is_number_of_host(const at::Tensor& t) const { return is_unrecorded_on_device() && t.is_cpu() && t.dim() == 0; }
 
   /// What is zero beside the product of two factors, by the squares of their norms.
   at::Tensor rounding_of(const Scalar& v2, const Scalar& w2) const;
@@ -210,6 +210,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   at::Tensor active_mask_;  // undefined: every sample is active
   at::Tensor broken_;       // undefined: no breakdown so far
   double negligible_;
+  std::vector<double> norms_;  // ‖A‖ of each sample, once asked for
   // Who computes: torch's operations, which autograd records, or batch_loops, or torch's operations unrecorded.
   bool recording_;
   bool in_loops_;

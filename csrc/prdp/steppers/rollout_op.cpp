@@ -56,7 +56,7 @@ SolveOutputs solve_all(const Equation& equation, const at::Tensor& u, const c10:
   return outputs_of(solve_by_solve(u, solves.expect_int(), picard, [&](const at::Tensor& last, int64_t s) {
     interruption::Watch::local().spend(unknowns);
     if (s % picard == 0) b = equation_rhs(equation, last);
-    return linear_solve_kernel(equation_operator(equation, last), b, options, start_of_step(options, last));
+    return linear_solve_unrecorded(equation_operator(equation, last), b, options, start_of_step(options, last));
   }));
 }
 
@@ -72,7 +72,7 @@ SolveOutputs fake_solves(const Equation& equation, const at::Tensor& u, const c1
 std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
                                        const SolveOptions& options, at::IntArrayRef needed) {
   const at::NoGradGuard no_grad;
-  const auto found = vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve_kernel);
+  const auto found = vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve_unrecorded);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < found.size(); ++i) {
     if (!needed[i]) continue;

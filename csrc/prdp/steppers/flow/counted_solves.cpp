@@ -36,7 +36,7 @@ at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions&
   // Within a node of autograd there is nothing to record, and what is kept between solves does not cross a dispatcher.
   const bool at_once = !at::GradMode::is_enabled() && is_plain(b) && all_plain(a.tensors) && !has_tangent(b) &&
                        all_plain(options.solver.preconditioner.spec().tensors);
-  auto result = (at_once ? linear_solve_kernel : linear_solve)(a, b, options, /*x0=*/{});
+  auto result = (at_once ? linear_solve_unrecorded : linear_solve)(a, b, options, /*x0=*/{});
   info.add(result.info);
   return result.u;
 }
@@ -46,7 +46,7 @@ SystemVjp solve_vjp(const OperatorSpec& a, const at::Tensor& cotangent, const at
   std::vector<int64_t> needed(a.tensors.size() + 1, 0);
   needed[0] = 1;
   needed[1] = u.defined();
-  const auto found = implicit_vjp(cotangent, u, a, options, needed, linear_solve_kernel);
+  const auto found = implicit_vjp(cotangent, u, a, options, needed, linear_solve_unrecorded);
   info.add(found.info);
   return {found.gradients[0], found.gradients[1]};
 }

@@ -209,7 +209,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   ImplicitBack implicit(e, velocity_bar.on_free_faces, of_potential, options);
   if (is_implicit(e)) {
     if (needed[1]) implicit.run_forward(explicit_part(e, beginning).change);
-    back = implicit.back(/*of_nu=*/!beginning.of_kernels, adjoint);
+    back = implicit.back(/*of_nu=*/needed[1] && !beginning.of_kernels, adjoint);
   }
   info = adjoint.info();
   // Back through the explicit part: by kernels, which add the share of ν; where none can be made, by autograd.
@@ -217,7 +217,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
     auto found =
         flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
     if (found) return as_given(equation, *std::move(found), needed);
-    if (is_implicit(e)) back = implicit.back(/*of_nu=*/true, adjoint);
+    if (is_implicit(e) && needed[1]) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
   // On the CPU by loops, else by autograd.
