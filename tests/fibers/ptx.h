@@ -89,6 +89,13 @@ inline uint32_t bits_of(uint32_t v, uint32_t first, uint32_t n) {
   const uint64_t mask = n >= 32 ? ~uint64_t{0} : (uint64_t{1} << n) - 1;
   return static_cast<uint32_t>((first >= 32 ? 0 : v >> first) & mask);
 }
+/// b with n bits of a from number `first` on.
+template <class T>
+T with_bits(T a, T b, uint32_t first, uint32_t n) {
+  constexpr uint32_t most = 8 * sizeof(T);
+  const T ones = n >= most ? ~T(0) : static_cast<T>((T(1) << n) - 1);
+  return first >= most ? b : static_cast<T>((b & ~(ones << first)) | ((a & ones) << first));
+}
 /// Four of the eight bytes of b and a, or of their signs, each chosen by four bits.
 inline uint32_t permuted(uint32_t a, uint32_t b, uint32_t by) {
   const uint64_t bytes = uint64_t{b} << 32 | a;

@@ -27,6 +27,7 @@ UNARY = {
     "not": "~{}",
     "rcp": "T(1) / {}",
     "sqrt": "std::sqrt({})",
+    "ex2": "std::exp2({})",
     "clz": "std::countl_zero(static_cast<std::make_unsigned_t<T>>({}))",
     "popc": "std::popcount(static_cast<std::make_unsigned_t<T>>({}))",
 }
@@ -39,6 +40,8 @@ OTHERS = {
 }
 SHARED_READS = ("volatile", "cg", "cv", "relaxed", "acquire")  # loads of what other blocks may have written
 
+# 1/x in log(), whose result only says when to look next, and 2^n in ldexp(), whose n is whole.
+EXACT_HERE = ("rcp.approx.ftz.f64", "ex2.approx.ftz.f32")
 # Modifiers that change bits and are not translated.
 REFUSED = {"NaN", "approx", "ftz", "full", "sat", "rz", "rm", "rp", "warp", "f4e", "b4e", "rc8", "ecl", "ecr", "rc16"}
 
@@ -94,8 +97,7 @@ class Instructions:
         translate = getattr(self, f"_{parts[0]}", None)
         if translate is not None and not REFUSED & set(parts):
             return translate(parts, kinds, args)
-        # 1/x in log(), whose result only says when to look next: exact here.
-        if operation != "rcp.approx.ftz.f64" and REFUSED & set(parts):
+        if operation not in EXACT_HERE and REFUSED & set(parts):
             raise Unknown(operation)
         return self._arithmetic(parts, kinds, args)
 
@@ -206,6 +208,11 @@ class Instructions:
             raise Unknown(".".join(parts))
         function = "funnel_left" if parts[1] == "l" else "funnel_right"
         return self.put(args[0], "u32", "{}({}, {}, {})".format(function, *self.values(args[1:], "u32")))
+
+    def _bfi(self, parts, kinds, args):
+        kind = "u" + kinds[0][1:]
+        given = [*self.values(args[1:3], kind), *self.values(args[3:], "u32")]
+        return self.put(args[0], kind, "with_bits<{}>({}, {}, {}, {})".format(TYPES[kind], *given))
 
     def _copysign(self, parts, kinds, args):
         sign, size = self.values(args[1:], kinds[0])
