@@ -7,7 +7,7 @@
 # make records  the records of the documentation again, with its pictures and tables: a day and a half on one core, and it goes on where it stopped
 # make records-gpu  the records of a GPU, after make cuda: it goes on where it stopped (PARTS="kolmogorov_unet heat_3d/auto": some of them; python -m benchmarks.records_gpu does ten minutes of it)
 # make cuda   build against the PyTorch of PYTHON, run the tests of GPUs and the benchmark of devices (DEVICE=cpu tries the target without a GPU; HEADERS=folder where the system has no headers)
-# make kernels  compile the kernels of all methods and operators for three cards, without a GPU, and print what each takes
+# make kernels  compile the kernels of all methods and operators for three cards, without a GPU, print what each takes, and run what NVRTC makes of them on the CPU
 # make wheel   a wheel in dist/, which runs on the CPU and on CUDA alike, for the torch of requirements.txt
 # make bench-peers   the benchmarks beside JAX, lineax and SciPy, in an environment of their own
 # What is done is remembered in .stamps and by the build itself: a second call does no work twice.
@@ -45,6 +45,7 @@ kernels: $(STAMPS)/configure
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python prdp_fibers
 	@$(MAKE) --no-print-directory $(STAMPS)/install && $(BIN)/cmake --install build --component python --prefix prdp_torch > build/install.log
 	$(BIN)/python tests/python/kernel_table.py | tee build/kernels.md
+	OMP_NUM_THREADS=1 PRDP_PTX=1 $(BIN)/pytest tests/python/test_cuda.py -k bits_of --numprocesses auto --maxprocesses 8
 
 bench-peers: $(STAMPS)/configure $(STAMPS)/peers
 	$(BIN)/cmake --build build --parallel $$(nproc) --target python
