@@ -91,32 +91,27 @@ std::string compiled(const std::string& text) {
 /// PTX of the newest device that NVRTC knows, which compiles on to that one's binary, as C++ (ptx.py).
 std::string ptx_as_cpp(const std::string& text) {
   constexpr int beyond_all = 999;
-  const auto name = (folder() / std::to_string(std::hash<std::string>()(text + "PTX"))).string(),
-             part = name + "." + std::to_string(getpid());
-  std::ofstream(part) << prdp::gpu::nvrtc::compile(text, beyond_all);
-  const std::string command =
-      std::string("python3 ") + PRDP_FIBERS + "/ptx.py " + part + " " + name + " 2> " + name + ".log";
-  const int failed = std::system(command.c_str());
-  fs::remove(part);
-  if (failed) throw Unavailable("ptx.py fails: " + read(name + ".log"));
-  return read(name);
+  const auto part =
+      (folder() / std::to_string(std::hash<std::string>()(text + "PTX"))).string() + "." + std::to_string(getpid());
+  const auto ptx = part + ".ptx", cpp = part + ".cpp", log = part + ".log";
+  std::ofstream(ptx) << prdp::gpu::nvrtc::compile(text, beyond_all);
+  const std::string command = std::string("python3 ") + PRDP_FIBERS + "/ptx.py " + ptx + " " + cpp + " 2> " + log;
+  const bool failed = std::system(command.c_str()) != 0;
+  const auto made = read(failed ? log : cpp);
+  for (const auto& file : {ptx, cpp, log}) fs::remove(file);
+  if (failed) throw Unavailable("ptx.py fails: " + made);
+  return made;
 }
 
-/// The text itself, with a function that launches its kernel.
-std::string with_entry(const std::string& text) {
-  return "#include \"fibers.h\"\n" + text +
-         "extern \"C\" int run(const void* arguments, int blocks, int threads, long memory, int order, int "
-         "left_out, bool poisons) {\n"
-         "  fibers::left_out = left_out;\n"
-         "  fibers::poisons = poisons;\n"
-         "  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {\n"
-         "    prdp_kernel(*static_cast<const Arguments*>(arguments)); });\n}\n";
+/// The text itself, with the function that launches its kernel.
+std::string with_run(const std::string& text) {
+  return "#include \"fibers.h\"\n" + text + "PRDP_FIBERS_RUN(prdp_kernel(*static_cast<const Arguments*>(arguments)))\n";
 }
 
 class FiberKernel final : public prdp::gpu::Kernel {
  public:
   explicit FiberKernel(const KernelSource& source) : source_(source) {
-    const auto text = settings.from_ptx ? ptx_as_cpp(source.text) : with_entry(source.text);
+    const auto text = settings.from_ptx ? ptx_as_cpp(source.text) : with_run(source.text);
     void* const library = dlopen(compiled(text).c_str(), RTLD_NOW);
     if (!library) throw Unavailable(dlerror());
     run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));

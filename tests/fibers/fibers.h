@@ -278,3 +278,12 @@ inline bool launch(int blocks, int threads, int64_t memory, Order order, unsigne
 }
 
 }  // namespace fibers
+
+/// The function by which the runtime of the tests launches the kernel of a library: `call` is one of its threads.
+#define PRDP_FIBERS_RUN(call)                                                                              \
+  extern "C" int run(const void* arguments, int blocks, int threads, long memory, int order, int left_out, \
+                     bool poisons) {                                                                       \
+    fibers::left_out = left_out;                                                                           \
+    fibers::poisons = poisons;                                                                             \
+    return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] { call; });   \
+  }

@@ -17,15 +17,6 @@ OPENS_LIST = re.compile(r"\s*(?:@!?%\w+\s+)?(?:mov|ld|st)\.|[^;]*=\s*$")
 ARRAY = re.compile(r"\.align (\d+) \.b8 ([\w$]+)\[(\d*)\](?: = \{(.*)\})?")
 SCALAR = re.compile(r"\.([busf]\d+) ([\w$]+)(?:\[(\d*)\])?(?: = (.*))?")
 HEADER = re.compile(r"\.(entry|func)\s*(?:\((.*?)\)\s*)?([\w$]+)\s*(?:\((.*?)\))?\s*((?:\.\w+[^{]*)?\{?)$")
-ENTRY = """
-extern "C" int run(const void* arguments, int blocks, int threads, long memory, int order, int left_out,
-                   bool poisons) {{
-  fibers::left_out = left_out;
-  fibers::poisons = poisons;
-  return fibers::launch(blocks, threads, memory, static_cast<fibers::Order>(order), 7, [&] {{
-    {}(nullptr, static_cast<const unsigned char*>(arguments)); }});
-}}
-"""
 
 
 def statements(text):
@@ -177,7 +168,8 @@ class Module:
 
     def text(self):
         parts = ['#include "fibers.h"', '#include "ptx.h"', "namespace {", *self.declarations, *self.functions, "}"]
-        return "\n".join(parts) + ENTRY.format(in_cpp(self.entry))
+        call = f"{in_cpp(self.entry)}(nullptr, static_cast<const unsigned char*>(arguments))"
+        return "\n".join([*parts, f"PRDP_FIBERS_RUN({call})", ""])
 
 
 if __name__ == "__main__":

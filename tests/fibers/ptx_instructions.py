@@ -328,7 +328,7 @@ class Instructions:
     _exit = _ret
 
     def _call(self, parts, kinds, args):
-        *result, name = [a for a in args[: 2 if args[0].startswith("(") else 1]]
+        *result, name = args[: 2 if args[0].startswith("(") else 1]
         given = split(args[len(result) + 1].strip("() ")) if len(args) > len(result) + 1 else []
         passed = [in_cpp(result[0].strip("() ")) if result else "nullptr", *map(in_cpp, given)]
         return f"{in_cpp(name)}({', '.join(passed)});"

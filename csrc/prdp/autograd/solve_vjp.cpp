@@ -79,8 +79,8 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   };
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
-  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) &&
-      !in_torch_func()) {  // the host does not look: what may overflow is left out
+  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
+    // The host does not look: what may overflow is left out.
     const auto overflowing = may_overflow(lambda, u);
     lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
     if (needed[0]) found.gradients[0] = lambda;

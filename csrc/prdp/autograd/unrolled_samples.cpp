@@ -76,8 +76,8 @@ class SampleVjps {
 
   const int64_t batch_ = solved_.b.size(0);
   const std::unique_ptr<Operator> a_ = make_operator(spec_);
-  const std::vector<int64_t> counts_ =
-      to_host<int64_t>(solved_.iterations, batch_);  // of the forward solve, as statuses_
+  // Of the forward solve.
+  const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()

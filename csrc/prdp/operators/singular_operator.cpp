@@ -8,6 +8,7 @@
 #include "prdp/operators/apply_on_loops.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/probes.h"
 #include "prdp/operators/remembered.h"
 #include "prdp/operators/stencil_direct.h"
 #include "prdp/operators/stencil_operator.h"
@@ -128,9 +129,7 @@ at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
 at::Tensor size_of_products(const Operator& a, const at::Tensor& b) {
   const auto norm = norm_of(a, b);
   if (!norm.eq(0).all().item<bool>()) return norm;
-  const auto numbers = at::arange(1, b.numel() / b.size(0) + 1, b.options().dtype(at::kDouble));
-  const auto signs = numbers.square().sin().sign().to(b.scalar_type());
-  return largest_of_samples(apply_on_loops(a, signs.view_as(b[0]).expand_as(b).contiguous(), /*transposed=*/false));
+  return largest_of_samples(apply_on_loops(a, without_structure(b).sign().contiguous(), /*transposed=*/false));
 }
 
 }  // namespace

@@ -130,8 +130,7 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
 
 TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
   const auto u = solution(x).detach();
-  const auto places = at::arange(1, u[0].numel() + 1, u.options().dtype(at::kDouble));
-  const auto negated = places.square().sin().lt(0).view_as(u[0]);  // as is_negated()
+  const auto negated = without_structure(u).lt(0);  // as is_negated()
   const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
   return dot(terms, terms);
 }
