@@ -42,4 +42,5 @@ for _ in range(40):
     controller.step(error)
 print(f"process {rank} of {processes}: error {controller.history[-1].metric:.3f}, K = {heat.max_iter}", flush=True)
 distributed.barrier()  # gloo may abort a process whose partner has left first
+del network  # It holds the group, and so the group's threads. One that outlives Python aborts the process.
 distributed.destroy_process_group()

@@ -361,9 +361,27 @@ def test_only_training_is_split_and_only_the_first_process_prints(tmp_path):
     assert (tmp_path / "errors_1").read_text() == ""
 
 
-def test_the_example_of_a_loop_of_ones_own_has_one_k(tmp_path):
-    launcher = torchrun("examples/distributed.py")
+COUNTS_THREADS = """
+import runpy
+from pathlib import Path
+from torch import distributed
+
+def destroy(destroy=distributed.destroy_process_group):
+    destroy()
+    names = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
+    print(f"{sum('gloo' in name for name in names)} threads left ")
+
+distributed.destroy_process_group = destroy
+runpy.run_path("examples/distributed.py", run_name="__main__")
+"""
+
+
+def test_the_example_of_a_loop_of_ones_own_has_one_k_and_leaves_no_thread(tmp_path):
+    script = tmp_path / "counts_threads.py"
+    script.write_text(COUNTS_THREADS)  # one that lets a tensor go after Python has ended aborts the process
+    launcher = torchrun(script)
     output, errors = launcher.communicate(timeout=100)
     assert launcher.returncode == 0, errors
+    assert output.count("0 threads left") == 2, output
     (k,) = set(re.findall(r"process [01] of 2: error (0\.\d+, K = \d+)", output))
     assert float(k.split(",")[0]) < 0.2 and int(k.split()[-1]) > 1
