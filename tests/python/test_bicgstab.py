@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script")
 CSR_WARNS = pytest.mark.filterwarnings("ignore:linear_solve. the gradient of a sparse CSR tensor")
 TILT = 1 + 0.3 * torch.randn(3, 6, 6, generator=torch.Generator().manual_seed(5)).double().tril(-1)
 MATRICES = spd_matrices(3, 6) * TILT
-K_TERMS = torch.logspace(0, 1, 6, dtype=torch.float64)
+SHIFTS = torch.logspace(0, 1, 6, dtype=torch.float64)
 WINDS = field((6,), 3, seed=1)
 WINDS_2D = field((4, 3), 3, seed=2, channels=2)
 COEFFICIENTS = torch.stack([4 + field((6,), 3, 6)[:, 0].abs(), -field((6,), 3, 7)[:, 0].abs(),
@@ -34,8 +34,10 @@ def bicgstab(max_iter, rtol=0.0):
     return prdp.BiCGStab(max_iter, rtol=rtol)
 
 
-def function(k):
-    return operators.Function(lambda v, k: (1 + k) * v - 0.3 * v.roll(1, -1), tensors=(k,), diagonal=lambda k: 1 + k)
+def function(shift):
+    return operators.Function(
+        lambda v, k: (1 + k) * v - 0.3 * v.roll(1, -1), tensors=(shift,), diagonal=lambda k: 1 + k
+    )
 
 
 def stencil(c):
@@ -59,8 +61,8 @@ CASES = {
     "dense": (operators.Matrix, (MATRICES,), (6,), list(MATRICES.numpy())),
     "negative": (operators.Matrix, (-MATRICES[0],), (6,), [-MATRICES[0].numpy()] * 3),
     "csr": (lambda m: operators.Matrix(m.to_sparse_csr()), (MATRICES,), (6,), list(MATRICES.numpy())),
-    "function": (function, (K_TERMS,), (6,),
-                 [np.diag(1 + K_TERMS.numpy()) - 0.3 * np.roll(np.eye(6), 1, 0)] * 3),
+    "function": (function, (SHIFTS,), (6,),
+                 [np.diag(1 + SHIFTS.numpy()) - 0.3 * np.roll(np.eye(6), 1, 0)] * 3),
 }  # fmt: skip
 
 
@@ -289,7 +291,7 @@ def test_both_trainers_take_it(tmp_path):
 
 @pytest.mark.parametrize("k", [12, 20])
 def test_unrolled_gradients_of_a_are_those_of_differences_but_near_rounding(k):
-    """Before residuals of 1e-6, and once the sample was solved to rounding; between, Ā is rounding, and b̄ is not."""
+    """K = 12 ends before residuals of 1e-6, and at K = 20 the sample is solved to rounding. Between, Ā is rounding."""
     b, c = noise(3, 1, *SHAPE), five_points(4.3)
     direction = noise(*c.shape, seed=5)
 

@@ -165,6 +165,7 @@ def test_a_tensor_with_nan_stays_with_its_sample(backward):
     "call, error, message",
     [
         (lambda: operators.Function("a", shifted), TypeError, "Function: matvec must be callable, got 'a'"),
+        (lambda: operators.Function(torch.eye(9)), TypeError, r"must be callable, got a tensor of shape \(9, 9\)"),
         (lambda: operators.Function(shifted, 3), TypeError, "Function: transpose must be callable, got 3"),
         (lambda: operators.Function(shifted, diagonal=3), TypeError, "Function: diagonal must be callable, got 3"),
         (lambda: operators.Function(shifted, shifted, symmetric=True), ValueError, "give only one of the two"),

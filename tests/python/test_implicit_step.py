@@ -231,7 +231,7 @@ def test_a_compiled_step_follows_k(backward):
             u = field((N,)).requires_grad_()
             gradients.append(torch.autograd.grad((f(u) ** 2).sum(), (u, nu)))
         assert all(torch.equal(*pair) for pair in zip(*gradients, strict=True))
-    assert counter.frame_count <= 3  # as in test_rollout.py
+    assert counter.frame_count <= 3  # as in test_rollout_compiled.py
 
 
 class AllenCahn(prdp.Stepper):

@@ -1,0 +1,163 @@
+"""Arguments and settings out of range, of a wrong type or misspelt: clear errors, tested by their words."""
+
+import math
+import re
+
+import pytest
+import torch
+from helpers import field
+from test_errors import heat
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: prdp.Jacobi(-1), "Jacobi: max_iter must be >= 0, got -1"),
+        (lambda: prdp.Jacobi(2**63), f"Jacobi: max_iter must be less than 2\\*\\*63, got {2**63}"),
+        (
+            lambda: prdp.Heat((2**70,), 1e-3, 1.0, prdp.Jacobi(1)),
+            r"Heat: every extent of shape must be less than 2\*\*63",
+        ),
+        (lambda: prdp.CG(3, rtol=10**400), r"CG: rtol must be less than 2\*\*1024"),
+        (lambda: prdp.CG(3, rtol=-1e-5), "CG: rtol must be >= 0, got -1e-05"),
+        (lambda: prdp.SteepestDescent(3, rtol=math.nan), "SteepestDescent: rtol must be >= 0, got nan"),
+        (lambda: heat(backward="adjoint"), "backward: unknown name 'adjoint'; allowed: implicit, unrolled, none"),
+        (
+            lambda: heat(on_failure="ignore"),
+            "on_failure: unknown name 'ignore'; allowed: raise, warn, return, zero_grad",
+        ),
+        (lambda: heat(adjoint_max_iter=-2), "Heat: adjoint_max_iter must be >= 0, got -2"),
+        (lambda: heat(adjoint_rtol=-1.0), "Heat: adjoint_rtol must be >= 0, got -1"),
+        (lambda: prdp.Heat((30,), -1e-3, 1.0, prdp.Jacobi(1)), "Heat: nu must be finite and >= 0, got -0.001"),
+        (lambda: prdp.Heat((30,), 1e-3, -1.0, prdp.Jacobi(1)), "Heat: dt must be finite and > 0, got -1"),
+        (lambda: prdp.Poisson((0,), prdp.Jacobi(1)), r"Poisson: every extent of shape must be >= 1, got \[0\]"),
+    ],
+)
+def test_arguments_out_of_range(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_step_costs_no_memory_until_it_is_taken():
+    for kind in (prdp.Heat, prdp.Burgers, prdp.NavierStokes):
+        assert kind((10**7, 10**7), 1e-3, 1.0, prdp.Jacobi(1)).max_iter == 1  # a field would take 400 TB
+        with pytest.raises(ValueError, match=r"\[1099511627776, 1099511627776\] has more than 2\*\*63 numbers"):
+            kind((2**40, 2**40), 1e-3, 1.0, prdp.Jacobi(1))
+
+
+def test_arguments_out_of_range_where_they_reach_the_op():
+    a, b = operators.Heat((5,), 1e-3, 1.0), field((5,))
+    solver = prdp.Jacobi(3)
+    solver.max_iter = -1
+    with pytest.raises(ValueError, match="linear_solve: max_iter must be >= 0, got -1"):
+        prdp.linear_solve(a, b, solver)
+    with pytest.raises(ValueError, match="linear_solve: adjoint_rtol must be >= 0, got -1"):
+        prdp.linear_solve(a, b, prdp.Jacobi(3), adjoint_rtol=-1.0)
+    with pytest.raises(ValueError, match="backward: unknown name 'both'"):
+        prdp.linear_solve(a, b, prdp.Jacobi(3), backward="both")
+
+
+def test_a_viscosity_that_turns_bad_is_found_at_the_step():
+    nu = torch.tensor(1e-3, dtype=torch.float64)
+    step = prdp.Heat((5,), nu, 1.0, solver=prdp.Jacobi(3))
+    nu.fill_(-1.0)
+    with pytest.raises(ValueError, match="Heat: nu must be finite and >= 0, got -1"):
+        step(field((5,)))
+
+
+def test_k_must_stay_a_number_of_iterations():
+    step = heat()
+    with pytest.raises(ValueError, match="Heat: max_iter must be >= 0, got -3"):
+        step.max_iter = -3
+    assert step.max_iter == 3
+
+
+def test_tolerances_are_checked_when_they_are_set():
+    step = heat()
+    for wrong, error, message in (("x", TypeError, "must be a real number, got 'x'"), (-1, ValueError, "must be >= 0")):
+        for name in ("rtol", "adjoint_rtol"):
+            with pytest.raises(error, match=f"Heat: {name} {message}"):
+                setattr(step, name, wrong)
+    step.rtol, step.adjoint_rtol = 0, None
+    assert step.rtol == 0.0 and step.adjoint_rtol is None
+
+
+def test_wrong_kinds_of_arguments():
+    with pytest.raises(TypeError, match=r"solver must be a Solver such as Jacobi\(10\), got 'jacobi'"):
+        prdp.linear_solve(torch.eye(2), torch.ones(2), "jacobi")
+    with pytest.raises(TypeError, match=r"Heat: solver must be a Solver such as Jacobi\(10\), got 10"):
+        heat(solver=10)
+    with pytest.raises(TypeError, match="A must be an operator or a tensor, got list"):
+        prdp.linear_solve([[1.0]], torch.ones(1), prdp.Jacobi(1))
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: prdp.Jacobi(2.5), "Jacobi: max_iter must be a whole number, got 2.5"),
+        (lambda: prdp.Jacobi(True), "Jacobi: max_iter must be a whole number, got True"),
+        (lambda: prdp.CG(3, rtol="tight"), "CG: rtol must be a real number, got 'tight'"),
+        (lambda: prdp.Heat(30, 1e-3, 1.0, prdp.Jacobi(1)), r"Heat: shape must be a tuple .* such as \(30,\), got 30"),
+        (lambda: prdp.Poisson((30.5,), prdp.Jacobi(1)), "Poisson: every extent of shape must be a whole number"),
+        (lambda: prdp.Heat((30,), "a", 1.0, prdp.Jacobi(1)), "Heat: nu must be a real number, got 'a'"),
+        (lambda: prdp.Heat((30,), 1e-3, None, prdp.Jacobi(1)), "Heat: dt must be a real number, got None"),
+        (lambda: heat(backward=None), "Heat: backward must be a string, got None"),
+        (lambda: heat(adjoint_max_iter="3"), "Heat: adjoint_max_iter must be a whole number, got '3'"),
+        (lambda: heat()([0.0] * 30), "Heat: u must be a torch tensor, got list"),
+        (lambda: heat()(torch.zeros(2, 1, 30).to_sparse()), "Heat: u must be a dense tensor, got one of layout"),
+        (lambda: setattr(heat(), "max_iter", 1.5), "Heat: max_iter must be a whole number, got 1.5"),
+        (lambda: prdp.linear_solve(torch.eye(2), [1.0, 2.0], prdp.Jacobi(1)), "linear_solve: b must be a torch tensor"),
+        (lambda: prdp.PRDPController(heat()), r"PRDPController: steppers must be a list such as \[heat\], got Heat"),
+        (lambda: prdp.PRDPController([3]), "PRDPController: a stepper must have max_iter, got 3"),
+        (lambda: prdp.PRDPController(tau=0.9), "PRDPController: unknown setting 'tau'; allowed: tau_step, tau_stop"),
+        (lambda: prdp.PRDPController(delta=2.5), "PRDPController: delta must be a whole number, got 2.5"),
+        (lambda: prdp.PRDPController().step("low"), "PRDPController: metric must be a real number, got 'low'"),
+    ],
+)  # fmt: skip
+def test_wrong_types(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("make, expected", [
+    (lambda: prdp.Heat((8,), 1e-2, 1.0, prdp.CG(5), onfailure="warn"),
+     "Heat: unknown argument 'onfailure'; allowed: shape, nu, dt, solver, backward, length, .*, on_failure"),
+    (lambda: prdp.Flow((8, 8), 1e-2, 1e-3, bounday="wall"), "Flow: unknown argument 'bounday'; allowed: .*boundary"),
+    (lambda: prdp.ImplicitStep(lambda u: None, solver=prdp.CG(5), strat="state"),
+     "ImplicitStep: unknown argument 'strat'; allowed: operator, rhs, .*, start"),
+])  # fmt: skip
+def test_an_argument_that_no_stepper_has_is_named_with_those_it_has(make, expected):
+    with pytest.raises(TypeError, match=expected):
+        make()
+
+
+@pytest.mark.parametrize("name, expected", [
+    ("max_iters", "Heat: no setting 'max_iters'; did you mean 'max_iter'?"),
+    ("adjoint_tol", "Heat: no setting 'adjoint_tol'; did you mean 'adjoint_rtol'?"),
+    ("onfailure", "Heat: no setting 'onfailure'; did you mean 'on_failure'?"),
+    ("solver", "Heat: the solver cannot be set later; max_iter, rtol, restart and preconditioner can"),
+])  # fmt: skip
+def test_a_misspelt_setting_is_refused(name, expected):
+    step = heat()
+    with pytest.raises(AttributeError, match=re.escape(expected)):
+        setattr(step, name, 50)
+    assert not hasattr(step, name) and step.max_iter == 3
+
+
+def test_other_attributes_are_free():
+    """Those of another name, and all of a user's own stepper."""
+
+    class Own(prdp.Stepper):
+        def __init__(self):
+            super().__init__(prdp.CG(5))
+            self.solver, self.max_iters = "mine", 3
+
+        def operator(self, u):
+            return operators.Heat((8,), 1e-2, 1.0)
+
+    step = heat()
+    step.label, step.name = "fine", "heat"
+    assert Own().max_iters == 3 and step.label == "fine"
