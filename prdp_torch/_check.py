@@ -12,13 +12,20 @@ from torch import Tensor
 T = TypeVar("T")
 
 
+def shown(value: object) -> str:
+    """What was given, for an error: a tensor by its shape, anything else as it prints."""
+    if isinstance(value, Tensor) and value.numel() > 1:
+        return f"a tensor of shape {tuple(value.shape)}"
+    return repr(value)
+
+
 def whole(who: str, name: str, value: object) -> int:
     if type(value) is int or (isinstance(value, numbers.Integral) and not isinstance(value, bool)):
         number = int(value)
         if abs(number) >= 2**63:
             raise ValueError(f"{who}: {name} must be less than 2**63, got {value}")
         return number
-    raise TypeError(f"{who}: {name} must be a whole number, got {value!r}")
+    raise TypeError(f"{who}: {name} must be a whole number, got {shown(value)}")
 
 
 def real(who: str, name: str, value: object) -> float:
@@ -29,7 +36,7 @@ def real(who: str, name: str, value: object) -> float:
             return float(value)
         except OverflowError:
             raise ValueError(f"{who}: {name} must be less than 2**1024, got a number of more digits") from None
-    raise TypeError(f"{who}: {name} must be a real number, got {value!r}")
+    raise TypeError(f"{who}: {name} must be a real number, got {shown(value)}")
 
 
 def optional(check: Callable[[str, str, object], T], who: str, name: str, value: object) -> T | None:
@@ -39,13 +46,13 @@ def optional(check: Callable[[str, str, object], T], who: str, name: str, value:
 def string(who: str, name: str, value: object) -> str:
     if isinstance(value, str):
         return value
-    raise TypeError(f"{who}: {name} must be a string, got {value!r}")
+    raise TypeError(f"{who}: {name} must be a string, got {shown(value)}")
 
 
 def shape(who: str, value: object) -> list[int]:
     if isinstance(value, (tuple, list)):
         return [whole(who, "every extent of shape", n) for n in value]
-    raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {value!r}")
+    raise TypeError(f"{who}: shape must be a tuple of whole numbers such as (30,), got {shown(value)}")
 
 
 def lengths(who: str, value: object, axes: int) -> list[float]:

@@ -240,14 +240,14 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     else:
         why = f"it is the fastest to {loosest}. With {best.name}, the fastest to {finest}, {cost}"
     most = f"{percent(saving)} of {update.whole}, as {cheapest} takes"
-    return f"{choice}: {why}. {_limit(saving, f'{most} {milliseconds(least)}', best)}"
+    return f"{choice}: {why}. {_what_refinement_saves(saving, f'{most} {milliseconds(least)}', best)}"
 
 
-def _limit(saving: float, most: str, best: Row) -> str:
+def _what_refinement_saves(saving: float, amount: str, best: Row) -> str:
     if saving >= WORTH_REFINING:
-        return f"Refinement can save at most {most}."
+        return f"Refinement can save at most {amount}."
     if saving > 0.0:
-        return f"Refinement has little to save: at most {most}."
+        return f"Refinement has little to save: at most {amount}."
     if _most(best) == 1 and not isinstance(best.solver, Direct):
         return "Refinement has nothing to save: one iteration is enough."
     return f"Refinement has nothing to save: no solver is faster to {power(TOLERANCES[0])}."

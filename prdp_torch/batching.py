@@ -1,7 +1,8 @@
 """The batching rules of the library's ops: what torch.func.vmap makes of a solve.
 
 A mapped axis is folded into the batch, as samples do not influence each other. Where all samples share a
-tensor that is mapped, such as nu, the entries are solved one after the other.
+tensor that is mapped, such as nu, the entries are solved one after the other. Where each sample has an A of its own
+and b alone is mapped, the samples are: what is made of an A, such as its factors, serves all its right-hand sides.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,19 +34,35 @@ def _linear_solve(
     *options: Any,
 ) -> tuple[Any, Any]:
     size, op = info.batch_size, torch.ops.prdp.linear_solve
-
-    def in_batch(t: Tensor, dim: int | None) -> Tensor:
-        return (t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)).flatten(0, 1)
-
     samples = b.shape[0 if in_dims[0] is None else int(in_dims[0] == 0)]
+
+    def entries(t: Tensor | None, dim: int | None) -> Tensor | None:  # the mapped axis in front
+        return t if t is None else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
+
+    def solved(b: Tensor, tensors: list[Tensor], x0: Tensor | None) -> Any:
+        return op(b, tensors, kind, shape, parameters, transposed, x0, *options)
+
+    of_b, of_x0 = cast(Tensor, entries(b, in_dims[0])), entries(x0, in_dims[6])  # the places among the arguments
     mapped = [dim is not None for dim in in_dims[1]]
+    own = _of_samples(tensors, kind, len(shape), samples)
+    if not any(mapped) and any(own) and 0 < samples <= size:
+        found = []
+        for s in range(samples):
+            of_one = [t[s : s + 1] if is_own else t for t, is_own in zip(tensors, own, strict=True)]
+            found.append(solved(of_b[:, s], of_one, None if of_x0 is None else of_x0[:, s]))
+        return [torch.stack(parts, 1) for parts in zip(*found, strict=True)], [0] * len(found[0])
     in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
     folded = _fold(in_front, mapped, kind, len(shape), size, samples)
     if folded is None:
         return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, parameters, transposed, x0, *options))
-    start = None if x0 is None else in_batch(x0, in_dims[6])
-    results = op(in_batch(b, in_dims[0]), folded, kind, shape, parameters, transposed, start, *options)
+    results = solved(of_b.flatten(0, 1), folded, None if of_x0 is None else of_x0.flatten(0, 1))
     return [t.unflatten(0, (size, samples)) for t in results], [0] * len(results)
+
+
+def _of_samples(tensors: list[Tensor], kind: str, axes: int, batch: int) -> list[bool]:
+    """Which tensors of an operator hold a part for each sample of the batch."""
+    dims = _C.batched_axes(kind, axes, len(tensors)) or [0] * len(tensors)
+    return [n > 0 and t.dim() == n and t.shape[0] == batch for t, n in zip(tensors, dims, strict=True)]
 
 
 def _fold(
@@ -58,7 +75,7 @@ def _fold(
     folded = []
     for t, is_mapped, n in zip(tensors, mapped, dims, strict=True):
         if batch == 1 and any(mapped) and n == t.dim() - is_mapped + 1:
-            t = t.unsqueeze(int(is_mapped))  # the one sample's
+            t = t.unsqueeze(int(is_mapped))  # has no batch axis: it is that of the only sample
         of_samples = t.dim() - is_mapped == n and n > 0
         if is_mapped:
             if not of_samples or t.shape[1] != batch:

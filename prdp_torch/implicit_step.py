@@ -8,7 +8,7 @@ from typing import Any, Self, Unpack
 import torch
 from torch import Tensor
 
-from prdp_torch import operators, torch_private
+from prdp_torch import _check, operators, torch_private
 from prdp_torch.closures import warn_of_shared
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solvers import Solver
@@ -66,7 +66,7 @@ class ImplicitStep(Stepper):
         if not callable(operator):
             raise TypeError(f"{who}: operator must be a function of u or an operator, got {operator!r}")
         if rhs is not None and not callable(rhs):
-            raise TypeError(f"{who}: rhs must be a function of u or None, got {rhs!r}")
+            raise TypeError(f"{who}: rhs must be a function of u or None, got {_check.shown(rhs)}")
         self.operator_at = operator
         self.rhs_at = rhs
 

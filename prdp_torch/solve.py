@@ -212,8 +212,9 @@ def linear_solve(
         options = check_options("linear_solve", solver, *settings)
         log = AdjointLog()
         if vars(A).setdefault("_solves", 0) == 1:
-            A.explain_freed_graphs()  # who makes a new one for each update has no need of it
+            A.explain_freed_graphs()  # at its second solve: an operator made anew for each update never gets here
         vars(A)["_solves"] += 1
+        # None where a mode or subclass in Python is to see the op
         found = _C.linear_solve(
             rhs, A.tensors, A.kind, A.shape, A.parameters, options, solver.max_iter, log.number, start
         )

@@ -70,7 +70,8 @@ def check_preconditioner(who: str, preconditioner: object) -> None:
         raise ValueError(f"{who}: unknown preconditioner {preconditioner!r}; allowed: {names}, or an operator")
     if not isinstance(preconditioner, str | Operator | Multigrid | None):
         raise TypeError(
-            f"{who}: preconditioner must be a name or an operator of prdp_torch.operators, got {preconditioner!r:.80}"
+            f"{who}: preconditioner must be a name or an operator of prdp_torch.operators, "
+            f"got {_check.shown(preconditioner):.80}"
         )
 
 
@@ -284,7 +285,7 @@ def check_options(
 ) -> _C.SolveOptions:
     """The arguments that every solve takes, as options: TypeError or ValueError in the name of `who`."""
     if not isinstance(solver, Solver):
-        raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {solver!r}")
+        raise TypeError(f"{who}: solver must be a Solver such as Jacobi(10), got {_check.shown(solver)}")
     return check_settings(
         who,
         solver.method,

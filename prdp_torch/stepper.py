@@ -177,7 +177,8 @@ class Stepper(HasSettings):
             found = self._solve_from(u, log)
             if not may_lose or not _C.any_refused(found[3]):
                 return found
-        # On the CPU not before a sample is refused: gradients that go through a view are summed in another order.
+        # Gradients through a view are summed in another order. On the CPU, where looking is free, u becomes one only
+        # once a sample was refused.
         state = u.view_as(u)
         found = self._solve_from(state, log)
         _C.block_gradients_of_lost(state, found[3], self.on_failure)
@@ -197,6 +198,7 @@ class Stepper(HasSettings):
             )
         x0 = u if self.start == "state" else None
         if not compiling:
+            # None where a mode or subclass in Python is to see the op
             found: Solution | None = _C.linear_solve(
                 b, a.tensors, a.kind, a.shape, a.parameters, self._options_kept(), self._max_iter, log.number, x0
             )

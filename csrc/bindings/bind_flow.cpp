@@ -3,7 +3,7 @@
 #include "bindings.h"
 #include "prdp/operators/autocast.h"
 #include "prdp/steppers/flow/flow.h"
-#include "prdp/steppers/flow/steps.h"
+#include "prdp/steppers/flow/step_node.h"
 
 namespace py = pybind11;
 using namespace prdp;

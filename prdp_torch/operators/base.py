@@ -174,4 +174,4 @@ def _basis(who: str, name: str, value: NullSpace, like: Tensor | None) -> Tensor
         return torch.empty(0) if like is None else like.new_empty(0)
     if not isinstance(value, Tensor):
         raise TypeError(f"{who}: {name} must be None, 'constant' or a tensor (k, *shape), got {value!r:.80}")
-    return _check.dense(who, name, value).detach()
+    return _check.dense(who, name, value)

@@ -50,7 +50,7 @@ class Function(Operator):
     ) -> None:
         for name, function in (("matvec", matvec), ("transpose", transpose), ("diagonal", diagonal)):
             if not callable(function) and (name == "matvec" or function is not None):
-                raise TypeError(f"Function: {name} must be callable, got {function!r}")
+                raise TypeError(f"Function: {name} must be callable, got {_check.shown(function)}")
         if symmetric and transpose is not None:
             raise ValueError("Function: with symmetric=True matvec is its own transpose; give only one of the two")
         if isinstance(tensors, torch.Tensor):

@@ -80,7 +80,9 @@ def _offsets(offsets: Sequence[Sequence[int]], coefficients: tuple[int, ...]) ->
     """As a list of tuples of whole numbers, one for each axis of the grid."""
     dim = len(coefficients) - 2
     if not isinstance(offsets, (tuple, list)) or not all(isinstance(o, (tuple, list)) for o in offsets):
-        raise TypeError(f"Stencil: offsets must be a list of tuples such as [(0, 0), (0, -1)], got {offsets!r}")
+        raise TypeError(
+            f"Stencil: offsets must be a list of tuples such as [(0, 0), (0, -1)], got {_check.shown(offsets)}"
+        )
     for offset in offsets:
         if len(offset) != dim:
             entries = "1 entry" if dim == 1 else f"{dim} entries"

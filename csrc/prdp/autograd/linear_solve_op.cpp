@@ -88,15 +88,14 @@ SolveOutputs call_op_below_autograd(const at::Tensor& b, const OperatorSpec& a, 
   return outputs_of(linear_solve_unrecorded(a, b, o, x0));
 }
 
-/// A start is a constant of the derivatives.
-at::Tensor without_derivative(const at::Tensor& x0) {
-  if (!x0.defined()) return x0;
-  return (has_tangent(x0) ? x0._fw_primal(/*level=*/0) : x0).detach();
+at::Tensor without_derivative(const at::Tensor& t) {
+  if (!t.defined()) return t;
+  return (has_tangent(t) ? t._fw_primal(/*level=*/0) : t).detach();
 }
 
-/// The op's autograd kernel.
-SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
-                              const at::Tensor& x0) {
+/// The op's autograd kernel, but for what depends on the null spaces.
+SolveOutputs record_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                          const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
   if (differentiable && at::GradMode::is_enabled() && is_function(a) && is_plain(b) && all_plain(a.tensors))
     refuse_captured_gradients(a);
@@ -106,10 +105,23 @@ SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const 
   const auto node = reverse ? make_node<SolveNode>(b, a, options) : nullptr;
   const auto out = call_op_below_autograd(b, a, node ? node->options() : options, x0);
   const auto& [u, iterations, residual, status, applications, floor] = out;
-  const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};
+  const Solved solved{b, u, iterations, status, residual, without_derivative(x0)};  // a start is a constant
   if (reverse) torch::autograd::set_history(u, node);
   if (forward) u._set_fw_grad(solve_jvp(b, solved, a, options), /*level=*/0, /*is_inplace_op=*/false);
   if (reverse) node->save(b, solved);
+  return out;
+}
+
+/// The op's autograd kernel.
+SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                              const at::Tensor& x0) {
+  if (!is_singular(a) || options.backward == Backward::kNone) return record_solve(b, a, options, x0);
+  const auto bases = at::TensorList(a.tensors).slice(a.tensors.size() - 2);
+  if (!any_moves(bases)) return record_solve(b, a, options, x0);
+  auto fixed = a;
+  for (size_t k = 0; k < 2; ++k) fixed.tensors[a.tensors.size() - 2 + k] = without_derivative(bases[k]);
+  auto out = record_solve(b, fixed, options, x0);
+  std::get<0>(out) = follow_null_space(std::get<0>(out), bases[a.transposed]);
   return out;
 }
 

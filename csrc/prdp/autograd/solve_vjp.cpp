@@ -24,6 +24,7 @@ at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, 
     }
     if (!any) return derivative;
   }
+  // is_failure() and is_refused() of a tensor: keep them alike.
   const auto lost = all_failures ? status.lt(static_cast<int64_t>(SolveStatus::kStagnated))
                                  : status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
                                        .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));

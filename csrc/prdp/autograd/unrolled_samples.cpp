@@ -112,7 +112,7 @@ class SampleVjps {
   /// finite_sum() may ask for fewer samples in between, and last for those that stay, so that outcomes_ ends as theirs.
   void differentiate(Rows& rows) {
     gradients_ = finite_sum(rows, [this](const Rows& some) {
-      auto [sum, applications] = take_iterations_back(some);
+      auto [sum, applications] = vjp_of_iterations(some);
       const auto products = to_host<int64_t>(applications, batch_);
       for (int64_t i = 0; i < batch_; ++i)
         outcomes_[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
@@ -123,7 +123,7 @@ class SampleVjps {
     });
   }
 
-  UnrolledVjp take_iterations_back(const Rows& rows) const {
+  UnrolledVjp vjp_of_iterations(const Rows& rows) const {
     auto caps = at::zeros({batch_}, at::kLong);
     // finite_sum() may ask for the share of no sample: all iterations, with a cotangent of zero.
     const bool for_no_sample = !any(rows);
@@ -194,7 +194,7 @@ class SampleVjps {
     bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
       no_other_contributes = no_other_contributes && (rows[i] || !finite_[i] || derivatives_[i] == Derivative::kNone);
-    const auto found = no_other_contributes ? gradients_ : take_iterations_back(rows).gradients;
+    const auto found = no_other_contributes ? gradients_ : vjp_of_iterations(rows).gradients;
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
     const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);

@@ -27,7 +27,8 @@ UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b
   const auto method = solve.solver.method;
   const bool for_b_alone = std::count(needed.begin(), needed.end(), 1) == 1 && needed[0] == 1;
   if (traits(method).is_polynomial && for_b_alone) {
-    // K iterations from zero are u = p(I - D⁻¹A) D⁻¹ b; transposed, that is K iterations with Aᵀ.
+    // K iterations from zero are u = p(M⁻¹A) M⁻¹ b, M being the diagonal or a cycle; transposed, K iterations with Aᵀ
+    // and M⁻ᵀ.
     auto transpose = solve.a;
     transpose.transposed = !transpose.transposed;
     const Solver transposed{method, 0, 0.0, solve.solver.restart, solve.solver.preconditioner.transposed()};

@@ -115,6 +115,8 @@ struct PseudoInverse {
     const bool all_are_there = count_parts(m) >= nullity;
     Eigen::VectorXd inverse = Eigen::VectorXd::Zero(m.rows());
     is_whole = true;
+    // Where all null vectors are there, the last `nullity` are left out, whatever their size; else those that look
+    // null.
     for (int64_t i = 0; i < m.rows(); ++i) {
       const double size = singular[i] / singular[0];
       if (i >= m.rows() - nullity && (all_are_there || size < 1e-3)) continue;

@@ -24,15 +24,16 @@ const std::vector<OperatorKind> kKinds{
     {"heat", "Heat", make<HeatOperator>, Axes{0}},
     {"poisson", "Poisson", make<PoissonOperator>, Axes{}},
     {"burgers", "Burgers", make<BurgersOperator>, Axes{kLikeState, 0}},
-    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0}, false, /*has_pressure=*/true},
+    {"navier_stokes", "NavierStokes", make<NavierStokesOperator>, Axes{kLikeState, 0},
+     /*takes_null_spaces=*/false, /*has_pressure=*/true},
     {"diffusion", "Diffusion", make<DiffusionOperator>, Axes{kLikeField, kLikeField, kLikeSide},
      /*takes_null_spaces=*/true},
     {"diffusion_per_axis", "Diffusion", make<DiffusionOperator>, Axes{kLikeState, kLikeField, kLikeSide},
      /*takes_null_spaces=*/true},
-    {"stencil", "Stencil", make<StencilOperator>, Axes{kLikeState}, true},
-    {"dense", "Matrix", make<DenseOperator>, Axes{3}, true},
-    {"csr", "Matrix", make<CsrOperator>, Axes{2, 2, 2}, true},
-    {"function", "Function", make<FunctionOperator>, std::nullopt, true},
+    {"stencil", "Stencil", make<StencilOperator>, Axes{kLikeState}, /*takes_null_spaces=*/true},
+    {"dense", "Matrix", make<DenseOperator>, Axes{3}, /*takes_null_spaces=*/true},
+    {"csr", "Matrix", make<CsrOperator>, Axes{2, 2, 2}, /*takes_null_spaces=*/true},
+    {"function", "Function", make<FunctionOperator>, std::nullopt, /*takes_null_spaces=*/true},
 };
 
 }  // namespace
@@ -50,7 +51,7 @@ std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_
   const size_t bases = is_singular(kind) ? 2 : 0;  // of null spaces, which all samples share
   if (!of_tensors->empty()) of_tensors->resize(tensors - bases, of_tensors->back());
   for (auto& n : *of_tensors)
-    if (n < 0) n += axes - kLikeSide;
+    if (n < 0) n += axes - kLikeSide;  // a side, the lowest constant, has `axes` with the batch; each above it one more
   of_tensors->resize(of_tensors->size() + bases, 0);
   return of_tensors;
 }

@@ -72,6 +72,13 @@ DenseOperator::DenseOperator(const OperatorSpec& spec) {
   TORCH_CHECK_VALUE((dim == 2 || dim == 3) && matrix_.sym_size(-1) == matrix_.sym_size(-2),
                     "linear_solve: A must have shape (n, n) or (batch, n, n), got ", matrix_.sym_sizes());
   check_has_rows(matrix_.sym_size(-1));
+  drop_axis_of_one();
+}
+
+void DenseOperator::drop_axis_of_one() {
+  if (matrix_.dim() == 2 || matrix_.sym_size(0) != 1) return;
+  has_axis_ = true;
+  matrix_ = matrix_.select(0, 0);
 }
 
 void DenseOperator::check_vector(const at::Tensor& b) const {
@@ -89,9 +96,9 @@ at::Tensor DenseOperator::solve_directly(const at::Tensor& b, bool transposed) c
 
 std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
-  if (matrix_.dim() == 2) return {at::matmul(lambda.mT(), u)};
-  if (matrix_.sym_size(0) == 1) return {at::matmul(lambda.mT(), u).unsqueeze(0)};
-  return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
+  if (matrix_.dim() == 3) return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
+  const auto of_all = at::matmul(lambda.mT(), u);
+  return {has_axis_ ? of_all.unsqueeze(0) : of_all};
 }
 
 std::vector<int64_t> DenseOperator::first_nonfinite(int64_t sample) const {
@@ -100,7 +107,9 @@ std::vector<int64_t> DenseOperator::first_nonfinite(int64_t sample) const {
 
 std::unique_ptr<Operator> DenseOperator::select(const at::Tensor& index) const {
   auto chosen = std::make_unique<DenseOperator>(*this);
-  if (matrix_.dim() == 3) chosen->matrix_ = matrix_.index_select(0, index);
+  if (matrix_.dim() == 2) return chosen;
+  chosen->matrix_ = matrix_.index_select(0, index);
+  chosen->drop_axis_of_one();
   return chosen;
 }
 
@@ -155,6 +164,13 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
   };
   crow_ = for_values(crow);
   col_ = for_values(col);
+  drop_axis_of_one();
+}
+
+void CsrOperator::drop_axis_of_one() {
+  if (values_.dim() == 1 || values_.sym_size(0) != 1) return;
+  has_axis_ = true;
+  for (auto* t : {&crow_, &col_, &values_}) *t = t->select(0, 0);
 }
 
 void CsrOperator::check_parameters(Checks checks) const {
@@ -250,14 +266,15 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, cons
   if (has_product_kernel(lambda, u) && values_.numel() > 0) {
     const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
     const auto all = by_kernel(lambda.contiguous(), u.contiguous(), shared_or_own(crow_), shared_or_own(col_), values_);
-    if (all.defined()) return {at::Tensor(), at::Tensor(), all};
+    if (all.defined()) return {at::Tensor(), at::Tensor(), has_axis_ ? all.unsqueeze(0) : all};
   }
   // ∂⟨λ, A u⟩/∂A_ij = λ_i u_j at the stored entries, summed over the samples that share A
   const auto col = col_.expand({u.size(0), -1});
   const auto row = rows().expand({u.size(0), -1});
   const auto outer = lambda.gather(1, row) * u.gather(1, col);
-  const bool shared = values_.dim() == 1 || values_.size(0) == 1;
-  return {at::Tensor(), at::Tensor(), shared ? outer.sum(0).view_as(values_) : outer};
+  if (values_.dim() == 2) return {at::Tensor(), at::Tensor(), outer};
+  const auto of_all = outer.sum(0);
+  return {at::Tensor(), at::Tensor(), has_axis_ ? of_all.unsqueeze(0) : of_all};
 }
 
 std::vector<int64_t> CsrOperator::first_nonfinite(int64_t sample) const {
@@ -275,6 +292,7 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
   chosen->col_ = col_.index_select(0, index);
   chosen->values_ = values_.index_select(0, index);
   chosen->rows_ = at::Tensor();
+  chosen->drop_axis_of_one();
   return chosen;
 }
 

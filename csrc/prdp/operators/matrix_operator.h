@@ -6,6 +6,7 @@ namespace prdp {
 /// A matrix given by the user as a tensor (n, n) shared by the batch, or (batch, n, n).
 class DenseOperator final : public Operator {
  public:
+  /// A matrix (1, n, n) is that of all samples, as (n, n) is.
   explicit DenseOperator(const OperatorSpec& spec);
   void check_vector(const at::Tensor& b) const override;
   at::Tensor apply(const at::Tensor& v) const override;
@@ -22,14 +23,18 @@ class DenseOperator final : public Operator {
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
 
  private:
-  at::Tensor matrix_;
+  void drop_axis_of_one();
+
+  at::Tensor matrix_;        // (n, n) or (batch, n, n)
+  bool has_axis_ = false;    // it was (1, n, n)
 };
 
 /// A sparse matrix as compressed rows; tensors (crow, col, values), each (…) or (batch, …); only
 /// `values` carries a gradient. A derivative with respect to A exists on its pattern alone.
 class CsrOperator final : public Operator {
  public:
-  /// Checks types and shapes; what the indices say is left to check_parameters().
+  /// Checks types and shapes; what the indices say is left to check_parameters(). Values (1, nnz) are those of all
+  /// samples, as (nnz,) are.
   explicit CsrOperator(const OperatorSpec& spec);
   void check_vector(const at::Tensor& b) const override;
   /// Raises ValueError unless each crow rises from 0 to nnz and each column lies in [0, n). Torch does not
@@ -53,8 +58,10 @@ class CsrOperator final : public Operator {
   /// The row of each stored entry, which is kept: products ask for it again and again.
   at::Tensor rows() const;
   at::Tensor to_dense() const;
+  void drop_axis_of_one();
 
-  at::Tensor crow_, col_, values_;
+  at::Tensor crow_, col_, values_;  // (…) or (batch, …)
+  bool has_axis_ = false;           // values were (1, nnz)
   mutable at::Tensor rows_;
 };
 

@@ -31,6 +31,12 @@ inline bool no_mode_is_on() { return no_mode_but_a_profiler_is_on() && !at::hasC
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }
 inline bool any_tangent(at::TensorList tensors) { return std::any_of(tensors.begin(), tensors.end(), has_tangent); }
+/// Whether a derivative is asked for with respect to one of them.
+inline bool any_moves(at::TensorList tensors) {
+  const auto requires_grad = [](const at::Tensor& t) { return t.requires_grad(); };
+  return any_tangent(tensors) ||
+         (at::GradMode::is_enabled() && std::any_of(tensors.begin(), tensors.end(), requires_grad));
+}
 
 /// Whether a transform of torch.func is running.
 inline bool in_torch_func() { return at::functorch::maybeCurrentDynamicLayer().has_value(); }

@@ -6,7 +6,7 @@
 
 namespace prdp {
 
-at::Tensor without_structure(const at::Tensor& like) {
+at::Tensor unstructured_like(const at::Tensor& like) {
   const auto numbers = at::arange(1, like[0].numel() + 1, like.options().dtype(at::kDouble));
   return numbers.square().sin().to(like.scalar_type()).view_as(like[0]).expand_as(like);
 }
@@ -15,7 +15,7 @@ at::Tensor estimated_norm(const Operator& a, const at::Tensor& like) {
   const at::NoGradGuard no_grad;
   const auto norm_of = [](const at::Tensor& v) { return v.flatten(1).norm(2, 1); };
   constexpr int products = 4;
-  auto v = without_structure(like);
+  auto v = unstructured_like(like);
   v = v / per_sample(norm_of(v), v);
   at::Tensor largest;
   for (int k = 0; k < products; ++k) {

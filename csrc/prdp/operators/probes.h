@@ -5,7 +5,7 @@
 namespace prdp {
 
 /// A vector of no structure, the same for each sample of `like`.
-at::Tensor without_structure(const at::Tensor& like);
+at::Tensor unstructured_like(const at::Tensor& like);
 
 /// About ‖A‖ of each sample, from below: the largest growth of such a vector in a few products.
 at::Tensor estimated_norm(const Operator& a, const at::Tensor& like);

@@ -6,8 +6,10 @@
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/autocast.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/diffusion_operator.h"
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/remembered.h"
 #include "prdp/operators/stencil_direct.h"
@@ -54,6 +56,7 @@ SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSp
       spec_(spec),
       right_{spec.tensors[spec.tensors.size() - 2].detach(), {}},
       left_{spec.tensors.back().detach(), {}},
+      moves_(any_moves(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
       title_(operator_kind(spec.kind).title) {
   TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
                     ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
@@ -85,6 +88,15 @@ at::Tensor by_vector(const at::Tensor& v, bool spans_channels) {
 }
 
 }  // namespace
+
+at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis) {
+  const WithoutAutocast full_precision;
+  const auto parts = by_vector(u, u.dim() > 2 && basis.dim() == u.dim());
+  const auto rows = basis.flatten(1).to(u.scalar_type());
+  const auto gram = at::matmul(rows, rows.t());
+  const auto along = at::linalg_solve(gram, at::matmul(parts, rows.t()), /*left=*/false);  // zero, up to rounding
+  return u - at::matmul(along, rows).reshape_as(u);
+}
 
 at::Tensor SingularOperator::orthonormal(const Basis& basis, const at::Tensor& v) const {
   if (basis.is_constant()) {
@@ -129,7 +141,7 @@ at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
 at::Tensor size_of_products(const Operator& a, const at::Tensor& b) {
   const auto norm = norm_of(a, b);
   if (!norm.eq(0).all().item<bool>()) return norm;
-  return largest_of_samples(apply_on_loops(a, without_structure(b).sign().contiguous(), /*transposed=*/false));
+  return largest_of_samples(apply_on_loops(a, unstructured_like(b).sign().contiguous(), /*transposed=*/false));
 }
 
 }  // namespace

@@ -11,6 +11,10 @@ namespace prdp {
 /// symmetric A.
 OperatorSpec with_null_space(OperatorSpec a, const at::Tensor& right = {}, std::optional<at::Tensor> left = {});
 
+/// u, of least norm, with the part of its derivative that comes of the null space: where the basis N depends on
+/// parameters, u̇ has the part -N (NᵀN)⁻¹ Ṅᵀ u beside that of b and A. `basis`: as SingularOperator's.
+at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis);
+
 /// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
 /// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
 /// solutions onto those of least norm. Its kind is "singular_" and that of A; its tensors are those of A and the two
@@ -29,9 +33,12 @@ class SingularOperator final : public Operator {
   /// checked last, it is known.
   void check_null_spaces(const at::Tensor& b) const override;
 
-  /// Without what rounding leaves along the null space, which would add up in the residuals that a method carries on.
-  at::Tensor apply(const at::Tensor& v) const override { return project(a_->apply(v)); }
-  at::Tensor apply_transpose(const at::Tensor& v) const override { return project_solution(a_->apply_transpose(v)); }
+  /// Without what rounding leaves along the null space, which would add up in the residuals that a method carries on;
+  /// but for a null space that depends on parameters, along which the product has a derivative.
+  at::Tensor apply(const at::Tensor& v) const override { return moves_ ? a_->apply(v) : project(a_->apply(v)); }
+  at::Tensor apply_transpose(const at::Tensor& v) const override {
+    return moves_ ? a_->apply_transpose(v) : project_solution(a_->apply_transpose(v));
+  }
   at::Tensor diagonal() const override { return a_->diagonal(); }
   at::Tensor norm() const override { return a_->norm(); }
   at::Tensor project(const at::Tensor& v) const override { return without(left_, v); }
@@ -71,6 +78,7 @@ class SingularOperator final : public Operator {
   std::unique_ptr<Operator> a_;
   OperatorSpec spec_;
   Basis right_, left_;
+  bool moves_;  // a derivative with respect to a basis is asked for
   const char* title_;
 };
 

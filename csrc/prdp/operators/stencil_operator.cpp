@@ -35,7 +35,7 @@ kernels::Offset offset_of(at::ArrayRef<double> cells) {
   const auto dim = static_cast<int64_t>(cells.size());
   kernels::Offset offset{{0, 0, 0}};
   for (int64_t d = 0; d < dim; ++d) {
-    constexpr double exact = 1LL << 53;  // whole numbers of which a double has each
+    constexpr double exact = 1LL << 53;  // up to here a double holds every whole number
     TORCH_CHECK_VALUE(std::abs(cells[d]) <= exact && cells[d] == std::trunc(cells[d]),
                       "Stencil: every entry of an offset must be a whole number, got ", cells[d]);
     offset.along[3 - dim + d] = static_cast<int64_t>(cells[d]);
@@ -273,6 +273,7 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
       const int64_t stride = is_number || held.size(0) == 1 ? 0 : held.stride(0);
       given.hold = {held.template const_data_ptr<T>(), stride, is_number};
     }
+    // c and held are captured for their memory, to which `given` points.
     kernels::KernelBatch<T> batch{c.size(0) == 1,
                                   [c, held, given, channels](int64_t s) { return given.make(s, channels); }};
     if (given.is_one_to_one())

@@ -81,8 +81,8 @@ class ConjugateGradientMethod {
 
   Space& space_;
   typename Space::Vector r_, p_, q_, z_;  // residual; search direction; A p; M⁻¹ r, or r itself
-  Scalar rr_{}, rz_{}, pp_{};             // r·r, |r·z|, p·p
-  Scalar sign_{};                         // of r·z
+  Scalar rr_{}, rz_{}, pp_{};             // r·r, sign_·r·z, p·p
+  Scalar sign_{};                         // of r·z where the directions began
   Scalar alpha_{}, beta_{};
 };
 

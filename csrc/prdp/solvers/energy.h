@@ -7,15 +7,15 @@
 /// Whether an iterate whose residual is above ‖b‖ is what a method for definite operators is made for.
 namespace prdp::detail {
 
-/// What energy_falls() is told by: products of x; b; r, its residual; and A r.
+/// What energy_falls() is told by: products of x; b; r, its residual; A r; and ‖A‖ ‖x‖².
 struct Energies {
-  double xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2;
+  double xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2, largest;
 };
 
 /// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
 /// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
-/// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, x lies almost in the null
-/// space of A, and says nothing.
+/// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, or x·A x is the rounding of
+/// A x, x lies almost in the null space of A, and says nothing.
 inline bool energy_falls(const Energies& e, double epsilon) {
   const auto positive = [](double v) { return std::max(v, 0.0); };
   const double scale =
@@ -23,7 +23,7 @@ inline bool energy_falls(const Energies& e, double epsilon) {
   const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - 2e3 * epsilon * scale);
   const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
   const bool nearer = e.xb * e.xb > e.xr * e.xr;
-  const bool not_rounding = std::abs(energy) > 2e3 * epsilon * std::abs(e.xb);
+  const bool not_rounding = std::abs(energy) > epsilon * std::max(2e3 * std::abs(e.xb), e.largest);
   const bool definite = e.r_ar * energy > across * across;
   return symmetric && definite && nearer && not_rounding;
 }
@@ -48,6 +48,7 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
              bb = values_of(b, b);
   const auto x_ar = values_of(x, ar), r_ar = values_of(r, ar), xx = values_of(x, x), ar2 = values_of(ar, ar);
   space.fill_zero(ar);
+  const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(x));  // ‖A‖ and u without their scale
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (!is_above(s)) {
@@ -55,7 +56,8 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
       continue;
     }
     s.answer = Answer::kLast;
-    const Energies e{xb[i], xr[i], rb[i], rr[i], bb[i], x_ar[i], r_ar[i], xx[i], ar2[i]};
+    const Energies e{xb[i],   xr[i],   rb[i], rr[i],  bb[i],
+                     x_ar[i], r_ar[i], xx[i], ar2[i], norm_a[i] * std::sqrt(u2[i] * xx[i])};
     if (!energy_falls(e, space.epsilon())) s.status = SolveStatus::kDiverged;
   }
 }

@@ -43,7 +43,7 @@ double value_of_sample(const at::Tensor& t, int64_t sample) {
 
 /// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample; NaN for a function without a transpose.
 double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
-  const auto v = without_structure(b);
+  const auto v = unstructured_like(b);
   const auto product = a.apply(v).select(0, sample), other = a.apply_transpose(v).select(0, sample);
   return norm_of(product - other) / norm_of(product);
 } catch (const std::exception&) {  // it has nothing to add to a message
@@ -97,7 +97,7 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
   if (b.scalar_type() == at::kFloat && holds_within_rounding(a, b, sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
-  return "A is symmetric but not definite; take MINRES";
+  return "A is symmetric but not definite; take MINRES, or name all its null vectors (nullspace) if it is singular";
 }
 
 /// Why MINRES finds no direction.
@@ -140,7 +140,7 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
 std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (traits(solver.method).is_direct)
     return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
-           " GMRES solves it for any b in the range of A";
+           " GMRES solves it for any b in the range of A, and Direct where nullspace names all null vectors";
   if (traits(solver.method).made_for == MadeFor::kDefinite && solver.preconditioner.is_operator())
     return "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, "
            "or A is not; prdp.check_operator(A, b, solver) looks at both";

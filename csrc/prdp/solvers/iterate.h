@@ -49,15 +49,16 @@ PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states,
   }
 }
 
-/// Iteration `done` + 1, to be differentiated, as run() took it: where a recursively updated residual had met the
-/// tolerance and the true one had not, it goes on from the true one, which `confirm()` recomputes.
+/// Iteration `done` + 1, to be differentiated, as run() took it. `confirm()` looks for samples whose recursive residual
+/// has met the tolerance, and recomputes theirs: from the true one they go on.
 template <class Method, class Confirm>
 void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& confirm) {
   if constexpr (kHasRecursiveResidual<Method>)
     if (rtol > 0.0 && done > 0) confirm();
   if constexpr (kTakesStrides<Method>) method.step(1);
   else method.step();
-  if constexpr (kLeastResidual<Method>) method.residual2();
+  if constexpr (kLeastResidual<Method>)
+    method.residual2();  // for what it does: it takes back a cycle that made it grow
 }
 
 /// Recomputes the residual of each sample that is not concluded, and sets its status.
@@ -91,7 +92,7 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
 template <class Space, class Method>
 void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
-  if (!std::none_of(states.begin(), states.end(), is_doubtful)) {
+  if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
     const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];

@@ -41,8 +41,8 @@ struct MethodTraits {
   double nanoseconds;         // of a core per unknown and iteration, or vector of a cycle
   bool divides_by_diagonal = false;  // refuses an operator with a zero on it
   bool is_direct = false;  // takes the operator's exact method, and no start
-  /// From zero, u is a polynomial of A, fixed by the number of iterations, times b. Then u is smooth in A and
-  /// linear in b, and the transposed map is as many iterations with Aᵀ.
+  /// From zero, u = p(M⁻¹A) M⁻¹ b, M being the diagonal or a cycle, and p a polynomial that the number of iterations
+  /// fixes. Then u is smooth in A and linear in b, and the transposed map is as many iterations with Aᵀ and M⁻ᵀ.
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
   /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);

@@ -63,11 +63,11 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
     if (doubtful(s) && says_something && residual <= slack_of(s, floor) * floor) floors[i] = floor;
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
-  constexpr double far = 64.0;
+  constexpr double roundings = 64.0;  // of a product
   const auto terms2 = space.values_of(space.terms2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double rounding_of_product = far * space.epsilon() * std::sqrt(terms2[i]);
+    const double rounding_of_product = roundings * space.epsilon() * std::sqrt(terms2[i]);
     if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) continue;
     s.stop(SolveStatus::kStagnated);
     s.floor2 = floors[i] * floors[i];
@@ -122,8 +122,9 @@ void stop_what_idles(Space& space, const Method& method, typename Space::States&
                            [rtol](const SampleState& s) { return rtol > 0.0 && !s.candidate && is_idle<Method>(s); });
   }
   if constexpr (kLeastResidual<Method>)
-    stop_at_rounding_floor(space, method, states, rtol,
-                           [](const SampleState& s) { return s.active && !s.candidate && s.still > 0; });
+    stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) {
+      return s.active && !s.candidate && s.cycles_without_progress > 0;
+    });
 }
 
 /// Judges the candidates by their true residual, as a recursive one may have drifted from it.

@@ -5,7 +5,13 @@
 
 #include "prdp/solvers/status.h"
 
-/// A sample while it is iterated, and what comes of it. The rules are in verdicts.h.
+/// A sample while it is iterated, and what comes of it. The rules are in verdicts.h. The words of this folder:
+///   settled beforehand  answered without an iteration: b = 0, numbers that are not finite, a zero on the diagonal
+///   active, frozen      still iterating; the vectors of a frozen sample no longer change
+///   candidate           a recursive residual has met the tolerance, and the true one is to confirm it
+///   concluded           the true residual of the last iterate has been judged
+///   guarded             a sample whose last iterate is of no use hands out an earlier one, or zero
+///   x_bar               the cotangent of x, x̄ in comments
 namespace prdp {
 
 /// Which iterate of a sample is handed out.
@@ -23,7 +29,7 @@ struct SampleState {
   double b2 = 0.0;         // ‖b‖²
   bool active = true;      // still iterating; a frozen sample's u no longer changes
   bool candidate = false;  // its residual has just come below rtol, to be confirmed
-  bool concluded = false;  // residual2 is the true one of the returned u, and status is final
+  bool concluded = false;  // residual2 is the true one of the last iterate, and conclude() leaves the sample alone
   SolveStatus status = SolveStatus::kMaxIter;
   int64_t iterations = 0;
   int64_t applications = 0;
@@ -33,8 +39,8 @@ struct SampleState {
   int64_t next_look = 0;  // iterations when it is to be looked at next
   int64_t best = 0;       // iterations after which the residual was smallest
   double best2 = std::numeric_limits<double>::infinity();
-  int64_t still = 0;  // cycles since the residual last fell, for methods whose residual never grows
-  double last_progress2 = std::numeric_limits<double>::infinity();  // the residual then
+  int64_t cycles_without_progress = 0;  // for methods whose residual never grows
+  double last_progress2 = std::numeric_limits<double>::infinity();  // the residual that last fell
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
@@ -58,7 +64,7 @@ struct SampleState {
     active = cap > 0;
     concluded = candidate = false;
     status = SolveStatus::kMaxIter;
-    iterations = still = next_look = 0;
+    iterations = cycles_without_progress = next_look = 0;
     floor2 = 0.0;
     last_progress2 = std::numeric_limits<double>::infinity();
     rejected2 = std::numeric_limits<double>::infinity();

@@ -47,7 +47,7 @@ NullSpaceArguments<T> arguments_of(const at::Tensor& basis, const at::Tensor& b,
 /// A kernel, with all that its launch needs.
 struct Prepared {
   std::shared_ptr<const Kernel> kernel;
-  SolveKernel source;
+  SolveKernel made;
   OperatorView a;
   at::Tensor hierarchy;  // undefined without cycles
 };
@@ -66,12 +66,13 @@ SolveInfo new_report(const at::Tensor& b, bool apart) {
 
 template <class T>
 SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& request) {
-  const auto& [kernel, source, a, hierarchy] = of;
+  const auto& [kernel, made, a, hierarchy] = of;
   const int64_t batch = b.size(0);
   SolveResult result{at::empty(b.sizes(), b.options()), new_report(b, request.report_apart)};
-  const int64_t blocks = source.source.blocks_of_team;
+  const int64_t blocks = made.source.blocks_of_team;
+  // Teams of several blocks meet, so all must be at work at once. Single blocks may queue.
   const int64_t teams = std::min(batch, blocks > 1 ? kernel->teams() : 4 * kernel->teams());
-  const TeamMemory memory(blocks, teams, b.options(), teams * source.memory_of_team * b.element_size());
+  const TeamMemory memory(blocks, teams, b.options(), teams * made.memory_of_team * b.element_size());
   const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
 
@@ -123,14 +124,15 @@ std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Te
     const auto& m = solver.preconditioner;
     auto hierarchy = m.is_multigrid() && kept ? kept->get() : at::Tensor();
     std::optional<HierarchyKernel> maker;
-    if (m.is_multigrid() && !hierarchy.defined())  // of A, where this is its transpose
+    // The grids are those of the forward A, also where this is its transpose.
+    if (m.is_multigrid() && !hierarchy.defined())
       maker = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
-    const auto source = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
-    auto kernel = runtime->kernel(b.device(), source.source);
+    const auto made = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
+    auto kernel = runtime->kernel(b.device(), made.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
     if (maker) hierarchy = make_hierarchy(*maker, b);
     if (maker && kept) kept->keep(hierarchy);
-    return Prepared{std::move(kernel), source, *std::move(view), std::move(hierarchy)};
+    return Prepared{std::move(kernel), made, *std::move(view), std::move(hierarchy)};
   });
 }
 

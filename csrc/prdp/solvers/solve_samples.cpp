@@ -77,7 +77,7 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
   };
   int64_t s = begin;
   GivenSample<T> sample{};
-  const kernels::Kernel<T>*a = nullptr, *set = nullptr;  // of sample s, and the one that the system is made of
+  const kernels::Kernel<T>*a = nullptr, *in_system = nullptr;  // of sample s, and the one that the system is made of
   const auto& solver = batch.solver;
   // Goes to the next sample that is to be iterated, and sets its system; false behind the last.
   const auto find_next = [&] {
@@ -85,10 +85,10 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
       a = kernel_of(s);
       sample = given_sample(batch, s);
       if (settled_beforehand(batch, s, sample, a)) continue;
-      if (shared && a == set) return true;
-      set = nullptr;
+      if (shared && a == in_system) return true;
+      in_system = nullptr;
       if (system.set(*a, solver.preconditioner, shared ? shared->factors : factors_of(*a, solver))) {
-        set = a;
+        in_system = a;
         return true;
       }
       report(batch, s, zero_instead(SolveStatus::kZeroDiagonal));

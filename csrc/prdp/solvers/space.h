@@ -85,7 +85,7 @@ concept NumberOperations =
       /// num/den for a step, where den = v·w, and v2 = ‖v‖² and w2 = ‖w‖². 0 where num is negligible or negative; NaN
       /// where w2 is not finite; 0 and a breakdown of the sample where den is rounding, |den| <= ε ‖v‖ ‖w‖.
       { s.guarded_quotient(num, den, v2, w2) } -> std::same_as<typename S::Scalar>;
-      /// 1 where guarded_quotient() would break down and `active` is not zero, else 0.
+      /// 1 where den is rounding, |den| <= ε ‖v‖ ‖w‖, both norms are finite and `active` is not zero; else 0.
       { s.breaks_down(den, v2, w2, active) } -> std::same_as<typename S::Scalar>;
       /// num/den for den >= 0; 0 where den is negligible.
       { s.ratio(num, den) } -> std::same_as<typename S::Scalar>;
@@ -118,9 +118,10 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
                                                    typename S::Vector y, int64_t n, const typename S::Scalar* omega) {
   /// y = D⁻¹ x
   s.divide_by_diagonal(x, y);
-  /// n sweeps x ← c + x - D⁻¹A x, of which y keeps the last but one; Chebyshev's with their weights omega.
+  /// n sweeps x ← c + x - D⁻¹A x, for which y is memory. With Chebyshev's weights omega y holds the iterate before x,
+  /// on entry and on return.
   s.sweeps(c, x, y, n, omega);
-  /// One sweep from x to y; returns ‖b - A x‖².
+  /// One sweep from x to y, which holds the iterate before x if there is an omega; returns ‖b - A x‖².
   { s.measured_sweep(c, x, y, omega) } -> std::same_as<typename S::Scalar>;
   /// The square of the spectral radius of I - D⁻¹A.
   { s.radius2() } -> std::same_as<typename S::Scalar>;

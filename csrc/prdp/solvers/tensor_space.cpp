@@ -81,7 +81,10 @@ void TensorSpace::apply(const Vector& v, Vector& out) {
 }
 
 std::array<TensorSpace::Scalar, 2> TensorSpace::apply_along(const Vector& v, const Vector& w, Vector& out) {
-  if (in_loops_) return batch_loops::scale_with_dots(system_.scale_of_a, unscaled_product(v), w, out);
+  if (in_loops_) {
+    const auto made = unscaled_product(v);  // first: it sets the scale
+    return batch_loops::scale_with_dots(system_.scale_of_a, made, w, out);
+  }
   apply(v, out);
   return {dot(w, out), dot(out, out)};
 }
@@ -116,9 +119,9 @@ TensorSpace::Vector TensorSpace::swept(const Vector& x, const Vector& change, co
   return at::addcmul(before, omega->to(b_.options()), step);
 }
 
-TensorSpace::Scalar TensorSpace::measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega) {
+TensorSpace::Scalar TensorSpace::measured_sweep(const Vector& c, const Vector& x, Vector& y, const Scalar* omega) {
   const auto change = jacobi_change(c, x);
-  next = swept(x, change, next, omega);
+  y = swept(x, change, /*before=*/y, omega);
   const auto r = diagonal() * change;
   return dot(r, r);
 }
@@ -130,7 +133,7 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
 
 TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
   const auto u = solution(x).detach();
-  const auto negated = without_structure(u).lt(0);  // as is_negated()
+  const auto negated = unstructured_like(u).lt(0);  // as is_negated()
   const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
   return dot(terms, terms);
 }

@@ -28,8 +28,8 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
 
   // ---- the system
 
-  /// A and the preconditioner (undefined `inverse`: the diagonal). The first apply() and precondition() set a power of
-  /// two per sample that keeps later products in range.
+  /// A and the preconditioner (an empty `inverse`: none, or the diagonal). The first apply() and precondition() set a
+  /// power of two per sample that keeps later products in range.
   struct System {
     const Operator& a;
     const Preconditioner& preconditioner;
@@ -113,13 +113,13 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   // ---- sweeps
 
   void divide_by_diagonal(const Vector& b, Vector& c) { c = b / diagonal(); }
-  void sweeps(const Vector& c, Vector& x, Vector& next, int64_t n, const Scalar* omega) {
+  void sweeps(const Vector& c, Vector& x, Vector& y, int64_t n, const Scalar* omega) {
     for (int64_t s = 0; s < n; ++s) {
-      next = swept(x, jacobi_change(c, x), next, omega ? omega + s : nullptr);
-      advance(x, next);
+      y = swept(x, jacobi_change(c, x), /*before=*/y, omega ? omega + s : nullptr);
+      advance(x, y);
     }
   }
-  Scalar measured_sweep(const Vector& c, const Vector& x, Vector& next, const Scalar* omega);
+  Scalar measured_sweep(const Vector& c, const Vector& x, Vector& y, const Scalar* omega);
   Scalar radius2() const { return system_.a.jacobi_radius().square(); }
   static constexpr bool sweeps_contract() { return false; }  // not known of the operator
 

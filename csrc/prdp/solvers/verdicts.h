@@ -39,14 +39,14 @@ inline void judge_progress(SampleState& s, bool exhausted) {
   constexpr int64_t patience = 10;
   if (s.residual2 < progress2 * s.last_progress2) {
     s.last_progress2 = s.residual2;
-    s.still = 0;
+    s.cycles_without_progress = 0;
     return;
   }
   if (exhausted) {
     s.take_back_iteration();
     return s.stop(SolveStatus::kBreakdown);
   }
-  if (++s.still >= patience) s.stop(SolveStatus::kStagnated);
+  if (++s.cycles_without_progress >= patience) s.stop(SolveStatus::kStagnated);
 }
 
 /// Sets when the residual is to be looked at next. Where it is log-convex it falls no faster from here

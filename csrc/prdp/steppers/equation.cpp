@@ -16,7 +16,7 @@ namespace prdp {
 namespace {
 
 /// A state of the equation in which nothing moves.
-at::Tensor rest(const Equation& equation) {
+at::Tensor state_at_rest(const Equation& equation) {
   const int64_t channels = equation_kind(equation.kind).channels;
   std::vector<int64_t> sizes{1, channels == kPerAxis ? static_cast<int64_t>(equation.shape.size()) : channels};
   // A negative extent is left for the operator to refuse.
@@ -35,7 +35,7 @@ void Equation::check_picard_steps() const {
 
 void Equation::check() const {
   check_picard_steps();
-  make_operator(equation_operator(*this, rest(*this)))->check_parameters();
+  make_operator(equation_operator(*this, state_at_rest(*this)))->check_parameters();
 }
 
 OperatorSpec equation_operator(const Equation& equation, const at::Tensor& u) {

@@ -131,7 +131,7 @@ struct FlowViscosityBars {
   FlowField<const T> diffused, lambda;
   const T* patterns[3];
   // Of the share of the pressure that is taken off beyond a largest ν. Absent: the whole one is.
-  FlowField<const T> change, balanced, potential, of_potential;
+  FlowField<const T> change, balanced, potential, potential_bar;
   double largest_nu;
 
   double at(const FlowReverse<T>& reverse, int s, int c, const FlowPlace& p) const {
@@ -148,8 +148,8 @@ struct FlowViscosityBars {
     sum -= terms.dt * bar * of_pattern(grid, s, c, p);
     if (!balanced || nu <= largest_nu) return sum;
     double of_share = bar * static_cast<double>(balanced.at(s, c, p) - change.at(s, c, p));
-    if (c == 0 && of_potential)
-      of_share += static_cast<double>(of_potential.at(s, 0, p)) * static_cast<double>(potential.at(s, 0, p));
+    if (c == 0 && potential_bar)
+      of_share += static_cast<double>(potential_bar.at(s, 0, p)) * static_cast<double>(potential.at(s, 0, p));
     return sum - of_share / nu;
   }
 

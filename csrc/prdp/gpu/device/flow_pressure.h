@@ -58,12 +58,12 @@ struct FlowVelocity {
   }
 };
 
-/// b = factor · div u (+ of_potential) in the cells whose pressure is unknown, zero in the others; without its means,
+/// b = factor · div u (+ potential_bar) in the cells whose pressure is unknown, zero in the others; without its means,
 /// and zero where the dtype has no normal numbers for it.
 template <class T>
 struct FlowDivergence {
   FlowVelocity<T> u;
-  FlowField<const T> cells, of_potential;
+  FlowField<const T> cells, potential_bar;
   FlowClosedParts<T> parts;
   FlowShare<T> share;
   double factor;
@@ -94,7 +94,7 @@ struct FlowDivergence {
     }
     const T inside = cells ? cells.at(s, 0, p) : T(1);
     sum *= inside;
-    if (of_potential && !(u.refused && u.refused[s] != 0)) sum += of_potential.at(s, 0, p) * inside;
+    if (potential_bar && !(u.refused && u.refused[s] != 0)) sum += potential_bar.at(s, 0, p) * inside;
     return sum * share.value();
   }
 };

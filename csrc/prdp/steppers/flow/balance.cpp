@@ -37,11 +37,11 @@ Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOp
 
 namespace {
 
-FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& of_potential,
+FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& potential_bar,
                       const SolveOptions& options, CombinedInfo& info) {
   const double limit = largest_viscosity(e);
   if (flow_kernels::take(cotangent[0])) {
-    const ByKernels by{{.added = cotangent, .of_potential = of_potential, .share_by_nu = e.nu, .largest_nu = limit},
+    const ByKernels by{{.added = cotangent, .potential_bar = potential_bar, .share_by_nu = e.nu, .largest_nu = limit},
                        {.added = cotangent},
                        {.factor = scale_of_pressure(*e.box)},
                        /*reverse=*/true};
@@ -49,24 +49,24 @@ FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const a
   }
   const auto& free = e.box->fields(cotangent[0].options()).free;
   const auto given = joined(cotangent) * free;
-  if (e.nu.item<double>() <= limit) return {project_vjp(*e.box, given, of_potential, {}, options, info).on_free_faces};
+  if (e.nu.item<double>() <= limit) return {project_vjp(*e.box, given, potential_bar, {}, options, info).on_free_faces};
   const auto share = limit / e.nu;
-  const auto of_whole = of_potential.defined() ? of_potential * share : of_potential;
+  const auto of_whole = potential_bar.defined() ? potential_bar * share : potential_bar;
   return {given * (1.0 - share) + project_vjp(*e.box, given * share, of_whole, {}, options, info).on_free_faces};
 }
 
 }  // namespace
 
-BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& of_potential,
+BalanceVjp balance_vjp(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& potential_bar,
                        const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
   if (!is_incremental(e)) return {cotangent, {}};
-  BalanceVjp found{change_back(e, cotangent, of_potential, options, info), {}};
+  BalanceVjp found{change_back(e, cotangent, potential_bar, options, info), {}};
   const double limit = largest_viscosity(e);
   if (!change.defined() || e.nu.item<double>() <= limit) return found;
   CombinedInfo again;
   const auto whole = project(*e.box, change, options, again);
   auto of_share = (joined(cotangent) * (whole.u - change)).sum();
-  if (of_potential.defined()) of_share = of_share + (of_potential * whole.potential).sum();
+  if (potential_bar.defined()) of_share = of_share + (potential_bar * whole.potential).sum();
   found.nu = -of_share * (limit / e.nu) / e.nu;
   return found;
 }

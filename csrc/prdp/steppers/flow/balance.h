@@ -20,7 +20,7 @@ struct BalanceVjp {
   FlowParts change;
   at::Tensor nu;
 };
-BalanceVjp balance_vjp(const FlowEquation& equation, const FlowParts& cotangent, const at::Tensor& of_potential,
+BalanceVjp balance_vjp(const FlowEquation& equation, const FlowParts& cotangent, const at::Tensor& potential_bar,
                        const at::Tensor& change, const SolveOptions& options, CombinedInfo& info);
 
 }  // namespace prdp

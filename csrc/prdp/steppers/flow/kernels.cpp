@@ -92,7 +92,7 @@ at::Tensor divergence(const FlowBox& box, const Correction& correction, double f
   const bool launched = each_sample({"FlowDivergence", kPressure}, like, cells_of(box), [&]<class T>(T) {
     return gpu::FlowDivergence<T>{.u = velocity_of<T>(box, correction, like),
                                   .cells = field_of<const T>(fields.cells),
-                                  .of_potential = field_of<const T>(correction.of_potential),
+                                  .potential_bar = field_of<const T>(correction.potential_bar),
                                   .parts = parts_of<T>(box, like),
                                   .share = share_of<T>(correction),
                                   .factor = factor,

@@ -27,7 +27,7 @@ at::Tensor change(const FlowEquation& equation, const Start& start);
 struct Correction {
   at::Tensor base = {};         // a velocity; undefined: none
   FlowParts added = {};         // to which this is added on the free faces; empty: nothing
-  at::Tensor of_potential = {}; // for the reverse: the cotangent of the potential; undefined: none
+  at::Tensor potential_bar = {}; // for the reverse: the cotangent of the potential; undefined: none
   at::Tensor refused = {};      // samples whose status is not 0 are zero; undefined: none
   at::Tensor share_by_nu = {};  // ν, where less than the whole pressure is taken off beyond a largest one
   double largest_nu = 0;
@@ -59,7 +59,7 @@ std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, con
 struct ImplicitPart {
   at::Tensor change = {}, balanced = {}, potential = {};
   FlowParts diffused = {}, lambda = {};
-  at::Tensor of_potential = {};
+  at::Tensor potential_bar = {};
   double largest_nu = 0;  // for which the whole pressure is taken off
 };
 

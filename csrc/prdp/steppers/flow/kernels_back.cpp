@@ -55,7 +55,7 @@ gpu::FlowViscosityBars<T> bars_of(const FlowBox& box, const ImplicitPart& part) 
                                .change = field_of<const T>(part.change),
                                .balanced = field_of<const T>(part.potential.defined() ? part.balanced : at::Tensor()),
                                .potential = field_of<const T>(part.potential),
-                               .of_potential = field_of<const T>(part.of_potential),
+                               .potential_bar = field_of<const T>(part.potential_bar),
                                .largest_nu = part.largest_nu};
   if (part.diffused.empty()) return of;
   const auto& patterns = box.fields(part.change.options()).diffusion;

@@ -135,12 +135,12 @@ Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& adde
   return all;
 }
 
-ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_potential, const at::Tensor& refused,
+ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor potential_bar, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
   if (flow_kernels::take(cotangent)) {
     const flow_kernels::How how{scale_of_pressure(box), /*on_all_faces=*/true, /*wants_on_free_faces=*/true};
-    const ByKernels by{{.added = {cotangent}, .of_potential = of_potential, .refused = refused},
+    const ByKernels by{{.added = {cotangent}, .potential_bar = potential_bar, .refused = refused},
                        {.base = cotangent, .refused = refused},
                        how,
                        /*reverse=*/true};
@@ -149,10 +149,10 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_p
       return t.defined() && refused.defined() ? t.masked_fill(per_sample(refused.ne(0), t), 0.0) : t;
     };
     cotangent = cleared(cotangent);
-    of_potential = cleared(of_potential);
+    potential_bar = cleared(potential_bar);
   }
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
-  if (of_potential.defined()) phi_bar = phi_bar + masked(of_potential, fields.cells);
+  if (potential_bar.defined()) phi_bar = phi_bar + masked(potential_bar, fields.cells);
   phi_bar = without_least_numbers(without_means(box, phi_bar));
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);

@@ -23,7 +23,7 @@ Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& adde
 struct ProjectVjp {
   at::Tensor u, on_free_faces;
 };
-ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor of_potential, const at::Tensor& refused,
+ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor potential_bar, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info);
 
 /// A projection of which all but the solve are two launches; nothing where there are no kernels. `given` is projected,

@@ -37,7 +37,7 @@ ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundar
 struct Beginning {
   at::Tensor velocity;
   RefusedSamples refused;                           // with kernels, only where the host looks
-  std::optional<flow_kernels::Start> of_kernels{};  // by these all values of such samples are zero
+  std::optional<flow_kernels::Start> of_kernels{};  // its status says which these are; all their values are zero
 
   at::Tensor mask() const { return of_kernels ? at::Tensor() : refused.mask; }
   /// 0, or why a sample was refused; undefined: none was.
@@ -53,7 +53,7 @@ Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks) {
   return {velocity, find_refused(e, velocity.detach())};
 }
 
-/// The same with its change.
+/// The velocity of a beginning, and its change.
 ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning) {
   if (!beginning.of_kernels) return explicit_part(e, beginning.velocity, beginning.refused.mask);
   const auto change = flow_kernels::change(e, *beginning.of_kernels);
@@ -143,14 +143,14 @@ std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, cons
 /// The way back through the diffusion and the balance.
 struct ImplicitBack {
   const FlowEquation& e;
-  const at::Tensor &cotangent, &of_potential;
+  const at::Tensor &cotangent, &potential_bar;
   const SolveOptions& options;
   std::vector<OperatorSpec> operators{};
   flow_kernels::ImplicitPart part{};
 
   ImplicitBack(const FlowEquation& equation, const at::Tensor& diffused_bar, const at::Tensor& potential_bar,
                const SolveOptions& o)
-      : e(equation), cotangent(diffused_bar), of_potential(potential_bar), options(o) {
+      : e(equation), cotangent(diffused_bar), potential_bar(potential_bar), options(o) {
     if (is_implicit(e)) operators = diffusion_operators(e, cotangent);
   }
 
@@ -162,14 +162,14 @@ struct ImplicitBack {
             .balanced = balanced.u,
             .potential = balanced.potential,
             .diffused = diffuse(e, operators, balanced.u, options, not_reported),
-            .of_potential = of_potential,
+            .potential_bar = potential_bar,
             .largest_nu = largest_viscosity(e)};
   }
   /// The cotangents of the change and, with `of_nu`, of ν, for which run_forward() comes first.
   DiffuseVjp back(bool of_nu, CombinedInfo& info) {
     auto found = diffuse_vjp(e, operators, cotangent, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
     part.lambda = found.change;
-    auto balanced = balance_vjp(e, found.change, of_potential, of_nu ? part.change : at::Tensor(), options, info);
+    auto balanced = balance_vjp(e, found.change, potential_bar, of_nu ? part.change : at::Tensor(), options, info);
     add_to(balanced.nu, found.nu);
     return {balanced.change, balanced.nu};
   }
@@ -199,17 +199,18 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
   if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
   const auto e = equation.for_state(u);
+  const bool needs_nu = needed[1] != 0;  // u is first, then equation.tensors(), ν at their head
   const auto beginning = begin(e, u, /*looks=*/false);
   const auto refused = beginning.mask();
   CombinedInfo adjoint;
-  const auto of_potential = cleared(cotangent.potential, refused);
+  const auto potential_bar = cleared(cotangent.potential, refused);
   const auto velocity_bar =
-      project_vjp(*e.box, cleared(cotangent.u, refused), of_potential, beginning.status(), options, adjoint);
+      project_vjp(*e.box, cleared(cotangent.u, refused), potential_bar, beginning.status(), options, adjoint);
   DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
-  ImplicitBack implicit(e, velocity_bar.on_free_faces, of_potential, options);
+  ImplicitBack implicit(e, velocity_bar.on_free_faces, potential_bar, options);
   if (is_implicit(e)) {
-    if (needed[1]) implicit.run_forward(explicit_part(e, beginning).change);
-    back = implicit.back(/*of_nu=*/needed[1] && !beginning.of_kernels, adjoint);
+    if (needs_nu) implicit.run_forward(explicit_part(e, beginning).change);
+    back = implicit.back(/*of_nu=*/needs_nu && !beginning.of_kernels, adjoint);
   }
   info = adjoint.info();
   // Back through the explicit part: by kernels, which add the share of ν; where none can be made, by autograd.
@@ -217,7 +218,7 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
     auto found =
         flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
     if (found) return as_given(equation, *std::move(found), needed);
-    if (is_implicit(e) && needed[1]) back = implicit.back(/*of_nu=*/true, adjoint);
+    if (is_implicit(e) && needs_nu) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
   // On the CPU by loops, else by autograd.

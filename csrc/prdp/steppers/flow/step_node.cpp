@@ -1,3 +1,5 @@
+#include "prdp/steppers/flow/step_node.h"
+
 #include <ATen/core/grad_mode.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/custom_class.h>
@@ -8,7 +10,6 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
-#include "prdp/steppers/flow/steps.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/threads/interruption.h"
 
