@@ -25,8 +25,8 @@ R = TypeVar("R")
 Row: TypeAlias = tuple[float, float, int, bool, float | None, float | None]
 """What the compiled controllers keep of a call of `step`, as a `Record` has it."""
 
-PATIENCE = 5
-"""A `warning` that lasts so many intervals without a refinement is said aloud."""
+PATIENCE, LONG_PATIENCE = 5, 30
+"""A `warning` that lasts so many intervals without a refinement is said aloud; so many with refinements, too."""
 
 
 class _Attached(_Compiled):
@@ -35,6 +35,7 @@ class _Attached(_Compiled):
     steppers: list[Refinable]
     process_group: "ProcessGroup | None"
     _warned_for: int  # intervals
+    _warned_unrefined_for: int  # of these, those since the last refinement
     _has_spoken: bool
 
     if TYPE_CHECKING:  # each compiled controller has its own
@@ -47,7 +48,7 @@ class _Attached(_Compiled):
         if process_group is not None and data_parallel.rank(who, process_group) < 0:
             raise ValueError(f"{who}: this process does not belong to process_group")
         self.process_group = process_group
-        self._warned_for, self._has_spoken = 0, False
+        self._warned_for, self._warned_unrefined_for, self._has_spoken = 0, 0, False
         self._records: list[Any] = []  # what `history` has returned
         if not isinstance(steppers, Iterable):
             raise TypeError(f"{who}: steppers must be a list such as [heat], got {steppers!r}")
@@ -84,8 +85,10 @@ class _Attached(_Compiled):
     def _speak(self, refined: bool) -> None:
         """Say once what `warning` says, if a few intervals have not ended it."""
         warning = self.warning
-        self._warned_for = 0 if warning is None or refined else self._warned_for + 1
-        if self._warned_for == PATIENCE and not self._has_spoken:
+        self._warned_for = 0 if warning is None else self._warned_for + 1
+        self._warned_unrefined_for = 0 if warning is None or refined else self._warned_unrefined_for + 1
+        lasts = self._warned_unrefined_for == PATIENCE or self._warned_for == LONG_PATIENCE
+        if lasts and not self._has_spoken:
             self._has_spoken = True
             warnings.warn(f"{warning} (said once; `.warning` has the state of the last interval)", stacklevel=5)
 
@@ -145,8 +148,7 @@ def _number(who: str, name: str, value: Number) -> float:
 
 
 def _checked(who: str, settings: Mapping[str, object], defaults: dict[str, Any]) -> dict[str, Any]:
-    """The settings over the defaults, each of its default's type; a maximum or ratio may be None where its
-    default is."""
+    """The settings over the defaults: whole numbers where named so here, else real ones, or the default itself."""
     whole = {"delta", "window", "initial", "increment", "maximum"}
     for name, value in settings.items():
         if name not in defaults:
@@ -212,6 +214,8 @@ class PRDPController(_C.PRDPController, _Attached):
     def step(self, metric: Number, converged: bool | None = None, error: Number | None = None) -> bool:
         """Decide after an interval. Returns True if K was raised.
 
+        `warning` looks at `info` of the steppers' last solves: validate with steps of their own.
+
         Args:
             metric: of the interval; finite, >= 0, and smaller is better.
             converged: whether the solves meet their tolerance. None asks the steppers.
@@ -276,6 +280,8 @@ class ToleranceController(_C.ToleranceController, _Attached):
     def step(self, error: Number, converged: bool | None = None) -> bool:
         """Decide after an interval. Returns True if rtol became smaller.
 
+        `warning` looks at `info` of the steppers' last solves: validate with steps of their own.
+
         Args:
             error: the relative error of what is trained; finite, >= 0. For a network this is
                 ‖u - u_ref‖ / ‖u_ref‖ on validation data after one step, the square root of a normalised squared
@@ -303,8 +309,8 @@ class ToleranceController(_C.ToleranceController, _Attached):
 class LinearSchedule(_C.LinearSchedule, _Attached):
     """A manual schedule: K = initial + increment·(calls of step), at most `maximum`. increment = 0 keeps K constant.
 
-    It has the interface of `PRDPController` and ignores the metric. `adjoint_ratio` and
-    `process_group` have the same meaning."""
+    Its `step`, `state_dict` and `warning` are those of `PRDPController`; it ignores the metric and keeps no history.
+    `adjoint_ratio` and `process_group` have the same meaning."""
 
     def __init__(
         self,

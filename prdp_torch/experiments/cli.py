@@ -75,7 +75,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output has left
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        except (typer.Exit, typer.Abort):  # RuntimeErrors, too
+        except (typer.Exit, typer.Abort):  # both are RuntimeErrors, which the next clause would take
             raise
         except (ValueError, TypeError, OSError, ImportError, RuntimeError, OverflowError, MemoryError) as error:
             words = "std::bad_alloc" if isinstance(error, MemoryError) else str(error)

@@ -233,8 +233,8 @@ def _files_of(
 
 
 def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | None:
-    """The curves of the record at `path` if it is of this training. ValueError if it is of another length, and no
-    checkpoint is left to go on from."""
+    """The curves of the record at `path` if it is of this training, and its weights are there. ValueError if they are
+    damaged, or if it is of another length, and no checkpoint is left to go on from."""
     record = records.read_training(path)
     if record is None:
         return None
@@ -242,6 +242,8 @@ def _finished(path: Path, scene: _C.Scene, checkpoint: Checkpoint) -> Curves | N
     if record["settings"] != records.identity(scene):
         return None
     if intervals == scene.training.intervals:
+        if "weights" in record and _C.read_weights(path, record["weights"]) is None:
+            return None
         checkpoint.remove_before(path)
     else:
         if not checkpoint.find():

@@ -27,6 +27,10 @@ class Trained(NamedTuple):
     curves: Curves
     """The curves of the record, as `training.train` returns them."""
 
+    def __repr__(self) -> str:
+        weights = sum(parameter.numel() for parameter in self.network.parameters())
+        return f"Trained({self.scene.name}: {type(self.network).__name__}, {weights} weights)"
+
     def __call__(self, u: Tensor) -> Tensor:
         """Make one time step."""
         return self.step(u)

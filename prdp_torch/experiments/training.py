@@ -209,7 +209,7 @@ class _Run:
 
     def go(self, task: Task, found: Found) -> None:
         stopped = False
-        if not self._restores(task, found):
+        if not self._restore(task, found):
             self._observe(task, 0)
         else:
             for number in range(1, self._done() + 1):
@@ -251,8 +251,8 @@ class _Run:
         tensors = {**task.state(), **random_states(self.device)}
         checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
-    def _restores(self, task: Task, found: Found) -> bool:
-        """Whether there is a checkpoint to continue from."""
+    def _restore(self, task: Task, found: Found) -> bool:
+        """Continue from the checkpoint; False where there is none."""
         if self.checkpoint is None or not self.checkpoint.restore(found, functools.partial(self._load, task)):
             return False
         self.checkpoint.check_length(self._done(), self.intervals)
@@ -301,6 +301,7 @@ class _Run:
             self.curves[name].append(value)
 
     def _observe(self, task: Task, done: int) -> None:
+        """Append the metric and the error after `done` intervals, and let the controller decide by them."""
         metric = task.metric()
         if not math.isfinite(metric):
             raise _Diverged(f"interval {done}: the metric is {metric}")

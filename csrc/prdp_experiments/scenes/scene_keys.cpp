@@ -327,21 +327,7 @@ std::string data_settings(const Scene& scene) {
 Scene read_scene(const std::string& path) { return parse_scene(read_whole("scene", path), path); }
 
 Scene parse_scene(const std::string& text, const std::string& path) {
-  // toml++ ends the process on tables nested a hundred thousand deep; a file of this size cannot hold so many.
-  constexpr size_t kLongest = 65536;
-  TORCH_CHECK_VALUE(text.size() <= kLongest, "scene: '", path, "' has ", text.size(), " bytes; a scene has at most ",
-                    kLongest);
-
-  toml::table table;
-  try {
-    table = toml::parse(text, path);
-  } catch (const toml::parse_error& error) {
-    TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
-  } catch (const BrokenToml&) {
-    TORCH_CHECK_VALUE(false, path,
-                      ": not a TOML file; a key or the name of a table has a character that it cannot have");
-  }
-
+  const auto table = parse_toml(text, path);
   Scene scene;
   scene.path = path;
   scene.name = std::filesystem::path(path).stem().string();

@@ -37,6 +37,24 @@ struct BrokenToml {};
 
 namespace prdp {
 
+/// The tables of a scene. ValueError with the line where it is no TOML.
+inline toml::table parse_toml(const std::string& text, const std::string& path) {
+  // toml++ ends the process on tables nested a hundred thousand deep; a file of this size cannot hold so many.
+  constexpr size_t kLongest = 65536;
+  TORCH_CHECK_VALUE(text.size() <= kLongest, "scene: '", path, "' has ", text.size(), " bytes; a scene has at most ",
+                    kLongest);
+
+  try {
+    return toml::parse(text, path);
+  } catch (const toml::parse_error& error) {
+    TORCH_CHECK_VALUE(false, path, ":", error.source().begin.line, ": ", error.description());
+  } catch (const BrokenToml&) {
+    TORCH_CHECK_VALUE(false, path,
+                      ": not a TOML file; a key or the name of a table has a character that it cannot have");
+  }
+  return {};
+}
+
 /// One table of a TOML file while it is read. KeyRecorder has the same functions, so that one declaration of a key
 /// serves the reader and the documentation. Every key that is asked for is an allowed one; finish() refuses the others.
 class TomlSection {

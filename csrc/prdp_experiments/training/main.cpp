@@ -88,8 +88,8 @@ prdp::Checkpoint checkpoint_of(const fs::path& record, const Identity& identity,
   return {fs::path(record).replace_extension(".checkpoint"), text_of(all)};
 }
 
-/// Whether the record is of this training, finished. Throws if it is of another length and nothing is left to go on
-/// from.
+/// Whether the record is of this training, finished, and its weights are there. Throws if they are damaged, or if it is
+/// of another length and nothing is left to go on from.
 bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& checkpoint) {
   const auto kept = prdp::read_training(path);
   if (!kept) return false;
@@ -99,6 +99,7 @@ bool is_done(const fs::path& path, const Identity& identity, prdp::Checkpoint& c
   const auto wanted = identity.scene.training.intervals;
   if (found != identity.settings()) return false;
   if (intervals == wanted) {
+    if (kept->contains("weights") && !prdp::read_weights(path, kept->at("weights").get<std::string>())) return false;
     checkpoint.remove_before(path);
     return true;
   }
