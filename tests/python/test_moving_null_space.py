@@ -127,3 +127,31 @@ def test_left_and_right_vectors_may_move_apart():
     cotangent = torch.linspace(0, 1, 6, dtype=F64)[None]
     found, exact = (torch.autograd.grad(u(logits), logits, cotangent)[0] for u in (mine, pinv))
     torch.testing.assert_close(found, exact, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("of_all_channels", [False, True])
+def test_vectors_of_a_channel_and_of_all_channels_move(of_all_channels):
+    scale = (torch.rand(5, dtype=F64, generator=torch.Generator().manual_seed(5)) + 0.5).requires_grad_()
+    f = torch.randn(3, 2, 5, dtype=F64, generator=torch.Generator().manual_seed(6))
+
+    def product(v, scale):  # S L S, with L the periodic second difference: S⁻¹ 1 is its null vector
+        v = scale * v
+        return scale * (2 * v - v.roll(1, -1) - v.roll(-1, -1))
+
+    def in_range_of_channels(vector):
+        return f - (f @ vector)[..., None] * vector / vector.square().sum()
+
+    def mine(scale):
+        vector = 1 / scale
+        basis = torch.eye(2, dtype=F64)[..., None] * vector if of_all_channels else vector[None]
+        a = operators.Function(product, tensors=(scale,), symmetric=True, nullspace=basis)
+        return prdp.linear_solve(a, in_range_of_channels(vector), prdp.CG(40, rtol=1e-13))[0]
+
+    def exact(scale):
+        matrix = product(torch.eye(5, dtype=F64), scale).T
+        return in_range_of_channels(1 / scale) @ torch.linalg.pinv(matrix, hermitian=True)
+
+    torch.testing.assert_close(mine(scale), exact(scale), rtol=1e-9, atol=1e-10)
+    cotangent = torch.linspace(-1, 2, 30, dtype=F64).view(3, 2, 5)
+    found, expected = (torch.autograd.grad(u(scale), scale, cotangent)[0] for u in (mine, exact))
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
