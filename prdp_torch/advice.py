@@ -225,9 +225,12 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     if isinstance(best.solver, Direct):
         chosen, choice = best, "Use the direct solver, Direct()"
     elif saving < WORTH_REFINING:
-        chosen, choice = best, f"Use converged solves with {call_of(best.solver, 2 * _most(best), best.rtol)}"
+        chosen, choice = (
+            best,
+            f"Use converged solves with {call_of(best.solver, 2 * _most_iterations(best), best.rtol)}",
+        )
     else:
-        chosen, choice = refined, f"Refine {refined.name} with a controller, up to K = {_most(refined)}"
+        chosen, choice = refined, f"Refine {refined.name} with a controller, up to K = {_most_iterations(refined)}"
     loosest, finest = (power(rtol) for rtol in TOLERANCES)
     cost = (
         f"physics is {update.share(physics)}"
@@ -248,7 +251,7 @@ def _what_refinement_saves(saving: float, amount: str, best: Row) -> str:
         return f"Refinement can save at most {amount}."
     if saving > 0.0:
         return f"Refinement has little to save: at most {amount}."
-    if _most(best) == 1 and not isinstance(best.solver, Direct):
+    if _most_iterations(best) == 1 and not isinstance(best.solver, Direct):
         return "Refinement has nothing to save: one iteration is enough."
     return f"Refinement has nothing to save: no solver is faster to {power(TOLERANCES[0])}."
 
@@ -264,7 +267,7 @@ def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, upd
         if update.physics(rough) < (1 - NOISE) * update.physics(own):
             refined = solved.get((rough.name, finest), rough)
             return refined, update.physics(rough), f"{rough.name} to {power(loosest)}"
-    if isinstance(best.solver, Direct) or _most(best) == 1:
+    if isinstance(best.solver, Direct) or _most_iterations(best) == 1:
         return best, update.physics(best), ""
     return best, update.physics(measure_one_iteration(step, sample, best.solver)), "a single iteration"
 
@@ -287,7 +290,7 @@ def _misleading(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def _most(row: Row) -> int:
+def _most_iterations(row: Row) -> int:
     return max(solve.iterations for solve in row.solves)
 
 

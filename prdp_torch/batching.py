@@ -1,8 +1,9 @@
 """The batching rules of the library's ops: what torch.func.vmap makes of a solve.
 
 A mapped axis is folded into the batch, as samples do not influence each other. Where all samples share a
-tensor that is mapped, such as nu, the entries are solved one after the other. Where each sample has an A of its own
-and b alone is mapped, the samples are: what is made of an A, such as its factors, serves all its right-hand sides.
+tensor that is mapped, such as nu, the entries are solved one after the other. Where no tensor of A is mapped,
+each sample has an A of its own, and there are no more samples than entries, one sample is solved after the other: what
+is made of an A, such as its factors, serves all its right-hand sides.
 """
 
 from collections.abc import Callable, Sequence

@@ -182,13 +182,14 @@ class PRDPController(_C.PRDPController, _Attached):
     K is not raised while every solve of the steppers meets its tolerance. It is raised if the metric grows, as on a
     plateau.
 
-    Every controller has a `warning`. It is None, or a sentence about one of these. It becomes a `UserWarning`, once, if
-    it lasts five intervals without a refinement:
+    Every controller has a `warning`. It is None, or a sentence about each of these that holds. It becomes a
+    `UserWarning`, once, if it lasts five intervals without a refinement, or thirty with some:
 
     - The solves stop so far from the solution that their error dominates what is trained.
     - Most of the last solves took no iteration, so that steps pass their start on.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
+    - Of a `ToleranceController`: the error has not fallen in twenty calls, and adjoint solves are loose.
 
     Raises:
         ValueError, TypeError: a setting or a metric is out of range or of a wrong type.

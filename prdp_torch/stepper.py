@@ -175,10 +175,10 @@ class Stepper(HasSettings):
         may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
         if not may_lose or u.is_cpu:
             found = self._solve_from(u, log)
-            if not may_lose or not _C.any_refused(found[3]):
+            if not may_lose or not _C.any_nonfinite(found[3]):
                 return found
-        # Gradients through a view are summed in another order. On the CPU, where looking is free, u becomes one only
-        # once a sample was refused.
+        # The hook sits on a view, to see the cotangent of this step alone. Gradients through a view are summed in
+        # another order. On the CPU, where looking is free, u becomes one only once a sample was refused.
         state = u.view_as(u)
         found = self._solve_from(state, log)
         _C.block_gradients_of_lost(state, found[3], self.on_failure)

@@ -205,7 +205,7 @@ void bind_solvers(py::module_& m) {
   m.def("way_of_last_solve", &way_of_last_solve,
         "How this thread's last solve was computed: kernel, loops or tensors.");
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
-  m.def("any_refused", &any_refused, py::arg("status"), "Whether a sample was refused for a NaN or Inf in b or A.");
+  m.def("any_nonfinite", &any_nonfinite, py::arg("status"), "Whether a sample was refused for a NaN or Inf in b or A.");
   m.def(
       "block_gradients_of_lost",
       [](const at::Tensor& u, const at::Tensor& status, const std::string& on_failure) {
@@ -225,12 +225,10 @@ void bind_solvers(py::module_& m) {
         a.transposed = transposed;
         const auto result = [&] {
           const py::gil_scoped_release no_gil;
-          return solve_with_tensors(
-              *make_operator(a), b,
-              {{method_from_name(solver), max_iter, rtol, restart, OperatorSpec{std::move(preconditioner), {}, {}, {}}},
-               {},
-               true,
-               x0.value_or(at::Tensor())});
+          return solve_with_tensors(*make_operator(a), b,
+                                    {.solver = {method_from_name(solver), max_iter, rtol, restart,
+                                                OperatorSpec{std::move(preconditioner), {}, {}, {}}},
+                                     .x0 = x0.value_or(at::Tensor())});
         }();
         return py::make_tuple(result.u, as_tuple(result.info));
       },

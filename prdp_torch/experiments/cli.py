@@ -1,4 +1,4 @@
-"""The command `prdp`: list scenes, train them, compare ways of choosing K."""
+"""The command `prdp`: scenes, trainings, comparisons, advice, data and benchmarks."""
 
 import functools
 import importlib
@@ -121,7 +121,7 @@ def train(
     folder = records.prepare_folder(out or Path("runs") / f"{loaded.name}-train")
     environment = records.environment(loaded.device)
     diverged: dict[int, str] = {}
-    warnings: dict[int, str] = {}
+    warned: dict[int, str] = {}
     with records.alone_in([folder / refinement.label]), progress_bars() as progress:
         comparison.refuse_to_lose(loaded, [refinement.label], seeds or 1, folder, environment, resume)
         for seed in range(seeds or 1):
@@ -150,9 +150,9 @@ def train(
             if (why := comparison.why_lost(curves)) is not None:
                 diverged[seed] = why
             if "warning" in curves:
-                warnings[seed] = curves["warning"]
+                warned[seed] = curves["warning"]
     console.print(f"records: {folder / refinement.label}", soft_wrap=True)
-    for seed, what in warnings.items():
+    for seed, what in warned.items():
         print(f"prdp: warning: seed {seed}, {what}", file=sys.stderr)
     for seed, why in diverged.items():
         print(f"prdp: seed {seed} diverged, {why}", file=sys.stderr)
@@ -256,8 +256,8 @@ def _bench_device(project: Path, device: str, suites: Sequence[str], out: Path |
     path = records.prepare_folder(out or Path("runs") / "bench").resolve() / "devices.json"
     arguments = ["--device", device, *(["--quick"] if quick else [])]
     found = []
-    command = [sys.executable, "-m", "benchmarks.devices", *arguments]
-    with subprocess.Popen(command, cwd=project, stdout=subprocess.PIPE, text=True) as running:
+    run = [sys.executable, "-m", "benchmarks.devices", *arguments]
+    with subprocess.Popen(run, cwd=project, stdout=subprocess.PIPE, text=True) as running:
         for line in cast(IO[str], running.stdout):
             print(line, end="", flush=True)
             found.append(json.loads(line))

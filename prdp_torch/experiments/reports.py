@@ -29,7 +29,7 @@ def on_host(infos: Iterable[SolveInfo | None]) -> list[Report]:
     return reports
 
 
-def any_refused(reports: Sequence[Report]) -> bool:
+def any_nonfinite(reports: Sequence[Report]) -> bool:
     """Whether a solver was given NaN or Inf."""
     return any(bool((report.status <= SolveStatus.NONFINITE_INPUT).any()) for report in reports)
 

@@ -17,7 +17,7 @@ from prdp_torch.controller import ToleranceController
 from prdp_torch.experiments import _C, datasets, field_task, network_task, parameter_task
 from prdp_torch.experiments.checkpoint import Checkpoint, Found, check_tensors, load_random, random_states
 from prdp_torch.experiments.refinement import Refinement
-from prdp_torch.experiments.reports import any_refused, on_host, spent_on
+from prdp_torch.experiments.reports import any_nonfinite, on_host, spent_on
 from prdp_torch.experiments.scenes import make_stepper, placed
 from prdp_torch.experiments.task import Task
 from prdp_torch.stepper import Stepper
@@ -125,7 +125,8 @@ def train(
         - "seconds": of the updates.
         - "warning": only if the controller ends with one.
         - "diverged": only if the loss or the metric was no longer finite. It says where and why. The training stops
-          there, and the curves end with that interval, with a metric of NaN and no costs.
+          there, and the curves end with that interval, with a metric of NaN, and costs of zero unless its updates
+          were done.
 
     Raises:
         ValueError, TypeError: network, data or checkpoint do not fit the scene, or there is no such device here.
@@ -275,7 +276,7 @@ class _Run:
             reports = on_host(stepper.info for stepper in self.steppers)
             adjoints = on_host(stepper.adjoint_info for stepper in self.steppers)
             solves += sum(report.iterations[0].numel() for report in reports)
-            known = [loss, any_refused(reports), *spent_on(reports, adjoints)]
+            known = [loss, any_nonfinite(reports), *spent_on(reports, adjoints)]
             loss, refused, *spent = data_parallel.mean(known, len(reports[0].iterations))
             self._check(loss, refused, number)
             self.curves["update_loss"].append(loss)
@@ -317,8 +318,8 @@ class _Run:
             else:
                 self.controller.step(metric, error=error)
 
-    def _check(self, loss: float, refused: float, done: int) -> None:
+    def _check(self, loss: float, refused: float, number: int) -> None:
         if not math.isfinite(loss):
-            raise _Diverged(f"interval {done}: the loss is {loss}")
+            raise _Diverged(f"interval {number}: the loss is {loss}")
         if refused and not self.goes_on:
-            raise _Diverged(f"interval {done}: the solver was given NaN or Inf")
+            raise _Diverged(f"interval {number}: the solver was given NaN or Inf")

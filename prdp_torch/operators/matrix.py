@@ -44,6 +44,14 @@ class Matrix(Operator):
         like = given["values" if self.kind == "csr" else "matrix"]
         super().__init__([], [], given, null_spaces_of("Matrix", nullspace, left_nullspace, like))
 
+    def apply(self, v: Tensor) -> Tensor:
+        """Return A v, with gradients. v: (batch, n), or (n,)."""
+        return super().apply(v) if v.dim() > 1 else super().apply(v.unsqueeze(0)).squeeze(0)
+
+    def apply_transpose(self, v: Tensor) -> Tensor:
+        """Return Aᵀ v, with gradients. v: (batch, n), or (n,)."""
+        return super().apply_transpose(v) if v.dim() > 1 else super().apply_transpose(v.unsqueeze(0)).squeeze(0)
+
     def __repr__(self) -> str:
         values = self.tensors[2] if self.kind.endswith("csr") else self.tensors[0]
         of_one = values.dim() == 1 + (not self.kind.endswith("csr"))

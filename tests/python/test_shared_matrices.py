@@ -85,6 +85,17 @@ def test_fields_of_samples_go_through_vmap_with_b_alone(samples):
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-11)
 
 
+def test_products_take_a_lone_vector():
+    a, v = matrices(), rhs(7).detach()
+    for make in (dense, csr):
+        torch.testing.assert_close(make(a).apply(v), a @ v)
+        torch.testing.assert_close(make(a).apply_transpose(v), a.T @ v)
+    with pytest.raises(
+        ValueError, match=r"shape of a channel, \[7\], got \[7\]; give n.unsqueeze\(0\) for one vector n"
+    ):
+        prdp.linear_solve(operators.Matrix(a.detach(), nullspace=v), v, SOLVERS[1])
+
+
 def test_a_failed_solve_among_them_is_told():
     a, b = matrices(2), rhs(2, 3, 7).detach()
     b[1, 2, 0] = torch.nan

@@ -128,7 +128,7 @@ def test_cycles_run_on_the_host_whose_grids_are_kept(solver):
         u, info = prdp.linear_solve(make(scale * c), b, solver(k, 0.0), on_failure="return")
         torch.testing.assert_close(run.u, u, rtol=1e-9, atol=1e-11)
         assert torch.equal(run.device.fetch(run.info.status), info.status)
-    assert looks[1] == looks[2] and looks[1] - looks[0] <= 6
+    assert looks[1] == looks[2] == looks[0] + 3  # three more cycles
 
 
 @pytest.mark.parametrize("name", ["burgers", "navier_stokes"])

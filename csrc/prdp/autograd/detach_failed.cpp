@@ -24,7 +24,7 @@ at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status) {
   return at::where(per_sample(failed, u), u.detach(), u);
 }
 
-bool any_refused(const at::Tensor& status) {
+bool any_nonfinite(const at::Tensor& status) {
   if (!status.is_cpu() || at::isTensorSubclassLike(status)) return false;
   return status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)).any().item<bool>();
 }

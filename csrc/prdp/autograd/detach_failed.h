@@ -11,7 +11,7 @@ namespace prdp {
 at::Tensor detach_failed(const at::Tensor& u, const at::Tensor& status);
 
 /// Whether a sample was refused for a NaN or Inf in b or A, as far as the host can tell without waiting for a device.
-bool any_refused(const at::Tensor& status);
+bool any_nonfinite(const at::Tensor& status);
 
 /// From here on no gradient passes through a state u that A(u) and b(u) were made of, for samples whose solve has none:
 /// their zero cotangent times an infinite derivative of A or b would be NaN, which weights are shared by. Nothing with

@@ -104,7 +104,7 @@ void take_bits(const c10::SymInt& bits, Number& tolerance, c10::SymInt& traced) 
 
 }  // namespace detail
 
-/// Raises ValueError for names that do not exist, and for lists that are too short.
+/// Raises ValueError for names that do not exist, and for lists of a wrong length.
 inline SolveOptions unpack(const c10::List<std::string>& names, c10::SymIntArrayRef counts,
                            at::ArrayRef<double> numbers, at::TensorList preconditioner) {
   using namespace packed;

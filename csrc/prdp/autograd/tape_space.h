@@ -157,7 +157,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return values_.measured_sweep(value(c), value(x), fresh(next), nullptr);  // a residual alone; no derivative
   }
   Scalar radius2() const { return values_.radius2(); }
-  bool sweeps_contract() const { return values_.sweeps_contract(); }
+  bool sweeps_are_log_convex() const { return values_.sweeps_are_log_convex(); }
   Scalar residual(const Vector& x, Vector& r) {
     const T* from = value(x);
     const auto of = x.version;

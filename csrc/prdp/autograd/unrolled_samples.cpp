@@ -164,8 +164,8 @@ class SampleVjps {
     if (!may_mislead_ || !gradients_[0].defined()) return;
     Rows solved(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
-      const bool ended = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      solved[i] = ended && derivatives_[i] == Derivative::kOfIterations && finite_[i];
+      const bool is_solved = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
+      solved[i] = is_solved && derivatives_[i] == Derivative::kOfIterations && finite_[i];
     }
     if (!any(solved)) return;
     const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
@@ -174,7 +174,7 @@ class SampleVjps {
       misleading[i] = solved[i] && residual[i] > 1.0;
       to_look_at[i] = solved[i] && !misleading[i];
     }
-    if (needs_gradient_of_a_ && any(to_look_at)) add_misleading_gradients_of_a(to_look_at, misleading);
+    if (needs_gradient_of_a_ && any(to_look_at)) mark_misleading_gradients_of_a(to_look_at, misleading);
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
       if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
@@ -188,9 +188,9 @@ class SampleVjps {
     return t.dim() > 0 && t.size(0) == batch_ && (!axes || (*axes)[k] == t.dim());
   }
 
-  /// Those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that
+  /// Marks those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that
   /// share a tensor of A are looked at together: it has the sum of their gradients.
-  void add_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
+  void mark_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
     bool no_other_contributes = true;
     for (int64_t i = 0; i < batch_; ++i)
       no_other_contributes = no_other_contributes && (rows[i] || !finite_[i] || derivatives_[i] == Derivative::kNone);
@@ -202,13 +202,13 @@ class SampleVjps {
       if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
       const auto right = of_solution[k].to(at::kDouble), off = found[k + 1].detach() + right;
       const bool of_samples = is_of_samples(k);
-      const auto mark_misleading = [&](const auto& norm) {
+      const auto mark_by = [&](const auto& norm) {
         const auto is_misleading = norm(off).gt(norm(right)).expand({batch_}).contiguous();
         const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch_);
         for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
       };
-      if (of_samples) mark_misleading([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
-      if (!of_samples || is_function(spec_)) mark_misleading([](const at::Tensor& t) { return t.norm(); });
+      if (of_samples) mark_by([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
+      if (!of_samples || is_function(spec_)) mark_by([](const at::Tensor& t) { return t.norm(); });
     }
   }
 
@@ -216,7 +216,7 @@ class SampleVjps {
     auto good = finite_;
     for (int64_t i = 0; i < batch_; ++i) good[i] = finite_[i] && !adjoint_failed(i);
     if (good == finite_) return;
-    const auto outcomes_before = outcomes_;
+    const auto outcomes_before = outcomes_;  // for the sums alone: the failed adjoint solves stay in the report
     differentiate(good);
     outcomes_ = outcomes_before;
   }
@@ -229,7 +229,7 @@ class SampleVjps {
       if (!finite_[i])
         outcomes_[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
                                                                             : SolveStatus::kOverflow);
-    auto failures = outcomes_;
+    auto failures = outcomes_;  // the forward solve has reported its own
     for (int64_t i = 0; i < batch_; ++i)
       if (finite_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
     auto info = info_of(outcomes_, solved_.b.scalar_type());

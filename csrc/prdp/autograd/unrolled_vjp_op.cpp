@@ -55,7 +55,7 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
     if (needed[i]) inputs.push_back(i == 0 ? rhs : a.tensors[i - 1]);
   const auto gradients = torch::autograd::grad({u}, inputs, {cotangent}, /*retain_graph=*/true,
                                                /*create_graph=*/true, /*allow_unused=*/true);
-  return {in_places(gradients, needed), 2 * applications};
+  return {in_places(gradients, needed), 2 * applications};  // as many again on the way back
 }
 
 template <class... Args>

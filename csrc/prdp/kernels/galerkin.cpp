@@ -24,7 +24,8 @@ struct CoarseRun {
   int64_t first, count;
 };
 
-/// The fine points at the first point of a run and beside it, along the axis. There may be none before or after it.
+/// The fine points at the first point of a run and beside it, along the axis. Without
+/// has_before or has_after that neighbour is itself coarse, or there is none.
 struct Neighbourhood {
   Point before, here, after;
   bool has_before, has_after;
@@ -77,6 +78,7 @@ class CoarseCoefficients {
       const auto& o = offset_.along;
       return weights.data() + ringed_.at(p[0] + o[0], p[1] + o[1], p[2] + o[2]);
     };
+    // A neighbour that is itself coarse is interpolated from itself alone, and nothing is restricted from it.
     const auto& [interpolation, restriction] = transfer_;
     const int64_t to = run.row.first + run.first;
     const GalerkinProduct<T> product{.lower_before = side(kLower, before),

@@ -1,8 +1,8 @@
 #pragma once
 #include "prdp/kernels/vector_loops.h"
 
-/// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and for the
-/// same reason all of internal linkage.
+/// The part of loops.cpp for stencils with coefficients of their own at every point; included there only, and all
+/// of internal linkage, so that no code for one processor is linked in place of another's.
 namespace prdp::kernels {
 
 namespace {

@@ -59,7 +59,7 @@ void check_rows(const int64_t* crow, const int64_t* col, int64_t n, int64_t stor
 }
 
 at::Tensor solve_matrix(const at::Tensor& matrix, const at::Tensor& b, bool transposed) {
-  // A singular matrix gives a non-finite solution here, and a status there.
+  // A singular matrix gives numbers that are not finite; TensorSpace::solve_directly() calls that a breakdown.
   return solve_dense(transposed ? matrix.mT() : matrix, b.unsqueeze(-1)).squeeze(-1);
 }
 
@@ -77,7 +77,7 @@ DenseOperator::DenseOperator(const OperatorSpec& spec) {
 
 void DenseOperator::drop_axis_of_one() {
   if (matrix_.dim() == 2 || matrix_.sym_size(0) != 1) return;
-  has_axis_ = true;
+  had_axis_of_one_ = true;
   matrix_ = matrix_.select(0, 0);
 }
 
@@ -98,7 +98,7 @@ std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda, co
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
   if (matrix_.dim() == 3) return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
   const auto of_all = at::matmul(lambda.mT(), u);
-  return {has_axis_ ? of_all.unsqueeze(0) : of_all};
+  return {had_axis_of_one_ ? of_all.unsqueeze(0) : of_all};
 }
 
 std::vector<int64_t> DenseOperator::first_nonfinite(int64_t sample) const {
@@ -158,7 +158,8 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
                       index->sym_sizes(), " and ", values_.sym_sizes());
   check_has_rows(crow.sym_size(-1) - 1);
   const auto for_values = [&](const at::Tensor& index) {
-    // Each operation takes its time on a GPU; within a transform this one makes of the index what the values are.
+    // A conversion takes its time on a GPU: none where the dtype is right. But within a transform it wraps the index as
+    // the values are wrapped.
     const auto whole = index.scalar_type() == at::kLong && !in_torch_func() ? index : index.to(at::kLong);
     return batched && whole.dim() == 1 ? whole.expand_symint({values_.sym_size(0), -1}) : whole;
   };
@@ -169,13 +170,13 @@ CsrOperator::CsrOperator(const OperatorSpec& spec) {
 
 void CsrOperator::drop_axis_of_one() {
   if (values_.dim() == 1 || values_.sym_size(0) != 1) return;
-  has_axis_ = true;
+  had_axis_of_one_ = true;
   for (auto* t : {&crow_, &col_, &values_}) *t = t->select(0, 0);
 }
 
 void CsrOperator::check_parameters(Checks checks) const {
   if (checks == Checks::kHost) return;
-  // Tensors that stand for others while a graph is traced have no numbers yet: the kernel checks them.
+  // Tensors that stand for others while a graph is traced have no numbers yet: the op checks them when it runs.
   if (at::isTensorSubclassLike(crow_) || at::isTensorSubclassLike(col_) || crow_.is_meta()) return;
   const auto crow = crow_.to(at::kCPU).contiguous(), col = col_.to(at::kCPU).contiguous();
   const int64_t matrices = values_.dim() == 2 ? values_.size(0) : 1, stored = values_.size(-1);
@@ -266,7 +267,7 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, cons
   if (has_product_kernel(lambda, u) && values_.numel() > 0) {
     const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
     const auto all = by_kernel(lambda.contiguous(), u.contiguous(), shared_or_own(crow_), shared_or_own(col_), values_);
-    if (all.defined()) return {at::Tensor(), at::Tensor(), has_axis_ ? all.unsqueeze(0) : all};
+    if (all.defined()) return {at::Tensor(), at::Tensor(), had_axis_of_one_ ? all.unsqueeze(0) : all};
   }
   // ∂⟨λ, A u⟩/∂A_ij = λ_i u_j at the stored entries, summed over the samples that share A
   const auto col = col_.expand({u.size(0), -1});
@@ -274,7 +275,7 @@ std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, cons
   const auto outer = lambda.gather(1, row) * u.gather(1, col);
   if (values_.dim() == 2) return {at::Tensor(), at::Tensor(), outer};
   const auto of_all = outer.sum(0);
-  return {at::Tensor(), at::Tensor(), has_axis_ ? of_all.unsqueeze(0) : of_all};
+  return {at::Tensor(), at::Tensor(), had_axis_of_one_ ? of_all.unsqueeze(0) : of_all};
 }
 
 std::vector<int64_t> CsrOperator::first_nonfinite(int64_t sample) const {
@@ -299,7 +300,8 @@ std::unique_ptr<Operator> CsrOperator::select(const at::Tensor& index) const {
 std::shared_ptr<const kernels::Kernels> CsrOperator::kernels(const at::Tensor& b, bool transposed) const {
   const auto of_samples = [transposed, n = n(), crow = crow_.contiguous(), col = col_.contiguous(),
                            a = values_.detach().contiguous()]<class T>(T) -> kernels::KernelBatch<T> {
-    const int64_t stored = a.size(-1), own = a.dim() == 2 && a.size(0) > 1;
+    const int64_t stored = a.size(-1);
+    const bool own = a.dim() == 2 && a.size(0) > 1;
     return {!own, [=](int64_t s) -> std::unique_ptr<kernels::Kernel<T>> {
               const T* values = a.template const_data_ptr<T>() + own * s * stored;
               const T magnitude = kernels::largest_magnitude(values, stored);

@@ -26,7 +26,7 @@ class DenseOperator final : public Operator {
   void drop_axis_of_one();
 
   at::Tensor matrix_;        // (n, n) or (batch, n, n)
-  bool has_axis_ = false;    // it was (1, n, n)
+  bool had_axis_of_one_ = false;    // it was (1, n, n)
 };
 
 /// A sparse matrix as compressed rows; tensors (crow, col, values), each (…) or (batch, …); only
@@ -61,7 +61,7 @@ class CsrOperator final : public Operator {
   void drop_axis_of_one();
 
   at::Tensor crow_, col_, values_;  // (…) or (batch, …)
-  bool has_axis_ = false;           // values were (1, nnz)
+  bool had_axis_of_one_ = false;           // values were (1, nnz)
   mutable at::Tensor rows_;
 };
 

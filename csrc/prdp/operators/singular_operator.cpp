@@ -70,9 +70,11 @@ void SingularOperator::check_vector(const at::Tensor& b) const {
     const auto& basis = side->given;
     const auto vector = b.sym_sizes().slice(1), channel = b.sym_sizes().slice(b.dim() < 3 ? 1 : 2);
     const auto given = basis.sym_sizes().slice(basis.dim() > 0);
-    TORCH_CHECK_VALUE(basis.dim() >= 2 && (given == channel || given == vector), title_,
-                      ": a null space must have shape (k, *shape) with the shape of a channel, ", channel,
-                      b.dim() < 3 ? "" : ", or (k, channels, *shape)", ", got ", basis.sym_sizes());
+    TORCH_CHECK_VALUE(
+        basis.dim() >= 2 && (given == channel || given == vector), title_,
+        ": a null space must have shape (k, *shape) with the shape of a channel, ", channel,
+        b.dim() < 3 ? "" : ", or (k, channels, *shape)", ", got ", basis.sym_sizes(),
+        basis.sym_sizes() == channel || basis.sym_sizes() == vector ? "; give n.unsqueeze(0) for one vector n" : "");
     TORCH_CHECK_VALUE(basis.device() == b.device(), title_, ": its null space is on ", basis.device(),
                       " but the vector is on ", b.device());
   }

@@ -57,8 +57,7 @@ void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& 
     if (rtol > 0.0 && done > 0) confirm();
   if constexpr (kTakesStrides<Method>) method.step(1);
   else method.step();
-  if constexpr (kLeastResidual<Method>)
-    method.residual2();  // for what it does: it takes back a cycle that made it grow
+  if constexpr (kMayExhaust<Method>) method.residual2();  // for what it does: it takes back a cycle that made it grow
 }
 
 /// Recomputes the residual of each sample that is not concluded, and sets its status.
@@ -78,7 +77,7 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
   }
   stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
     const bool unsolved =
-        s.status == SolveStatus::kMaxIter || (kLeastResidual<Method> && s.status == SolveStatus::kBreakdown);
+        s.status == SolveStatus::kMaxIter || (kMayExhaust<Method> && s.status == SolveStatus::kBreakdown);
     return rtol > 0.0 && !s.concluded && unsolved;
   });
   for (auto& s : states) {

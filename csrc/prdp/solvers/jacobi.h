@@ -46,7 +46,7 @@ class JacobiMethod {
   /// Of its own, as a sweep at a fixed point of its rounding changes nothing, however large b - A x is.
   auto recompute_residual() { return space_.residual(x, r_); }
   /// With a symmetric iteration matrix G, ‖Gr‖² = r·G²r <= ‖r‖ ‖G²r‖: the residual falls by ever less.
-  bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_contract(); }
+  bool residual_is_log_convex() const { return !accelerated_ && space_.sweeps_are_log_convex(); }
 
   /// What the next iteration starts from; resume() once it has been put back, as after `done` iterations.
   auto iteration_state() { return std::tie(x); }

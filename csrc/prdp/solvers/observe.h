@@ -8,11 +8,11 @@
 /// How the loop around the methods (iterate.h) looks at residuals, and stops the samples that are done.
 namespace prdp::detail {
 
-/// GMRES and its like: each iteration takes the least residual over a space, which may be exhausted.
+/// GMRES in its two forms, not MINRES: each cycle takes the least residual over a space, which may be exhausted.
 template <class Method>
-inline constexpr bool kLeastResidual = requires(const Method& m) { m.exhausted(); };
+inline constexpr bool kMayExhaust = requires(const Method& m) { m.exhausted(); };
 
-/// Methods that may say how their residual falls, and then take several iterations in one step.
+/// Methods whose step takes several iterations: up to the next look, or all where nobody looks.
 template <class Method>
 inline constexpr bool kTakesStrides = requires(Method& m, int64_t n) { m.step(n); };
 
@@ -77,7 +77,7 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
 /// Of each sample, whether the space of a method of least residuals is exhausted; nothing for other methods.
 template <class Space, class Method>
 auto exhausted_of(Space& space, const Method& method) {
-  if constexpr (kLeastResidual<Method>) return space.values_of(method.exhausted());
+  if constexpr (kMayExhaust<Method>) return space.values_of(method.exhausted());
   else return 0;
 }
 
@@ -100,7 +100,7 @@ bool judge_known_residuals(Space& space, Method& method, typename Space::States&
       continue;
     }
     judge(s, rtol);
-    if constexpr (kLeastResidual<Method>) {
+    if constexpr (kMayExhaust<Method>) {
       if (s.active && rtol > 0.0) judge_progress(s, exhausted[i] != 0.0);
     }
     if constexpr (kTakesStrides<Method>) plan_next_look(s, method.residual_is_log_convex(), rtol);
@@ -121,7 +121,7 @@ void stop_what_idles(Space& space, const Method& method, typename Space::States&
     stop_at_rounding_floor(space, method, states, rtol,
                            [rtol](const SampleState& s) { return rtol > 0.0 && !s.candidate && is_idle<Method>(s); });
   }
-  if constexpr (kLeastResidual<Method>)
+  if constexpr (kMayExhaust<Method>)
     stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) {
       return s.active && !s.candidate && s.cycles_without_progress > 0;
     });
@@ -139,7 +139,7 @@ void confirm_candidates(Space& space, Method& method, typename Space::States& st
     s.residual2 = true_residual2[i];
     judge(s, rtol);
     if (s.active && has_drifted(s, rtol)) s.stop(SolveStatus::kStagnated);
-    if constexpr (kLeastResidual<Method>) {
+    if constexpr (kMayExhaust<Method>) {
       if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
     }
     s.rejected2 = s.residual2;

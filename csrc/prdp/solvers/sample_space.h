@@ -153,7 +153,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     return static_cast<T>(radius * radius);
   }
   /// Whether the norms of Jacobi's residuals are a convex sequence on a logarithmic scale.
-  bool sweeps_contract() const { return system_.a().radius().has_value(); }
+  bool sweeps_are_log_convex() const { return system_.a().radius().has_value(); }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(solution(x), r);

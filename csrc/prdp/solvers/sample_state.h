@@ -42,7 +42,7 @@ struct SampleState {
   int64_t cycles_without_progress = 0;  // for methods whose residual never grows
   double last_progress2 = std::numeric_limits<double>::infinity();  // the residual that last fell
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
-  double floor2 = 0.0;  // where it stopped at its rounding, the square of that: ε ‖A‖ ‖u‖
+  double floor2 = 0.0;  // where it stopped at rounding, the square of that: ε ‖A‖ ‖u‖, or what verdicts.h takes for it
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
   Answer answer = Answer::kLast;
 
@@ -76,7 +76,7 @@ struct SampleOutcome {
   SolveStatus status = SolveStatus::kMaxIter;
   int64_t iterations = 0, applications = 0;
   double residual = 0.0, floor = 0.0;  // relative to ‖b‖
-  bool is_zero = false;                // u is zero in place of an iterate, and yet to be written
+  bool is_zero = false;  // u is zero in place of an iterate, and yet to be written
 };
 
 }  // namespace prdp

@@ -26,7 +26,7 @@ std::string not_made(const Solver& solver) {
          " has no kernel";
 }
 
-/// Entries of a vector that a null space belongs to: those of a channel.
+/// Entries of a vector that a null space belongs to: those of a channel, or of all that it spans.
 int64_t length_of(const at::Tensor& basis, const at::Tensor& b) {
   if (basis.defined() && basis.numel() > 0) return basis.size(1);
   return b.numel() / (b.size(0) * (b.dim() < 3 ? 1 : b.size(1)));
@@ -108,7 +108,7 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
   return result;
 }
 
-/// For A, or Aᵀ; `kept` may have its coarse grids, or keeps them. Nothing where there is none.
+/// For A, or Aᵀ; `kept` may have its coarse grids, or keeps them. Nothing where there is no kernel.
 std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver,
                                 KeptHierarchy* kept) {
   auto* const runtime = runtime_of(b.device());
@@ -127,7 +127,8 @@ std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Te
     // The grids are those of the forward A, also where this is its transpose.
     if (m.is_multigrid() && !hierarchy.defined())
       maker = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
-    const auto made = solve_kernel(*view, !a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
+    const auto made =
+        solve_kernel(*view, /*is_saddle_point=*/!a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
     auto kernel = runtime->kernel(b.device(), made.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
     if (maker) hierarchy = make_hierarchy(*maker, b);

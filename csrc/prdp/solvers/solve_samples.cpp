@@ -34,8 +34,8 @@ GivenSample<T> given_sample(const SampleBatch<T>& batch, int64_t s) {
 /// Reports on a sample that needs no iterations, or gets none; returns false for all others. Without a kernel, A is not
 /// finite.
 template <class T>
-bool settled_beforehand(const SampleBatch<T>& batch, int64_t s, const GivenSample<T>& sample,
-                        const kernels::Kernel<T>* a) {
+bool report_if_settled(const SampleBatch<T>& batch, int64_t s, const GivenSample<T>& sample,
+                       const kernels::Kernel<T>* a) {
   const T start = sample.x0 ? kernels::largest_magnitude(sample.x0, batch.unknowns) : T(0);
   const auto divides_by_zero = [&] { return divides_by_diagonal(batch.solver) && a->has_zero_diagonal(); };
   SampleOutcome outcome;
@@ -84,7 +84,7 @@ void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>
     for (; s < end; ++s) {
       a = kernel_of(s);
       sample = given_sample(batch, s);
-      if (settled_beforehand(batch, s, sample, a)) continue;
+      if (report_if_settled(batch, s, sample, a)) continue;
       if (shared && a == in_system) return true;
       in_system = nullptr;
       if (system.set(*a, solver.preconditioner, shared ? shared->factors : factors_of(*a, solver))) {

@@ -39,7 +39,8 @@ void fill_states(std::vector<SampleState>& states, const PreparedBatch& batch, c
 /// freed untouched raises the bound, as the first large tensor of a training would.
 void keep_top_of_heap() {
   [[maybe_unused]] static const bool done = [] {
-    void* volatile block = std::malloc((size_t{32} << 20) - 8192);  // volatile: or the pair is optimised away
+    // Just below 32 MiB: for no larger block glibc raises that bound. Volatile, or the pair is optimised away.
+    void* volatile block = std::malloc((size_t{32} << 20) - 8192);
     std::free(block);
     return true;
   }();
@@ -79,7 +80,7 @@ SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const Sol
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
   TensorSpace space(system, batch.rhs, states);
-  fill_states(states, batch, space.b2());
+  fill_states(states, batch, space.b2());  // before start_from(), after which b2() is that of the start's residual
   if (batch.start.x.defined()) space.start_from(batch.start.x, batch.start.r);
 
   const auto run = [&](auto method) {

@@ -30,10 +30,11 @@ concept Primitives =
              typename S::Vector r, typename S::Scalar alpha, typename S::Scalar beta) {
       /// A vector of zeros, which the method keeps.
       { s.vector() } -> std::convertible_to<typename S::Vector>;
-      /// The right-hand side, scaled to the order of one; with a start, the residual of the start. And ‖b‖².
+      /// The right-hand side, scaled to the order of one; with a start, the residual of the start. And the squared norm
+      /// of what b() is now; SampleState::b2 keeps that of the right-hand side.
       { s.b() } -> std::convertible_to<typename S::Vector>;
       { s.b2() } -> std::convertible_to<typename S::Scalar>;
-      /// Entries of a vector; unit roundoff.
+      /// Entries of a vector; unit roundoff, which is half the ε of the comments below.
       { s.unknowns() } -> std::same_as<int64_t>;
       { s.epsilon() } -> std::same_as<double>;
 
@@ -53,7 +54,7 @@ concept Primitives =
       { s.update_iterate_and_residual(alpha, p, q, x, r) } -> std::same_as<typename S::Scalar>;
       /// y = A x
       s.apply(x, y);
-      /// r = b - A x, projected on the range of A; with a start, of x and the start. Returns ‖r‖².
+      /// r = b - A x; with a start, the right-hand side - A (start + x). Projected on the range of A. Returns ‖r‖².
       { s.residual(x, r) } -> std::same_as<typename S::Scalar>;
       /// y = M⁻¹ x, which returns x·y; and whether there is a preconditioner M.
       { s.precondition(x, y) } -> std::same_as<typename S::Scalar>;
@@ -70,7 +71,8 @@ concept FusedOperations =
       { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
       /// y = A x; returns p·y and ‖y‖², both for the guarded_quotient() that makes the next step.
       { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-      /// y = M⁻¹ x ≈ A⁻¹ x, of the A that residual() has: no scale of the two is left open.
+      /// y = M⁻¹ x ≈ A⁻¹ x, without the powers of two that TensorSpace puts into apply() and precondition(): a method
+      /// that calls this calls neither.
       s.correct(x, y);
     };
 
@@ -126,7 +128,7 @@ concept SweepingSpace = VectorSpace<S> && requires(S s, typename S::Vector c, ty
   /// The square of the spectral radius of I - D⁻¹A.
   { s.radius2() } -> std::same_as<typename S::Scalar>;
   /// Whether the norms of Jacobi's residuals are known to be a convex sequence on a logarithmic scale.
-  { s.sweeps_contract() } -> std::same_as<bool>;
+  { s.sweeps_are_log_convex() } -> std::same_as<bool>;
 };
 
 /// What GMRES and MINRES need beside: a basis, and numbers that may vanish.

@@ -68,21 +68,21 @@ TensorSpace::Vector TensorSpace::product(const Vector& v) {
   return laid_out(system_.a.apply(in_loops_ ? v.detach() : v));  // a handle of its own, which a product may keep
 }
 
-TensorSpace::Vector TensorSpace::unscaled_product(const Vector& v) {
+TensorSpace::Vector TensorSpace::product_setting_scale(const Vector& v) {
   auto made = product(v);
   define_scale(made, v, system_.scale_of_a);
   return made;
 }
 
 void TensorSpace::apply(const Vector& v, Vector& out) {
-  const auto made = unscaled_product(v);
+  const auto made = product_setting_scale(v);
   if (in_loops_) return batch_loops::scale(system_.scale_of_a, made, out);
   out = made * system_.scale_of_a;
 }
 
 std::array<TensorSpace::Scalar, 2> TensorSpace::apply_along(const Vector& v, const Vector& w, Vector& out) {
   if (in_loops_) {
-    const auto made = unscaled_product(v);  // first: it sets the scale
+    const auto made = product_setting_scale(v);  // first: it sets the scale
     return batch_loops::scale_with_dots(system_.scale_of_a, made, w, out);
   }
   apply(v, out);
@@ -133,7 +133,7 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
 
 TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
   const auto u = solution(x).detach();
-  const auto negated = unstructured_like(u).lt(0);  // as is_negated()
+  const auto negated = unstructured_like(u).lt(0);  // as is_negated() of sample_numbers.h
   const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
   return dot(terms, terms);
 }

@@ -121,7 +121,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   }
   Scalar measured_sweep(const Vector& c, const Vector& x, Vector& y, const Scalar* omega);
   Scalar radius2() const { return system_.a.jacobi_radius().square(); }
-  static constexpr bool sweeps_contract() { return false; }  // not known of the operator
+  static constexpr bool sweeps_are_log_convex() { return false; }  // not known of the operator
 
   // ---- GMRES and MINRES (tensor_space_basis.cpp)
 
@@ -182,7 +182,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   /// A v, not scaled, and counted.
   Vector product(const Vector& v);
   /// The same; from then on, the scale of A is known.
-  Vector unscaled_product(const Vector& v);
+  Vector product_setting_scale(const Vector& v);
   /// Sets the scale that brings the product to the order of v, if it is not known yet.
   void define_scale(const Vector& product, const Vector& v, at::Tensor& scale) const;
   void check_scale(const at::Tensor& scale) const;

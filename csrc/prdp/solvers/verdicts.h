@@ -32,7 +32,7 @@ inline bool has_drifted(const SampleState& s, double rtol) {
   return s.residual2 > 0.25 * s.rejected2 && s.residual2 > 2.25 * rtol * rtol * s.b2;
 }
 
-/// A method of least residuals that no longer moves: a breakdown where its space is exhausted, and
+/// GMRES that no longer moves: a breakdown where its space is exhausted, and
 /// stagnation where several cycles in a row have not taken a thousandth off the residual.
 inline void judge_progress(SampleState& s, bool exhausted) {
   constexpr double progress2 = 0.998;

@@ -63,8 +63,8 @@ SolveInfo joined(const SolveInfo& before, const SolveInfo& last) {
 SolveResult step(const Equation& equation, const at::Tensor& u, const SolveOptions& options) {
   check_memory(options, u);
   const auto b = equation_rhs(equation, u);
-  const auto solve_about = [&](const at::Tensor& winds) {
-    return linear_solve(equation_operator(equation, winds), b, options, start_of_step(options, winds));
+  const auto solve_about = [&](const at::Tensor& state) {
+    return linear_solve(equation_operator(equation, state), b, options, start_of_step(options, state));
   };
   auto result = solve_about(u);
   for (int64_t k = 1; k < equation.picard_steps; ++k) {

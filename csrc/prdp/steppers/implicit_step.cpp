@@ -24,7 +24,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
   const bool may_lose = options_.on_failure != OnFailure::kRaise && u.requires_grad();
   if (!may_lose || u.is_cpu()) {
     auto result = solve_from(u, adjoint_log);
-    if (!may_lose || !any_refused(result.info.status)) return result;
+    if (!may_lose || !any_nonfinite(result.info.status)) return result;
   }
   // On the CPU not before a sample is refused: gradients that go through a view are summed in another order.
   const auto state = at::alias(u);

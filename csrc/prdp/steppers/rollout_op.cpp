@@ -76,9 +76,8 @@ std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSo
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < found.size(); ++i) {
     if (!needed[i]) continue;
-    gradients.push_back(!found[i].defined() ? at::zeros_like(equation.tensors[i - 1])
-                        : i == 0            ? found[i].contiguous()
-                                            : found[i]);
+    if (i == 0) gradients.push_back(found[0].contiguous());  // defined where it is needed
+    else gradients.push_back(found[i].defined() ? found[i] : at::zeros_like(equation.tensors[i - 1]));
   }
   return gradients;
 }

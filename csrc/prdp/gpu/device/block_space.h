@@ -190,7 +190,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     return team_.sum(s);
   }
   Scalar radius2() const { return static_cast<T>(a_.radius() * a_.radius()); }
-  static constexpr bool sweeps_contract() { return A::kKnowsRadius; }
+  static constexpr bool sweeps_are_log_convex() { return A::kKnowsRadius; }
 
   /// Seldom: one thread computes it.
   PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,

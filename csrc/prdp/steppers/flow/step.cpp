@@ -23,7 +23,7 @@ at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
   return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
 }
 
-/// The change of the velocity by explicit Euler.
+/// The velocity that the explicit part starts from, and its change by explicit Euler.
 struct ExplicitPart {
   at::Tensor velocity, change;
 };
@@ -37,9 +37,10 @@ ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundar
 struct Beginning {
   at::Tensor velocity;
   RefusedSamples refused;                           // with kernels, only where the host looks
-  std::optional<flow_kernels::Start> of_kernels{};  // its status says which these are; all their values are zero
+  std::optional<flow_kernels::Start> of_kernels{};  // its status names the refused, whose values are zero
 
-  at::Tensor mask() const { return of_kernels ? at::Tensor() : refused.mask; }
+  /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
+  at::Tensor to_clear() const { return of_kernels ? at::Tensor() : refused.mask; }
   /// 0, or why a sample was refused; undefined: none was.
   at::Tensor status() const {
     if (of_kernels) return of_kernels->status;
@@ -91,11 +92,12 @@ std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<a
 /// The gradients of a step by recording it and differentiating what was recorded; for derivatives of derivatives.
 std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                      SolveOptions options, at::IntArrayRef needed) {
-  options.adjoint_log = 0;
+  options.adjoint_log = 0;  // the solves are nodes of their own here: each would log itself as the whole step
   const auto given = equation.tensors();
   std::vector<at::Tensor> inputs{input_of(u, needed[0])};
   for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
-  const auto step = flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, false);
+  const auto step =
+      flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, /*reported=*/false);
   return gradients({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed, /*create_graph=*/true);
 }
 
@@ -143,15 +145,15 @@ std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, cons
 /// The way back through the diffusion and the balance.
 struct ImplicitBack {
   const FlowEquation& e;
-  const at::Tensor &cotangent, &potential_bar;
+  const at::Tensor &diffused_bar, &potential_bar;
   const SolveOptions& options;
   std::vector<OperatorSpec> operators{};
   flow_kernels::ImplicitPart part{};
 
-  ImplicitBack(const FlowEquation& equation, const at::Tensor& diffused_bar, const at::Tensor& potential_bar,
+  ImplicitBack(const FlowEquation& equation, const at::Tensor& of_diffused, const at::Tensor& of_potential,
                const SolveOptions& o)
-      : e(equation), cotangent(diffused_bar), potential_bar(potential_bar), options(o) {
-    if (is_implicit(e)) operators = diffusion_operators(e, cotangent);
+      : e(equation), diffused_bar(of_diffused), potential_bar(of_potential), options(o) {
+    if (is_implicit(e)) operators = diffusion_operators(e, diffused_bar);
   }
 
   /// Balances and diffuses again: the gradient of ν needs what came of it.
@@ -167,7 +169,7 @@ struct ImplicitBack {
   }
   /// The cotangents of the change and, with `of_nu`, of ν, for which run_forward() comes first.
   DiffuseVjp back(bool of_nu, CombinedInfo& info) {
-    auto found = diffuse_vjp(e, operators, cotangent, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
+    auto found = diffuse_vjp(e, operators, diffused_bar, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
     part.lambda = found.change;
     auto balanced = balance_vjp(e, found.change, potential_bar, of_nu ? part.change : at::Tensor(), options, info);
     add_to(balanced.nu, found.nu);
@@ -191,7 +193,7 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
       is_implicit(e) ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info) : FlowParts{change};
   const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
   const bool none_refused = looks && !refused.mask.defined();
-  return {cleared(next, beginning.mask()), cleared(potential, beginning.mask()),
+  return {cleared(next, beginning.to_clear()), cleared(potential, beginning.to_clear()),
           info.info(none_refused ? at::Tensor() : beginning.status())};
 }
 
@@ -201,15 +203,16 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
   const auto e = equation.for_state(u);
   const bool needs_nu = needed[1] != 0;  // u is first, then equation.tensors(), ν at their head
   const auto beginning = begin(e, u, /*looks=*/false);
-  const auto refused = beginning.mask();
+  const auto to_clear = beginning.to_clear();
   CombinedInfo adjoint;
-  const auto potential_bar = cleared(cotangent.potential, refused);
+  const auto potential_bar = cleared(cotangent.potential, to_clear);
   const auto velocity_bar =
-      project_vjp(*e.box, cleared(cotangent.u, refused), potential_bar, beginning.status(), options, adjoint);
+      project_vjp(*e.box, cleared(cotangent.u, to_clear), potential_bar, beginning.status(), options, adjoint);
   DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
   ImplicitBack implicit(e, velocity_bar.on_free_faces, potential_bar, options);
   if (is_implicit(e)) {
     if (needs_nu) implicit.run_forward(explicit_part(e, beginning).change);
+    // With kernels the share of ν is made below, of implicit.part; else it comes with this solve.
     back = implicit.back(/*of_nu=*/needs_nu && !beginning.of_kernels, adjoint);
   }
   info = adjoint.info();
@@ -218,12 +221,13 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
     auto found =
         flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
     if (found) return as_given(equation, *std::move(found), needed);
+    // The same adjoint solve again, now with the share of ν; `info`, taken above, does not count it.
     if (is_implicit(e) && needs_nu) back = implicit.back(/*of_nu=*/true, adjoint);
     return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
   }
   // On the CPU by loops, else by autograd.
   const auto by_loops = flow_has_loops(u);
-  return (by_loops ? explicit_vjp_by_loops : explicit_vjp_by_autograd)(equation, u, refused, velocity_bar.u, back,
+  return (by_loops ? explicit_vjp_by_loops : explicit_vjp_by_autograd)(equation, u, to_clear, velocity_bar.u, back,
                                                                        needed);
 }
 

@@ -22,7 +22,8 @@ struct FlowCotangent {
 };
 
 /// The gradients of u and the tensors of the equation from these, in implicit mode: undefined where `needed` holds 0.
-/// Needs the state u alone. Where autograd records, they are differentiable. `info`: the report of the adjoint solves.
+/// Needs the state u alone. Where autograd records, they are differentiable. `info`: the report of the adjoint solves;
+/// left empty where autograd records.
 std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info);
 
