@@ -25,11 +25,11 @@ class Ended(NamedTuple):
             if info is None:
                 residuals.append((0.0, 0.0))
                 continue
-            parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations)])
-            residual, floor, iterations = parts.cpu()  # one copy of a device
+            parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations, info.status)])
+            residual, floor, iterations, status = parts.cpu()  # one copy of a device
             residual = residual.masked_fill(floor > 0, 0.0)  # it is rounding alone
             residuals.append((float(residual.sum()), float(residual.numel())))
-            is_idle = ((iterations == 0) & (residual > _C.SMALL_RESIDUAL)).double()
+            is_idle = ((iterations == 0) & (status > 0) & (residual > _C.SMALL_RESIDUAL)).double()  # K may be 0
             idle.append(float(is_idle.mean()) if is_idle.numel() else 0.0)
         return cls(residuals, max(idle))
 

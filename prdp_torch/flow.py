@@ -130,6 +130,8 @@ class Flow(HoldsTensors, Stepper):
                 self._set(name, _checked(name, value))
             elif name in TENSORS:
                 self._hold(name, _checked(name, value))
+            elif name == "pressure":
+                raise AttributeError("Flow: pressure is a method; the form of the argument is set by pressure_form")
             else:
                 super().__setattr__(name, value)
 
@@ -196,13 +198,14 @@ class Flow(HoldsTensors, Stepper):
 
     @not_in_graphs
     def project(self, u: Tensor) -> Tensor:
-        """Return the velocity nearest to u that has the boundary values and no divergence."""
+        """Return the velocity nearest to u that has the boundary values and no divergence. NaN in u remains, and `info`
+        stays that of the last step."""
         return self._equation().project(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     @not_in_graphs
     def pressure(self, u: Tensor) -> Tensor:
         """Return the pressure of the step from u, (batch, 1, *shape). It is zero inside obstacles, and its mean is zero
-        unless an axis is open."""
+        unless an axis is open. `info` stays that of the last step."""
         return self._equation().pressure(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     @not_in_graphs

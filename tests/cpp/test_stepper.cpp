@@ -51,6 +51,24 @@ TEST(Heat, BudgetMayChangeAtAnyTime) {
   EXPECT_THROW(heat.set_max_iter(-1), c10::ValueError);
 }
 
+TEST(Heat, ABudgetKeepsThePreconditioner) {
+  const auto u = prdp_test::random_field({30}, 2);
+  for (const prdp::Solver& solver :
+       {prdp::Solver(prdp::Multigrid{.max_iter = 1}),
+        prdp::Solver(prdp::CG{.max_iter = 1, .preconditioner = prdp::Preconditioner::multigrid()})}) {
+    auto heat = prdp::Heat({30}, 0.05, 1.0, solver);
+    heat.set_max_iter(30);
+    heat(u);
+    EXPECT_TRUE(heat.converged());
+    EXPECT_LT(heat.info()->iterations.max().item<int64_t>(), 15);
+  }
+}
+
+TEST(Heat, ASolverThatNobodyGaveIsRefused) {
+  EXPECT_THROW(prdp::Heat({30}, 0.05, 1.0, prdp::Solver{}), c10::ValueError);
+  EXPECT_THROW(prdp::linear_solve(prdp::matrix(at::eye(3)), at::ones({3}), prdp::SolveOptions{}), c10::ValueError);
+}
+
 TEST(Heat, AStepThatThrowsLeavesNoReportOfAnEarlierOne) {
   auto heat = prdp::Heat({30}, 1e-3, 1.0, prdp::CG{.max_iter = 100});
   auto u = prdp_test::random_field({30}, 2);

@@ -1,5 +1,7 @@
 """What a controller warns of: solves that make the error, take no iteration, or stall."""
 
+import warnings
+
 import torch
 from helpers import field, heat_step
 
@@ -44,6 +46,26 @@ def test_solves_that_take_no_iteration_are_told():
         controller.step(0.9)
         assert (int(heat.info.iterations.max()) == 0) == told
         assert ("took no iteration" in (controller.warning or "")) == told
+
+
+def test_no_iterations_that_were_asked_for_are_not_told():
+    heat = heat_step()
+    controller = prdp.LinearSchedule([heat], initial=0, increment=0, maximum=1)
+    heat(field((30,)))
+    controller.step()
+    assert heat.info.iterations.eq(0).all() and "took no iteration" not in (controller.warning or "")
+
+
+def test_a_warning_that_lasts_is_said_though_the_controller_refines():
+    heat = heat_step()
+    heat(field((30,)))  # K = 1, which leaves a large residual
+    controller = prdp.ToleranceController([heat])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        controller.step(1.0)
+        for k in range(40):
+            assert controller.step(0.9 * 0.97**k)  # refines in every interval
+    assert len(said) == 1 and "the solves stop at a residual of" in str(said[0].message)
 
 
 def test_without_an_error_prdp_warns_of_a_stalled_metric():

@@ -1,12 +1,14 @@
 """Multigrid as a preconditioner and as a method: dense truth, both derivatives, threads, failures."""
 
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers import field, statuses
+from helpers import field, statuses, written
 
 import prdp_torch as prdp
 from prdp_torch import _C, operators
@@ -197,6 +199,17 @@ def test_what_it_cannot_do_is_said():
     assert statuses(info) == ["ZERO_DIAGONAL"]
     with pytest.raises(ValueError, match="smoothing"):
         prdp.Multigrid(3, smoothing=0)
+
+
+@pytest.mark.parametrize("way", ["--auto", "--prdp"])
+def test_the_cpp_trainer_refines_it(tmp_path, way):
+    path = written(tmp_path, ('method = "jacobi"', 'method = "multigrid"'))
+    trainer = Path(__file__).parents[2] / "build" / "prdp_train"
+    command = [trainer, path, "--out", tmp_path / "out", way, "--intervals", "3"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (record,) = (tmp_path / "out").glob("*/seed_0.json")
+    assert json.loads(record.read_text())["curves"]["failed"] == [0, 0, 0]
 
 
 def test_steps_and_rollouts_take_it():

@@ -162,6 +162,12 @@ def test_numbers_parameters_and_buffers_that_are_set_are_state():
     assert set(flow.state_dict()) == STATE - {"force"} and not list(flow.parameters())
 
 
+def test_the_form_of_the_pressure_is_not_set_over_the_method():
+    flow = prdp.Flow((8, 8), nu=0.1, dt=0.01)
+    with pytest.raises(AttributeError, match="pressure is a method; the form of the argument is set by pressure_form"):
+        flow.pressure = "plain"
+
+
 def test_controllers_set_the_tolerance():
     flow = prdp.Flow((16, 16), 0.1, 0.01)
     controller = prdp.ToleranceController([flow], ratio=0.1)

@@ -31,7 +31,8 @@ at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpe
   rhs = without_lost(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
   // No u has a part in the null space, whatever b has.
-  const auto tangent = linear_solve(spec, make_operator(spec)->project(rhs), options);
+  const auto made = make_operator(spec);
+  const auto tangent = linear_solve(spec, made->project(made->project(rhs)), options);  // as of an adjoint solve
   return options.on_failure == OnFailure::kZeroGrad ? without_lost(tangent.u, tangent.info.status, options.on_failure)
                                                     : tangent.u;
 }

@@ -22,7 +22,7 @@ Solves last_solves(const std::vector<const StepperBase*>& steppers) {
     const auto beyond_rounding = info.residual.masked_fill(info.floor.gt(0), 0.0);
     const auto residual = beyond_rounding.to(at::kDouble).mean().item<double>();
     if (std::isfinite(residual)) solves.residual = std::max(residual, solves.residual.value_or(0.0));
-    const auto idle = info.iterations.eq(0) & (beyond_rounding > kSmallResidual);
+    const auto idle = info.iterations.eq(0) & info.status.gt(0) & (beyond_rounding > kSmallResidual);  // K may be 0
     solves.idle = std::max(solves.idle, idle.to(at::kDouble).mean().item<double>());
   }
   return solves;

@@ -12,8 +12,9 @@ struct ToleranceSettings {
 };
 
 /// Ties the tolerance of the solves to the error of what is trained:
-///   rtol         = max(floor, ratio · min(1, e)), where e is the smallest relative error so far; max(floor, 1e-3)
-///   before the first adjoint_rtol = rtol / adjoint_ratio, at least adjoint_floor and at most 1/2, but never below rtol
+///   rtol         = max(floor, ratio · min(1, e)), e being the smallest relative error so far; before the first,
+///                  max(floor, 1e-3)
+///   adjoint_rtol = rtol / adjoint_ratio, at least adjoint_floor and at most 1/2, but never below rtol
 /// A tolerance of 1 would be no solve, hence 1/2. The floor is there because the cotangent shrinks with the error, and
 /// gradients need not become more accurate late. K, and ⌈adjoint_ratio·K⌉ for the adjoint solve, are only limits.
 /// Source: the forcing term of inexact Newton methods (Eisenstat and Walker 1996) and of optimisation with

@@ -21,7 +21,7 @@ enum class FaceMean { kHarmonic, kArithmetic };
 /// 0-dimensional tensor or (batch or 1, *shape). Both get gradients, which for kappa are formed from differences of u
 /// and not from coefficients, so that rounding does not grow with the number of cells. sides: (low, high) for each
 /// axis, or one pair for all. lengths: of the box, for each axis or one for all. robin: h >= 0 of each such side in
-/// their order, 0- dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises
+/// their order, 0-dimensional or (batch or 1, *side), where side is shape without the axis; it gets a gradient. Raises
 /// ValueError if these do not fit together.
 OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
                        const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},

@@ -17,8 +17,8 @@ at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis);
 
 /// A singular operator together with its null spaces, which its user names: vectors that A maps to zero (right), and
 /// such that Aᵀ maps to zero (left). Right-hand sides and cotangents are projected onto what A, or Aᵀ, can reach, and
-/// solutions onto those of least norm. Its kind is "singular_" and that of A; its tensors are those of A and the two
-/// bases.
+/// solutions onto those of least norm. A right-hand side with a part outside, beyond rtol, is INCONSISTENT. Its kind is
+/// "singular_" and that of A; its tensors are those of A and the two bases.
 class SingularOperator final : public Operator {
  public:
   /// `a` is the operator of `spec` without its null spaces. These, the last two tensors, are the same for every sample:

@@ -29,6 +29,9 @@ struct SolveRequest {
   gpu::KeptHierarchy* hierarchy = nullptr;
 };
 
+/// For what has been checked: arguments that do not fit each other read beyond their memory. Others take
+/// linear_solve().
+///
 /// Solves A u = b by a kernel of a GPU, by the CPU loops, or by plain tensor operations where there is neither. Samples
 /// do not influence each other; in kernels and loops not even in the last bit.
 SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& request);

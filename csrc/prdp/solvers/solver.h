@@ -74,8 +74,8 @@ inline constexpr int64_t kToBeGiven = -1;
 /// A solver and its limits. Each sample starts from zero or from a given start. It stops when ‖b - A u‖ <= rtol ‖b‖, or
 /// after max_iter iterations. With rtol = 0, exactly max_iter iterations run.
 struct Solver {
-  Method method;
-  c10::SymInt max_iter;  // K; symbolic only while a graph is being traced
+  Method method{};
+  c10::SymInt max_iter = kToBeGiven;  // K; symbolic only while a graph is being traced
   double rtol = kDefaultRtol;
   int64_t restart = kDefaultRestart;  // m of GMRES(m)
   Preconditioner preconditioner{};

@@ -34,8 +34,10 @@ StepperBase::StepperBase(std::string who, SolveOptions options)
 }
 
 void StepperBase::set_max_iter(int64_t k) {
-  Solver{options_.solver.method, k}.check(who_.c_str());
-  options_.solver.max_iter = k;
+  auto solver = options_.solver;
+  solver.max_iter = k;
+  solver.check(who_.c_str());
+  options_.solver = std::move(solver);
 }
 
 std::optional<SolveInfo> StepperBase::adjoint_info() const {

@@ -33,7 +33,8 @@ struct Length {
   std::vector<double> sides;
 };
 
-/// Maps p to the solution u of Δu = -p, with u = 0 on the boundary (paper, appendix C.1).
+/// Maps p to the solution u of Δu = -p, with u = 0 on the boundary (paper, appendix C.1); both (batch, 1, *shape). Its
+/// operator is Δ, its right-hand side -p.
 class Poisson : public Stepper {
  public:
   Poisson(std::vector<int64_t> shape, Solver solver, Backward backward = Backward::kImplicit, Length length = 1.0);

@@ -79,6 +79,7 @@ struct FlowDivergence {
     team.each(n, [&](int i) { return at(s, grid.place(i)); }, store);
     if (!for_a_solve) return;
     parts.without_means(team, n, mine);
+    if (potential_bar) parts.without_means(team, n, mine);  // as project_vjp()
     const T largest = largest_of(team, n, [&](int i) { return std::abs(mine[i]); });
     if (largest < std::numeric_limits<T>::min()) team.each(n, [](int) { return T(0); }, store);
   }

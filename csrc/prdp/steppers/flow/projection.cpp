@@ -153,7 +153,10 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   }
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
   if (potential_bar.defined()) phi_bar = phi_bar + masked(potential_bar, fields.cells);
-  phi_bar = without_least_numbers(without_means(box, phi_bar));
+  phi_bar = without_means(box, phi_bar);
+  // The cotangent of a potential may be taken off but for rounding, which without its mean is not without its mean.
+  if (potential_bar.defined()) phi_bar = without_means(box, phi_bar);
+  phi_bar = without_least_numbers(phi_bar);
   const auto a = pressure_operator(box, cotangent, options);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
   const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});

@@ -23,13 +23,25 @@ at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
   return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
 }
 
+/// Without what the boundary brings into these samples: zero times NaN would be NaN. A value that all samples share is
+/// left, as all are refused then.
+FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples) {
+  if (!samples.defined()) return e;
+  const auto clear = [&](at::Tensor& t) {
+    if (t.defined() && t.dim() > 1 && t.size(0) == samples.size(0)) t = cleared(t, samples);
+  };
+  clear(e.inflow);
+  for (auto& velocity : e.wall_velocity) clear(velocity);
+  return e;
+}
+
 /// The velocity that the explicit part starts from, and its change by explicit Euler.
 struct ExplicitPart {
   at::Tensor velocity, change;
 };
 ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused) {
   const auto velocity = cleared(with_boundary, refused);
-  const auto change = cleared(tendency(e, velocity), refused);
+  const auto change = cleared(tendency(without_boundary_of(e, refused), velocity), refused);
   return {velocity, flow_has_loops(velocity) ? change.mul_(e.dt) : change * e.dt};
 }
 
@@ -131,7 +143,7 @@ std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::T
 std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, const at::Tensor& u,
                                               const at::Tensor& refused, const at::Tensor& velocity_bar,
                                               const DiffuseVjp& back, at::IntArrayRef needed) {
-  const auto e = equation.for_state(u);
+  const auto e = without_boundary_of(equation.for_state(u), refused);
   const auto velocity = cleared(with_boundary_values(e, u), refused);
   auto found = tendency_vjp(e, velocity, back.change[0] * e.dt);
   add_to(found.nu, back.nu);
