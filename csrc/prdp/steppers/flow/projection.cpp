@@ -154,7 +154,7 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
   if (potential_bar.defined()) phi_bar = phi_bar + masked(potential_bar, fields.cells);
   phi_bar = without_means(box, phi_bar);
-  // The cotangent of a potential may be taken off but for rounding, which without its mean is not without its mean.
+  // What a potential's cotangent leaves may be its mean and little else. What rounding leaves of the mean counts then.
   if (potential_bar.defined()) phi_bar = without_means(box, phi_bar);
   phi_bar = without_least_numbers(phi_bar);
   const auto a = pressure_operator(box, cotangent, options);
