@@ -174,3 +174,12 @@ def test_iterations_in_vain_are_told():
 def test_it_is_said_once():
     done = subprocess.run([sys.executable, "-W", "always", "-c", SAID_ONCE], capture_output=True, text=True, check=True)
     assert done.stderr.count("STAGNATED far above") == 1 and "This is said once" in done.stderr
+
+
+def test_direct_steps_of_a_flow_at_their_rounding_are_solved():
+    """Their residuals are twice rtol, and the floor is about rtol: an iteration might go on there, Direct cannot."""
+    flow = prdp.Flow((32, 32), 0.1, 0.003, boundary="wall", wall_velocity={(0, "high"): 1.0}, solver=prdp.Direct())
+    states = flow.rollout(torch.zeros(1, 2, 32, 32), 40)
+    assert flow.info.solved.all()
+    exact = flow.double().rollout(torch.zeros(1, 2, 32, 32, dtype=F64), 40)
+    assert (states - exact).norm() <= 1e-6 * exact.norm()

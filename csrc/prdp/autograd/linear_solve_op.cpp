@@ -165,9 +165,13 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);
   if (!spec.transposed) a->check_null_spaces(b);  // an adjoint solve follows one
   const auto& s = options.solver;
-  // No u has a part in a null space that was named, so the cotangent's there has no influence. It may be large beside
-  // the rest, and so may what rounding leaves of it: hence twice.
-  const auto rhs = spec.transposed && is_singular(spec) ? a->project(a->project(b)) : b;
+  auto rhs = b;
+  if (spec.transposed && is_singular(spec)) {
+    // No u has a part in a null space that was named, so the cotangent's there has no influence. It may be large beside
+    // the rest, and so may what rounding leaves of it: hence twice.
+    rhs = a->project(b);
+    if (!options.cotangent_is_in_range) rhs = a->project(rhs);
+  }
   const bool may_wait = waits_for_report(options);
   auto result = solve(*a, rhs,
                       {.solver = s,

@@ -41,10 +41,10 @@ bool is_idle(const SampleState& s) {
 }
 
 /// Stops those of the `doubtful` samples whose residual is rounding: at most slack · floor, with floor = ε ‖A‖ ‖u‖. The
-/// slack is 1, or 8 where rtol lies below the floor, or 100 where a space is exhausted. As the floor overstates the
-/// rounding where columns of A differ in size, the residual must also be at most slack · 64 ε ‖|A| |u|‖, which terms2()
-/// estimates: that is what a product rounds. A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there
-/// u is garbage.
+/// slack is 1, or 8 where rtol lies below the floor, or below 8 floors for direct methods, which reach no lower; or 100
+/// where a space is exhausted. As the floor overstates the rounding where columns of A differ in size, the residual
+/// must also be at most slack · 64 ε ‖|A| |u|‖, which terms2() estimates: that is what a product rounds. A floor above
+/// ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {
@@ -52,7 +52,8 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
   const auto norm_a = space.operator_norm();
   const auto u2 = space.values_of(space.solution2(method.x));
   const auto slack_of = [&](const SampleState& s, double floor) {
-    return s.status == SolveStatus::kBreakdown ? 100.0 : rtol * std::sqrt(s.b2) <= floor ? 8.0 : 1.0;
+    if (s.status == SolveStatus::kBreakdown) return 100.0;
+    return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
   };
   auto floors = space.map(states, [](const SampleState&) { return 0.0; });
   for (size_t i = 0; i < states.size(); ++i) {

@@ -33,9 +33,10 @@ OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const So
   return with_null_space(std::move(a), fields.closed_parts);
 }
 
-/// All solves for the pressure share the coarse grids.
+/// All solves for the pressure share the coarse grids, and have right-hand sides without_means().
 SolveOptions for_pressure(const FlowBox& box, const at::Tensor& b, SolveOptions options) {
   options.hierarchy = box.fields(b.options()).coarse_grids;
+  options.cotangent_is_in_range = true;
   return options;
 }
 
