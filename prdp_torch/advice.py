@@ -225,10 +225,8 @@ def _recommend(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, up
     if isinstance(best.solver, Direct):
         chosen, choice = best, "Use the direct solver, Direct()"
     elif saving < WORTH_REFINING:
-        chosen, choice = (
-            best,
-            f"Use converged solves with {call_of(best.solver, 2 * _most_iterations(best), best.rtol)}",
-        )
+        converged = call_of(best.solver, 2 * _most_iterations(best), best.rtol)
+        chosen, choice = best, f"Use converged solves with {converged}"
     else:
         chosen, choice = refined, f"Refine {refined.name} with a controller, up to K = {_most_iterations(refined)}"
     loosest, finest = (power(rtol) for rtol in TOLERANCES)

@@ -88,10 +88,7 @@ SolveOutputs call_op_below_autograd(const at::Tensor& b, const OperatorSpec& a, 
   return outputs_of(linear_solve_unrecorded(a, b, o, x0));
 }
 
-at::Tensor without_derivative(const at::Tensor& t) {
-  if (!t.defined()) return t;
-  return (has_tangent(t) ? t._fw_primal(/*level=*/0) : t).detach();
-}
+at::Tensor without_derivative(const at::Tensor& t) { return t.defined() ? primal(t).detach() : t; }
 
 /// The op's autograd kernel, but for what depends on the null spaces.
 SolveOutputs record_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
@@ -166,12 +163,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   if (!spec.transposed) a->check_null_spaces(b);  // an adjoint solve follows one
   const auto& s = options.solver;
   auto rhs = b;
-  if (spec.transposed && is_singular(spec)) {
-    // No u has a part in a null space that was named, so the cotangent's there has no influence. It may be large beside
-    // the rest, and so may what rounding leaves of it: hence twice.
-    rhs = a->project(b);
-    if (!options.cotangent_is_in_range) rhs = a->project(rhs);
-  }
+  if (spec.transposed && is_singular(spec)) rhs = options.cotangent_is_in_range ? a->project(b) : reachable_part(*a, b);
   const bool may_wait = waits_for_report(options);
   auto result = solve(*a, rhs,
                       {.solver = s,

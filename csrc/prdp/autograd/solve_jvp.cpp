@@ -6,11 +6,13 @@
 
 namespace prdp {
 
-namespace {
-
 at::Tensor primal(const at::Tensor& t) { return has_tangent(t) ? t._fw_primal(/*level=*/0) : t; }
 
-OperatorSpec primal(OperatorSpec a) {
+at::Tensor reachable_part(const Operator& a, const at::Tensor& v) { return a.project(a.project(v)); }
+
+namespace {
+
+OperatorSpec without_tangents(OperatorSpec a) {
   for (auto& t : a.tensors) t = primal(t);
   return a;
 }
@@ -26,13 +28,11 @@ at::Tensor tangent_rhs(const at::Tensor& b, const at::Tensor& u, const OperatorS
 }
 
 at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, SolveOptions options) {
-  const auto spec = primal(a);
+  const auto spec = without_tangents(a);
   auto rhs = tangent_rhs(b, solved.u, a);
   rhs = without_lost(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
-  // No u has a part in the null space, whatever b has.
-  const auto made = make_operator(spec);
-  const auto tangent = linear_solve(spec, made->project(made->project(rhs)), options);  // as of an adjoint solve
+  const auto tangent = linear_solve(spec, reachable_part(*make_operator(spec), rhs), options);
   return options.on_failure == OnFailure::kZeroGrad ? without_lost(tangent.u, tangent.info.status, options.on_failure)
                                                     : tangent.u;
 }
@@ -48,7 +48,8 @@ at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpe
   for (const auto& t : a.tensors) take(t);
   auto plain = solved;
   plain.b = primal(b);
-  return without_lost(unrolled_jvp(tangents, plain, primal(a), options, needed), solved.status, options.on_failure);
+  return without_lost(unrolled_jvp(tangents, plain, without_tangents(a), options, needed), solved.status,
+                      options.on_failure);
 }
 
 }  // namespace

@@ -24,8 +24,8 @@ struct CoarseRun {
   int64_t first, count;
 };
 
-/// The fine points at the first point of a run and beside it, along the axis. Without
-/// has_before or has_after that neighbour is itself coarse, or there is none.
+/// The fine points at the first point of a run and beside it, along the axis. Without has_before or has_after
+/// that neighbour is itself coarse, or there is none.
 struct Neighbourhood {
   Point before, here, after;
   bool has_before, has_after;

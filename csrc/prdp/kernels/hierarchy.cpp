@@ -108,8 +108,8 @@ struct PseudoInverse {
   bool is_whole;  // nothing was left out but the null space
 
   /// For a null space of `nullity` dimensions: rounding of the coefficients may have made the matrix regular, and its
-  /// inverse would be rounding all the same. Parts that nothing couples have a null vector each, which
-  /// may be gone on so coarse a grid.
+  /// inverse would be rounding all the same. Parts that nothing couples have a null vector each, which may be gone on
+  /// so coarse a grid.
   PseudoInverse(const MatrixXd& m, int64_t nullity, double tiny) {
     const Eigen::JacobiSVD<MatrixXd> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
     const auto& singular = svd.singularValues();

@@ -162,9 +162,9 @@ struct ImplicitBack {
   std::vector<OperatorSpec> operators{};
   flow_kernels::ImplicitPart part{};
 
-  ImplicitBack(const FlowEquation& equation, const at::Tensor& of_diffused, const at::Tensor& of_potential,
+  ImplicitBack(const FlowEquation& equation, const at::Tensor& bar_of_diffused, const at::Tensor& bar_of_potential,
                const SolveOptions& o)
-      : e(equation), diffused_bar(of_diffused), potential_bar(of_potential), options(o) {
+      : e(equation), diffused_bar(bar_of_diffused), potential_bar(bar_of_potential), options(o) {
     if (is_implicit(e)) operators = diffusion_operators(e, diffused_bar);
   }
 
