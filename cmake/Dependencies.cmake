@@ -14,6 +14,9 @@ if(NOT Torch_DIR)
   list(APPEND CMAKE_PREFIX_PATH ${torch_prefix})
 endif()
 include(${CMAKE_CURRENT_LIST_DIR}/prdpTorch.cmake)
+if(prdp_torch_problem)
+  message(FATAL_ERROR "prdp: ${prdp_torch_problem}")
+endif()
 
 execute_process(
   COMMAND ${Python_EXECUTABLE} -c "import pathlib, cmeel; print(pathlib.Path(cmeel.__file__).parent.parent / 'cmeel.prefix')"

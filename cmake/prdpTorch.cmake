@@ -1,15 +1,26 @@
 # LibTorch as the target prdp::torch: its headers and the libraries that the CPU needs, as torch's own extensions for
 # setuptools link them. find_package(Torch) asks for the CUDA toolkit where torch was built with CUDA; nothing here does.
+# Sets prdp_torch_release, such as 2.13, and TORCH_INSTALL_PREFIX; or prdp_torch_problem, a sentence.
 find_path(Torch_DIR TorchConfig.cmake HINTS ${CMAKE_PREFIX_PATH} $ENV{CMAKE_PREFIX_PATH}
   PATH_SUFFIXES Torch share/cmake/Torch)
+
+# A function, as the file of torch sets variables of whoever is looking for a package.
+function(prdp_torch_version version)
+  include(${Torch_DIR}/TorchConfigVersion.cmake)
+  set(${version} ${PACKAGE_VERSION} PARENT_SCOPE)
+endfunction()
+
+unset(prdp_torch_problem)
 if(NOT Torch_DIR)
-  message(FATAL_ERROR "prdp: LibTorch was not found; give the folder that torch.utils.cmake_prefix_path names in CMAKE_PREFIX_PATH")
+  set(prdp_torch_problem "LibTorch was not found; give the folder that torch.utils.cmake_prefix_path names in CMAKE_PREFIX_PATH")
+  return()
 endif()
-include(${Torch_DIR}/TorchConfigVersion.cmake)
-if(PACKAGE_VERSION VERSION_LESS 2.11)
-  message(FATAL_ERROR "prdp: needs PyTorch 2.11 or newer, found ${PACKAGE_VERSION} in ${Torch_DIR}; pip install torch==2.13.0")
+prdp_torch_version(prdp_torch_version)
+if(prdp_torch_version VERSION_LESS 2.11)
+  set(prdp_torch_problem "needs PyTorch 2.11 or newer, found ${prdp_torch_version} in ${Torch_DIR}; pip install torch==2.13.0")
+  return()
 endif()
-string(REGEX MATCH "^[0-9]+\\.[0-9]+" prdp_torch_release ${PACKAGE_VERSION})
+string(REGEX MATCH "^[0-9]+\\.[0-9]+" prdp_torch_release ${prdp_torch_version})
 get_filename_component(TORCH_INSTALL_PREFIX ${Torch_DIR}/../../.. ABSOLUTE)
 if(NOT TARGET prdp::torch)
   add_library(prdp::torch INTERFACE IMPORTED)

@@ -84,6 +84,24 @@ def test_the_package_refuses_another_release_of_torch(installed, tmp_path):
     assert f"prdp: was built with PyTorch {here}, found 2.99 in {torch_folder}" in said, said
 
 
+def test_a_project_may_do_without_the_package(installed, tmp_path):
+    """Where it is not REQUIRED, a torch that does not fit is no error, and the project's own variables stay."""
+    (tmp_path / "CMakeLists.txt").write_text("""
+cmake_minimum_required(VERSION 3.18)
+project(optional LANGUAGES CXX)
+set(PACKAGE_VERSION 0.1)
+find_package(prdp QUIET)
+message(STATUS "found ${prdp_FOUND}: ${PACKAGE_VERSION} ${prdp_NOT_FOUND_MESSAGE}")
+""")
+
+    def said(prefixes):
+        configured = run(CMAKE, "-S", tmp_path, "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={prefixes}", "--fresh")
+        return re.search(r"found .*", configured.stdout)[0].strip()
+
+    assert said(installed).startswith("found 0: 0.1 prdp: LibTorch was not found")
+    assert said(f"{installed};{torch.utils.cmake_prefix_path}") == "found 1: 0.1"
+
+
 def shown_symbols(library):
     """The names, with their namespaces alone, that other libraries can find in this one."""
     listed = run("nm", "--dynamic", "--defined-only", "--demangle", library).stdout

@@ -125,3 +125,26 @@ def test_no_step_is_too_long_for_the_diffusion(kinds, sides, per_cell, solid, se
 def test_the_form_is_named():
     with pytest.raises(ValueError, match="Flow: pressure must be 'incremental' or 'plain', got 'rotational'"):
         prdp.Flow((8, 6), 0.1, 0.01, pressure="rotational")
+
+
+@pytest.mark.parametrize("shape", [(12, 12), (6, 8, 10)])
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_the_pressure_of_a_periodic_box_does_not_depend_on_how_diffusion_is_solved(shape, backward):
+    """Where the velocity has no divergence, it is that of explicit diffusion, whose steps need no stability here."""
+    boxes = [
+        prdp.Flow(shape, 0.02, 1e-3, solver=EXACT, diffusion=diffusion, backward=backward)
+        for diffusion in ["implicit", "explicit"]
+    ]
+    u = boxes[0].project(random_velocity(shape))
+    implicit, explicit = (flow.pressure(u) for flow in boxes)
+    torch.testing.assert_close(implicit, explicit, rtol=0, atol=1e-8 * explicit.abs().max().item())
+
+
+def test_gradients_of_the_pressure_of_a_periodic_box():
+    u = random_velocity((6, 6))
+    nu = torch.tensor(0.3, dtype=torch.float64)
+
+    def pressure(u, nu):
+        return prdp.Flow((6, 6), nu, 0.02, solver=prdp.Direct()).pressure(u)
+
+    assert torch.autograd.gradcheck(pressure, (u.requires_grad_(), nu.requires_grad_()))

@@ -187,6 +187,21 @@ SolveResult next(const FlowEquation& equation, const at::Tensor& u, Returned ret
   return unrolled_step(equation, u, options, returned);
 }
 
+/// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it.
+bool is_diffused_with_pressure(const FlowEquation& e) {
+  return e.diffusion == FlowDiffusion::kImplicit && !e.box->fields(e.nu.options()).free.defined();
+}
+
+/// (I - ν Δt L) p in a periodic box.
+at::Tensor diffused_once_less(const FlowEquation& e, const at::Tensor& p) {
+  at::Tensor laplacian;
+  for (int64_t axis = 0; axis < e.box->dim(); ++axis) {
+    const auto sum = neighbour(*e.box, p, axis, 1, 0.0) + neighbour(*e.box, p, axis, -1, 0.0);
+    add_to(laplacian, (sum - 2.0 * p) / (e.box->dx(axis) * e.box->dx(axis)));
+  }
+  return p - e.nu * e.dt * laplacian;
+}
+
 SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
@@ -201,7 +216,12 @@ SolveResult flow_next(const FlowEquation& equation, const at::Tensor& u, const S
 }
 
 SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  return next(equation, u, Returned::kNextAndPressure, options);
+  auto found = next(equation, u, Returned::kNextAndPressure, options);
+  if (!is_diffused_with_pressure(equation)) return found;
+  const int64_t d = equation.box->dim();
+  const auto p = diffused_once_less(equation.for_state(u), found.u.narrow(1, d, 1));
+  found.u = at::cat({found.u.narrow(1, 0, d), p}, 1);
+  return found;
 }
 
 SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
