@@ -153,16 +153,16 @@ def transposed(matvec: Callable[..., Tensor], v: Tensor, tensors: list[Tensor]) 
 
 def product_rule(matvec: Callable[..., Tensor], cotangent: Tensor, u: Tensor, tensors: list[Tensor]) -> list[Tensor]:
     """∂⟨λ, A u⟩ with respect to each tensor of A by torch.func; zeros for those of whole numbers."""
-    real = [i for i, t in enumerate(tensors) if t.is_floating_point()]
+    wanted = [i for i, t in enumerate(tensors) if t.is_floating_point() or t.is_complex()]
 
     def product(*changed: Tensor) -> Tensor:
         given = list(tensors)
-        for i, t in zip(real, changed, strict=True):
+        for i, t in zip(wanted, changed, strict=True):
             given[i] = t
         return matvec(u, *given)
 
-    pullback = torch.func.vjp(product, *[tensors[i] for i in real])[1]
-    gradients = dict(zip(real, pullback(cotangent), strict=True))
+    pullback = torch.func.vjp(product, *[tensors[i] for i in wanted])[1]
+    gradients = dict(zip(wanted, pullback(cotangent), strict=True))
     return [gradients[i] if i in gradients else torch.zeros_like(t) for i, t in enumerate(tensors)]
 
 

@@ -130,7 +130,7 @@ def real_tensor(who: str, name: str, value: Number) -> Tensor:
     """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
     if isinstance(value, Tensor):
         return value
-    return torch.tensor(_check.real(who, name, value), dtype=torch.float64)
+    return torch.tensor(_check.real(who, name, value), dtype=torch.float64, device="cpu")  # under any default device
 
 
 @functools.cache

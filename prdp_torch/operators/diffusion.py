@@ -108,6 +108,9 @@ class Diffusion(Operator):
     def boundary_rhs(self, values: OfSides = 0.0, fluxes: OfSides = 0.0) -> Tensor:
         """The part of b that given values and fluxes at the sides make, (batch or 1, 1, *shape), with gradients.
 
+        Where all values lie far from zero beside their differences, such as 300 K for a rise of 1 K, solve for u minus
+        one of them: rtol is relative to b, which holds the whole value, and so is the rounding of float32.
+
         Args:
             values: u on the sides that are "zero", and u_ext of those that are "robin", where -κ ∂u/∂n is then
                 h (u - u_ext).

@@ -25,7 +25,8 @@ class Stencil(Operator):
     Args:
         coefficients: (batch, k, *shape), or (1, k, *shape) for all samples alike; float32 or float64, as the
             vectors (batch, channel, *shape). They get gradients. Where a neighbour lies outside the grid its
-            coefficient has no influence, but it must be finite.
+            coefficient has no influence, but it must be finite. Take float64 where the sum of a row is small beside
+            its diagonal, as for fourth derivatives on fine grids: float32 rounds it, and steps lose the mean of u.
         offsets: k tuples of whole numbers, one entry for each axis of shape, at most two cells along each.
         boundary: "zero" (v is 0 outside the grid) or "periodic", one for all axes or one for each.
         nullspace: what A maps to zero, where it is singular: "constant" (in each channel), vectors (k, *shape) for each

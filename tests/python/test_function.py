@@ -280,37 +280,6 @@ def test_a_product_that_torch_cannot_differentiate_needs_a_transpose():
     torch.testing.assert_close(b.grad, torch.full_like(b, 0.5))
 
 
-@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
-@pytest.mark.parametrize("rhs_requires_grad", [False, True])
-def test_tensors_that_would_lose_their_gradient_are_refused(rhs_requires_grad, backward):
-    k, b = torch.tensor(2.0, dtype=torch.float64, requires_grad=True), right_hand_side()
-    b.requires_grad_(rhs_requires_grad)
-
-    def solve(backward=backward):
-        return prdp.linear_solve(operators.Function(lambda v: k * v), b, prdp.GMRES(3), backward=backward)[0]
-
-    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
-        solve()
-    torch.testing.assert_close(solve("none"), b.detach() / 2)
-    with torch.no_grad():
-        torch.testing.assert_close(solve(), b / 2)
-    k.requires_grad_(False)
-    torch.testing.assert_close(solve(), b / 2)
-
-
-def test_what_is_captured_is_looked_for_once():
-    recorded = []
-
-    def matvec(v, k):
-        recorded.append(torch.is_grad_enabled())
-        return k * v
-
-    a = operators.Function(matvec, tensors=torch.tensor([2.0], dtype=torch.float64, requires_grad=True))
-    for _ in range(2):
-        prdp.linear_solve(a, right_hand_side(), prdp.GMRES(3))
-    assert recorded[0] and not any(recorded[1:])
-
-
 def test_copies_and_pickles():
     a = operators.Function(shifted, shifted_transpose, tensors(), diagonal)
     v = right_hand_side()

@@ -202,3 +202,20 @@ def test_a_step_that_raises_leaves_no_report_of_an_earlier_one(make, shape, step
     with pytest.raises(torch.linalg.LinAlgError, match="NONFINITE_INPUT"):
         call(u)
     assert step.info is None and not step.converged
+
+
+def test_steps_made_without_memory_get_their_values_later():
+    """As large models are made: on the meta device, then emptied on the real one and loaded."""
+    with torch.device("meta"):
+        kappa = torch.nn.Parameter(torch.empty(1, 8, 8))
+        field = prdp.ImplicitStep(operators.Diffusion(kappa, shift=1.0), None, prdp.CG(20))
+        heat = prdp.Heat((8,), nu=0.1, dt=0.1, solver=prdp.CG(20))
+        flow = prdp.Flow((8, 8), nu=0.1, dt=0.01)
+    field.to_empty(device="cpu").load_state_dict({"operator_at.kappa": torch.ones(1, 8, 8)})
+    u = torch.rand(1, 1, 8, 8)
+    expected, _ = prdp.linear_solve(operators.Diffusion(torch.ones(1, 8, 8), shift=1.0), u, prdp.CG(20))
+    torch.testing.assert_close(field(u), expected)
+    u = torch.rand(1, 1, 8)
+    torch.testing.assert_close(heat.to_empty(device="cpu")(u), prdp.Heat((8,), nu=0.1, dt=0.1, solver=prdp.CG(20))(u))
+    u = torch.rand(1, 2, 8, 8)
+    torch.testing.assert_close(flow.to_empty(device="cpu")(u), prdp.Flow((8, 8), nu=0.1, dt=0.01)(u))

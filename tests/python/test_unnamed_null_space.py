@@ -144,3 +144,39 @@ def test_a_tolerance_above_that_part_is_reached_or_raises(method, dtype):
     left = b - insulated(n, dtype).apply(u)
     if info.status.item() >= -2:
         assert statuses(info) == ["CONVERGED"] and left.norm() <= 0.1 * b.norm()
+
+
+@pytest.mark.parametrize(
+    "solver", [prdp.GMRES(5, restart=30), prdp.GMRES(50, restart=20), prdp.BiCGStab(200), prdp.CG(200), prdp.Direct()]
+)
+def test_what_a_second_null_vector_makes_large_is_not_solved(solver):
+    """Two insulated bars. The constant is named, one per bar is not, and b has a small part along the other."""
+    n, generator = 15, torch.Generator().manual_seed(0)
+    ones = torch.ones(n, dtype=torch.float64)
+    bar = torch.diag(2 * ones) - torch.diag(ones[1:], 1) - torch.diag(ones[1:], -1)
+    bar[0, 0] = bar[-1, -1] = 1
+    bars, other = torch.block_diag(bar, bar), torch.cat([ones, -ones])
+    b = bars @ torch.randn(2 * n, generator=generator, dtype=torch.float64)
+    b = b / b.norm() + 0.005 * other / other.norm()
+    a = operators.Matrix(bars, nullspace="constant")
+    u, info = prdp.linear_solve(a, b[None], solver, on_failure="return")
+    truth = torch.linalg.pinv(bars, rtol=1e-10) @ b
+    assert (u - truth).norm() < truth.norm() or not info.solved.any(), info
+
+
+def test_a_constraint_given_twice_with_two_values_is_not_solved():
+    """A saddle point without a solution. MINRES comes near one, and then u grows along the null vector."""
+    solved = 0
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        half = torch.randn(8, 8, generator=generator, dtype=torch.float64)
+        h = half @ half.T / 8 + torch.eye(8, dtype=torch.float64)
+        c = torch.randn(2, 8, generator=generator, dtype=torch.float64)
+        c = torch.cat([c, c[:1]])
+        a = torch.cat([torch.cat([h, c.T], 1), torch.cat([c, torch.zeros(3, 3, dtype=torch.float64)], 1)])
+        b = torch.randn(1, 11, generator=generator, dtype=torch.float64)
+        b[0, -1] = b[0, -3] + 0.1
+        u, info = prdp.linear_solve(operators.Matrix(a), b, prdp.MINRES(20), on_failure="return")
+        truth = torch.linalg.pinv(a, rtol=1e-10) @ b[0]
+        solved += bool(info.solved) and bool((u - truth).norm() > truth.norm())
+    assert solved == 0

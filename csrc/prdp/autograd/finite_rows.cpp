@@ -9,10 +9,11 @@ namespace prdp {
 
 namespace {
 
-/// Calls body(values, count) with the tensor's numbers on the host, as float or double.
+/// Calls body(values, count) with the tensor's numbers on the host, as float or double; complex ones are two each.
 template <class Body>
 auto with_numbers(const at::Tensor& t, const Body& body) {
   auto host = t.detach().to(at::kCPU).contiguous();
+  if (host.is_complex()) host = at::view_as_real(host.resolve_conj());
   if (host.scalar_type() == at::kFloat) return body(host.const_data_ptr<float>(), host.numel());
   host = host.to(at::kDouble);
   return body(host.const_data_ptr<double>(), host.numel());

@@ -200,7 +200,8 @@ class SampleVjps {
     const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);
     for (size_t k = 0; k < of_solution.size(); ++k) {
       if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
-      const auto right = of_solution[k].to(at::kDouble), off = found[k + 1].detach() + right;
+      const auto in_double = at::promote_types(of_solution[k].scalar_type(), at::kDouble);
+      const auto right = of_solution[k].to(in_double), off = found[k + 1].detach() + right;
       const bool of_samples = is_of_samples(k);
       const auto mark_by = [&](const auto& norm) {
         const auto is_misleading = norm(off).gt(norm(right)).expand({batch_}).contiguous();

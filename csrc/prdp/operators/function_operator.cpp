@@ -48,6 +48,12 @@ std::vector<at::Tensor> detached(const std::vector<at::Tensor>& tensors) {
   return plain;
 }
 
+/// Whether a tensor may have a gradient, and entries that are not finite. Complex ones are symbols of spectral
+/// operators.
+bool holds_numbers(const at::Tensor& t) {
+  return at::isFloatingType(t.scalar_type()) || at::isComplexType(t.scalar_type());
+}
+
 /// The matrix of a product, (batch, n, n), one unit vector at a time.
 template <class Product>
 at::Tensor probe(const Product& product, const at::Tensor& like) {
@@ -98,9 +104,7 @@ std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a) {
 }
 
 void refuse_captured_gradients(const OperatorSpec& a) {
-  auto unknown = RegisteredProducts::Captures::kUnknown;
-  RegisteredProducts::find(a.shape.at(0))
-      ->captures.compare_exchange_strong(unknown, RegisteredProducts::Captures::kWanted);
+  RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
 }
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
@@ -120,8 +124,7 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
 }
 
 at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
-  if (registered_->captures == RegisteredProducts::Captures::kWanted && !at::GradMode::is_enabled())
-    return product_without_captures(v);
+  if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_without_captures(v);
   return product(registered_->products().apply, v, tensors_, "matvec");
 }
 
@@ -158,7 +161,7 @@ at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const
   TORCH_CHECK_VALUE(!result.requires_grad(),
                     "Function: matvec uses a tensor that requires grad but is not among its tensors, so that no "
                     "gradient would reach it; hand it over in tensors, or detach it");
-  registered_->captures = RegisteredProducts::Captures::kNone;
+  registered_->looks_for_captures = false;
   return result;  // no graph hangs on it
 }
 
@@ -215,9 +218,8 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   return with_autograd([&] {
     std::vector<at::Tensor> arguments, wanted;
     for (const auto& t : tensors_) {
-      const bool real = at::isFloatingType(t.scalar_type());
       const bool recorded = create_graph && t.requires_grad();
-      arguments.push_back(recorded ? t.view_as(t) : real ? t.detach().requires_grad_() : t);
+      arguments.push_back(recorded ? t.view_as(t) : holds_numbers(t) ? t.detach().requires_grad_() : t);
       if (arguments.back().requires_grad()) wanted.push_back(arguments.back());
     }
     std::vector<at::Tensor> gradients(tensors_.size());
@@ -235,7 +237,7 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
 at::Tensor FunctionOperator::norm() const {
   auto norm = at::scalar_tensor(0.0, at::kDouble);
   for (const auto& t : tensors_)
-    if (at::isFloatingType(t.scalar_type()))
+    if (holds_numbers(t))
       norm = norm.to(t.device())
                  .masked_fill(t.detach().isfinite().all().logical_not(), std::numeric_limits<double>::quiet_NaN());
   return norm;
@@ -243,14 +245,14 @@ at::Tensor FunctionOperator::norm() const {
 
 at::Tensor FunctionOperator::nonfinite_samples(const at::Tensor& b) const {
   auto some = at::zeros({}, b.options().dtype(at::kBool));
-  bool any_real = false;
+  bool any_numbers = false;
   for (const auto& t : tensors_) {
-    if (!at::isFloatingType(t.scalar_type())) continue;
+    if (!holds_numbers(t)) continue;
     some = some.logical_or(nonfinite(t.detach()).any());
-    any_real = true;
+    any_numbers = true;
   }
   // Another device is not looked at: there the product is taken in any case.
-  if (!any_real || (b.is_cpu() && !some.item<bool>())) return some;
+  if (!any_numbers || (b.is_cpu() && !some.item<bool>())) return some;
   const auto rows = nonfinite(apply(at::ones_like(b))).flatten(1).any(1);
   return some.logical_and(rows.logical_or(rows.any().logical_not()));
 }

@@ -35,10 +35,8 @@ class RegisteredProducts {
 
   int64_t number() const { return number_; }
   const Products& products() const { return products_; }
-  /// Whether the first product below autograd looks for captured tensors
-  /// (see refuse_captured_gradients).
-  enum class Captures { kUnknown, kWanted, kNone };
-  mutable std::atomic<Captures> captures{Captures::kUnknown};
+  /// Whether the next product below autograd looks for captured tensors (see refuse_captured_gradients).
+  mutable std::atomic<bool> looks_for_captures{false};
   /// The operator, for linear_solve.
   OperatorSpec spec(std::vector<at::Tensor> tensors) const { return {"function", {number_}, {}, std::move(tensors)}; }
 
@@ -55,8 +53,8 @@ inline bool is_function(const OperatorSpec& a) { return a.kind.ends_with("functi
 std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a);
 
 /// A product that captures a tensor which requires grad, instead of getting it as an argument, would silently lose its
-/// gradient. After this call, the operator's next product below autograd raises ValueError in that case. This
-/// happens once for each RegisteredProducts, at the cost of recording one product.
+/// gradient. After this call, the operator's next product below autograd raises ValueError in that case, at the cost of
+/// recording it. Each differentiable solve asks anew: a parameter may have been frozen before.
 void refuse_captured_gradients(const OperatorSpec& a);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come

@@ -44,7 +44,8 @@ bool is_idle(const SampleState& s) {
 /// slack is 1, or 8 where rtol lies below the floor, or below 8 floors for direct methods, which reach no lower; or 100
 /// where a space is exhausted. As the floor overstates the rounding where columns of A differ in size, the residual
 /// must also be at most slack · 64 ε ‖|A| |u|‖, which terms2() estimates: that is what a product rounds. A floor above
-/// ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage.
+/// ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage. In float64 no floor above 1e-5 ‖b‖ is
+/// taken for rounding: there u is that of a singular system, which a null vector that nobody named has made large.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {
@@ -55,12 +56,13 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
     if (s.status == SolveStatus::kBreakdown) return 100.0;
     return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
   };
+  const double largest_floor = space.epsilon() < 1e-10 ? 1e-5 : 0.25;
   auto floors = space.map(states, [](const SampleState&) { return 0.0; });
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
     const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
     const double residual = std::sqrt(s.residual2);
-    const bool says_something = floor <= 0.25 * b && residual <= 0.1 * b;
+    const bool says_something = floor <= largest_floor * b && residual <= 0.1 * b;
     if (doubtful(s) && says_something && residual <= slack_of(s, floor) * floor) floors[i] = floor;
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;

@@ -1,0 +1,94 @@
+"""Tensors that a Function captures, and complex ones that it is given."""
+
+import pytest
+import torch
+from helpers import statuses
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+def right_hand_side():
+    return torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+@pytest.mark.parametrize("rhs_requires_grad", [False, True])
+def test_tensors_that_would_lose_their_gradient_are_refused(rhs_requires_grad, backward):
+    k, b = torch.tensor(2.0, dtype=torch.float64, requires_grad=True), right_hand_side()
+    b.requires_grad_(rhs_requires_grad)
+
+    def solve(backward=backward):
+        return prdp.linear_solve(operators.Function(lambda v: k * v), b, prdp.GMRES(3), backward=backward)[0]
+
+    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
+        solve()
+    torch.testing.assert_close(solve("none"), b.detach() / 2)
+    with torch.no_grad():
+        torch.testing.assert_close(solve(), b / 2)
+    k.requires_grad_(False)
+    torch.testing.assert_close(solve(), b / 2)
+
+
+def test_each_solve_looks_once_for_what_is_captured():
+    recorded = []
+
+    def matvec(v, k):
+        recorded.append(torch.is_grad_enabled())
+        return k * v
+
+    a = operators.Function(matvec, tensors=torch.tensor([2.0], dtype=torch.float64, requires_grad=True))
+    for _ in range(2):
+        prdp.linear_solve(a, right_hand_side(), prdp.GMRES(3))
+    assert recorded[0] and sum(recorded) == 2
+
+
+def test_a_captured_parameter_may_be_frozen_for_a_while():
+    k, b = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64)), right_hand_side().requires_grad_()
+    a = operators.Function(lambda v: k * v)
+    k.requires_grad_(False)
+    torch.testing.assert_close(prdp.linear_solve(a, b, prdp.GMRES(3))[0], b / 2)
+    k.requires_grad_(True)
+    with pytest.raises(ValueError, match="matvec uses a tensor that requires grad but is not among its tensors"):
+        prdp.linear_solve(a, b, prdp.GMRES(3))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script")  # by torch's own forward mode
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_complex_tensors_have_gradients(backward):
+    """The symbol of a convolution with drift, against the solve by FFT."""
+    n = 8
+    k = torch.fft.rfftfreq(n, 1 / n, dtype=torch.float64)
+    k[-1] = 0
+    u, w = torch.rand(2, n, dtype=torch.float64), torch.rand(2, n, dtype=torch.float64)
+
+    def symbol(c):
+        return 1 + 0.1 * k**2 + 1j * c * k
+
+    def product(v, symbol):
+        return torch.fft.irfft(torch.fft.rfft(v) * symbol, n=n)
+
+    def of_solve(c):
+        a = operators.Function(product, tensors=symbol(c))
+        solved, _ = prdp.linear_solve(a, u, prdp.GMRES(5, rtol=1e-13, restart=n), backward=backward)
+        return (solved * w).sum()
+
+    def exact(c):
+        return (torch.fft.irfft(torch.fft.rfft(u) / symbol(c), n=n) * w).sum()
+
+    c = torch.tensor(0.7, dtype=torch.float64)
+    slope = torch.func.grad(exact)(c)
+    (found,) = torch.autograd.grad(of_solve(c.requires_grad_()), c)
+    torch.testing.assert_close(found, slope, rtol=1e-8, atol=0)
+    torch.testing.assert_close(torch.func.grad(of_solve)(c.detach()), slope, rtol=1e-8, atol=0)
+    if backward == "implicit":
+        curvature = torch.func.hessian(exact)(c.detach())
+        torch.testing.assert_close(torch.func.hessian(of_solve)(c.detach()), curvature, rtol=1e-6, atol=0)
+
+
+def test_a_complex_tensor_that_is_not_finite_fails_its_sample():
+    s = torch.ones(2, 1, dtype=torch.complex128)
+    s[1] = complex(1, float("nan"))
+    a = operators.Function(lambda v, s: (v * s).real, tensors=s)
+    _, info = prdp.linear_solve(a, torch.ones(2, 4, dtype=torch.float64), prdp.GMRES(3), on_failure="return")
+    assert info.solved.tolist() == [True, False] and statuses(info)[1] == "NONFINITE_OPERATOR"
