@@ -10,6 +10,7 @@
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/rollout_vjp.h"
 #include "prdp/threads/interruption.h"
 
@@ -192,16 +193,6 @@ bool is_diffused_with_pressure(const FlowEquation& e) {
   return e.diffusion == FlowDiffusion::kImplicit && !e.box->fields(e.nu.options()).free.defined();
 }
 
-/// (I - ν Δt L) p in a periodic box.
-at::Tensor diffused_once_less(const FlowEquation& e, const at::Tensor& p) {
-  at::Tensor laplacian;
-  for (int64_t axis = 0; axis < e.box->dim(); ++axis) {
-    const auto sum = neighbour(*e.box, p, axis, 1, 0.0) + neighbour(*e.box, p, axis, -1, 0.0);
-    add_to(laplacian, (sum - 2.0 * p) / (e.box->dx(axis) * e.box->dx(axis)));
-  }
-  return p - e.nu * e.dt * laplacian;
-}
-
 SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
@@ -219,8 +210,9 @@ SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tenso
   auto found = next(equation, u, Returned::kNextAndPressure, options);
   if (!is_diffused_with_pressure(equation)) return found;
   const int64_t d = equation.box->dim();
-  const auto p = diffused_once_less(equation.for_state(u), found.u.narrow(1, d, 1));
-  found.u = at::cat({found.u.narrow(1, 0, d), p}, 1);
+  const auto p = found.u.narrow(1, d, 1);  // φ/Δt of the projection; the pressure is (I - ν Δt L) φ/Δt
+  const auto diffusion = make_operator(diffusion_operators(equation.for_state(u), p).front());  // the same for all
+  found.u = at::cat({found.u.narrow(1, 0, d), diffusion->apply(p)}, 1);
   return found;
 }
 
