@@ -13,7 +13,10 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, torch_private
+from prdp_torch.solvers import packed_options
 from prdp_torch.types import Report
+
+_COUNTS = len(packed_options("", 0, 0.0, 0, None)[1])  # of a solve without a preconditioner
 
 
 class _Map(Protocol):
@@ -32,7 +35,10 @@ def _linear_solve(
     parameters: list[float],
     transposed: bool,
     x0: Tensor | None,
-    *options: Any,
+    names: list[str],
+    counts: list[int],
+    numbers: list[float],
+    inverse: list[Tensor],
 ) -> tuple[Any, Any]:
     size, op = info.batch_size, torch.ops.prdp.linear_solve
     samples = b.shape[0 if in_dims[0] is None else int(in_dims[0] == 0)]
@@ -40,23 +46,25 @@ def _linear_solve(
     def entries(t: Tensor | None, dim: int | None) -> Tensor | None:  # the mapped axis in front
         return t if t is None else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
 
-    def solved(b: Tensor, tensors: list[Tensor], x0: Tensor | None) -> Any:
-        return op(b, tensors, kind, shape, parameters, transposed, x0, *options)
+    def solved(b: Tensor, tensors: list[Tensor], x0: Tensor | None, inverse: list[Tensor]) -> Any:
+        return op(b, tensors, kind, shape, parameters, transposed, x0, names, counts, numbers, inverse)
 
     of_b, of_x0 = cast(Tensor, entries(b, in_dims[0])), entries(x0, in_dims[6])  # the places among the arguments
     mapped = [dim is not None for dim in in_dims[1]]
     own = _of_samples(tensors, kind, len(shape), samples)
-    if not any(mapped) and any(own) and 0 < samples <= size:
+    if not any(mapped) and any(own) and not inverse and 0 < samples <= size:
         found = []
         for s in range(samples):
             of_one = [t[s : s + 1] if is_own else t for t, is_own in zip(tensors, own, strict=True)]
-            found.append(solved(of_b[:, s], of_one, None if of_x0 is None else of_x0[:, s]))
+            found.append(solved(of_b[:, s], of_one, None if of_x0 is None else of_x0[:, s], inverse))
         return [torch.stack(parts, 1) for parts in zip(*found, strict=True)], [0] * len(found[0])
-    in_front = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims[1], strict=True)]
-    folded = _fold(in_front, mapped, kind, len(shape), size, samples)
-    if folded is None:
-        return _one_by_one(op, info, in_dims, (b, tensors, kind, shape, parameters, transposed, x0, *options))
-    results = solved(of_b.flatten(0, 1), folded, None if of_x0 is None else of_x0.flatten(0, 1))
+    folded = _fold(tensors, in_dims[1], kind, len(shape), size, samples)
+    # A preconditioner, whose kind is the last of the names and whose shape is behind the counts.
+    folded_inverse = _fold(inverse, in_dims[10], names[-1], len(counts) - _COUNTS, size, samples) if inverse else []
+    if folded is None or folded_inverse is None:
+        arguments = b, tensors, kind, shape, parameters, transposed, x0, names, counts, numbers, inverse
+        return _one_by_one(op, info, in_dims, arguments)
+    results = solved(of_b.flatten(0, 1), folded, None if of_x0 is None else of_x0.flatten(0, 1), folded_inverse)
     return [t.unflatten(0, (size, samples)) for t in results], [0] * len(results)
 
 
@@ -67,9 +75,11 @@ def _of_samples(tensors: list[Tensor], kind: str, axes: int, batch: int) -> list
 
 
 def _fold(
-    tensors: list[Tensor], mapped: list[bool], kind: str, axes: int, size: int, batch: int
+    tensors: list[Tensor], in_dims: Sequence[int | None], kind: str, axes: int, size: int, batch: int
 ) -> list[Tensor] | None:
     """The tensors of an operator on `size` · `batch` samples; None where there is no such operator."""
+    tensors = [t if dim is None else t.movedim(dim, 0) for t, dim in zip(tensors, in_dims, strict=True)]
+    mapped = [dim is not None for dim in in_dims]
     dims = _C.batched_axes(kind, axes, len(tensors))
     if dims is None:  # a Function: unknown which of its tensors have a batch axis
         return None if tensors else []

@@ -198,3 +198,27 @@ def test_a_start_is_taken_and_a_step_uses_it():
     exact = prdp.Heat((30,), nu=1e-2, dt=1.0, solver=prdp.Direct())
     state = noise(2, 1, 30)
     torch.testing.assert_close(step.rollout(state, 3), exact.rollout(state, 3), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("way", ["loops", "tensors", "unrolled"])
+def test_iterations_after_convergence_leave_a_named_null_space_alone(way, dtype):
+    """What rounding puts there grows as fast as the residual falls."""
+    kappa = (0.3 + noise(1, 12, 12).abs()).to(dtype)
+    b = noise(2, 1, 12, 12).to(dtype)
+    a = operators.Diffusion(kappa, boundary="periodic")
+    exact = torch.linalg.pinv(operators.Diffusion(kappa.double(), boundary="periodic").dense(), hermitian=True)
+    b = b - b.mean((2, 3), keepdim=True)
+    if way == "tensors":
+        given = operators.Diffusion(kappa, boundary="periodic")
+        a = operators.Function(given.apply, symmetric=True, nullspace="constant")
+    rhs = b.clone().requires_grad_()
+    backward = "unrolled" if way == "unrolled" else "implicit"
+    u, _ = prdp.linear_solve(a, rhs, prdp.MINRES(400, 0.0), backward=backward)
+    expected = (exact @ b.double().flatten(1).T).T
+    bound = 1e-5 if dtype == F32 else 1e-12
+    assert (u.detach().double().flatten(1) - expected).norm() < bound * expected.norm()
+    if way == "unrolled":
+        return  # its derivative beyond convergence is that of rounding
+    (gradient,) = torch.autograd.grad((u * b).sum(), rhs)
+    assert (gradient.double().flatten(1) - expected).norm() < bound * expected.norm()

@@ -266,3 +266,42 @@ def test_steps_and_their_controller_take_it():
     assert u.grad.isfinite().all() and "preconditioner='diagonal'" in repr(step)
     step.max_iter = 5
     assert step(u).isfinite().all()
+
+
+def one_per_sample():
+    generator = torch.Generator().manual_seed(0)
+    a = 0.2 * torch.randn(3, 6, 6, dtype=torch.float64, generator=generator) + 4 * torch.eye(6, dtype=torch.float64)
+    return a, torch.linalg.inv(a) + 0.01 * torch.randn(a.shape, dtype=torch.float64, generator=generator), generator
+
+
+@pytest.mark.parametrize("mapped", ["b", "M", "b M", "b A M"])
+def test_one_matrix_per_sample_under_vmap(mapped):
+    a, m, generator = one_per_sample()
+    given = {"b": torch.randn(3, 6, dtype=torch.float64, generator=generator), "A": a, "M": m}
+    for name in mapped.split():
+        given[name] = torch.stack([given[name] * (1 + 0.1 * i) for i in range(4)])
+
+    def solve(b, a, m):
+        return prdp.linear_solve(a, b, prdp.GMRES(1, restart=4, rtol=0.0, preconditioner=prdp.operators.Matrix(m)))[0]
+
+    dims = tuple(0 if name in mapped.split() else None for name in given)
+    found = torch.func.vmap(solve, in_dims=dims)(*given.values())
+    for i in range(4):
+        one = [t if dim is None else t[i] for t, dim in zip(given.values(), dims, strict=True)]
+        assert torch.equal(found[i], solve(*one))
+
+
+@pytest.mark.parametrize("backward", ["implicit", "unrolled"])
+def test_one_matrix_per_sample_beside_a_zero(backward):
+    """The gradient of the others is what they have alone."""
+    a, m, generator = one_per_sample()
+    b = torch.randn(3, 6, dtype=torch.float64, generator=generator)
+    b[1] = 0.0
+
+    def gradient(index):
+        leaf = b[index].clone().requires_grad_()
+        solver = prdp.GMRES(1, restart=4, rtol=0.0, preconditioner=prdp.operators.Matrix(m[index]))
+        u, _ = prdp.linear_solve(a[index], leaf, solver, backward=backward)
+        return torch.autograd.grad(u.square().sum(), leaf)[0]
+
+    torch.testing.assert_close(gradient([0, 1, 2])[[0, 2]], gradient([0, 2]))

@@ -197,3 +197,25 @@ def test_the_backward_pass_keeps_one_state_per_step(device):
     with device(), torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
         flow.rollout(u, 20)
     assert sum(kept.values()) < 22 * u.nbytes
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("solver", [
+    prdp.CG(500, rtol=0.0), prdp.CG(5000, rtol=1e-20), prdp.CG(100, rtol=0.0, preconditioner="multigrid"),
+    prdp.MINRES(400, rtol=0.0), prdp.BiCGStab(400, rtol=0.0), prdp.GMRES(10, restart=30, rtol=0.0),
+], ids=str)  # fmt: skip
+@pytest.mark.parametrize("boundary", ["periodic", "wall"])
+def test_iterations_after_convergence_spoil_nothing(boundary, solver, dtype):
+    """On square cells as on others: rounding would leave something in the null space of the pressure."""
+    generator = torch.Generator().manual_seed(0)
+    u, w = (torch.randn(2, 2, 16, 16, dtype=torch.float64, generator=generator) for _ in range(2))
+    found = []
+    for method, of in ((solver, dtype), (prdp.Direct(), torch.float64)):
+        step = prdp.Flow((16, 16), nu=0.01, dt=0.005, boundary=boundary, solver=method)
+        state = (0.1 * u).to(of).requires_grad_()
+        after = step(state)
+        found.append((after.detach().double(), torch.autograd.grad((w.to(of) * after).sum(), state)[0].double()))
+    bound = 3e-6 if dtype == torch.float32 else 1e-12
+    for got, expected in zip(*found, strict=True):
+        assert (got - expected).norm() < bound * expected.norm()

@@ -99,9 +99,10 @@ UnrolledVjp replay_vjp(const at::Tensor& cotangent, const at::Tensor& b, const U
   const auto index = solve.iterations.gt(0).nonzero().flatten();
   if (index.numel() == 0) return found;
 
-  // Samples of no iterations are left out where the operator can be had without them.
+  // Samples of no iterations are left out where the operator can be had without them, and has no other beside it.
   const auto here = index.to(b.device());
-  const bool part = index.numel() < b.size(0) && make_operator(solve.a)->select(here);
+  const bool part =
+      index.numel() < b.size(0) && !solve.solver.preconditioner.is_operator() && make_operator(solve.a)->select(here);
   const auto make = [&](const std::vector<at::Tensor>& tensors) {
     auto spec = solve.a;
     spec.tensors = tensors;

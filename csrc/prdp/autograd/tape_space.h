@@ -123,6 +123,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
   Scalar sum_of_squares(const Scalar& v2, const Scalar& a, const Scalar& w2) const {
     return values_.sum_of_squares(v2.value, a.value, w2.value);
   }
+  void keep_in_range(Vector& v) { values_.keep_in_range(value(v)); }  // of whose derivative rounding is no part
   bool is_preconditioned() const { return values_.is_preconditioned(); }
   Scalar precondition(const Vector& v, Vector& out) {
     const T* from = value(v);
@@ -166,6 +167,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return number(Kind::kSquare, rr, r.version);
   }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
+  Scalar sensitivity2(const Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
   Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
     const T value = values_.guarded_quotient(num.value, den.value, v2.value, w2.value);

@@ -20,12 +20,12 @@ class Reader {
   explicit Reader(const PackedStencil<T>& a)
       : a_(a), n_(a.grid().shape), slack_(slack_of_sum(a.norm(), std::numeric_limits<T>::epsilon())) {}
 
-  /// A_d, as it is on the line of points through the first one.
+  /// A_d, as it is on the line of points through the middle, which no side holds.
   Eigen::MatrixXd along(int axis) const {
     const int64_t n = n_[axis];
     Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(n, n);
     for (int64_t i = 0; i < n; ++i) {
-      matrix(i, i) = at(axis, i, 0) - (axis == 2 ? 0.0 : at(axis, 0, 0));
+      matrix(i, i) = at(axis, i, 0) - (axis == 2 ? 0.0 : at(axis, middle(axis), 0));
       for (const int64_t step : {-1, 1})
         if (const auto j = neighbour(i, step, n, a_.grid().periodic[axis]); j >= 0)
           matrix(i, j) = at(axis, i, place_of(axis, step));
@@ -33,15 +33,30 @@ class Reader {
     return matrix;
   }
 
-  /// Whether every point couples to its neighbours as the matrices say, which the first row of each axis agrees with.
+  /// Whether every point couples to its neighbours as the matrices say, which the middle row agrees with.
   bool agrees_with(const SumOverAxes& sum) const {
-    const double first = sum[0](0, 0) + sum[1](0, 0);
     for (int64_t r = 0; r < a_.rows(); ++r) {
       const int64_t z = r / n_[1], y = r % n_[1];
-      if (!is_first_row(r, 0, sum[0](z, z) + sum[1](y, y) - first)) return false;
+      if (!is_middle_row(r, 0, sum[0](z, z) + sum[1](y, y))) return false;
       for (const int64_t step : {-1, 1}) {
-        if (!is_first_row(r, place_of(2, step), 0.0)) return false;
+        if (!is_middle_row(r, place_of(2, step), 0.0)) return false;
         if (!is_constant(r, sum[1], 1, y, step) || !is_constant(r, sum[0], 0, z, step)) return false;
+      }
+    }
+    return true;
+  }
+  /// Whether what holds the points is a sum over the axes; how it varies would pass for rounding beside a diagonal.
+  bool is_held_by_sum() const {
+    if (!a_.is_held_by_field()) return true;
+    constexpr double slack = 16.0 * std::numeric_limits<T>::epsilon();
+    const int64_t z0 = middle(0), y0 = middle(1), x0 = middle(2);
+    const double there = a_.held(z0 * n_[1] + y0, x0);
+    for (int64_t r = 0; r < a_.rows(); ++r) {
+      const double z = a_.held(r / n_[1] * n_[1] + y0, x0), y = a_.held(z0 * n_[1] + r % n_[1], x0);
+      for (int64_t i = 0; i < n_[2]; ++i) {
+        const double held = a_.held(r, i), x = a_.held(z0 * n_[1] + y0, i);
+        const double size = std::abs(held) + std::abs(x) + std::abs(y) + std::abs(z) + std::abs(there);
+        if (!(std::abs(held - (x + y + z - 2.0 * there)) <= slack * size)) return false;
       }
     }
     return true;
@@ -62,18 +77,20 @@ class Reader {
   bool is_symmetric(const Eigen::MatrixXd& matrix) const { return kernels::is_symmetric(matrix, slack_); }
 
  private:
+  int64_t middle(int axis) const { return n_[axis] / 2; }
+  int64_t middle_row() const { return middle(0) * n_[1] + middle(1); }
   double at(int axis, int64_t i, int64_t k) const {
-    const int64_t row = axis == 0 ? i * n_[1] : axis == 1 ? i : 0;
-    const int64_t x = axis == 2 ? i : 0;
+    const int64_t row = (axis == 0 ? i : middle(0)) * n_[1] + (axis == 1 ? i : middle(1));
+    const int64_t x = axis == 2 ? i : middle(2);
     return k == 0 ? a_.diagonal(row, x) : static_cast<double>(a_.value(row, k, x));
   }
-  /// Whether coefficient k of row r is that of the first row, and `more`.
-  bool is_first_row(int64_t r, int64_t k, double more) const {
-    const int64_t last = n_[2] - 1;
+  /// Whether coefficient k of row r is that of the middle row, and `more`.
+  bool is_middle_row(int64_t r, int64_t k, double more) const {
+    const int64_t last = n_[2] - 1, middle = middle_row();
     for (const int64_t end : {int64_t{0}, last})
-      if (!(std::abs(a_.value(r, k, end) - a_.value(0, k, end) - more) <= slack_)) return false;
-    const T *row = a_.coefficient(r, k), *first = a_.coefficient(0, k);
-    return all_within(1, last, [&, added = static_cast<T>(more)](int64_t i) { return row[i] - first[i] - added; });
+      if (!(std::abs(a_.value(r, k, end) - a_.value(middle, k, end) - more) <= slack_)) return false;
+    const T *row = a_.coefficient(r, k), *of_middle = a_.coefficient(middle, k);
+    return all_within(1, last, [&, added = static_cast<T>(more)](int64_t i) { return row[i] - of_middle[i] - added; });
   }
   /// Whether the coefficient of the neighbour along another axis than x is the same at all points of a row.
   bool is_constant(int64_t r, const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {
@@ -192,9 +209,8 @@ template <class T>
 std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<T>& a) {
   const auto& grid = a.grid();
   if (!has_axes_to_diagonalise(grid.dim, grid.shape) || !a.pattern().nearest) return std::nullopt;
-  if (!a.is_held_evenly()) return std::nullopt;  // beside a diagonal, how the hold varies would pass for rounding
   const Reader<T> reader(a);
-  if (!reader.has_even_rows()) return std::nullopt;
+  if (!reader.has_even_rows() || !reader.is_held_by_sum()) return std::nullopt;
   SumOverAxes sum;
   for (int d = 0; d < 3; ++d) {
     const bool is_there = d >= 3 - grid.dim;

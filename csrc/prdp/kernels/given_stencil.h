@@ -65,6 +65,7 @@ struct Hold {
   const T* values = nullptr;  // null: nothing is said of that
   int64_t sample_stride = 0;  // 0: all samples share them
   bool is_number = false;
+  std::vector<Offset> offsets = {};  // those that the coefficients are for
 };
 
 /// The stencils with `coefficients` (batch, k, nz, ny, nx) for the offsets that `pattern` was given, or their
@@ -121,7 +122,7 @@ struct GivenStencil {
     const T factor = scale_of_operator(magnitude);
     auto rows = std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, factor, transposed));
     const T* const held = hold.values ? hold.values + s * hold.sample_stride : nullptr;
-    if (held) rows->hold(held, hold.is_number, factor);
+    if (held) this->hold_rows(*rows, held, fields, factor);
     const auto key = [given_stencil = *this, from, held, count = given * points, points] {
       auto made = given_stencil.of_matrix().add_field(from, count);
       return held ? made.add_field(held, given_stencil.hold.is_number ? 1 : points).key() : made.key();
@@ -134,6 +135,22 @@ struct GivenStencil {
   }
 
  private:
+  /// By the values given, and by the zeros beyond the grid that points at its sides are coupled to.
+  void hold_rows(PackedStencil<T>& rows, const T* values, const std::vector<const T*>& fields, T factor) const {
+    rows.hold(values, hold.is_number, factor);
+    const auto& n = pattern->grid.shape;
+    for (size_t given = 0; given < fields.size(); ++given) {
+      const auto& along = hold.offsets[given].along;
+      for (int64_t r = 0; r < n[0] * n[1]; ++r)
+        for (int64_t axis = 0; axis < 3; ++axis) {
+          if (along[axis] == 0 || pattern->grid.periodic[axis]) continue;
+          const int64_t side = along[axis] < 0 ? 0 : n[axis] - 1;
+          if (axis < 2 && (axis == 0 ? r / n[1] : r % n[1]) != side) continue;
+          for (int64_t i = axis < 2 ? 0 : side; i < (axis < 2 ? n[2] : side + 1); ++i)
+            rows.hold_more(r, i, -factor * fields[given][r * n[2] + i]);
+        }
+    }
+  }
   /// The products of one coefficient in row r: with neighbours in their row or with those that leave it. Beyond the
   /// grid there are zeros.
   void add_to_row(const Offset& offset, const T* field, const T* v, int64_t r, bool wraps, const T* zeros,

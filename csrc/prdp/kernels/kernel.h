@@ -52,6 +52,8 @@ class Kernel {
 
   /// ‖A‖∞
   virtual double norm() const = 0;
+  /// Whether A is known to be positive definite, and rounding does not change that.
+  virtual bool is_surely_definite() const { return false; }
   /// Multiplications of a product.
   virtual int64_t work() const { return unknowns(); }
   /// out = A v

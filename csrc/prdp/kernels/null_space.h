@@ -26,14 +26,16 @@ class NullSpace {
                              layout.row, layout.rows, layout.nx);
     }
   }
-  /// Takes off the part of v in the null space; returns the norm of that part.
-  T project(T* v) const {
+  /// Takes off the part of v in the null space, but for parts along one of its vectors that are no larger than
+  /// `negligible`; returns the norm of what it takes off.
+  T project(T* v, T negligible = 0) const {
     double part2 = 0;
     const int64_t length = span_ * layout_.plane;
     for (int64_t f = first_; f < first_ + fields_; f += span_)
       for (const auto& q : basis_) {
         T* field = v + f * layout_.plane;
         const T along = vectors_.dot(q.data(), field, length);
+        if (std::abs(along) <= negligible) continue;
         vectors_.axpy(-along, q.data(), field, length);
         part2 += static_cast<double>(along) * static_cast<double>(along);
       }

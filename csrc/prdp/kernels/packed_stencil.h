@@ -62,19 +62,31 @@ class PackedStencil {
     for (int64_t r = 0; r < (is_number ? 1 : rows()); ++r)
       for (int64_t i = 0; i < nx_; ++i) held_[r * row_ + i] = factor * values[is_number ? 0 : r * nx_ + i];
   }
-  /// Whether every point is held by the same, or nothing was said of that.
-  bool is_held_evenly() const {
-    if (held_step_ == 0) return true;
-    const double first = static_cast<double>(held_[0]), slack = 16.0 * std::numeric_limits<T>::epsilon();
-    for (int64_t r = 0; r < rows(); ++r)
-      for (int64_t i = 0; i < nx_; ++i)
-        if (!(std::abs(held_[r * row_ + i] - first) <= slack * std::abs(first))) return false;
-    return true;
+  /// Point i of row r, of which hold() was told, by so much more: what its coupling to a zero beyond the grid adds.
+  void hold_more(int64_t r, int64_t i, T by) {
+    if (by == T(0)) return;
+    if (held_step_ == 0) {
+      Field<T> of_rows = zeros<T>(rows() * row_);
+      for (int64_t k = 0; k < rows(); ++k) std::copy_n(held_.data(), row_, of_rows.data() + k * row_);
+      held_ = std::move(of_rows);
+      held_step_ = row_;
+    }
+    held_[r * row_ + i] += by;
   }
+  /// Whether some points may be held by more than others.
+  bool is_held_by_field() const { return held_step_ != 0; }
+  /// Whether A is positive definite, as products of differences keep it however they are rounded: something holds v,
+  /// and nothing holds it by less than zero. False where hold() was not told.
+  bool is_surely_definite() const {
+    if (held_.empty()) return false;
+    const auto [least, most] = std::minmax_element(held_.begin(), held_.end());
+    return *least >= T(0) && *most > T(0);
+  }
+  double held(int64_t r, int64_t i) const { return static_cast<double>(held_[r * held_step_ + i]); }
   /// The entry of the matrix on its diagonal at point i of row r.
   double diagonal(int64_t r, int64_t i) const {
     if (held_.empty()) return static_cast<double>(coefficient(r, 0)[i]);
-    double sum = static_cast<double>(held_[r * held_step_ + i]);
+    double sum = held(r, i);
     for (int64_t k = 1; k < count_; ++k) sum -= static_cast<double>(value(r, k, i));
     return sum;
   }

@@ -14,11 +14,6 @@ namespace prdp {
 
 namespace {
 
-/// The least mean of a sample.
-double mean_of_least_sample(const at::Tensor& t) {
-  return t.dim() == 0 ? t.item<double>() : t.to(at::kDouble).flatten(1).mean(1).min().item<double>();
-}
-
 /// `t` in this dtype; a number of the host without operations of torch, four of them, where autograd does not care.
 at::Tensor in_dtype(const at::Tensor& t, at::ScalarType dtype) {
   if (t.scalar_type() == dtype) return t;
@@ -160,11 +155,8 @@ void DiffusionOperator::check_parameters(Checks checks) const {
                       "Diffusion: h of a Robin side must be finite and >= 0, got ", least);
   }
   if (checks == Checks::kHost) return;
-  const auto [low, high] = at::aminmax(kappa_);
-  const auto ends = at::stack({low, high}).to(at::kCPU, at::kDouble);
-  const auto* least_and_most = ends.const_data_ptr<double>();
-  known_positive_ = least_and_most[0] > 0.0;
-  if (known_positive_) return warn_if_rounding_holds(least_and_most[0], least_and_most[1]);
+  known_positive_ = kappa_.min().item<double>() > 0.0;
+  if (known_positive_) return;
   const auto wrong = kappa_.le(0);
   if (checks == Checks::kShared || !wrong.any().item<bool>()) return;
   const auto index = first_true(wrong);
@@ -199,46 +191,6 @@ std::string DiffusionOperator::refusal(int64_t sample) const {
   std::ostringstream text;
   text << found->must << ", got " << found->value;
   return text.str();
-}
-
-bool DiffusionOperator::takes_differences() const {
-  if (kappa_.scalar_type() != at::kFloat) return false;
-  for (const auto& [low, high] : sides_)
-    for (const auto side : {low, high})
-      if (side == Side::kZero || side == Side::kRobin) return false;
-  return true;
-}
-
-void DiffusionOperator::warn_if_rounding_holds(double least_kappa, double largest_kappa) const {
-  if (kappa_.scalar_type() != at::kFloat || takes_differences() || !kappa_.is_cpu() || !shift_.is_cpu()) return;
-  double diagonal = 0.0;
-  for (int64_t axis = 0; axis < dim(); ++axis)
-    diagonal += 2.0 * (per_axis_ ? kappa_along(axis).max().item<double>() : largest_kappa) * per_cell2(axis);
-  const double rounding = 10.0 * epsilon_of(kappa_) * diagonal;
-  const double least_shift = shift_.min().item<double>();
-  if (!std::isfinite(diagonal) || rounding <= held_by(least_shift, least_shift, least_kappa)) return;
-  const double shift = mean_of_least_sample(shift_);
-  const double held = held_by(shift, least_shift, std::exp(kappa_.log().mean().item<double>()));
-  if (!(held > 0.0) || rounding <= held) return;
-  TORCH_WARN_ONCE("Diffusion: in float32, what holds u, a shift and sides that act as one of about ", held,
-                  ", is lost in the rounding of a diagonal of up to ", diagonal,
-                  ", so that u may be off by per cents; take float64");
-}
-
-double DiffusionOperator::held_by(double shift, double least_shift, double kappa) const {
-  double by_sides = 0.0, through_cells = 0.0;
-  for (int64_t axis = 0; axis < dim(); ++axis) {
-    through_cells += 8.0 * kappa / (lengths_[axis] * lengths_[axis]);
-    for (size_t end = 0; end < 2; ++end) {
-      const auto side = sides_[axis][end];
-      if (side != Side::kZero && side != Side::kRobin) continue;
-      const double within = 2.0 * kappa * per_cell(axis);
-      const double beyond = side == Side::kRobin ? mean_of_least_sample(robin(axis, end)) : 0.0;
-      by_sides += (side == Side::kZero ? within : within * beyond / (within + beyond)) / lengths_[axis];
-    }
-  }
-  const double at_some_cells = shift - least_shift + by_sides;
-  return least_shift + at_some_cells / (1.0 + at_some_cells / through_cells);
 }
 
 }  // namespace prdp

@@ -64,14 +64,9 @@ class DiffusionOperator final : public Operator {
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
   bool is_closed(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
-  /// Whether the loops make products of differences: in float32, nothing but the shift holds u, so that the rounding of
-  /// a diagonal would change the mean of u in every solve.
-  bool takes_differences() const;
-  /// Warns where float32 rounds the diagonal by as much as what holds u, if that is part of the diagonal.
-  void warn_if_rounding_holds(double least_kappa, double largest_kappa) const;
-  /// About the least eigenvalue of A where κ is the same everywhere: what holds u in the mean, in series with the way
-  /// there through the cells.
-  double held_by(double shift, double least_shift, double kappa) const;
+  /// Whether the loops make products of differences: in float32, the rounding of a diagonal would change what is slow
+  /// to change, the mean of u first, in every solve.
+  bool takes_differences() const { return kappa_.scalar_type() == at::kFloat; }
   at::Tensor kappa_along(int64_t axis) const { return per_axis_ ? kappa_.narrow(1, axis, 1) : kappa_; }
   double per_cell(int64_t axis) const;   // 1/h
   double per_cell2(int64_t axis) const;  // 1/h²

@@ -264,14 +264,14 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Te
                                                                     const at::Tensor& held) const {
   const auto offsets = transposed ? turned(offsets_) : offsets_;
   const auto make_batch =
-      [transposed, held, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
+      [transposed, held, offsets, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
        pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                    transposed};
     if (held.defined()) {
       const bool is_number = held.dim() == 0;
       const int64_t stride = is_number || held.size(0) == 1 ? 0 : held.stride(0);
-      given.hold = {held.template const_data_ptr<T>(), stride, is_number};
+      given.hold = {held.template const_data_ptr<T>(), stride, is_number, offsets};
     }
     // c and held are captured for their memory, to which `given` points.
     kernels::KernelBatch<T> batch{c.size(0) == 1,

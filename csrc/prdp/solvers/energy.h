@@ -15,15 +15,16 @@ struct Energies {
 /// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
 /// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
 /// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, or x·A x is the rounding of
-/// A x, x lies almost in the null space of A, and says nothing.
-inline bool energy_falls(const Energies& e, double epsilon) {
+/// A x, x lies almost in the null space of A, and says nothing, unless A has none for sure.
+inline bool energy_falls(const Energies& e, double epsilon, bool surely_definite) {
   const auto positive = [](double v) { return std::max(v, 0.0); };
   const double scale =
       std::sqrt(e.rr) * std::sqrt(positive(e.bb - 2 * e.rb + e.rr)) + std::sqrt(e.xx) * std::sqrt(e.ar2);
   const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - 2e3 * epsilon * scale);
   const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
   const bool nearer = e.xb * e.xb > e.xr * e.xr;
-  const bool not_rounding = std::abs(energy) > epsilon * std::max(2e3 * std::abs(e.xb), e.largest);
+  const double rounding = std::max(2e3 * std::abs(e.xb), surely_definite ? 0.0 : e.largest);
+  const bool not_rounding = std::abs(energy) > epsilon * rounding;
   const bool definite = e.r_ar * energy > across * across;
   return symmetric && definite && nearer && not_rounding;
 }
@@ -49,6 +50,7 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
   const auto x_ar = values_of(x, ar), r_ar = values_of(r, ar), xx = values_of(x, x), ar2 = values_of(ar, ar);
   space.fill_zero(ar);
   const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(x));  // ‖A‖ and u without their scale
+  const auto definite = space.surely_definite();
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
     if (!is_above(s)) {
@@ -58,7 +60,7 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
     s.answer = Answer::kLast;
     const Energies e{xb[i],   xr[i],   rb[i], rr[i],  bb[i],
                      x_ar[i], r_ar[i], xx[i], ar2[i], norm_a[i] * std::sqrt(u2[i] * xx[i])};
-    if (!energy_falls(e, space.epsilon())) s.status = SolveStatus::kDiverged;
+    if (!energy_falls(e, space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
   }
 }
 

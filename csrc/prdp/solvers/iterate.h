@@ -86,17 +86,41 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
   }
 }
 
-/// For direct methods: zero replaces u where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖ and the residual exceeds
-/// 1e-2 ‖b‖, as A is singular to the dtype there. That, and a residual above ‖b‖, is a breakdown.
+/// Of a sample that ended above ‖b‖: where A is definite for sure, and the residual is the rounding of a product, the
+/// last iterate is as good as the dtype allows.
+template <class Space, class Method>
+void excuse_rounding_of_definite(Space& space, const Method& method, typename Space::States& states) {
+  const auto is_above = [](const SampleState& s) { return s.answer != Answer::kLast; };
+  if (std::none_of(states.begin(), states.end(), is_above)) return;
+  const auto definite = space.surely_definite();
+  const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
+  for (size_t i = 0; i < states.size(); ++i) {
+    const double floor2 = space.epsilon() * space.epsilon() * norm_a[i] * norm_a[i] * u2[i];
+    if (is_above(states[i]) && definite[i] && states[i].residual2 <= 64.0 * floor2) states[i].answer = Answer::kLast;
+  }
+}
+
+/// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖, and the residual exceeds 1e-2 ‖b‖: if the
+/// rounding of A may move u, A is singular to the dtype, and zero replaces u; else u is as good as the dtype allows,
+/// and its residual is rounding. A residual above ‖b‖ is else a breakdown.
 template <class Space, class Method>
 void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
+    const double epsilon = space.epsilon();
     const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
+    const auto moved2 = space.values_of(space.sensitivity2(method.x));
+    const auto definite = space.surely_definite();
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
-      if (is_doubtful(s) && space.epsilon() * norm_a[i] * std::sqrt(u2[i]) > 0.25 * std::sqrt(s.b2))
-        s.answer = Answer::kZero;
+      const double floor = epsilon * norm_a[i] * std::sqrt(u2[i]);
+      if (!is_doubtful(s) || !(floor > 0.25 * std::sqrt(s.b2))) continue;
+      s.answer = Answer::kZero;
+      constexpr double stays = 1e-3;  // far below 1, as moved2 comes of one choice of signs
+      if (!definite[i] && !(epsilon * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))) continue;
+      s.answer = Answer::kLast;
+      s.status = SolveStatus::kStagnated;
+      s.floor2 = s.residual2;
     }
   }
   for (auto& s : states)
@@ -110,6 +134,7 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
     const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
     s.answer = may_be_worse && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
   }
+  excuse_rounding_of_definite(space, method, states);
   if constexpr (kIsExact<Method>) refuse_rounding(space, method, states);
   if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
   bool all_last = true;

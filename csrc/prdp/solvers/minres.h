@@ -46,6 +46,7 @@ class MinresMethod {
     const Scalar inverse = space_.ratio(one_, gamma_);
     const Scalar delta = space_.apply_with_dots(space_.is_preconditioned() ? z_ : v_, az_)[0] * inverse * inverse;
     combine(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
+    space_.keep_in_range(next_);  // where rounding grows as fast as the residual falls
     turn(v_, last_v_);
     const Vector& z = space_.is_preconditioned() ? z_ : last_v_;
     const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, next_z_) : space_.dot(v_, v_);

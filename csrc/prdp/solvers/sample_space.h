@@ -100,23 +100,23 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   Scalar dot(const T* a, const T* b) const { return vectors_.dot(a, b, length()); }
   Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
     const Scalar rr = vectors_.update_iterate_and_residual(alpha, p, q, x, r, length());
-    if (!system_.a().needs_projection()) return rr;
-    project(r);  // no product takes away what rounding leaves there
-    return dot(r, r);
+    return system_.a().needs_projection() ? projected(r, rr) : rr;  // no product takes away what rounding leaves there
   }
 
   std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    if (system_.a().needs_projection()) {
-      apply(v, out);
-      return {dot(v, out), dot(out, out)};
-    }
     count(1);
-    return system_.a().apply_with_dots(v, out);
+    auto dots = system_.a().apply_with_dots(v, out);
+    // v·out stays, as v has no part in the null space but rounding.
+    if (system_.a().needs_projection()) dots[1] = projected(out, dots[1]);
+    return dots;
   }
   void apply(const T* v, Vector out) {
     count(1);
     system_.a().apply(v, out);
     if (system_.a().needs_projection()) project(out);
+  }
+  void keep_in_range(Vector v) {
+    if (system_.a().needs_projection()) project(v);
   }
   bool projects_products() const { return system_.a().needs_projection(); }
   bool is_preconditioned() const { return system_.preconditioner(); }
@@ -170,16 +170,20 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     return dot(u, u);
   }
   Scalar terms2(const T* x) {
-    std::vector<T> values(unknowns());
-    layout().store(solution(x), T(1), values.data());
-    for (int64_t i = 0; i < unknowns(); ++i)
-      if (is_negated(i)) values[i] = -values[i];
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    layout().load(values.data(), T(1), memory.vector(0));
-    system_.a().apply(memory.vector(0), memory.vector(1));
+    sum_terms(x, memory);
     return dot(memory.vector(1), memory.vector(1));
   }
+  Scalar sensitivity2(const T* x) {
+    kernels::Workspace<T> memory;
+    memory.prepare(2, length(), layout().halo);
+    sum_terms(x, memory);
+    change_signs(memory.vector(1), 1, memory.vector(0));
+    if (!system_.factors().solve(memory.vector(0), memory.vector(1))) return std::numeric_limits<T>::infinity();
+    return dot(memory.vector(1), memory.vector(1));
+  }
+  std::array<bool, 1> surely_definite() const { return {system_.a().is_surely_definite()}; }
   void solve_directly(const T* r, Vector d) {
     if (system_.factors().solve(r, d)) return;
     broken_ = true;
@@ -235,6 +239,25 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     copy(x, scratch());
     add(start(), scratch());
     return scratch();
+  }
+  /// Takes off v, with ‖v‖² = vv, what counts of its part in the null space; returns ‖v‖² of what is left.
+  Scalar projected(Vector v, Scalar vv) {
+    constexpr T negligible = std::numeric_limits<T>::epsilon() / 8;  // of ‖v‖
+    const T part = system_.a().left_null_space()->project(v, negligible * std::sqrt(vv));
+    return part * part < vv / 2 ? vv - part * part : dot(v, v);
+  }
+  /// out = v with signs that have no pattern, those from number `first` on.
+  void change_signs(const T* v, int64_t first, T* out) const {
+    std::vector<T> values(unknowns());
+    layout().store(v, T(1), values.data());
+    for (int64_t i = 0; i < unknowns(); ++i)
+      if (is_negated(first + i)) values[i] = -values[i];
+    layout().load(values.data(), T(1), out);
+  }
+  /// In vector 1, A times u with such signs.
+  void sum_terms(const T* x, kernels::Workspace<T>& memory) {
+    change_signs(solution(x), 0, memory.vector(0));
+    system_.a().apply(memory.vector(0), memory.vector(1));
   }
   void count(int64_t products) {
     watch_.spend(products * system_.a().work());

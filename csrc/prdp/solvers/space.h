@@ -71,6 +71,8 @@ concept FusedOperations =
       { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
       /// y = A x; returns p·y and ‖y‖², both for the guarded_quotient() that makes the next step.
       { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
+      /// Takes off x what rounding has left of it outside the range of A, where somebody named the null space.
+      s.keep_in_range(x);
       /// y = M⁻¹ x ≈ A⁻¹ x, without the powers of two that TensorSpace puts into apply() and precondition(): a method
       /// that calls this calls neither.
       s.correct(x, y);
@@ -170,6 +172,9 @@ template <class S>
 concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y) {
   /// y = A⁻¹ x; zero with a breakdown where A is singular.
   s.solve_directly(x, y);
+  /// ‖A⁻¹ w‖², w being the terms of terms2() with such signs once more: ε² times that is how far the rounding of A
+  /// moves u.
+  { s.sensitivity2(x) } -> std::same_as<typename S::Scalar>;
 };
 
 /// All that methods need.
@@ -181,10 +186,12 @@ template <class S>
 concept LoopSpace =
     Primitives<S> && requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
                               typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
-      /// One number per sample, on the host: a; whether it broke down; ‖A‖.
+      /// One number per sample, on the host: a; whether it broke down; ‖A‖; whether A is known to be positive definite,
+      /// and rounding does not change that.
       s.values_of(a);
       s.broken();
       s.operator_norm();
+      s.surely_definite();
       /// ‖u‖², where u is x and the start.
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
       /// ‖A v‖², v being u with signs that have no pattern, so that terms do not cancel: about ‖|A| |u|‖².
@@ -218,6 +225,7 @@ class SpaceDefaults {
     if (!(x == p)) found[0] = self().dot(p, y);
     return found;
   }
+  void keep_in_range(auto&&) {}
   void correct(const auto& x, auto&& y) { self().precondition(x, y); }
 
  private:

@@ -131,11 +131,22 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
   return started() ? start_ + from_zero : from_zero;
 }
 
-TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
+TensorSpace::Vector TensorSpace::terms(const Vector& x) const {
   const auto u = solution(x).detach();
   const auto negated = unstructured_like(u).lt(0);  // as is_negated() of sample_numbers.h
-  const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
-  return dot(terms, terms);
+  return laid_out(system_.a.apply(at::where(negated, -u, u)));
+}
+
+TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
+  const auto w = terms(x);
+  return dot(w, w);
+}
+
+TensorSpace::Scalar TensorSpace::sensitivity2(const Vector& x) const {
+  const auto w = terms(x);
+  const auto negated = unstructured_like(w).lt(0).flatten(1).roll(-1, 1).view_as(w);
+  const auto moved = laid_out(system_.a.solve_directly(at::where(negated, -w, w), /*transposed=*/false));
+  return dot(moved, moved);
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {

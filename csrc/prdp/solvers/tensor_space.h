@@ -73,6 +73,9 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   Scalar update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q, Vector& x, Vector& r);
   void apply(const Vector& v, Vector& out);
   Scalar residual(const Vector& x, Vector& r);
+  void keep_in_range(Vector& v) const {
+    if (system_.a.needs_projection()) v = keep_frozen(system_.a.project(v), v);
+  }
   bool is_preconditioned() const { return static_cast<bool>(system_.preconditioner); }
   Scalar precondition(const Vector& v, Vector& out);
 
@@ -142,18 +145,22 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   // ---- direct methods
 
   void solve_directly(const Vector& r, Vector& d);
+  Scalar sensitivity2(const Vector& x) const;
 
   // ---- the loop around the methods
 
   std::vector<double> values_of(const Scalar& value) const;
   std::vector<bool> broken() const;
   const std::vector<double>& operator_norm();
+  std::vector<bool> surely_definite() const { return std::vector<bool>(states_.size()); }
   /// u = start + scale_of_a x: the solution for the A that is not scaled.
   Vector solution(const Vector& x) const;
   Scalar solution2(const Vector& x) const {
     const auto u = solution(x);
     return dot(u, u);
   }
+  /// A times u with signs that have no pattern.
+  Vector terms(const Vector& x) const;
   Scalar terms2(const Vector& x) const;
   Vector scratch() const { return vector(); }
   template <class Predicate>

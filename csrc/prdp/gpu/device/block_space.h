@@ -110,6 +110,9 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     product(v, [&](int i, T value) { out[i] = value; });
     if (needs_projection_) project(out);
   }
+  void keep_in_range(Vector v) {
+    if (needs_projection_) project(v);
+  }
   PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
     if (needs_projection_) {
       apply(v, out);
@@ -207,11 +210,13 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (where != 0) copy(from, to);
   }
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
+  Scalar sensitivity2(const T*) const { return 0; }
 
   // ---- what iterate.h asks for
   std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {norm_}; }
+  std::array<bool, 1> surely_definite() const { return {false}; }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}
   template <class Function>

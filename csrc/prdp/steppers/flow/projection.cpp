@@ -16,21 +16,11 @@ namespace prdp {
 
 namespace {
 
-/// Whether the sums of rows are zero to the last bit, as all coefficients are whole numbers.
-bool has_square_cells(const FlowBox& box) {
-  for (int64_t axis = 0; axis < box.dim(); ++axis)
-    if (box.dx(axis) != box.dx(box.dim() - 1)) return false;
-  return true;
-}
-
-/// A direct solver is told of the null space. Iterations with square cells do not meet it: no right-hand side has a
-/// part there, and no product. With others, rounding makes A regular there or even indefinite.
-OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u, const SolveOptions& options) {
+/// It knows its null space, in which rounding would leave something of residuals that a method carries on.
+OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
   const auto& fields = box.fields(u.options());
   auto a = stencil_of(box, fields.pressure);
-  const bool meets_it = options.solver.method == Method::kDirect || !has_square_cells(box);
-  if (!meets_it || !fields.closed_parts.defined()) return a;
-  return with_null_space(std::move(a), fields.closed_parts);
+  return fields.closed_parts.defined() ? with_null_space(std::move(a), fields.closed_parts) : a;
 }
 
 /// All solves for the pressure share the coarse grids, and have right-hand sides without_means().
@@ -105,7 +95,7 @@ std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, co
   const double factor = by.reverse ? 1.0 : -scale_of_pressure(box);
   const auto b = flow_kernels::divergence(box, by.given, factor, /*for_a_solve=*/true);
   if (!b.defined()) return std::nullopt;
-  const auto a = pressure_operator(box, b, options);
+  const auto a = pressure_operator(box, b);
   const auto o = for_pressure(box, b, options);
   const auto found = by.reverse ? solve_vjp(a, b, {}, o, info).b : solve(a, b, o, info);
   return flow_kernels::correct(box, by.corrected, found, by.how);
@@ -115,8 +105,7 @@ Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& o
   const auto& fields = box.fields(u.options());
   const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
   // A preconditioner may leave something in the cells of solids.
-  const auto found =
-      masked(solve(pressure_operator(box, u, options), b, for_pressure(box, b, options), info), fields.cells);
+  const auto found = masked(solve(pressure_operator(box, u), b, for_pressure(box, b, options), info), fields.cells);
   const auto phi = without_means(box, found);
   return {add_gradient(box, u, phi, -1.0, fields.free), phi};
 }
@@ -158,7 +147,7 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   // What a potential's cotangent leaves may be its mean and little else. What rounding leaves of the mean counts then.
   if (potential_bar.defined()) phi_bar = without_means(box, phi_bar);
   phi_bar = without_least_numbers(phi_bar);
-  const auto a = pressure_operator(box, cotangent, options);
+  const auto a = pressure_operator(box, cotangent);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
   const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});
   return {u_bar, masked(u_bar, fields.free)};

@@ -1,0 +1,64 @@
+"""`Direct` where the residual of a regular system is all rounding, and where a system is singular to its dtype."""
+
+import pytest
+import torch
+from stand_in_device import StandIn
+
+import prdp_torch as prdp
+from prdp_torch.operators import Matrix
+
+F64 = torch.float64
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def constrained(stiffness=1e5, n=30, constraints=4):
+    """A saddle point: a stiffness, and constraints whose numbers are of the order of one."""
+    half = noise(n, n) / n**0.5
+    coupling = noise(constraints, n, seed=1)
+    top = torch.cat([(half @ half.T + torch.eye(n)) * stiffness, coupling.T], 1)
+    return torch.cat([top, torch.cat([coupling, torch.zeros(constraints, constraints)], 1)])
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "ignore:.* with a residual above")
+@pytest.mark.parametrize("form", ["dense", "csr", "device"])
+@pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7])
+def test_a_regular_system_is_solved_though_its_residual_is_rounding(stiffness, form):
+    a = constrained(stiffness).float()
+    b = torch.zeros(2, len(a))
+    b[:, 30:] = 1e-3 * noise(2, 4, seed=2).float()
+    expected = torch.linalg.solve(a.double(), b.double().T).T
+    if form == "device":
+        with StandIn() as device:
+            u, _ = prdp.linear_solve(Matrix(device.send(a)), device.send(b), prdp.Direct())
+            u = device.fetch(u)
+    else:
+        u, _ = prdp.linear_solve(Matrix(a if form == "dense" else a.to_sparse_csr()), b, prdp.Direct())
+    u = u.double()
+    assert ((u - expected)[:, :30].norm(dim=1) < 1e-4 * expected[:, :30].norm(dim=1)).all()
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "ignore:.* with a residual above")
+@pytest.mark.parametrize("scale", [1e10, 1e20])
+def test_one_row_of_another_size_is_no_singularity(scale):
+    a, b = noise(6, 6), torch.ones(1, 6, dtype=F64)
+    a[2] *= scale
+    u, _ = prdp.linear_solve(a, b, prdp.Direct())
+    torch.testing.assert_close(u[0], torch.linalg.solve(a, b[0]), rtol=1e-10, atol=0)
+
+
+def test_what_is_singular_to_its_dtype_is_refused():
+    """Of a hundred with an eigenvalue of zero, which rounding makes about 1e-8."""
+    refused = 0
+    for seed in range(100):
+        q, _ = torch.linalg.qr(noise(12, 12, seed=seed))
+        d = torch.logspace(0, -2, 12, dtype=F64)
+        d[-1] = 0.0
+        a, b = (q @ torch.diag(d) @ q.T).float(), noise(1, 12, seed=seed + 100).float()
+        u, info = prdp.linear_solve(a, b, prdp.Direct(), on_failure="return")
+        failed = info.status[0] == prdp.SolveStatus.BREAKDOWN
+        assert not failed or not u.any()
+        refused += int(failed)
+    assert refused >= 95
