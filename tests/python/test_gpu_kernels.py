@@ -242,6 +242,18 @@ def test_null_spaces_and_starts(method):
         agree(mine, other, F64, slack=1e7)
 
 
+@pytest.mark.parametrize("count", [8, 20, 60])
+def test_an_iterate_above_b_is_handed_out_where_a_is_surely_definite(count):
+    """Of a jump of 1e6 in float32, whose energy is less than the rounding of A would be."""
+    kappa = torch.ones(1, 12, 12)
+    kappa[:, 4:8, 4:8] = 1e6
+    a, b = operators.Diffusion(kappa), torch.ones(1, 1, 12, 12)
+    (u, info), (v, report) = (solve(a, b, prdp.CG(count, rtol=0.0), device) for device in ({}, None))
+    for each in (info, report):
+        assert each.status.tolist() == [prdp.SolveStatus.MAX_ITER] and each.iterations.tolist() == [count]
+    assert report.residual > 1 and (u - v).norm() < 1e-3 * v.norm()
+
+
 def test_zero_on_the_diagonal_and_infinite_entries():
     c = coefficients(F64)
     c[1, 0, 2, 3], c[2, 1, 0, 0] = 0.0, torch.inf

@@ -49,7 +49,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
         cycle_{of.hierarchy, sample, in_block, beyond + Vectors::kCyclesAt},
         null_space_(of.null_space),
         left_null_space_(of.left_null_space),
-        needs_projection_(of.needs_projection != 0) {}
+        needs_projection_(of.needs_projection != 0),
+        constant_(T(1) / std::sqrt(static_cast<T>(of.left_null_space.length))) {}
 
   // ---- a sample (solve_sample.h)
   void begin(SampleState& state) {
@@ -94,17 +95,17 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   Vector b() { return own(Vectors::kB); }
   Scalar b2() const { return b2_; }
   PRDP_ONCE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
-    T s = 0;
+    T s[2] = {0, 0};
+    const bool on_one = projects_on_one();
     each([&](int i) { return Pair{x[i] + alpha * p[i], r[i] - alpha * q[i]}; },
          [&](int i, Pair next) {
            x[i] = next.first;
            r[i] = next.second;
-           s += next.second * next.second;
+           s[0] += next.second * next.second;
+           if (on_one) s[1] += entry_of(left_null_space_, 0, 0, i) * next.second;
          });
-    const T rr = team_.sum(s);
-    if (!needs_projection_) return rr;
-    project(r);  // no product takes away what rounding leaves there
-    return dot(r, r);
+    sum_with_part(s);
+    return needs_projection_ ? projected(r, s[0], s[1]) : s[0];  // no product takes away what rounding leaves there
   }
   PRDP_ONCE void apply(const T* v, Vector out) {
     product(v, [&](int i, T value) { out[i] = value; });
@@ -114,18 +115,17 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (needs_projection_) project(v);
   }
   PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
-    if (needs_projection_) {
-      apply(v, out);
-      return {dot(v, out), dot(out, out)};
-    }
-    T s[2] = {0, 0};
+    T s[3] = {0, 0, 0};
+    const bool on_one = projects_on_one();
     product(v, [&](int i, T value) {
       out[i] = value;
       s[0] += v[i] * value;
       s[1] += value * value;
+      if (on_one) s[2] += entry_of(left_null_space_, 0, 0, i) * value;
     });
-    team_.sum(s);
-    return {s[0], s[1]};
+    sum_with_part(s);
+    // v·out stays, as v has no part in the null space but rounding.
+    return {s[0], needs_projection_ ? projected(out, s[1], s[2]) : s[1]};
   }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   PRDP_ONCE Scalar residual(const T* x, Vector r) {
@@ -216,7 +216,12 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {norm_}; }
-  std::array<bool, 1> surely_definite() const { return {false}; }
+  std::array<bool, 1> surely_definite() {
+    if constexpr (requires { a_.held(0); })
+      return {!is_singular() && largest_over_rows([&](int i) { return T(a_.held(i) < T(0)); }) == 0 &&
+              largest_over_rows([&](int i) { return a_.held(i); }) > 0};
+    else return {false};
+  }
   template <class Predicate>
   void freeze_unless(const States&, const Predicate&) {}
   template <class Function>
@@ -253,24 +258,48 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
       tell(i, change);
     });
   }
-  PRDP_ONCE T project(const NullSpaceArguments<T>& space, Vector v) {
+  /// Entry i of basis vector k, in this of the fields that have one.
+  T entry_of(const NullSpaceArguments<T>& space, int field, int k, int i) const {
+    const int length = static_cast<int>(space.length), at = i - (static_cast<int>(space.first) + field) * length;
+    if (at < 0 || at >= length) return T(0);
+    return space.basis ? space.basis[k * length + at] : constant_;
+  }
+  /// Parts no larger than `negligible` stay.
+  PRDP_ONCE T project(const NullSpaceArguments<T>& space, Vector v, T negligible = 0) {
     double part2 = 0;
-    const int length = static_cast<int>(space.length);
-    const T entry = T(1) / std::sqrt(static_cast<T>(length));
     for (int field = 0; field < static_cast<int>(space.fields); ++field)
       for (int k = 0; k < static_cast<int>(space.count); ++k) {
-        const auto q = [&](int i) {
-          const int at = i - (static_cast<int>(space.first) + field) * length;
-          if (at < 0 || at >= length) return T(0);
-          return space.basis ? space.basis[k * length + at] : entry;
-        };
         T s = 0;
-        each([&](int i) { return q(i) * v[i]; }, [&](int, T value) { s += value; });
+        each([&](int i) { return entry_of(space, field, k, i) * v[i]; }, [&](int, T value) { s += value; });
         const T along = team_.sum(s);
-        each([&](int i) { return v[i] - along * q(i); }, into(v));
+        if (std::abs(along) <= negligible) continue;
+        take_off(space, field, k, along, v);
         part2 += static_cast<double>(along) * static_cast<double>(along);
       }
     return static_cast<T>(std::sqrt(part2));
+  }
+  void take_off(const NullSpaceArguments<T>& space, int field, int k, T along, Vector v) {
+    each([&](int i) { return v[i] - along * entry_of(space, field, k, i); }, into(v));
+  }
+  /// Whether products are projected, and on a single vector: the sum for that goes along with others.
+  bool projects_on_one() const { return needs_projection_ && left_null_space_.count * left_null_space_.fields == 1; }
+  /// The sums over the team; that of the last, the part along that vector, only where there is one.
+  template <int n>
+  void sum_with_part(T (&s)[n]) {
+    if (projects_on_one()) return team_.sum(s);
+    T others[n - 1];
+    for (int k = 0; k < n - 1; ++k) others[k] = s[k];
+    team_.sum(others);
+    for (int k = 0; k < n - 1; ++k) s[k] = others[k];
+  }
+  /// As that of SampleSpace: takes off v, with ‖v‖² = vv, what counts of its part in the null space; returns ‖v‖² of
+  /// what is left. `along`: its part along the vector, where there is one alone.
+  PRDP_ONCE T projected(Vector v, T vv, T along) {
+    const T negligible = std::numeric_limits<T>::epsilon() / 8 * std::sqrt(vv);
+    if (!projects_on_one()) along = project(left_null_space_, v, negligible);
+    else if (!(std::abs(along) <= negligible)) take_off(left_null_space_, 0, 0, along, v);
+    else return vv;
+    return along * along < vv / 2 ? vv - along * along : dot(v, v);
   }
   PRDP_ONCE const T* solution(const T* x) {
     if (!started_) return x;
@@ -283,6 +312,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   SampleState* state_ = nullptr;
   const NullSpaceArguments<T>&null_space_, &left_null_space_;
   bool needs_projection_;
+  T constant_;  // the entry of a vector of equal numbers whose norm is one
   T factor_ = 1, b2_ = 0;
   double norm_ = 0;
   bool started_ = false;

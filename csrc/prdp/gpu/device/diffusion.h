@@ -62,6 +62,10 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     const T held = for_each_face(point, inside, couple);
     f(held + through, 0, 0, 0);
   }
+  /// What the shift and the sides hold unknown i by: A is definite if that is never negative, and not always zero.
+  T held(int i) const {
+    return for_each_face(i, [](T, int, int, int) {});
+  }
   /// By differences, which no coefficient rounds away.
   template <class V>
   T product(const V& v, int i) const {
