@@ -11,20 +11,20 @@ from prdp_torch.operators import Operator
 from prdp_torch.operators.base import full_precision, without_autocast
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solve import linear_solve
-from prdp_torch.solvers import CG, GMRES, Solver
+from prdp_torch.solvers import CG, GMRES, MINRES, Solver
 
 _UNIT_VECTORS = 256
 
 
 def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None = None) -> Literal[True]:
-    """Check that the parts of an operator fit each other, and a preconditioner of your own. It takes any operator;
-    `operators.Function` needs it most.
+    """Check that the parts of an operator fit each other and a solver. It takes any operator; `operators.Function`
+    needs it most.
 
     Args:
         A: an operator of `prdp_torch.operators`, or a tensor as `linear_solve` takes it.
         example: a right-hand side (batch, ...) in float32 or float64, of which only shape and dtype are used. In
             float64 the comparison is sharp; in float32 it finds only large mistakes.
-        solver: one whose preconditioner is checked as well, such as `CG(10, preconditioner=M)`.
+        solver: one that A, and a preconditioner of your own, are to fit, such as `CG(10, preconditioner=M)`.
 
     It checks that:
 
@@ -34,7 +34,9 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
     - the diagonal, if there is one, agrees with products with unit vectors (at most 256 of them);
     - A maps its `nullspace` to zero, and the constant only if that is its `nullspace`;
     - the gradient of ⟨w, A v⟩ for each tensor agrees with finite differences in one random direction;
-    - an operator that preconditions is linear and fits its transpose, and that of `CG` is symmetric and definite.
+    - for `CG` and `MINRES` A is symmetric, and for `CG` definite;
+    - an operator that preconditions is linear and fits its transpose; for `CG` it is symmetric and definite, for
+      `MINRES` positive definite.
 
     Returns:
         True.
@@ -61,6 +63,7 @@ def check_operator(A: Operator | Tensor, example: Tensor, solver: Solver | None 
             *_captures(A, v),
             *_diagonal(A, v),
             *_gradients(A, v, w, generator),
+            *_fits(A, solver, A, v, w),
             *_preconditioner(A, solver, v, w),
         ]
     if wrong:
@@ -189,13 +192,26 @@ def _preconditioner(A: Operator, solver: Solver | None, v: Tensor, w: Tensor) ->
         )
         return
     yield from _products(M, v, w, "M")
-    if not isinstance(solver, CG):
+    yield from _fits(M, solver, A, v, w)
+
+
+def _fits(M: Operator, solver: Solver | None, A: Operator, v: Tensor, w: Tensor) -> Iterator[str]:
+    """Whether M, which is A or preconditions it, is symmetric and definite where the method asks for that."""
+    if not isinstance(solver, (CG, MINRES)):
         return
-    left, right = _dot(product, w), _dot(v, M.apply(w))
-    bound = 1e3 * torch.finfo(v.dtype).eps * (_norm(product) * _norm(w) + _norm(v) * _norm(M.apply(w)))
+    is_a, method = M is A, type(solver).__name__
+    name, what = ("A", "A") if is_a else ("M", "preconditioner")
+    mv, mw = M.apply(v), M.apply(w)
+    left, right = _dot(mv, w), _dot(v, mw)
+    bound = 1e3 * torch.finfo(v.dtype).eps * (_norm(mv) * _norm(w) + _norm(v) * _norm(mw))
     if ((left - right).abs() > bound).any():
         worst = (left - right).abs().argmax()
-        yield f"CG needs a symmetric preconditioner: <M v, w> = {left[worst]:.6g} but <v, M w> = {right[worst]:.6g}"
+        at = f"<{name} v, w> = {left[worst]:.6g} but <v, {name} w> = {right[worst]:.6g}"
+        yield f"{method} needs a symmetric {what}: {at}"
+    if is_a and isinstance(solver, MINRES):
+        return
     signs = torch.stack([_dot(x, M.apply(x)).sign() for x in (v, w, A.apply(v), A.apply(w))])
-    if (signs != signs[0]).any() or (signs == 0).any():
-        yield "CG needs a definite preconditioner: <v, M v> is not of one sign"
+    if (signs == 0).any() or (signs != signs[0]).any():
+        yield f"{method} needs a definite {what}: <v, {name} v> is not of one sign"
+    elif isinstance(solver, MINRES) and (signs < 0).any():
+        yield f"{method} needs a positive definite {what}: <v, {name} v> is negative"

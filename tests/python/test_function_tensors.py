@@ -92,3 +92,33 @@ def test_a_complex_tensor_that_is_not_finite_fails_its_sample():
     a = operators.Function(lambda v, s: (v * s).real, tensors=s)
     _, info = prdp.linear_solve(a, torch.ones(2, 4, dtype=torch.float64), prdp.GMRES(3), on_failure="return")
     assert info.solved.tolist() == [True, False] and statuses(info)[1] == "NONFINITE_OPERATOR"
+
+
+B = right_hand_side()
+
+
+def of_captured(k):
+    a = operators.Function(lambda v: k * v, symmetric=True)
+    return prdp.linear_solve(a, B, prdp.CG(9, rtol=1e-10))[0].sum()
+
+
+@pytest.mark.parametrize("transform", ["grad", "jacrev", "jacfwd", "jvp", "vmap of grad", "dual tensors"])
+def test_what_a_transform_follows_and_a_product_captures_is_refused(transform):
+    """It would have no derivative, in silence."""
+    k = torch.rand(4, dtype=torch.float64) + 1
+
+    def dual_tensors():
+        with torch.autograd.forward_ad.dual_level():
+            return of_captured(torch.autograd.forward_ad.make_dual(k, torch.ones_like(k)))
+
+    calls = {
+        "grad": lambda: torch.func.grad(of_captured)(k),
+        "jacrev": lambda: torch.func.jacrev(of_captured)(k),
+        "jacfwd": lambda: torch.func.jacfwd(of_captured)(k),
+        "jvp": lambda: torch.func.jvp(of_captured, (k,), (torch.ones_like(k),)),
+        "vmap of grad": lambda: torch.func.vmap(torch.func.grad(of_captured))(torch.stack([k, k])),
+        "dual tensors": dual_tensors,
+    }
+    with pytest.raises(ValueError, match=r"a tensor that forward mode or torch\.func follows but is not among"):
+        calls[transform]()
+    of_captured(k)  # nothing follows it here

@@ -136,3 +136,24 @@ def test_a_preconditioner_of_gmres_need_not_be_symmetric():
     assert looked_at(operators.Function(lambda v: 3 * v + v.roll(1, -1)), solver=prdp.GMRES)
     with pytest.raises(ValueError, match="multigrid"):
         looked_at("multigrid")
+
+
+@pytest.mark.parametrize("a, solver, message", [
+    (lambda v: 3 * v + v.roll(1, -1), prdp.CG(3), "CG needs a symmetric A: <A v, w> = .* but <v, A w>"),
+    (lambda v: 3 * v + v.cumsum(-1), prdp.MINRES(3), "MINRES needs a symmetric A"),
+    (lambda v: v * torch.linspace(-1, 1, N), prdp.CG(3), "CG needs a definite A: <v, A v> is not of one sign"),
+    (lambda v: v @ spd_matrices(1, N)[0], prdp.MINRES(3, preconditioner=operators.Function(lambda v: v + v.cumsum(-1))),
+     "MINRES needs a symmetric preconditioner"),
+    (lambda v: v @ spd_matrices(1, N)[0], prdp.MINRES(3, preconditioner=operators.Function(lambda v: -v)),
+     "MINRES needs a positive definite preconditioner: <v, M v> is negative"),
+])  # fmt: skip
+def test_what_a_method_asks_of_an_operator_is_looked_at(a, solver, message):
+    with pytest.raises(ValueError, match=message):
+        prdp.check_operator(operators.Function(a), EXAMPLE, solver)
+    assert prdp.check_operator(operators.Function(a), EXAMPLE, prdp.GMRES(3))
+
+
+def test_minres_takes_what_is_indefinite_and_cg_what_is_negative():
+    indefinite = operators.Function(lambda v: v * torch.linspace(-1, 1, N))
+    assert prdp.check_operator(indefinite, EXAMPLE, prdp.MINRES(3))
+    assert prdp.check_operator(operators.Function(lambda v: -v), EXAMPLE, prdp.CG(3))

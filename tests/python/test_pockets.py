@@ -116,7 +116,6 @@ def test_blocks_that_do_not_touch_on_devices_without_loops(n, size):
     assert (without(null_space, u) - without(null_space, exact)).norm() <= 1e-4 * exact.norm()
 
 
-@pytest.mark.filterwarnings("ignore:Diffusion. in float32")
 @pytest.mark.parametrize("boundary", ["zero", "flux"])
 @pytest.mark.parametrize("inside", [2, 3, 6])
 def test_a_pocket_behind_a_contrast_that_float32_does_not_see(inside, boundary):

@@ -44,7 +44,6 @@ def names(info):
     return {prdp.SolveStatus(int(s)).name for s in info.status}
 
 
-@pytest.mark.filterwarnings("ignore:Diffusion. in float32")
 @pytest.mark.parametrize("on_failure", ["raise", "warn", "return", "zero_grad"])
 def test_a_residual_far_above_rtol_in_float32_is_told_with_the_remedy(on_failure):
     kappa, b = rough(2), torch.ones(2, 1, 48, 48)
@@ -103,7 +102,7 @@ def test_a_residual_above_b_is_told_of_steps_and_of_adjoint_solves():
         step(rough)
     assert float(step.info.residual) > 1 and "linear_solve: 1 of 1 samples stopped at max_iter = 30" in words[0]
     assert words[0].endswith("take more iterations, a preconditioner, GMRES or Direct; or rtol=0 if this is meant. "
-                             "This is said once")  # fmt: skip
+                             "This is said once, and again if it gets ten times worse")  # fmt: skip
     b = (a @ torch.sin(3 * x)).requires_grad_()
     u, info = prdp.linear_solve(a, b, prdp.CG(30, rtol=1e-3))
     with told("above ‖b‖") as words:
@@ -174,6 +173,21 @@ def test_iterations_in_vain_are_told():
 def test_it_is_said_once():
     done = subprocess.run([sys.executable, "-W", "always", "-c", SAID_ONCE], capture_output=True, text=True, check=True)
     assert done.stderr.count("STAGNATED far above") == 1 and "This is said once" in done.stderr
+
+
+WORSE = """
+import torch, prdp_torch as prdp
+solver = prdp.CG(60, rtol=1e-6, preconditioner="multigrid")
+for n, jump in ((64, 1e3), (64, 2e3), (96, 1e5), (96, 1e5)):
+    kappa = torch.ones(1, n, n)
+    kappa[:, 20:40, 20:40] = jump
+    prdp.linear_solve(prdp.operators.Diffusion(kappa), torch.ones(1, 1, n, n), solver)
+"""
+
+
+def test_it_is_said_again_where_it_is_ten_times_worse():
+    done = subprocess.run([sys.executable, "-W", "always", "-c", WORSE], capture_output=True, text=True, check=True)
+    assert done.stderr.count("STAGNATED far above") == 2
 
 
 def test_direct_steps_of_a_flow_at_their_rounding_are_solved():

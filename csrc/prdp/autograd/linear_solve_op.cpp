@@ -94,8 +94,10 @@ at::Tensor without_derivative(const at::Tensor& t) { return t.defined() ? primal
 SolveOutputs record_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                           const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
-  if (differentiable && at::GradMode::is_enabled() && is_function(a) && is_plain(b) && all_plain(a.tensors))
-    refuse_captured_gradients(a);
+  if (differentiable && at::GradMode::is_enabled() && is_function(a)) {
+    if (in_torch_func()) refuse_what_a_transform_follows(a, b);
+    else if (is_plain(b) && all_plain(a.tensors)) refuse_captured_gradients(a);
+  }
   const bool reverse =
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
   const bool forward = differentiable && (has_tangent(b) || any_tangent(a.tensors));

@@ -6,8 +6,6 @@
 
 namespace prdp {
 
-at::Tensor primal(const at::Tensor& t) { return has_tangent(t) ? t._fw_primal(/*level=*/0) : t; }
-
 at::Tensor reachable_part(const Operator& a, const at::Tensor& v) { return a.project(a.project(v)); }
 
 namespace {

@@ -10,9 +10,6 @@ namespace prdp {
 /// Differentiable in implicit mode.
 at::Tensor solve_jvp(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, const SolveOptions& options);
 
-/// t without its tangent.
-at::Tensor primal(const at::Tensor& t);
-
 /// v, a right-hand side of a derivative, without what A cannot reach: no u has a part in a null space that was named,
 /// so it has no influence. It may be large beside the rest, and so may what rounding leaves of it: it is taken off
 /// twice.

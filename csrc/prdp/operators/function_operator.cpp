@@ -54,6 +54,15 @@ bool holds_numbers(const at::Tensor& t) {
   return at::isFloatingType(t.scalar_type()) || at::isComplexType(t.scalar_type());
 }
 
+/// Raises ValueError if a product of constants has a derivative.
+void check_nothing_is_captured(const at::Tensor& result) {
+  const bool followed = has_tangent(result) || in_torch_func();
+  TORCH_CHECK_VALUE(!result.requires_grad() && !has_tangent(result), "Function: matvec uses a tensor that ",
+                    followed ? "forward mode or torch.func follows" : "requires grad",
+                    " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
+                    "detach it");
+}
+
 /// The matrix of a product, (batch, n, n), one unit vector at a time.
 template <class Product>
 at::Tensor probe(const Product& product, const at::Tensor& like) {
@@ -107,6 +116,14 @@ void refuse_captured_gradients(const OperatorSpec& a) {
   RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
 }
 
+void refuse_what_a_transform_follows(const OperatorSpec& a, const at::Tensor& b) {
+  if (a.transposed) return;  // of an adjoint solve, whose A was looked at
+  auto constant = a;
+  for (auto& t : constant.tensors) t = primal(t).detach();
+  const auto v = primal(b).detach();
+  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }));
+}
+
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
   TORCH_CHECK_VALUE(spec.shape.size() == 1 && spec.parameters.empty(),
                     "Function: takes the number of its products and no parameters");
@@ -158,9 +175,7 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
 at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const {
   const auto result =
       with_autograd([&] { return product(registered_->products().apply, v.detach(), detached(tensors_), "matvec"); });
-  TORCH_CHECK_VALUE(!result.requires_grad(),
-                    "Function: matvec uses a tensor that requires grad but is not among its tensors, so that no "
-                    "gradient would reach it; hand it over in tensors, or detach it");
+  check_nothing_is_captured(result);
   registered_->looks_for_captures = false;
   return result;  // no graph hangs on it
 }

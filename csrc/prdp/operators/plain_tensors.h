@@ -30,6 +30,8 @@ inline bool no_mode_is_on() { return no_mode_but_a_profiler_is_on() && !at::hasC
 
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }
+/// t without its tangent.
+inline at::Tensor primal(const at::Tensor& t) { return has_tangent(t) ? t._fw_primal(/*level=*/0) : t; }
 inline bool any_tangent(at::TensorList tensors) { return std::any_of(tensors.begin(), tensors.end(), has_tangent); }
 /// Whether a derivative is asked for with respect to one of them.
 inline bool any_moves(at::TensorList tensors) {

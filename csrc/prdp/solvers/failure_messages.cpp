@@ -201,7 +201,7 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
            (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
            " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") +
-           "give nullspace=\"constant\" to the operator";
+           "give nullspace=\"constant\" to the operator, or all vectors if it maps more to zero";
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure)
@@ -221,7 +221,9 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
   const auto why = [&]() -> std::string {
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         forgets_constants(role, a, b, sample))
-      return "A maps the constant to zero, so it is singular; give nullspace=\"constant\"";
+      return "A maps the constant to zero, so it is singular; give nullspace=\"constant\", or all vectors if it maps "
+             "more "
+             "to zero";
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {

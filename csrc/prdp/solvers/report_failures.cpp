@@ -1,8 +1,8 @@
 #include <c10/util/Exception.h>
 
 #include <algorithm>
+#include <map>
 #include <mutex>
-#include <set>
 #include <sstream>
 #include <utility>
 
@@ -53,22 +53,25 @@ std::string of_step() {
   return step_now > 0 ? "step " + std::to_string(step_now) + " of " + std::to_string(steps_in_all) + ": " : "";
 }
 
-/// Whether this is the first time that somebody says so.
-bool is_news(const std::string& what) {
+/// Whether nobody has said so yet, or only of what is less than a tenth as bad.
+bool is_news(const std::string& what, double size) {
   static std::mutex mutex;
-  static std::set<std::string> said;
+  static std::map<std::string, double> said;
   const std::lock_guard lock(mutex);
-  return said.insert(what).second || c10::WarningUtils::get_warnAlways();
+  const auto [at, is_first] = said.try_emplace(what, size);
+  const bool is_worse = !is_first && size > 10.0 * at->second;
+  if (is_worse) at->second = size;
+  return is_first || is_worse || c10::WarningUtils::get_warnAlways();
 }
 
-/// Warns with what `say` writes, the first time for this `key`.
+/// Warns with what `say` writes, the first time for this `key`, and again where it is ten times as bad.
 template <class Say>
-void warn_once(const std::string& key, const Say& say) {
-  if (!is_news(key)) return;
+void warn_once(const std::string& key, double size, const Say& say) {
+  if (!is_news(key, size)) return;
   std::ostringstream text;
   text << of_step();
   say(text);
-  text << ". This is said once";
+  text << (size > 0.0 ? ". This is said once, and again if it gets ten times worse" : ". This is said once");
   warning_sink()(text.str());
 }
 
@@ -90,7 +93,8 @@ void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
   const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
   if (!(residual[worst] > bound)) return;
   const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
-  warn_once(name_of(role) + std::string(name(role.solver.method)) + role.a.kind, [&](std::ostream& text) {
+  const std::string key = name_of(role) + std::string(name(role.solver.method)) + role.a.kind;
+  warn_once(key, residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst
          << " at relative residual " << residual[worst] << " after " << info.iterations[worst].item<int64_t>()
@@ -107,7 +111,7 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
   for (int64_t i = 0; i < status.size(0); ++i)
     lost += static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteInput;
   if (lost == 0) return;
-  warn_once("cotangents", [&](std::ostream& text) {
+  warn_once("cotangents", 0.0, [&](std::ostream& text) {
     text << name_of(role) << ": the cotangent of " << lost << " of " << status.size(0)
          << " samples contains NaN or Inf, and their gradient is zero. A GradScaler cannot see that: take bfloat16 "
             "without one, or a small scale that stays, such as GradScaler(init_scale=256.0, growth_interval=10**9)";
@@ -137,7 +141,8 @@ void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
     if (worst < 0 || residual[i] > residual[worst]) worst = i;
   }
   if (many == 0) return;
-  warn_once("grown: " + (name_of(role) + std::string(name(role.solver.method)) + role.a.kind), [&](std::ostream& text) {
+  const std::string key = "grown: " + (name_of(role) + std::string(name(role.solver.method)) + role.a.kind);
+  warn_once(key, residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
@@ -157,7 +162,7 @@ void warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
   if (vain.empty()) return warn_of_growth(role, a, b, status, residual);
   const char* cycles = role.solver.preconditioner.is_multigrid() ? " with multigrid" : "";
   const std::string key = name_of(role) + std::string(name(role.solver.method)) + cycles + role.a.kind;
-  warn_once("in vain: " + key, [&, first = vain.front()](std::ostream& text) {
+  warn_once("in vain: " + key, residual[vain.front()], [&, first = vain.front()](std::ostream& text) {
     text << name_of(role) << ": " << vain.size() << " of " << b.size(0)
          << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
          << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])
@@ -220,7 +225,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 }
 
 void warn_of_constant_cycles() {
-  warn_once("constant cycles", [](std::ostream& text) {
+  warn_once("constant cycles", 0.0, [](std::ostream& text) {
     text << "backward=\"unrolled\": the gradient of A leaves out how the cycles of multigrid depend on A, which is all "
             "of it after one iteration; take backward=\"implicit\"";
   });
