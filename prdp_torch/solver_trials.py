@@ -100,7 +100,7 @@ class Trial:
     sample: Tensor
     cotangent: Tensor
     renewed: bool
-    """Whether A is another one in every update: what is kept of it, factors and grids, is made anew for each run."""
+    """Whether A changes in every update: kept factors and coarse grids are then cleared before each run."""
 
     def forget(self) -> None:
         """Before a solve: frees what an update would not find."""

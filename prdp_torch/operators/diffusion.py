@@ -34,9 +34,10 @@ class Diffusion(Operator):
             3 axes. With per_axis (batch or 1, axes, *shape). Gets a gradient, which is formed from fluxes: in float32
             it keeps digits that the gradient of a `Stencil`'s coefficients loses.
         shift: a number, or a tensor (batch or 1, *shape), which gets a gradient. With 1/dt, A is a step of
-            ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32 products are made of fluxes: a small shift,
-            weak sides and jumps of κ are not lost in the rounding of a diagonal, though the residual may end at
-            ε max κ Σ 2/dx² |u|, with a warning. The coarse grids of multigrid do lose what holds u by less than that.
+            ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32 products are made of fluxes: for `CG` and
+            `Direct` a small shift, weak sides and jumps of κ are not lost in the rounding of a diagonal, though the
+            residual may end at ε max κ Σ 2/dx² |u|, with a warning. `MINRES` and `GMRES`, which go by the residual,
+            and the coarse grids of multigrid do lose what holds u by less than that.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
             ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
             one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor

@@ -62,3 +62,18 @@ def test_what_is_singular_to_its_dtype_is_refused():
         assert not failed or not u.any()
         refused += int(failed)
     assert refused >= 95
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("nodes", [2, 3])
+def test_a_few_unknowns_that_are_singular_are_found_wherever_they_stand(nodes, dtype):
+    """A graph's Laplacian, in float32 with rounding in its row sums, among unknowns of which nothing is wrong."""
+    weights = 0.1 + torch.rand(nodes, nodes, dtype=F64, generator=torch.Generator().manual_seed(0))
+    weights = (weights + weights.T) / 3
+    laplacian = torch.diag(weights.sum(1)) - weights
+    for at in range(12):
+        a = torch.eye(12 + nodes, dtype=F64)
+        a[at : at + nodes, at : at + nodes] = laplacian
+        b = noise(1, 12 + nodes, seed=at).to(dtype)
+        u, info = prdp.linear_solve(a.to(dtype), b, prdp.Direct(), on_failure="return")
+        assert not info.solved.any() and u.abs().max() < 1e3

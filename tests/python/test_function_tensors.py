@@ -102,7 +102,19 @@ def of_captured(k):
     return prdp.linear_solve(a, B, prdp.CG(9, rtol=1e-10))[0].sum()
 
 
-@pytest.mark.parametrize("transform", ["grad", "jacrev", "jacfwd", "jvp", "vmap of grad", "dual tensors"])
+@pytest.mark.parametrize(
+    "transform",
+    [
+        "grad",
+        "jacrev",
+        "jacfwd",
+        "jvp",
+        "vmap of grad",
+        "dual tensors",
+        "dual tensors without grad",
+        "jvp without grad",
+    ],
+)
 def test_what_a_transform_follows_and_a_product_captures_is_refused(transform):
     """It would have no derivative, in silence."""
     k = torch.rand(4, dtype=torch.float64) + 1
@@ -118,7 +130,9 @@ def test_what_a_transform_follows_and_a_product_captures_is_refused(transform):
         "jvp": lambda: torch.func.jvp(of_captured, (k,), (torch.ones_like(k),)),
         "vmap of grad": lambda: torch.func.vmap(torch.func.grad(of_captured))(torch.stack([k, k])),
         "dual tensors": dual_tensors,
+        "dual tensors without grad": torch.no_grad()(dual_tensors),
+        "jvp without grad": torch.no_grad()(lambda: torch.func.jvp(of_captured, (k,), (torch.ones_like(k),))),
     }
-    with pytest.raises(ValueError, match=r"a tensor that forward mode or torch\.func follows but is not among"):
+    with pytest.raises(ValueError, match=r"or that forward mode or torch\.func follows, but is not among"):
         calls[transform]()
     of_captured(k)  # nothing follows it here

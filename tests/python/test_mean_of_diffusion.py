@@ -88,3 +88,26 @@ def test_products_of_a_constant_are_the_shift(boundary):
         shift = (1e-7 * rand(1, *kappa.shape[1:], seed=3)).float()
         found = Diffusion(1e3 * kappa, shift=shift, boundary=boundary).apply(torch.ones(2, 1, *kappa.shape[1:]))
         assert torch.equal(found, shift[:, None].expand_as(found))
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (3, 40), (6, 5, 7)], ids=str)
+@pytest.mark.parametrize("spread", [0.0, 1e-7, 1e-6, 1e-4])
+def test_direct_steps_keep_the_mean_where_kappa_is_almost_one_number(spread, shape):
+    """Beside a diagonal, how κ varies passes for rounding."""
+    for size in (1.0, 1e3):
+        kappa = (size * (1 + spread * rand(1, *shape))).float()
+        u0 = rand(1, 1, *shape, seed=1).float()
+        a = Diffusion(kappa, shift=1 / LARGE, boundary="flux", length=[float(n) for n in shape])
+        u, _ = prdp.linear_solve(a, u0 / LARGE, prdp.Direct())
+        assert (mean(u) / mean(u0) - 1).abs().max() < 1e-5
+
+
+def test_direct_steps_keep_the_mean_where_kappa_differs_between_the_axes():
+    """That of the other axis is a hundred thousand times as large."""
+    small = 1 + 0.3 * rand(1, 1, 16, 16)
+    kappa = torch.cat([small, 1e5 * torch.ones_like(small)], 1)
+    u0 = rand(1, 1, 16, 16, seed=1)
+    options = {"shift": 1.0, "boundary": "flux", "per_axis": True}
+    u, _ = prdp.linear_solve(Diffusion(kappa.float(), **options), u0.float(), prdp.Direct())
+    exact, _ = prdp.linear_solve(Diffusion(kappa, **options), u0, prdp.Direct())
+    assert (mean(u) / mean(u0) - 1).abs().max() < 1e-5 and (u - exact).norm() < 1e-5 * exact.norm()

@@ -91,12 +91,13 @@ SolveOutputs call_op_below_autograd(const at::Tensor& b, const OperatorSpec& a, 
 at::Tensor without_derivative(const at::Tensor& t) { return t.defined() ? primal(t).detach() : t; }
 
 /// The op's autograd kernel, but for what depends on the null spaces.
-SolveOutputs record_solve(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
-                          const at::Tensor& x0) {
+SolveOutputs solve_with_node(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                             const at::Tensor& x0) {
   const bool differentiable = options.backward != Backward::kNone;
-  if (differentiable && at::GradMode::is_enabled() && is_function(a)) {
-    if (in_torch_func()) refuse_what_a_transform_follows(a, b);
-    else if (is_plain(b) && all_plain(a.tensors)) refuse_captured_gradients(a);
+  if (differentiable && is_function(a)) {
+    const bool in_grad_mode = at::GradMode::is_enabled();  // which forward mode ignores
+    if (in_torch_func() || (!in_grad_mode && in_forward_mode())) refuse_captured_transforms(a, b);
+    else if (in_grad_mode && is_plain(b) && all_plain(a.tensors)) refuse_captured_gradients(a);
   }
   const bool reverse =
       differentiable && at::GradMode::is_enabled() && (b.requires_grad() || any_requires_grad(a.tensors));
@@ -112,25 +113,25 @@ SolveOutputs record_solve(const at::Tensor& b, const OperatorSpec& a, const Solv
 }
 
 /// The op's autograd kernel.
-SolveOutputs solve_and_record(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
-                              const at::Tensor& x0) {
-  if (!is_singular(a) || options.backward == Backward::kNone) return record_solve(b, a, options, x0);
+SolveOutputs solve_and_differentiate_null_space(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+                                                const at::Tensor& x0) {
+  if (!is_singular(a) || options.backward == Backward::kNone) return solve_with_node(b, a, options, x0);
   const auto bases = at::TensorList(a.tensors).slice(a.tensors.size() - 2);
-  if (!any_moves(bases)) return record_solve(b, a, options, x0);
+  if (!any_needs_derivative(bases)) return solve_with_node(b, a, options, x0);
   auto fixed = a;
   for (size_t k = 0; k < 2; ++k) fixed.tensors[a.tensors.size() - 2 + k] = without_derivative(bases[k]);
-  auto out = record_solve(b, fixed, options, x0);
+  auto out = solve_with_node(b, fixed, options, x0);
   std::get<0>(out) = follow_null_space(std::get<0>(out), bases[a.transposed]);
   return out;
 }
 
 /// Records without the dispatcher, which would pack and unpack the options, where no mode or subclass is to see the op;
 /// else calls the op.
-SolveOutputs record_or_call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
+SolveOutputs solve_or_dispatch(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                                const at::Tensor& x0) {
   if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
   RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
-  return solve_and_record(b, a, options, x0);
+  return solve_and_differentiate_null_space(b, a, options, x0);
 }
 
 /// A function pointer with the op's signature out of a template over its arguments.
@@ -142,7 +143,7 @@ struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
   static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_op(b, args...); }
   static SolveOutputs autograd(const at::Tensor& b, Args... args) {
     const auto [a, options, x0] = unpack_op(args...);
-    return solve_and_record(b, a, options, x0);
+    return solve_and_differentiate_null_space(b, a, options, x0);
   }
 };
 
@@ -151,8 +152,8 @@ struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
-  if (!lone_vector) return result_of(record_or_call_op(b, a, options, x0));
-  auto result = result_of(record_or_call_op(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
+  if (!lone_vector) return result_of(solve_or_dispatch(b, a, options, x0));
+  auto result = result_of(solve_or_dispatch(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
   result.u = result.u.squeeze(0);
   return result;
 }

@@ -5,7 +5,7 @@
 
 namespace prdp {
 
-/// Takes the operations of a tape back, from the cotangents of what they made to those of what they were made of.
+/// The reverse sweep over a tape: from the cotangents of the outputs of each operation to those of its inputs.
 /// Here stands the derivative of every operation of a space, and so that of every method.
 template <class T>
 class TapeBack {

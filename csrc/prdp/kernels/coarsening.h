@@ -72,8 +72,8 @@ Axes axes_to_coarsen(const Shape& shape, int dim, const Couplings& couplings) {
   return axes;
 }
 
-/// A coarse diagonal below this many roundings of the fine one is what was left of a pocket that the coarse grid does
-/// not resolve; where nothing couples to the point, roundings of the whole pocket may have gathered there. The fine
+/// A coarse diagonal below this many ε of the fine one is cancellation error, of a region that the coarse grid does not
+/// resolve; where nothing couples to the point, the errors of the whole region may have gathered there. The fine
 /// diagonal is kept in its place: there is nothing to correct, and nothing is divided by it.
 inline constexpr double kVanishing = 8.0, kVanishingAlone = 256.0;
 

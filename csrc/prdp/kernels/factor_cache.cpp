@@ -83,27 +83,27 @@ using Entries = std::list<Entry>;  // the last used first
 std::mutex mutex;
 // Never destroyed: at the end of a process, memory of a device can no longer be freed.
 auto& entries = *new Entries;
-auto& names_of_gone = *new Entries;
+auto& evicted_names = *new Entries;
 auto& places = *new std::unordered_map<Name, Entries::iterator, HashOfName>;
 int64_t bytes_of_all = 0, bytes_made = 0;
-constexpr int64_t kLeastReach = int64_t{1} << 26;
-int64_t reach = kLeastReach;
+constexpr int64_t kLeastRetention = int64_t{1} << 26;
+int64_t retention_bytes = kLeastRetention;
 std::atomic<int64_t> made = 0;
 
 /// Moves an entry of `entries` to the names of what has gone; what it kept goes with `gone`.
-void let_go(Entries::iterator entry, std::vector<Kept>& gone) {
+void evict(Entries::iterator entry, std::vector<Kept>& gone) {
   bytes_of_all -= entry->bytes;
   gone.push_back(std::move(entry->kept));
-  names_of_gone.splice(names_of_gone.begin(), entries, entry);
+  evicted_names.splice(evicted_names.begin(), entries, entry);
 }
 
 /// Frees what has not been used while so much else was made, or takes too much memory, and forgets the oldest names.
 void make_room(std::vector<Kept>& gone) {
-  while (!entries.empty() && (bytes_of_all > limit() || bytes_made - entries.back().used_at > reach))
-    let_go(std::prev(entries.end()), gone);
-  while (!names_of_gone.empty() && bytes_made - names_of_gone.back().used_at > limit()) {
-    places.erase(names_of_gone.back().name);
-    names_of_gone.pop_back();
+  while (!entries.empty() && (bytes_of_all > limit() || bytes_made - entries.back().used_at > retention_bytes))
+    evict(std::prev(entries.end()), gone);
+  while (!evicted_names.empty() && bytes_made - evicted_names.back().used_at > limit()) {
+    places.erase(evicted_names.back().name);
+    evicted_names.pop_back();
   }
 }
 
@@ -120,7 +120,7 @@ Kept find(const kernels::FactorKey& key, const std::type_info& type) {
   const auto place = places.find({key, type});
   if (place == places.end()) return nullptr;
   const auto entry = place->second;
-  reach = std::max(reach, std::min(limit(), 2 * (bytes_made - entry->used_at)));
+  retention_bytes = std::max(retention_bytes, std::min(limit(), 2 * (bytes_made - entry->used_at)));
   if (!entry->kept) return nullptr;
   entry->used_at = bytes_made;
   entries.splice(entries.begin(), entries, entry);
@@ -133,8 +133,8 @@ void keep(const kernels::FactorKey& key, const std::type_info& type, Kept kept, 
   if (bytes > limit()) return;
   const Name name{key, type};
   if (const auto place = places.find(name); place != places.end()) {
-    if (place->second->kept) let_go(place->second, gone);  // another thread made it too
-    names_of_gone.erase(place->second);
+    if (place->second->kept) evict(place->second, gone);  // another thread made it too
+    evicted_names.erase(place->second);
   }
   bytes_made += bytes;
   bytes_of_all += bytes;
@@ -147,10 +147,10 @@ void clear() {
   Entries gone;
   const std::lock_guard lock(mutex);
   gone.swap(entries);
-  names_of_gone.clear();
+  evicted_names.clear();
   places.clear();
   bytes_of_all = 0;
-  reach = kLeastReach;
+  retention_bytes = kLeastRetention;
 }
 
 void count_one() { ++made; }

@@ -25,10 +25,11 @@ class Reader {
     const int64_t n = n_[axis];
     Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(n, n);
     for (int64_t i = 0; i < n; ++i) {
-      matrix(i, i) = at(axis, i, 0) - (axis == 2 ? 0.0 : at(axis, middle(axis), 0));
       for (const int64_t step : {-1, 1})
         if (const auto j = neighbour(i, step, n, a_.grid().periodic[axis]); j >= 0)
           matrix(i, j) = at(axis, i, place_of(axis, step));
+      if (a_.has_row_sums()) matrix(i, i) = row_sum_along(axis, i) - matrix.row(i).sum();
+      else matrix(i, i) = at(axis, i, 0) - (axis == 2 ? 0.0 : at(axis, middle(axis), 0));
     }
     return matrix;
   }
@@ -37,7 +38,7 @@ class Reader {
   bool agrees_with(const SumOverAxes& sum) const {
     for (int64_t r = 0; r < a_.rows(); ++r) {
       const int64_t z = r / n_[1], y = r % n_[1];
-      if (!is_middle_row(r, 0, sum[0](z, z) + sum[1](y, y))) return false;
+      if (!a_.has_row_sums() && !is_middle_row(r, 0, sum[0](z, z) + sum[1](y, y))) return false;
       for (const int64_t step : {-1, 1}) {
         if (!is_middle_row(r, place_of(2, step), 0.0)) return false;
         if (!is_constant(r, sum[1], 1, y, step) || !is_constant(r, sum[0], 0, z, step)) return false;
@@ -45,18 +46,18 @@ class Reader {
     }
     return true;
   }
-  /// Whether what holds the points is a sum over the axes; how it varies would pass for rounding beside a diagonal.
-  bool is_held_by_sum() const {
-    if (!a_.is_held_by_field()) return true;
+  /// Whether the stored row sums are a sum over the axes; how they vary would pass for rounding beside a diagonal.
+  bool row_sums_are_separable() const {
+    if (!a_.has_row_sums()) return true;
     constexpr double slack = 16.0 * std::numeric_limits<T>::epsilon();
     const int64_t z0 = middle(0), y0 = middle(1), x0 = middle(2);
-    const double there = a_.held(z0 * n_[1] + y0, x0);
+    const double there = a_.row_sum(z0 * n_[1] + y0, x0);
     for (int64_t r = 0; r < a_.rows(); ++r) {
-      const double z = a_.held(r / n_[1] * n_[1] + y0, x0), y = a_.held(z0 * n_[1] + r % n_[1], x0);
+      const double z = a_.row_sum(r / n_[1] * n_[1] + y0, x0), y = a_.row_sum(z0 * n_[1] + r % n_[1], x0);
       for (int64_t i = 0; i < n_[2]; ++i) {
-        const double held = a_.held(r, i), x = a_.held(z0 * n_[1] + y0, i);
-        const double size = std::abs(held) + std::abs(x) + std::abs(y) + std::abs(z) + std::abs(there);
-        if (!(std::abs(held - (x + y + z - 2.0 * there)) <= slack * size)) return false;
+        const double row_sum = a_.row_sum(r, i), x = a_.row_sum(z0 * n_[1] + y0, i);
+        const double size = std::abs(row_sum) + std::abs(x) + std::abs(y) + std::abs(z) + std::abs(there);
+        if (!(std::abs(row_sum - (x + y + z - 2.0 * there)) <= slack * size)) return false;
       }
     }
     return true;
@@ -84,13 +85,32 @@ class Reader {
     const int64_t x = axis == 2 ? i : middle(2);
     return k == 0 ? a_.diagonal(row, x) : static_cast<double>(a_.value(row, k, x));
   }
+  /// The row sums of A_d, so that those of all axes add up to what is stored.
+  double row_sum_along(int axis, int64_t i) const {
+    const int64_t row = (axis == 0 ? i : middle(0)) * n_[1] + (axis == 1 ? i : middle(1));
+    if (axis == 2) return a_.row_sum(row, i);
+    return a_.row_sum(row, middle(2)) - a_.row_sum(middle_row(), middle(2));
+  }
+  /// How much a coefficient may differ from this one: where the row sums are stored it does not enter a diagonal,
+  /// beside whose rounding it would have to count.
+  double slack_of(double coefficient) const {
+    return a_.has_row_sums() ? 16.0 * std::numeric_limits<T>::epsilon() * std::abs(coefficient) : slack_;
+  }
   /// Whether coefficient k of row r is that of the middle row, and `more`.
   bool is_middle_row(int64_t r, int64_t k, double more) const {
     const int64_t last = n_[2] - 1, middle = middle_row();
-    for (const int64_t end : {int64_t{0}, last})
-      if (!(std::abs(a_.value(r, k, end) - a_.value(middle, k, end) - more) <= slack_)) return false;
+    for (const int64_t end : {int64_t{0}, last}) {
+      const double expected = a_.value(middle, k, end);
+      if (!(std::abs(a_.value(r, k, end) - expected - more) <= slack_of(expected))) return false;
+    }
     const T *row = a_.coefficient(r, k), *of_middle = a_.coefficient(middle, k);
-    return all_within(1, last, [&, added = static_cast<T>(more)](int64_t i) { return row[i] - of_middle[i] - added; });
+    if (a_.has_row_sums()) {
+      for (int64_t i = 1; i < last; ++i)
+        if (!(std::abs(row[i] - of_middle[i]) <= slack_of(static_cast<double>(of_middle[i])))) return false;
+      return true;
+    }
+    return all_within(1, last, slack_,
+                      [&, added = static_cast<T>(more)](int64_t i) { return row[i] - of_middle[i] - added; });
   }
   /// Whether the coefficient of the neighbour along another axis than x is the same at all points of a row.
   bool is_constant(int64_t r, const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {
@@ -98,11 +118,12 @@ class Reader {
     const auto j = neighbour(i, step, n_[axis], a_.grid().periodic[axis]);
     if (j < 0) return true;  // what points beyond the grid couples to nothing
     const T* row = a_.coefficient(r, place_of(axis, step));
-    return all_within(0, n_[2], [row, value = static_cast<T>(matrix(i, j))](int64_t x) { return row[x] - value; });
+    return all_within(0, n_[2], slack_of(matrix(i, j)),
+                      [row, value = static_cast<T>(matrix(i, j))](int64_t x) { return row[x] - value; });
   }
   template <class Difference>
-  bool all_within(int64_t first, int64_t end, const Difference& difference) const {
-    const auto slack = static_cast<T>(slack_);
+  bool all_within(int64_t first, int64_t end, double most, const Difference& difference) const {
+    const auto slack = static_cast<T>(most);
     int farther = 0;  // no early return, so that it becomes vector code
     for (int64_t i = first; i < end; ++i) farther |= !(std::abs(difference(i)) <= slack);
     return farther == 0;
@@ -152,7 +173,7 @@ bool is_circulant(const Eigen::MatrixXd& a, double epsilon) {
 }
 
 /// The eigenvalues of a symmetric circulant matrix, in the order of the wavenumbers.
-Eigen::VectorXd of_waves(const Eigen::MatrixXd& a) {
+Eigen::VectorXd circulant_eigenvalues(const Eigen::MatrixXd& a) {
   const auto n = a.rows();
   const Eigen::VectorXd cosines =
       (Eigen::VectorXd::LinSpaced(n, 0, static_cast<double>(n - 1)) * (2.0 * std::numbers::pi / static_cast<double>(n)))
@@ -199,7 +220,9 @@ bool is_symmetric(const Eigen::MatrixXd& a, double slack) { return (a - a.transp
 
 DiagonalisedSum diagonalise(const SumOverAxes& a, double epsilon, int64_t null_vectors) {
   if (is_circulant(a[0], epsilon) && is_circulant(a[1], epsilon) && is_circulant(a[2], epsilon))
-    return {std::nullopt, inverted({of_waves(a[0]), of_waves(a[1]), of_waves(a[2])}, null_vectors)};
+    return {std::nullopt,
+            inverted({circulant_eigenvalues(a[0]), circulant_eigenvalues(a[1]), circulant_eigenvalues(a[2])},
+                     null_vectors)};
   auto found = eigenpairs(a);
   auto inverse = inverted(found.eigenvalues, null_vectors);
   return {std::move(found.eigenvectors), std::move(inverse)};
@@ -210,7 +233,7 @@ std::optional<SumOverAxes> as_sum_over_axes(const PackedStencil<T>& a) {
   const auto& grid = a.grid();
   if (!has_axes_to_diagonalise(grid.dim, grid.shape) || !a.pattern().nearest) return std::nullopt;
   const Reader<T> reader(a);
-  if (!reader.has_even_rows() || !reader.is_held_by_sum()) return std::nullopt;
+  if (!reader.has_even_rows() || !reader.row_sums_are_separable()) return std::nullopt;
   SumOverAxes sum;
   for (int d = 0; d < 3; ++d) {
     const bool is_there = d >= 3 - grid.dim;

@@ -59,13 +59,13 @@ PackedStencil<T> assemble_rows(std::shared_ptr<const StencilSparsity> pattern,
   return a;
 }
 
-/// What the points are held by, see PackedStencil::hold(): (batch, nz, ny, nx), or one number for all of them.
+/// The row sums that products keep, see PackedStencil::set_row_sums(): (batch, nz, ny, nx), or one number for all.
 template <class T>
-struct Hold {
+struct RowSums {
   const T* values = nullptr;  // null: nothing is said of that
   int64_t sample_stride = 0;  // 0: all samples share them
   bool is_number = false;
-  std::vector<Offset> offsets = {};  // those that the coefficients are for
+  std::vector<Offset> offsets = {};  // those of the coefficients; none: these lead nowhere beyond the grid
 };
 
 /// The stencils with `coefficients` (batch, k, nz, ny, nx) for the offsets that `pattern` was given, or their
@@ -76,11 +76,11 @@ struct GivenStencil {
   int64_t sample_stride;  // 0: all samples share them
   std::shared_ptr<const StencilSparsity> pattern;
   bool transposed;
-  Hold<T> hold = {};
+  RowSums<T> row_sums = {};
 
   /// Whether apply() may be used: each given offset leads to a neighbour of its own, and products are of values.
   bool is_one_to_one() const {
-    if (hold.values) return false;
+    if (row_sums.values) return false;
     auto places = pattern->places;
     std::sort(places.begin(), places.end());
     return places.front() >= 0 && std::adjacent_find(places.begin(), places.end()) == places.end();
@@ -121,11 +121,12 @@ struct GivenStencil {
     for (int64_t k = 0; k < given; ++k) fields.push_back(from + k * points);
     const T factor = scale_of_operator(magnitude);
     auto rows = std::make_shared<PackedStencil<T>>(assemble_rows(pattern, fields, factor, transposed));
-    const T* const held = hold.values ? hold.values + s * hold.sample_stride : nullptr;
-    if (held) this->hold_rows(*rows, held, fields, factor);
-    const auto key = [given_stencil = *this, from, held, count = given * points, points] {
+    const T* const values_of_sample = row_sums.values ? row_sums.values + s * row_sums.sample_stride : nullptr;
+    if (values_of_sample) this->set_row_sums(*rows, values_of_sample, fields, factor);
+    const auto key = [given_stencil = *this, from, values_of_sample, count = given * points, points] {
       auto made = given_stencil.of_matrix().add_field(from, count);
-      return held ? made.add_field(held, given_stencil.hold.is_number ? 1 : points).key() : made.key();
+      return values_of_sample ? made.add_field(values_of_sample, given_stencil.row_sums.is_number ? 1 : points).key()
+                              : made.key();
     };
     const auto raw = [given_stencil = *this, fields, factor, points] {
       return given_stencil.raw(fields, factor, points);
@@ -135,19 +136,19 @@ struct GivenStencil {
   }
 
  private:
-  /// By the values given, and by the zeros beyond the grid that points at its sides are coupled to.
-  void hold_rows(PackedStencil<T>& rows, const T* values, const std::vector<const T*>& fields, T factor) const {
-    rows.hold(values, hold.is_number, factor);
+  /// The values given, and what the points at the sides of the grid are coupled to zeros beyond it by.
+  void set_row_sums(PackedStencil<T>& rows, const T* values, const std::vector<const T*>& fields, T factor) const {
+    rows.set_row_sums(values, row_sums.is_number, factor);
     const auto& n = pattern->grid.shape;
-    for (size_t given = 0; given < fields.size(); ++given) {
-      const auto& along = hold.offsets[given].along;
+    for (size_t given = 0; given < row_sums.offsets.size(); ++given) {
+      const auto& along = row_sums.offsets[given].along;
       for (int64_t r = 0; r < n[0] * n[1]; ++r)
         for (int64_t axis = 0; axis < 3; ++axis) {
           if (along[axis] == 0 || pattern->grid.periodic[axis]) continue;
           const int64_t side = along[axis] < 0 ? 0 : n[axis] - 1;
           if (axis < 2 && (axis == 0 ? r / n[1] : r % n[1]) != side) continue;
           for (int64_t i = axis < 2 ? 0 : side; i < (axis < 2 ? n[2] : side + 1); ++i)
-            rows.hold_more(r, i, -factor * fields[given][r * n[2] + i]);
+            rows.add_to_row_sum(r, i, -factor * fields[given][r * n[2] + i]);
         }
     }
   }

@@ -14,7 +14,7 @@ namespace {
 
 /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero.
 template <class T>
-double radius_of(const StencilFields<T>& a) {
+double gershgorin_bound(const StencilFields<T>& a) {
   const T* diagonal = a.coefficients[StencilFields<T>::kCentre];
   const T largest = largest_of_blocks<T>(a.points(), [&](int64_t begin, int64_t end) {
     std::vector<T> ratios(end - begin, T(0));
@@ -155,7 +155,7 @@ std::unique_ptr<const Hierarchy<T>> Hierarchy<T>::make(StencilFields<T> finest, 
   h->symmetric_ = is_symmetric(finest);
   StencilFields<T> a = std::move(finest);
   for (;;) {
-    const double radius = radius_of(a);
+    const double radius = gershgorin_bound(a);
     if (!std::isfinite(radius) || !all_finite(a)) return nullptr;
     h->levels_.push_back({a.grid, radius, {}});
     if (h->levels_.size() > 1) h->packed_.push_back(pack(a, false));

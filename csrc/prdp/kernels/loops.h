@@ -31,16 +31,16 @@ struct ConstantStencil {
 /// plane, comes the one from the other end, with coefficients of zero where the axis is not periodic.
 /// The padding holds zeros but for the centre's, which may be divided by.
 ///
-/// With `held`, products are made of differences: A v is held∘v and, for each neighbour, its coefficient times how far
-/// it is from the point itself. The centre, which is the sum of them all, is then for divisions alone. `held` has a row
-/// for each row of the grid, `held_step` apart.
+/// With `row_sums`, products are made of differences: A v is row_sums∘v and, for each neighbour, its coefficient times
+/// how far it is from the point itself. The centre, which is the sum of them all, is then for divisions alone.
+/// `row_sums` has a row for each row of the grid, `row_sum_step` apart.
 template <class T>
 struct NeighbourStencil {
   int64_t nz, ny, nx, row;
   const T* coefficients;
   const T* ends;
-  const T* held = nullptr;
-  int64_t held_step = 0;
+  const T* row_sums = nullptr;
+  int64_t row_sum_step = 0;
 };
 
 /// The same with neighbours at any offsets, the first being the point itself. What leaves a row has its

@@ -53,40 +53,38 @@ class PackedStencil {
     });
   }
 
-  /// Of nearest neighbours: from here on the diagonal is, but for rounding, these values and what the neighbours of a
-  /// point are coupled by, and products are made of differences. The rounding of a diagonal would hold v by more, or by
-  /// less, than the values say. One for all points, or one for each.
-  void hold(const T* values, bool is_number, T factor) {
-    held_step_ = is_number ? 0 : row_;
-    held_ = zeros<T>(is_number ? row_ : rows() * row_);
+  /// Of nearest neighbours: stores the row sums s_i, one for all points or one for each. Products are then evaluated as
+  /// s_i v_i + Σ_k a_k (v_k - v_i), so that rounding of the diagonal cannot change a row sum.
+  void set_row_sums(const T* values, bool is_number, T factor) {
+    row_sum_step_ = is_number ? 0 : row_;
+    row_sums_ = zeros<T>(is_number ? row_ : rows() * row_);
     for (int64_t r = 0; r < (is_number ? 1 : rows()); ++r)
-      for (int64_t i = 0; i < nx_; ++i) held_[r * row_ + i] = factor * values[is_number ? 0 : r * nx_ + i];
+      for (int64_t i = 0; i < nx_; ++i) row_sums_[r * row_ + i] = factor * values[is_number ? 0 : r * nx_ + i];
   }
-  /// Point i of row r, of which hold() was told, by so much more: what its coupling to a zero beyond the grid adds.
-  void hold_more(int64_t r, int64_t i, T by) {
+  /// Of point i of row r: a coupling to a zero beyond the grid belongs to the row sum.
+  void add_to_row_sum(int64_t r, int64_t i, T by) {
     if (by == T(0)) return;
-    if (held_step_ == 0) {
+    if (row_sum_step_ == 0) {
       Field<T> of_rows = zeros<T>(rows() * row_);
-      for (int64_t k = 0; k < rows(); ++k) std::copy_n(held_.data(), row_, of_rows.data() + k * row_);
-      held_ = std::move(of_rows);
-      held_step_ = row_;
+      for (int64_t k = 0; k < rows(); ++k) std::copy_n(row_sums_.data(), row_, of_rows.data() + k * row_);
+      row_sums_ = std::move(of_rows);
+      row_sum_step_ = row_;
     }
-    held_[r * row_ + i] += by;
+    row_sums_[r * row_ + i] += by;
   }
-  /// Whether some points may be held by more than others.
-  bool is_held_by_field() const { return held_step_ != 0; }
-  /// Whether A is positive definite, as products of differences keep it however they are rounded: something holds v,
-  /// and nothing holds it by less than zero. False where hold() was not told.
+  /// Whether row sums are stored.
+  bool has_row_sums() const { return !row_sums_.empty(); }
+  /// True if all row sums are >= 0 and one is > 0; false if none are stored.
   bool is_surely_definite() const {
-    if (held_.empty()) return false;
-    const auto [least, most] = std::minmax_element(held_.begin(), held_.end());
+    if (row_sums_.empty()) return false;
+    const auto [least, most] = std::minmax_element(row_sums_.begin(), row_sums_.end());
     return *least >= T(0) && *most > T(0);
   }
-  double held(int64_t r, int64_t i) const { return static_cast<double>(held_[r * held_step_ + i]); }
+  double row_sum(int64_t r, int64_t i) const { return static_cast<double>(row_sums_[r * row_sum_step_ + i]); }
   /// The entry of the matrix on its diagonal at point i of row r.
   double diagonal(int64_t r, int64_t i) const {
-    if (held_.empty()) return static_cast<double>(coefficient(r, 0)[i]);
-    double sum = held(r, i);
+    if (row_sums_.empty()) return static_cast<double>(coefficient(r, 0)[i]);
+    double sum = row_sum(r, i);
     for (int64_t k = 1; k < count_; ++k) sum -= static_cast<double>(value(r, k, i));
     return sum;
   }
@@ -123,11 +121,11 @@ class PackedStencil {
             row_,
             coefficients_,
             coupled_ ? coupled(0) : nullptr,
-            held_.empty() ? nullptr : held_.data(),
-            held_step_};
+            row_sums_.empty() ? nullptr : row_sums_.data(),
+            row_sum_step_};
   }
 
-  int64_t bytes() const { return static_cast<int64_t>((memory_.size() + held_.size()) * sizeof(T)); }
+  int64_t bytes() const { return static_cast<int64_t>((memory_.size() + row_sums_.size()) * sizeof(T)); }
   /// max_i Σ_j |A_ij|
   double norm() const {
     std::vector<T> sums(nx_);
@@ -215,8 +213,8 @@ class PackedStencil {
   int64_t nx_, row_, count_;
   int64_t coupled_;  // values for what leaves a row
   Field<T> memory_;
-  Field<T> held_;  // see hold()
-  int64_t held_step_ = 0;
+  Field<T> row_sums_;  // see set_row_sums()
+  int64_t row_sum_step_ = 0;
   T* coefficients_;  // aligned, within memory_, with those values behind them
 };
 

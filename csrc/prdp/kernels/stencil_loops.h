@@ -58,7 +58,7 @@ struct NeighbourRow {
         row(a.row),
         last((a.nx - 1) / kWidth<T> * kWidth<T>),
         w(a.coefficients + (z * a.ny + j) * (2 * Dim + 1) * row),
-        own(Differences ? a.held + (z * a.ny + j) * a.held_step : w),
+        own(Differences ? a.row_sums + (z * a.ny + j) * a.row_sum_step : w),
         ends(a.ends ? a.ends + (z * a.ny + j) * 2 * kLanes<T> : nullptr),
         below(field + (z * a.ny + wrapped_index(j - 1, a.ny)) * row),
         above(field + (z * a.ny + wrapped_index(j + 1, a.ny)) * row),
@@ -111,7 +111,7 @@ void go_along_rows(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& 
 }
 template <int Dim, class T, class Body>
 void for_each_register(const NeighbourStencil<T>& a, Lines lines, const T* v, Body& body) {
-  if (a.held) go_along_rows<Dim, true>(a, lines, v, body);
+  if (a.row_sums) go_along_rows<Dim, true>(a, lines, v, body);
   else go_along_rows<Dim, false>(a, lines, v, body);
 }
 

@@ -1,5 +1,7 @@
 #include "prdp/operators/dense.h"
 
+#include <algorithm>
+
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -26,6 +28,17 @@ at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b) {
   std::vector<at::Tensor> solutions;
   for (int64_t i = 0; i < matrix.size(0); ++i) solutions.push_back(std::get<0>(at::linalg_solve_ex(matrix[i], b[i])));
   return solutions.empty() ? at::empty_like(b) : at::stack(solutions);
+}
+
+at::Tensor matrix_by_columns(const std::function<at::Tensor(const at::Tensor&)>& product, const at::Tensor& like) {
+  const auto batch = like.size(0), n = like.numel() / std::max<int64_t>(batch, 1);
+  std::vector<at::Tensor> columns;
+  for (int64_t j = 0; j < n; ++j) {
+    auto unit = at::zeros({batch, n}, like.options());
+    unit.select(1, j).fill_(1.0);
+    columns.push_back(product(unit.view(like.sizes())).reshape({batch, n}));
+  }
+  return at::stack(columns, -1);
 }
 
 void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices) {

@@ -1,4 +1,5 @@
 #pragma once
+#include <functional>
 
 #include "prdp/operators/operator.h"
 
@@ -7,6 +8,9 @@ namespace prdp {
 /// A⁻¹ b by LU with partial pivoting, for a matrix (n, n), (1, n, n) or (batch, n, n) and b (batch, n, k). A singular
 /// matrix gives values that are not finite, and no exception.
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b);
+
+/// The matrix (batch, n, n) of a product with vectors like this one, (batch, ...), one unit vector at a time.
+at::Tensor matrix_by_columns(const std::function<at::Tensor(const at::Tensor&)>& product, const at::Tensor& like);
 
 /// Raises NotImplementedError where b is not on the CPU and so many dense matrices of n rows, made of an operator that
 /// was not given as one, would take too long to factorise or too much memory.

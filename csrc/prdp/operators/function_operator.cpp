@@ -54,27 +54,13 @@ bool holds_numbers(const at::Tensor& t) {
   return at::isFloatingType(t.scalar_type()) || at::isComplexType(t.scalar_type());
 }
 
-/// Raises ValueError if a product of constants has a derivative.
-void check_nothing_is_captured(const at::Tensor& result) {
-  const bool followed = has_tangent(result) || in_torch_func();
-  TORCH_CHECK_VALUE(!result.requires_grad() && !has_tangent(result), "Function: matvec uses a tensor that ",
-                    followed ? "forward mode or torch.func follows" : "requires grad",
+/// Raises ValueError if a product of constants has a derivative, in reverse mode only if that is asked for.
+void check_nothing_is_captured(const at::Tensor& result, bool reverse = true) {
+  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result),
+                    "Function: matvec uses a tensor that requires grad",
+                    has_tangent(result) || in_torch_func() ? ", or that forward mode or torch.func follows," : "",
                     " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
                     "detach it");
-}
-
-/// The matrix of a product, (batch, n, n), one unit vector at a time.
-template <class Product>
-at::Tensor probe(const Product& product, const at::Tensor& like) {
-  const auto batch = like.size(0), n = like.numel() / std::max<int64_t>(batch, 1);
-  check_dense_fits(like, n, batch);
-  std::vector<at::Tensor> columns;
-  for (int64_t j = 0; j < n; ++j) {
-    auto unit = at::zeros({batch, n}, like.options());
-    unit.select(1, j).fill_(1.0);
-    columns.push_back(product(unit.view(like.sizes())).reshape({batch, n}));
-  }
-  return at::stack(columns, -1);
 }
 
 at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
@@ -116,12 +102,13 @@ void refuse_captured_gradients(const OperatorSpec& a) {
   RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
 }
 
-void refuse_what_a_transform_follows(const OperatorSpec& a, const at::Tensor& b) {
+void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
   if (a.transposed) return;  // of an adjoint solve, whose A was looked at
   auto constant = a;
   for (auto& t : constant.tensors) t = primal(t).detach();
   const auto v = primal(b).detach();
-  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }));
+  const bool reverse = at::GradMode::is_enabled();
+  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
 }
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
@@ -221,7 +208,8 @@ std::vector<int64_t> FunctionOperator::vector_shape() const {
 
 at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed) const {
   const auto product = [&](const at::Tensor& v) { return transposed ? apply_transpose(v) : apply(v); };
-  return solve(probe(product, b), b);
+  check_dense_fits(b, b.numel() / std::max<int64_t>(b.size(0), 1), b.size(0));
+  return solve(matrix_by_columns(product, b), b);
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {

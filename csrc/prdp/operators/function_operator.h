@@ -57,7 +57,7 @@ std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a);
 /// recording it. Each differentiable solve asks anew: a parameter may have been frozen before.
 void refuse_captured_gradients(const OperatorSpec& a);
 /// The same of what a transform of torch.func follows at its level, where b is: by a product that is not used.
-void refuse_what_a_transform_follows(const OperatorSpec& a, const at::Tensor& b);
+void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
 /// from autograd through `apply`. The exact solve multiplies A with unit vectors, so it is for small n.

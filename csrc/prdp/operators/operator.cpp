@@ -1,9 +1,8 @@
 #include "prdp/operators/operator.h"
 
-#include <numeric>
-
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/factor_cache.h"
+#include "prdp/operators/dense.h"
 #include "prdp/operators/singular_operator.h"
 
 namespace prdp {
@@ -22,17 +21,10 @@ at::Tensor nonfinite(const at::Tensor& t) { return t.isfinite().logical_not(); }
 
 at::Tensor Operator::dense(const at::TensorOptions& options) const {
   auto shape = vector_shape();
-  const int64_t n = std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies<>());
   // One unit vector at a time: an operator with a batch axis takes the same one for every sample.
   const auto batch = norm().dim() == 0 ? 1 : norm().size(0);
   shape.insert(shape.begin(), batch);
-  std::vector<at::Tensor> columns;
-  for (int64_t j = 0; j < n; ++j) {
-    auto unit = at::zeros({batch, n}, options);
-    unit.select(1, j).fill_(1.0);
-    columns.push_back(apply(unit.view(shape)).reshape({batch, n}));
-  }
-  const auto matrix = at::stack(columns, -1);
+  const auto matrix = matrix_by_columns([this](const at::Tensor& v) { return apply(v); }, at::empty(shape, options));
   return batch == 1 && norm().dim() == 0 ? matrix.squeeze(0) : matrix;
 }
 

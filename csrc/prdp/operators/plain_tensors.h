@@ -4,6 +4,7 @@
 #include <ATen/functorch/DynamicLayer.h>
 #include <ATen/record_function.h>
 #include <c10/core/impl/LocalDispatchKeySet.h>
+#include <torch/csrc/autograd/forward_grad.h>
 
 #include <algorithm>
 #include <vector>
@@ -30,11 +31,13 @@ inline bool no_mode_is_on() { return no_mode_but_a_profiler_is_on() && !at::hasC
 
 /// Whether a tensor is dual: it carries a tangent of forward mode.
 inline bool has_tangent(const at::Tensor& t) { return t.defined() && t._fw_grad(/*level=*/0).defined(); }
+/// Whether a level of forward mode is open.
+inline bool in_forward_mode() { return torch::autograd::ForwardADLevel::try_get_by_idx(0) != nullptr; }
 /// t without its tangent.
 inline at::Tensor primal(const at::Tensor& t) { return has_tangent(t) ? t._fw_primal(/*level=*/0) : t; }
 inline bool any_tangent(at::TensorList tensors) { return std::any_of(tensors.begin(), tensors.end(), has_tangent); }
 /// Whether a derivative is asked for with respect to one of them.
-inline bool any_moves(at::TensorList tensors) {
+inline bool any_needs_derivative(at::TensorList tensors) {
   const auto requires_grad = [](const at::Tensor& t) { return t.requires_grad(); };
   return any_tangent(tensors) ||
          (at::GradMode::is_enabled() && std::any_of(tensors.begin(), tensors.end(), requires_grad));

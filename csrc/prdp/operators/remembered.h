@@ -6,9 +6,9 @@
 namespace prdp {
 
 /// An operator by its numbers and tensors, as these were.
-class Remembered {
+class SpecFingerprint {
  public:
-  void take(const OperatorSpec& spec, at::ScalarType dtype) {
+  void store(const OperatorSpec& spec, at::ScalarType dtype) {
     tensors_.clear();
     for (const auto& t : spec.tensors) {
       if (t.is_inference()) return;  // its version is not counted
@@ -19,7 +19,7 @@ class Remembered {
     parameters_ = spec.parameters;
     dtype_ = dtype;
   }
-  bool is(const OperatorSpec& spec, at::ScalarType dtype) const {
+  bool matches(const OperatorSpec& spec, at::ScalarType dtype) const {
     if (tensors_.empty() || tensors_.size() != spec.tensors.size()) return false;
     for (size_t i = 0; i < tensors_.size(); ++i) {
       const auto& [tensor, version] = tensors_[i];

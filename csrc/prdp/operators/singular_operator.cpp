@@ -56,7 +56,7 @@ SingularOperator::SingularOperator(std::unique_ptr<Operator> a, const OperatorSp
       spec_(spec),
       right_{spec.tensors[spec.tensors.size() - 2].detach(), {}},
       left_{spec.tensors.back().detach(), {}},
-      moves_(any_moves(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
+      needs_derivative_(any_needs_derivative(at::TensorList(spec.tensors).slice(spec.tensors.size() - 2))),
       title_(operator_kind(spec.kind).title) {
   TORCH_CHECK_VALUE(right_.count() == left_.count(), title_,
                     ": nullspace and left_nullspace must hold as many vectors, got ", right_.count(), " and ",
@@ -165,14 +165,14 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
 }
 
 void SingularOperator::check_null_spaces(const at::Tensor& b) const {
-  static thread_local Remembered checked;
-  if (b.numel() == 0 || checked.is(spec_, b.scalar_type())) return;
+  static thread_local SpecFingerprint checked;
+  if (b.numel() == 0 || checked.matches(spec_, b.scalar_type())) return;
   const at::NoGradGuard no_grad;
   a_->check_parameters(Checks::kShared);  // the products here are no kernel's
   const auto size = size_of_products(*a_, b);
   check_is_mapped_to_zero(right_, b, size, /*transposed=*/false);
   check_is_mapped_to_zero(left_, b, size, /*transposed=*/true);
-  checked.take(spec_, b.scalar_type());
+  checked.store(spec_, b.scalar_type());
 }
 
 namespace {
@@ -190,13 +190,7 @@ at::Tensor solve_regular(const at::Tensor& b, const at::Tensor& q_right, const a
                          const Product& product) {
   const int64_t batch = b.size(0), n = b.numel() / batch, channels = n / q_right.size(-1);
   check_dense_fits(b, n, batch);
-  std::vector<at::Tensor> columns;
-  for (int64_t j = 0; j < n; ++j) {
-    auto unit = at::zeros({batch, n}, b.options());
-    unit.select(1, j).fill_(1.0);
-    columns.push_back(product(unit.view_as(b)).reshape({batch, n}));
-  }
-  const auto a = at::stack(columns, -1);
+  const auto a = matrix_by_columns(product, b);
   const auto q = at::kron(at::eye(channels, b.options()), at::matmul(q_left.mT(), q_right));
   const auto scale = a.detach().abs().amax({-2, -1}, /*keepdim=*/true);
   return solve_dense(a + scale * q, b.flatten(1).unsqueeze(-1)).reshape_as(b);

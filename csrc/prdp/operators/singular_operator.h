@@ -35,9 +35,11 @@ class SingularOperator final : public Operator {
 
   /// Without what rounding leaves along the null space, which would add up in the residuals that a method carries on;
   /// but for a null space that depends on parameters, along which the product has a derivative.
-  at::Tensor apply(const at::Tensor& v) const override { return moves_ ? a_->apply(v) : project(a_->apply(v)); }
+  at::Tensor apply(const at::Tensor& v) const override {
+    return needs_derivative_ ? a_->apply(v) : project(a_->apply(v));
+  }
   at::Tensor apply_transpose(const at::Tensor& v) const override {
-    return moves_ ? a_->apply_transpose(v) : project_solution(a_->apply_transpose(v));
+    return needs_derivative_ ? a_->apply_transpose(v) : project_solution(a_->apply_transpose(v));
   }
   at::Tensor diagonal() const override { return a_->diagonal(); }
   at::Tensor norm() const override { return a_->norm(); }
@@ -78,7 +80,7 @@ class SingularOperator final : public Operator {
   std::unique_ptr<Operator> a_;
   OperatorSpec spec_;
   Basis right_, left_;
-  bool moves_;  // a derivative with respect to a basis is asked for
+  bool needs_derivative_;  // a derivative with respect to a basis is asked for
   const char* title_;
 };
 

@@ -25,15 +25,16 @@ using torch::autograd::variable_list;
 /// A solve that is cheap, for some samples of a batch or for all.
 struct FastSolve {
   std::function<at::Tensor(const at::Tensor& b)> solve;  // empty: there is none for any sample
-  at::Tensor rest{};  // the samples that it does not solve, (batch or 1,); undefined: none
+  at::Tensor unsolved{};  // the samples that it does not solve, (batch or 1,); undefined: none
 };
 
-FastSolve but_for(const std::vector<bool>& rest, const at::Device& device, decltype(FastSolve::solve) solve) {
-  const auto count = std::count(rest.begin(), rest.end(), true);
-  if (count == std::ssize(rest)) return {};
+FastSolve with_dense_fallback(const std::vector<bool>& unsolved, const at::Device& device,
+                              decltype(FastSolve::solve) solve) {
+  const auto count = std::count(unsolved.begin(), unsolved.end(), true);
+  if (count == std::ssize(unsolved)) return {};
   if (count == 0) return {std::move(solve)};
-  auto mask = at::empty({std::ssize(rest)}, at::kBool);
-  std::copy(rest.begin(), rest.end(), mask.mutable_data_ptr<bool>());
+  auto mask = at::empty({std::ssize(unsolved)}, at::kBool);
+  std::copy(unsolved.begin(), unsolved.end(), mask.mutable_data_ptr<bool>());
   return {std::move(solve), mask.to(device)};
 }
 
@@ -51,9 +52,9 @@ FastSolve solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_
   const auto real = widest_real(coefficients.device());
   const CyclicReduction line(coefficients.to(real), 8.0 * epsilon_of(coefficients));
   const auto dominant = line.is_dominant().to(at::kCPU);
-  std::vector<bool> rest;
-  for (int64_t s = 0; s < dominant.size(0); ++s) rest.push_back(!dominant.const_data_ptr<bool>()[s]);
-  return but_for(rest, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
+  std::vector<bool> unsolved;
+  for (int64_t s = 0; s < dominant.size(0); ++s) unsolved.push_back(!dominant.const_data_ptr<bool>()[s]);
+  return with_dense_fallback(unsolved, coefficients.device(), [line, null_space, real](const at::Tensor& b) {
     const auto rhs = b.to(real);
     return (null_space.is_constant ? line.solve_with_constant(rhs) : line.solve(rhs)).to(b.scalar_type());
   });
@@ -63,12 +64,12 @@ using Inverse = std::shared_ptr<const TensorAxes>;
 
 /// The keys of what the last few coefficients led to on this thread, which need not be looked at again: those of a flow
 /// are the same tensors in every step.
-class LastSums {
+class RecentFactors {
  public:
   /// Empty if any of them is not known any more.
   std::vector<Inverse> find(const OperatorSpec& a, int64_t null_vectors) const {
     for (const auto& known : known_) {
-      if (known.null_vectors != null_vectors || !known.of.is(a, a.tensors[0].scalar_type())) continue;
+      if (known.null_vectors != null_vectors || !known.of.matches(a, a.tensors[0].scalar_type())) continue;
       std::vector<Inverse> inverses;
       for (const auto& key : known.keys)
         if (auto kept = factor_cache::find(key, typeid(TensorAxes)))
@@ -79,18 +80,18 @@ class LastSums {
   }
   void keep(const OperatorSpec& a, int64_t null_vectors, std::vector<kernels::FactorKey> keys) {
     auto& oldest = known_[next_++ % known_.size()];
-    oldest.of.take(a, a.tensors[0].scalar_type());
+    oldest.of.store(a, a.tensors[0].scalar_type());
     oldest.null_vectors = null_vectors;
     oldest.keys = std::move(keys);
   }
-  static LastSums& local() {
-    static thread_local LastSums last;
+  static RecentFactors& local() {
+    static thread_local RecentFactors last;
     return last;
   }
 
  private:
   struct Known {
-    Remembered of;
+    SpecFingerprint of;
     int64_t null_vectors = 0;
     std::vector<kernels::FactorKey> keys;
   };
@@ -99,13 +100,13 @@ class LastSums {
 };
 
 /// Null if the sample is no such sum.
-Inverse inverse_of(const SumOnHost& told, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
+Inverse inverse_of(const SumOnHost& separable, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
                    const at::TensorOptions& options) {
-  const auto sum = told.is_finite(s) ? told.sum(s) : std::nullopt;
+  const auto sum = separable.is_finite(s) ? separable.sum(s) : std::nullopt;
   if (!sum) return nullptr;
   return factor_cache::find_or_make<TensorAxes>(key, [&] {
-    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, told.epsilon(), null_vectors), told.inner_box(s),
-                                        options);
+    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, separable.epsilon(), null_vectors),
+                                        separable.inner_box(s), options);
   });
 }
 
@@ -127,26 +128,26 @@ at::Tensor solve_by(const std::vector<Inverse>& inverses, const at::Tensor& b, c
 }
 
 FastSolve solve_sum(const OperatorSpec& a, int64_t null_vectors) {
-  auto inverses = LastSums::local().find(a, null_vectors);
-  std::vector<bool> rest(inverses.size());
+  auto inverses = RecentFactors::local().find(a, null_vectors);
+  std::vector<bool> unsolved(inverses.size());
   if (inverses.empty()) {
     const auto coefficients =
         StencilOperator(detached(a)).nearest_coefficients(/*transposed=*/false);  // sums are symmetric
     if (!coefficients.defined()) return {};
-    const SumOnHost told(coefficients, periodic_axes(a));
+    const SumOnHost separable(coefficients, periodic_axes(a));
     std::vector<kernels::FactorKey> keys;
-    for (int64_t s = 0; s < told.samples(); ++s) {
-      keys.push_back(told.key(s, null_vectors, coefficients.options()));
-      inverses.push_back(inverse_of(told, s, keys.back(), null_vectors, coefficients.options()));
-      rest.push_back(!inverses.back() && told.is_finite(s));
+    for (int64_t s = 0; s < separable.samples(); ++s) {
+      keys.push_back(separable.key(s, null_vectors, coefficients.options()));
+      inverses.push_back(inverse_of(separable, s, keys.back(), null_vectors, coefficients.options()));
+      unsolved.push_back(!inverses.back() && separable.is_finite(s));
     }
     const auto is_null = [](const Inverse& inverse) { return !inverse; };
     if (std::none_of(inverses.begin(), inverses.end(), is_null))
-      LastSums::local().keep(a, null_vectors, std::move(keys));
+      RecentFactors::local().keep(a, null_vectors, std::move(keys));
   }
   const auto diagonal = StencilOperator(detached(a)).diagonal();
-  return but_for(rest, a.tensors[0].device(),
-                 [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
+  return with_dense_fallback(unsolved, a.tensors[0].device(),
+                             [inverses, diagonal](const at::Tensor& b) { return solve_by(inverses, b, diagonal); });
 }
 
 FastSolve find_fast_solve(const OperatorSpec& a, const NamedNullSpace& null_space) {
@@ -181,10 +182,10 @@ struct Plan : public torch::CustomClassHolder {
 
 at::Tensor solve_planned(const Plan& plan, const at::Tensor& coefficients, const at::Tensor& b) {
   const auto u = plan.fast.solve(b);
-  if (!plan.fast.rest.defined()) return u;
+  if (!plan.fast.unsolved.defined()) return u;
   auto a = plan.a;
   a.tensors = {coefficients};
-  return at::where(per_sample(plan.fast.rest, b), solve_densely(a, b), u);
+  return at::where(per_sample(plan.fast.unsolved, b), solve_densely(a, b), u);
 }
 
 /// The derivative is that of the exact solution, by one more solve and the product rule.
@@ -217,7 +218,7 @@ class SolveStencil : public torch::autograd::Function<SolveStencil> {
 std::optional<at::Tensor> solve_stencil_on_axes(const OperatorSpec& a, const at::Tensor& b,
                                                 const NamedNullSpace& null_space) {
   auto fast = find_fast_solve(a, null_space);
-  if (!fast.solve || (fast.rest.defined() && null_space.vectors > 0)) return std::nullopt;
+  if (!fast.solve || (fast.unsolved.defined() && null_space.vectors > 0)) return std::nullopt;
   return SolveStencil::apply(a.tensors[0], b, c10::make_intrusive<Plan>(std::move(fast), a, null_space));
 }
 

@@ -47,7 +47,7 @@ kernels::Offset offset_of(at::ArrayRef<double> cells) {
 }
 
 /// The neighbours on the other side, which are those of the transpose.
-std::vector<kernels::Offset> turned(std::vector<kernels::Offset> offsets) {
+std::vector<kernels::Offset> negated(std::vector<kernels::Offset> offsets) {
   for (auto& offset : offsets)
     for (auto& cells : offset.along) cells = -cells;
   return offsets;
@@ -205,7 +205,7 @@ OperatorSpec StencilOperator::spec() const {
 }
 
 at::Tensor StencilOperator::nearest_coefficients(bool transposed) const {
-  const auto offsets = transposed ? turned(offsets_) : offsets_;
+  const auto offsets = transposed ? negated(offsets_) : offsets_;
   const kernels::StencilSparsity pattern(grid_, offsets);
   if (!pattern.nearest) return {};
   std::vector<at::Tensor> fields(1 + 2 * dim());
@@ -256,26 +256,26 @@ std::shared_ptr<const kernels::Kernels> StencilOperator::kernels(const at::Tenso
 }
 
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_by_differences(const at::Tensor& b,
-                                                                                const at::Tensor& held) const {
-  return kernels_of(b, /*transposed=*/false, held.detach().to(at::kCPU).contiguous());
+                                                                                const at::Tensor& row_sums) const {
+  return kernels_of(b, /*transposed=*/false, row_sums.detach().to(at::kCPU).contiguous());
 }
 
 std::shared_ptr<const kernels::Kernels> StencilOperator::kernels_of(const at::Tensor& b, bool transposed,
-                                                                    const at::Tensor& held) const {
-  const auto offsets = transposed ? turned(offsets_) : offsets_;
+                                                                    const at::Tensor& row_sums) const {
+  const auto offsets = transposed ? negated(offsets_) : offsets_;
   const auto make_batch =
-      [transposed, held, offsets, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
+      [transposed, row_sums, offsets, channels = b.size(1), c = coefficients_.detach().to(at::kCPU).contiguous(),
        pattern = std::make_shared<kernels::StencilSparsity>(grid_, offsets)]<class T>(T) -> kernels::KernelBatch<T> {
     kernels::GivenStencil<T> given{c.template const_data_ptr<T>(), c.size(0) == 1 ? 0 : c.stride(0), pattern,
                                    transposed};
-    if (held.defined()) {
-      const bool is_number = held.dim() == 0;
-      const int64_t stride = is_number || held.size(0) == 1 ? 0 : held.stride(0);
-      given.hold = {held.template const_data_ptr<T>(), stride, is_number, offsets};
+    if (row_sums.defined()) {
+      const bool is_number = row_sums.dim() == 0;
+      const int64_t stride = is_number || row_sums.size(0) == 1 ? 0 : row_sums.stride(0);
+      given.row_sums = {row_sums.template const_data_ptr<T>(), stride, is_number, offsets};
     }
-    // c and held are captured for their memory, to which `given` points.
+    // c and row_sums are captured for their memory, to which `given` points.
     kernels::KernelBatch<T> batch{c.size(0) == 1,
-                                  [c, held, given, channels](int64_t s) { return given.make(s, channels); }};
+                                  [c, row_sums, given, channels](int64_t s) { return given.make(s, channels); }};
     if (given.is_one_to_one())
       batch.product = [c, given, channels](int64_t s, const T* v, T* out) { given.apply(s, channels, v, out); };
     return batch;

@@ -41,10 +41,10 @@ class StencilOperator final : public Operator {
   std::optional<gpu::OperatorView> gpu_view(const at::Tensor& b, bool transposed) const override;
   std::optional<kernels::FactorKey> key(bool transposed) const override;
 
-  /// The kernels of a stencil of nearest neighbours whose diagonal is, but for rounding, `held` less the other
-  /// coefficients of a point: their products are held·v and differences of neighbours. held: 0-dimensional or (batch or
-  /// 1, 1, *shape). The coefficients hold as many samples.
-  std::shared_ptr<const kernels::Kernels> kernels_by_differences(const at::Tensor& b, const at::Tensor& held) const;
+  /// The kernels of a stencil of nearest neighbours whose diagonal is, but for rounding, `row_sums` less the other
+  /// coefficients of a point: their products are row_sums·v and differences of neighbours. row_sums: 0-dimensional or
+  /// (batch or 1, 1, *shape). The coefficients hold as many samples.
+  std::shared_ptr<const kernels::Kernels> kernels_by_differences(const at::Tensor& b, const at::Tensor& row_sums) const;
   OperatorSpec spec() const;
   /// Of A, or of Aᵀ, the diagonal and what couples a point to those before and behind it along each axis, (batch or 1,
   /// 1 + 2 dim, *shape), zero where there is none; undefined if A couples points that are no neighbours.
@@ -52,7 +52,7 @@ class StencilOperator final : public Operator {
 
  private:
   std::shared_ptr<const kernels::Kernels> kernels_of(const at::Tensor& b, bool transposed,
-                                                     const at::Tensor& held) const;
+                                                     const at::Tensor& row_sums) const;
   int64_t dim() const { return grid_.dim; }
   int64_t count() const { return static_cast<int64_t>(offsets_.size()); }
   /// The index of an axis among (z, y, x): the last dim() of them are this operator's.

@@ -54,7 +54,7 @@ double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
 bool knows_null_space(const SolveRole& role) { return is_singular(role.a) || operator_kind(role.a.kind).has_pressure; }
 
 /// Whether A maps the constant to zero, though nobody named its null space. Operators of the library know their own.
-bool forgets_constants(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+bool has_undeclared_constant_null_space(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   return a.may_be_singular() && !knows_null_space(role) &&
          maps_constant_to_zero(a, b, /*transposed=*/false)[sample].item<bool>();
 }
@@ -80,9 +80,9 @@ std::string badly_scaled(const Solver& solver, const Operator& a, const at::Tens
 }
 
 /// Whether A maps constants to no more than the rounding of its entries, though not to zero: what holds u is lost.
-bool holds_within_rounding(const Operator& a, const at::Tensor& b, int64_t sample) {
-  const double held = a.apply(at::ones_like(b)).select(0, sample).abs().max().item<double>();
-  return held > 0.0 && held <= 64.0 * epsilon_of(b) * value_of_sample(a.norm(), sample);
+bool row_sums_are_rounding(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const double row_sum = a.apply(at::ones_like(b)).select(0, sample).abs().max().item<double>();
+  return row_sum > 0.0 && row_sum <= 64.0 * epsilon_of(b) * value_of_sample(a.norm(), sample);
 }
 
 /// Where A is not symmetric: that, in words. Else empty.
@@ -94,7 +94,7 @@ std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample) {
 
 /// Why a method for symmetric definite operators fails on this one.
 std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (b.scalar_type() == at::kFloat && holds_within_rounding(a, b, sample))
+  if (b.scalar_type() == at::kFloat && row_sums_are_rounding(a, b, sample))
     return "what keeps A from being singular, such as its shift, is lost in the rounding of float32; take float64";
   if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
   return "A is symmetric but not definite; take MINRES, or name all its null vectors (nullspace) if it is singular";
@@ -220,7 +220,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
   const at::NoGradGuard no_grad;
   const auto why = [&]() -> std::string {
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
-        forgets_constants(role, a, b, sample))
+        has_undeclared_constant_null_space(role, a, b, sample))
       return "A maps the constant to zero, so it is singular; give nullspace=\"constant\", or all vectors if it maps "
              "more "
              "to zero";

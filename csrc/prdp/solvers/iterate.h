@@ -57,7 +57,7 @@ void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& 
     if (rtol > 0.0 && done > 0) confirm();
   if constexpr (kTakesStrides<Method>) method.step(1);
   else method.step();
-  if constexpr (kMayExhaust<Method>) method.residual2();  // for what it does: it takes back a cycle that made it grow
+  if constexpr (kMayExhaust<Method>) method.residual2();  // undoes a cycle that made the residual grow
 }
 
 /// Recomputes the residual of each sample that is not concluded, and sets its status.
@@ -89,7 +89,7 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
 /// Of a sample that ended above ‖b‖: where A is definite for sure, and the residual is the rounding of a product, the
 /// last iterate is as good as the dtype allows.
 template <class Space, class Method>
-void excuse_rounding_of_definite(Space& space, const Method& method, typename Space::States& states) {
+void accept_at_rounding_floor(Space& space, const Method& method, typename Space::States& states) {
   const auto is_above = [](const SampleState& s) { return s.answer != Answer::kLast; };
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto definite = space.surely_definite();
@@ -104,12 +104,12 @@ void excuse_rounding_of_definite(Space& space, const Method& method, typename Sp
 /// rounding of A may move u, A is singular to the dtype, and zero replaces u; else u is as good as the dtype allows,
 /// and its residual is rounding. A residual above ‖b‖ is else a breakdown.
 template <class Space, class Method>
-void refuse_rounding(Space& space, const Method& method, typename Space::States& states) {
+void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
     const double epsilon = space.epsilon();
     const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
-    const auto moved2 = space.values_of(space.sensitivity2(method.x));
+    const auto moved2 = space.values_of(space.skeel_estimate2(method.x));
     const auto definite = space.surely_definite();
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
@@ -134,8 +134,8 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
     const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
     s.answer = may_be_worse && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
   }
-  excuse_rounding_of_definite(space, method, states);
-  if constexpr (kIsExact<Method>) refuse_rounding(space, method, states);
+  accept_at_rounding_floor(space, method, states);
+  if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
   if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
   bool all_last = true;
   for (auto& s : states) {
@@ -149,12 +149,13 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   return all_last;
 }
 
-/// Runs the samples again that are not to hand out their last iterate, for as many iterations as `wanted` says. The
-/// others stay at zero.
-template <class Space, class Method, class Wanted>
+/// Runs the samples again that are not to hand out their last iterate, for as many iterations as `iteration_limit`
+/// says. The others stay at zero.
+template <class Space, class Method, class Limit>
 void run_again(Space& space, Method& method, typename Space::States& states, double rtol, bool track,
-               const Wanted& wanted) {
-  for (size_t i = 0; i < states.size(); ++i) states[i].rewind(states[i].answer == Answer::kLast ? 0 : wanted(i));
+               const Limit& iteration_limit) {
+  for (size_t i = 0; i < states.size(); ++i)
+    states[i].rewind(states[i].answer == Answer::kLast ? 0 : iteration_limit(i));
   space.reset();
   run(space, method, states, rtol, track);
 }

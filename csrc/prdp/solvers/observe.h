@@ -43,9 +43,10 @@ bool is_idle(const SampleState& s) {
 /// Stops those of the `doubtful` samples whose residual is rounding: at most slack · floor, with floor = ε ‖A‖ ‖u‖. The
 /// slack is 1, or 8 where rtol lies below the floor, or below 8 floors for direct methods, which reach no lower; or 100
 /// where a space is exhausted. As the floor overstates the rounding where columns of A differ in size, the residual
-/// must also be at most slack · 64 ε ‖|A| |u|‖, which terms2() estimates: that is what a product rounds. A floor above
-/// ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage. In float64 no floor above 1e-5 ‖b‖ is
-/// taken for rounding: there u is that of a singular system, which a null vector that nobody named has made large.
+/// must also be at most slack · 64 ε ‖|A| |u|‖, which componentwise_scale2() estimates: that is what a product rounds.
+/// A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage. In float64 no floor above
+/// 1e-5 ‖b‖ is taken for rounding: there u is that of a singular system, which a null vector that nobody named has made
+/// large.
 template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {
@@ -67,10 +68,10 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
   constexpr double roundings = 64.0;  // of a product
-  const auto terms2 = space.values_of(space.terms2(method.x));
+  const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x));
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    const double rounding_of_product = roundings * space.epsilon() * std::sqrt(terms2[i]);
+    const double rounding_of_product = roundings * space.epsilon() * std::sqrt(componentwise_scale2[i]);
     if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) continue;
     s.stop(SolveStatus::kStagnated);
     s.floor2 = floors[i] * floors[i];
@@ -118,7 +119,7 @@ bool judge_known_residuals(Space& space, Method& method, typename Space::States&
 
 /// Stops the samples whose residual is rounding though they claim nothing.
 template <class Space, class Method>
-void stop_what_idles(Space& space, const Method& method, typename Space::States& states, double rtol) {
+void stop_stalled(Space& space, const Method& method, typename Space::States& states, double rtol) {
   // Sweeps and cycles go on at their rounding for ever, and never claim what is below it.
   if constexpr (kTakesStrides<Method> || kContracts<Method>) {
     stop_at_rounding_floor(space, method, states, rtol,
@@ -157,7 +158,7 @@ template <class Space, class Method>
 PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto exhausted = exhausted_of(space, method);
   const bool any_candidates = judge_known_residuals(space, method, states, rtol, exhausted);
-  stop_what_idles(space, method, states, rtol);
+  stop_stalled(space, method, states, rtol);
   if (any_candidates) confirm_candidates(space, method, states, rtol, exhausted);
 }
 

@@ -54,7 +54,7 @@ std::string of_step() {
 }
 
 /// Whether nobody has said so yet, or only of what is less than a tenth as bad.
-bool is_news(const std::string& what, double size) {
+bool should_warn_again(const std::string& what, double size) {
   static std::mutex mutex;
   static std::map<std::string, double> said;
   const std::lock_guard lock(mutex);
@@ -67,7 +67,7 @@ bool is_news(const std::string& what, double size) {
 /// Warns with what `say` writes, the first time for this `key`, and again where it is ten times as bad.
 template <class Say>
 void warn_once(const std::string& key, double size, const Say& say) {
-  if (!is_news(key, size)) return;
+  if (!should_warn_again(key, size)) return;
   std::ostringstream text;
   text << of_step();
   say(text);
@@ -77,8 +77,14 @@ void warn_once(const std::string& key, double size, const Say& say) {
 
 const char* name_of(const SolveRole& role) { return role.adjoint ? "adjoint solve" : "linear_solve"; }
 
-/// A residual above this is told.
-double far_above(double rtol) { return std::max(10.0 * rtol, 0.01); }
+/// What tells a warning about one kind of solve from another.
+std::string key_of(const SolveRole& role) {
+  const auto& solver = role.solver;
+  return name_of(role) + std::string(name(solver.method)) + " " + solver.preconditioner.spec().kind + " " + role.a.kind;
+}
+
+/// Residuals above this are reported.
+double warning_threshold(double rtol) { return std::max(10.0 * rtol, 0.01); }
 
 /// Warns of samples whose residual stopped far above what was asked for. That is no failure: the residual may be all
 /// that rounding leaves of a u that is good enough, but nobody else would say that it may not be.
@@ -88,13 +94,12 @@ void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
   // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
   const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
   const auto* residual = residuals.const_data_ptr<double>();
-  const double bound = far_above(role.solver.rtol);
+  const double bound = warning_threshold(role.solver.rtol);
   const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
   const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
   if (!(residual[worst] > bound)) return;
   const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
-  const std::string key = name_of(role) + std::string(name(role.solver.method)) + role.a.kind;
-  warn_once(key, residual[worst], [&](std::ostream& text) {
+  warn_once(key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples STAGNATED far above rtol = " << role.solver.rtol << ": sample " << worst
          << " at relative residual " << residual[worst] << " after " << info.iterations[worst].item<int64_t>()
@@ -120,10 +125,10 @@ void warn_of_lost_cotangents(const SolveRole& role, const SolveInfo& info) {
 
 /// Whether max_iter stopped a sample far from its tolerance whose later iterations were in vain: its answer is the
 /// start, mostly zero, or comes from the first half of many. Below so many, residuals may yet fall.
-bool was_in_vain(const Solver& solver, SolveStatus status, int64_t iterations, double residual) {
+bool later_iterations_were_worse(const Solver& solver, SolveStatus status, int64_t iterations, double residual) {
   const int64_t max_iter = solver.max_iter.expect_int();
   constexpr int64_t many = 20;
-  if (status != SolveStatus::kMaxIter || !(residual > far_above(solver.rtol))) return false;
+  if (status != SolveStatus::kMaxIter || !(residual > warning_threshold(solver.rtol))) return false;
   return max_iter > 0 && (iterations == 0 || (max_iter >= many && iterations < max_iter / 2));
 }
 
@@ -141,8 +146,7 @@ void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
     if (worst < 0 || residual[i] > residual[worst]) worst = i;
   }
   if (many == 0) return;
-  const std::string key = "grown: " + (name_of(role) + std::string(name(role.solver.method)) + role.a.kind);
-  warn_once(key, residual[worst], [&](std::ostream& text) {
+  warn_once("grown: " + key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
@@ -158,11 +162,10 @@ void warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
   const auto residual = to_host<double>(info.residual, b.size(0));
   std::vector<int64_t> vain;
   for (int64_t i = 0; i < b.size(0); ++i)
-    if (was_in_vain(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i])) vain.push_back(i);
+    if (later_iterations_were_worse(role.solver, static_cast<SolveStatus>(status[i]), iterations[i], residual[i]))
+      vain.push_back(i);
   if (vain.empty()) return warn_of_growth(role, a, b, status, residual);
-  const char* cycles = role.solver.preconditioner.is_multigrid() ? " with multigrid" : "";
-  const std::string key = name_of(role) + std::string(name(role.solver.method)) + cycles + role.a.kind;
-  warn_once("in vain: " + key, residual[vain.front()], [&, first = vain.front()](std::ostream& text) {
+  warn_once("in vain: " + key_of(role), residual[vain.front()], [&, first = vain.front()](std::ostream& text) {
     text << name_of(role) << ": " << vain.size() << " of " << b.size(0)
          << " samples ended far above rtol = " << role.solver.rtol << ": sample " << first << " returned "
          << (iterations[first] > 0 ? "iterate " + std::to_string(iterations[first])

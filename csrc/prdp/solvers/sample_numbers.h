@@ -8,6 +8,15 @@ namespace prdp {
 /// Signs without a pattern, the same for every sample: whether number i changes its own.
 inline bool is_negated(int64_t i) { return std::sin(static_cast<double>((i + 1) * (i + 1))) < 0.0; }
 
+/// The same for many choices of signs, with which a few unknowns do not agree in all. (splitmix64)
+inline constexpr int64_t kSignPatterns = 16;
+inline bool is_negated(int64_t i, int64_t pattern) {
+  auto bits = static_cast<uint64_t>(i * kSignPatterns + pattern + 1) * 0x9e3779b97f4a7c15;
+  bits = (bits ^ (bits >> 30)) * 0xbf58476d1ce4e5b9;
+  bits = (bits ^ (bits >> 27)) * 0x94d049bb133111eb;
+  return ((bits ^ (bits >> 31)) & 1) != 0;
+}
+
 /// What the spaces of one sample do with its numbers (space.h): quotients that tell a breakdown from a small number,
 /// and numbers that vanish where they are rounding. b and A are scaled to the order of one.
 template <class T>

@@ -50,8 +50,8 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   void take_b() { b2_ = dot(b(), b()); }
   T factor() const { return system_.a().factor(); }
   bool is_singular() const { return system_.a().null_space().has_value(); }
-  /// Onto what products with A may contain, which returns the norm of what is taken off; and onto the solutions of
-  /// least norm.
+  /// project: orthogonal projection onto range(A), returns the norm of what it removes. project_solution: onto the
+  /// complement of null(A).
   T project(Vector v) {
     const auto& space = system_.a().left_null_space();
     return space ? space->project(v) : T(0);
@@ -63,10 +63,10 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   void scale(T factor, Vector x) { vectors_.scale(factor, x, x, length()); }
   void axpy(T alpha, const T* x, Vector y) { vectors_.axpy(alpha, x, y, length()); }
   Vector start() { return workspace_.vector(2); }
-  Vector whole_b() { return workspace_.vector(3); }
-  /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
-  void start_here(T left2) {
-    std::swap_ranges(b(), b() + length(), whole_b());
+  Vector original_b() { return workspace_.vector(3); }
+  /// From here on b() is what start() leaves of it, which is in original_b(); they change places.
+  void shift_to_start(T left2) {
+    std::swap_ranges(b(), b() + length(), original_b());
     started_ = true;
     b2_ = left2;
   }
@@ -157,7 +157,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   Scalar residual(const T* x, Vector r) {
     apply(solution(x), r);
-    const T* const of = started_ ? whole_b() : b();
+    const T* const of = started_ ? original_b() : b();
     const T one = 1;
     const Scalar rr = vectors_.multi_axpy(T(1), &one, &of, 1, T(-1), r, length());
     if (!system_.a().left_null_space()) return rr;
@@ -169,19 +169,31 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     const T* u = solution(x);
     return dot(u, u);
   }
-  Scalar terms2(const T* x) {
+  Scalar componentwise_scale2(const T* x) {
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    sum_terms(x, memory);
+    apply_with_signs(solution(x), [](int64_t i) { return is_negated(i); }, memory);
     return dot(memory.vector(1), memory.vector(1));
   }
-  Scalar sensitivity2(const T* x) {
+  /// Seldom: as many products, and then as many solves, as there are patterns.
+  Scalar skeel_estimate2(const T* x) {
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    sum_terms(x, memory);
-    change_signs(memory.vector(1), 1, memory.vector(0));
-    if (!system_.factors().solve(memory.vector(0), memory.vector(1))) return std::numeric_limits<T>::infinity();
-    return dot(memory.vector(1), memory.vector(1));
+    std::vector<T> values(unknowns()), scale2(unknowns(), T(0));  // of |A| |u|
+    for (int64_t p = 0; p < kSignPatterns; ++p) {
+      apply_with_signs(solution(x), [p](int64_t i) { return is_negated(i, p); }, memory);
+      layout().store(memory.vector(1), T(1), values.data());
+      for (int64_t i = 0; i < unknowns(); ++i) scale2[i] += values[i] * values[i];
+    }
+    T largest = 0;
+    for (int64_t p = 0; p < kSignPatterns; ++p) {
+      for (int64_t i = 0; i < unknowns(); ++i)
+        values[i] = (is_negated(unknowns() + i, p) ? -1 : 1) * std::sqrt(scale2[i] / T(kSignPatterns));
+      layout().load(values.data(), T(1), memory.vector(0));
+      if (!system_.factors().solve(memory.vector(0), memory.vector(1))) return std::numeric_limits<T>::infinity();
+      largest = std::max(largest, dot(memory.vector(1), memory.vector(1)));
+    }
+    return largest;
   }
   std::array<bool, 1> surely_definite() const { return {system_.a().is_surely_definite()}; }
   void solve_directly(const T* r, Vector d) {
@@ -240,23 +252,20 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     add(start(), scratch());
     return scratch();
   }
-  /// Takes off v, with ‖v‖² = vv, what counts of its part in the null space; returns ‖v‖² of what is left.
+  /// Removes the component of v in null(Aᵀ) if it is above ε/8 ‖v‖, where ‖v‖² = vv; returns the new ‖v‖².
   Scalar projected(Vector v, Scalar vv) {
     constexpr T negligible = std::numeric_limits<T>::epsilon() / 8;  // of ‖v‖
     const T part = system_.a().left_null_space()->project(v, negligible * std::sqrt(vv));
     return part * part < vv / 2 ? vv - part * part : dot(v, v);
   }
-  /// out = v with signs that have no pattern, those from number `first` on.
-  void change_signs(const T* v, int64_t first, T* out) const {
+  /// In vector 1, A times v with signs changed.
+  template <class Negated>
+  void apply_with_signs(const T* v, const Negated& negated, kernels::Workspace<T>& memory) {
     std::vector<T> values(unknowns());
     layout().store(v, T(1), values.data());
     for (int64_t i = 0; i < unknowns(); ++i)
-      if (is_negated(first + i)) values[i] = -values[i];
-    layout().load(values.data(), T(1), out);
-  }
-  /// In vector 1, A times u with such signs.
-  void sum_terms(const T* x, kernels::Workspace<T>& memory) {
-    change_signs(solution(x), 0, memory.vector(0));
+      if (negated(i)) values[i] = -values[i];
+    layout().load(values.data(), T(1), memory.vector(0));
     system_.a().apply(memory.vector(0), memory.vector(1));
   }
   void count(int64_t products) {
@@ -271,7 +280,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   SampleState* state_ = nullptr;
   int64_t own_, used_;
   T b2_ = 0;
-  bool started_ = false;  // from start(), and then whole_b() is what b() was
+  bool started_ = false;  // from start(), and then original_b() is what b() was
 };
 
 }  // namespace prdp

@@ -34,7 +34,7 @@ void start_from(Space& space, const typename Space::Scalar* x0) {
   using T = typename Space::Scalar;
   const T magnitude = space.largest_given(x0);
   if (magnitude == T(0)) return;
-  auto x = space.start(), product = space.scratch(), r = space.whole_b();
+  auto x = space.start(), product = space.scratch(), r = space.original_b();
   space.load(x0, kernels::power_of_two_scale(magnitude), x);
   if (space.is_singular()) {
     const T whole2 = space.dot(x, x);
@@ -57,7 +57,7 @@ void start_from(Space& space, const typename Space::Scalar* x0) {
     if (better && left2 > b2 / 4)  // less is no rounding's doing
       better = start_gains_more_than_rounding<double>(
           b2, left2, space.epsilon() * space.operator_norm()[0] * std::sqrt(space.dot(x, x)));
-    if (better) space.start_here(left2);
+    if (better) space.shift_to_start(left2);
   }
   space.fill_zero(product);
 }

@@ -71,7 +71,7 @@ concept FusedOperations =
       { s.apply_with_dots(x, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
       /// y = A x; returns p·y and ‖y‖², both for the guarded_quotient() that makes the next step.
       { s.apply_along(x, p, y) } -> std::same_as<std::array<typename S::Scalar, 2>>;
-      /// Takes off x what rounding has left of it outside the range of A, where somebody named the null space.
+      /// Projects x onto range(A) if a null space was named.
       s.keep_in_range(x);
       /// y = M⁻¹ x ≈ A⁻¹ x, without the powers of two that TensorSpace puts into apply() and precondition(): a method
       /// that calls this calls neither.
@@ -172,9 +172,8 @@ template <class S>
 concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y) {
   /// y = A⁻¹ x; zero with a breakdown where A is singular.
   s.solve_directly(x, y);
-  /// ‖A⁻¹ w‖², w being the terms of terms2() with such signs once more: ε² times that is how far the rounding of A
-  /// moves u.
-  { s.sensitivity2(x) } -> std::same_as<typename S::Scalar>;
+  /// Estimates Skeel's ‖|A⁻¹| |A| |u|‖²; times ε² it is the square of the error of u that rounding of A causes.
+  { s.skeel_estimate2(x) } -> std::same_as<typename S::Scalar>;
 };
 
 /// All that methods need.
@@ -194,8 +193,8 @@ concept LoopSpace =
       s.surely_definite();
       /// ‖u‖², where u is x and the start.
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-      /// ‖A v‖², v being u with signs that have no pattern, so that terms do not cancel: about ‖|A| |u|‖².
-      { s.terms2(x) } -> std::same_as<typename S::Scalar>;
+      /// Estimates ‖|A| |u|‖² as ‖A S u‖², where S is a fixed diagonal of ±1 without a pattern.
+      { s.componentwise_scale2(x) } -> std::same_as<typename S::Scalar>;
       /// A vector that the next operation may overwrite.
       { s.scratch() } -> std::convertible_to<typename S::Vector>;
       /// From here on, the samples that are not wanted are frozen.

@@ -6,6 +6,7 @@
 #include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/prepared_batch.h"
+#include "prdp/solvers/sample_numbers.h"
 
 namespace prdp {
 
@@ -131,22 +132,39 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
   return started() ? start_ + from_zero : from_zero;
 }
 
-TensorSpace::Vector TensorSpace::terms(const Vector& x) const {
+TensorSpace::Scalar TensorSpace::componentwise_scale2(const Vector& x) const {
   const auto u = solution(x).detach();
   const auto negated = unstructured_like(u).lt(0);  // as is_negated() of sample_numbers.h
-  return laid_out(system_.a.apply(at::where(negated, -u, u)));
+  const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
+  return dot(terms, terms);
 }
 
-TensorSpace::Scalar TensorSpace::terms2(const Vector& x) const {
-  const auto w = terms(x);
-  return dot(w, w);
+namespace {
+
+/// The signs of a pattern, the same for every sample.
+at::Tensor signs_like(const at::Tensor& v, int64_t first, int64_t pattern) {
+  const int64_t n = v.numel() / std::max<int64_t>(v.size(0), 1);
+  std::vector<double> signs(n);
+  for (int64_t i = 0; i < n; ++i) signs[i] = is_negated(first + i, pattern) ? -1.0 : 1.0;
+  auto shape = v.sizes().vec();
+  shape[0] = 1;
+  return at::tensor(signs, at::kDouble).to(v.options()).view(shape);
 }
 
-TensorSpace::Scalar TensorSpace::sensitivity2(const Vector& x) const {
-  const auto w = terms(x);
-  const auto negated = unstructured_like(w).lt(0).flatten(1).roll(-1, 1).view_as(w);
-  const auto moved = laid_out(system_.a.solve_directly(at::where(negated, -w, w), /*transposed=*/false));
-  return dot(moved, moved);
+}  // namespace
+
+TensorSpace::Scalar TensorSpace::skeel_estimate2(const Vector& x) const {
+  const auto u = solution(x).detach();
+  const int64_t n = u.numel() / std::max<int64_t>(u.size(0), 1);
+  at::Tensor scale2, largest;  // of |A| |u|; of all solves
+  for (int64_t p = 0; p < kSignPatterns; ++p) add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).square());
+  const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt();
+  for (int64_t p = 0; p < kSignPatterns; ++p) {
+    const auto moved = laid_out(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
+    const auto square = dot(moved, moved);
+    largest = largest.defined() ? at::maximum(largest, square) : square;  // NaN stays
+  }
+  return largest;
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {

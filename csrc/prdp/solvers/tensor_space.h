@@ -145,7 +145,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   // ---- direct methods
 
   void solve_directly(const Vector& r, Vector& d);
-  Scalar sensitivity2(const Vector& x) const;
+  Scalar skeel_estimate2(const Vector& x) const;
 
   // ---- the loop around the methods
 
@@ -159,9 +159,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     const auto u = solution(x);
     return dot(u, u);
   }
-  /// A times u with signs that have no pattern.
-  Vector terms(const Vector& x) const;
-  Scalar terms2(const Vector& x) const;
+  Scalar componentwise_scale2(const Vector& x) const;
   Vector scratch() const { return vector(); }
   template <class Predicate>
   void freeze_unless(const States& states, const Predicate& predicate) {

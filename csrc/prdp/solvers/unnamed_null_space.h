@@ -9,8 +9,8 @@ at::Tensor row_sizes(const Operator& a, const at::Tensor& b, bool transposed);
 /// Whether A, or Aᵀ if `transposed`, maps the constant to zero, each row up to its own rounding: bool, (batch,).
 at::Tensor maps_constant_to_zero(const Operator& a, const at::Tensor& b, bool transposed);
 
-/// Calls those unsolved samples INCONSISTENT whose b has a constant part, beyond rounding, that A cannot reach, as Aᵀ
-/// maps the constant to zero and nobody has said so. Their u is of no use: what rounding adds along the null space of A
+/// Marks an unsolved sample INCONSISTENT if Aᵀ maps the constant to zero, no null space was named, and b has a constant
+/// part above rounding. Its u is of no use: what rounding adds along the null space of A
 /// grows from iteration to iteration. The products that tell it are spent where a solve took hundreds, or where u looks
 /// like that.
 void find_inconsistent_constants(const Operator& a, const at::Tensor& b, const SolveRequest& request,

@@ -69,18 +69,18 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   PRDP_ONCE bool has_zero_diagonal() {
     return largest_over_rows([&](int i) { return T(a_.diagonal(i) == T(0)); }) != 0;
   }
-  /// Onto what products with A may contain, and onto the solutions of least norm. Returns the norm of what is taken
-  /// off.
+  /// project: orthogonal projection onto range(A), returns the norm of what it removes. project_solution: onto the
+  /// complement of null(A).
   T project(Vector v) { return project(left_null_space_, v); }
   T project_solution(Vector v) { return project(null_space_, v); }
   bool is_singular() const { return left_null_space_.count > 0; }
   Vector start() { return own(Vectors::kStart); }
-  Vector whole_b() { return own(Vectors::kWholeB); }
-  /// From here on b() is what start() leaves of it, which is in whole_b(); they change places.
-  PRDP_ONCE void start_here(T left2) {
-    this->template each<1>([&](int i) { return Pair{b()[i], whole_b()[i]}; },
+  Vector original_b() { return own(Vectors::kOriginalB); }
+  /// From here on b() is what start() leaves of it, which is in original_b(); they change places.
+  PRDP_ONCE void shift_to_start(T left2) {
+    this->template each<1>([&](int i) { return Pair{b()[i], original_b()[i]}; },
                            [&](int i, Pair both) {
-                             whole_b()[i] = both.first;
+                             original_b()[i] = both.first;
                              b()[i] = both.second;
                            });
     started_ = true;
@@ -129,7 +129,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
   PRDP_ONCE Scalar residual(const T* x, Vector r) {
-    const T* const of = started_ ? whole_b() : b();
+    const T* const of = started_ ? original_b() : b();
     T s = 0;
     product<1>(solution(x), [&](int i, T value) {
       const T left = of[i] - value;
@@ -145,7 +145,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     const T* u = solution(x);
     return dot(u, u);
   }
-  PRDP_ONCE Scalar terms2(const T* x) {
+  PRDP_ONCE Scalar componentwise_scale2(const T* x) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
     this->template each<1>([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
@@ -210,16 +210,16 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (where != 0) copy(from, to);
   }
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
-  Scalar sensitivity2(const T*) const { return 0; }
+  Scalar skeel_estimate2(const T*) const { return 0; }
 
   // ---- what iterate.h asks for
   std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
   std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {norm_}; }
   std::array<bool, 1> surely_definite() {
-    if constexpr (requires { a_.held(0); })
-      return {!is_singular() && largest_over_rows([&](int i) { return T(a_.held(i) < T(0)); }) == 0 &&
-              largest_over_rows([&](int i) { return a_.held(i); }) > 0};
+    if constexpr (requires { a_.row_sum(0); })
+      return {!is_singular() && largest_over_rows([&](int i) { return T(a_.row_sum(i) < T(0)); }) == 0 &&
+              largest_over_rows([&](int i) { return a_.row_sum(i); }) > 0};
     else return {false};
   }
   template <class Predicate>
@@ -292,8 +292,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     team_.sum(others);
     for (int k = 0; k < n - 1; ++k) s[k] = others[k];
   }
-  /// As that of SampleSpace: takes off v, with ‖v‖² = vv, what counts of its part in the null space; returns ‖v‖² of
-  /// what is left. `along`: its part along the vector, where there is one alone.
+  /// Removes the component of v in null(Aᵀ) if it is above ε/8 ‖v‖, where ‖v‖² = vv; returns the new ‖v‖². `along`: the
+  /// component along the vector, where there is only one.
   PRDP_ONCE T projected(Vector v, T vv, T along) {
     const T negligible = std::numeric_limits<T>::epsilon() / 8 * std::sqrt(vv);
     if (!projects_on_one()) along = project(left_null_space_, v, negligible);

@@ -118,8 +118,8 @@ class BlockVectors {
 
  protected:
   /// The vectors that the space itself keeps.
-  enum Own : int { kB, kScratch, kStart, kWholeB };
-  static_assert(kWholeB + 1 == kOwnVectors);
+  enum Own : int { kB, kScratch, kStart, kOriginalB };
+  static_assert(kOriginalB + 1 == kOwnVectors);
   Vector own(Own which) { return vector_at(S::Cycles::kVectors + which); }
   /// All vectors, those of cycles first, then the space's own and those of the method.
   Vector vector_at(int i) {

@@ -43,11 +43,11 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   template <class F>
   void for_each_entry(int i, const F& f) const {
     T through = 0;
-    const T held = for_each_face(i, [&](T c, int j, int, int) {
+    const T row_sum = for_each_face(i, [&](T c, int j, int, int) {
       through += c;
       f(-c, j);
     });
-    f(held + through, i);
+    f(row_sum + through, i);
   }
   template <class F>
   void for_each_offset(int point, const F& f) const {
@@ -59,11 +59,11 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
       through += c;
       couple(c, axis, cells);
     };
-    const T held = for_each_face(point, inside, couple);
-    f(held + through, 0, 0, 0);
+    const T row_sum = for_each_face(point, inside, couple);
+    f(row_sum + through, 0, 0, 0);
   }
-  /// What the shift and the sides hold unknown i by: A is definite if that is never negative, and not always zero.
-  T held(int i) const {
+  /// Of row i: the shift and what the sides add. A is definite if that is never negative, and not always zero.
+  T row_sum(int i) const {
     return for_each_face(i, [](T, int, int, int) {});
   }
   /// By differences, which no coefficient rounds away.
@@ -71,8 +71,8 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   T product(const V& v, int i) const {
     T flux = 0;
     const T centre = v[i];
-    const T held = for_each_face(i, [&](T c, int j, int, int) { flux += c * (centre - v[j]); });
-    return this->factor() * (held * centre + flux);
+    const T row_sum = for_each_face(i, [&](T c, int j, int, int) { flux += c * (centre - v[j]); });
+    return this->factor() * (row_sum * centre + flux);
   }
 
  private:
@@ -85,11 +85,11 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   T for_each_face(int i, const F& f, const Beyond& beyond = {}) const {
     const int point = i % G::kPoints;
     const G at(point);
-    T held = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
-    held += couple<0, 0>(at, i, f, beyond) + couple<0, 1>(at, i, f, beyond);
-    held += couple<1, 0>(at, i, f, beyond) + couple<1, 1>(at, i, f, beyond);
-    held += couple<2, 0>(at, i, f, beyond) + couple<2, 1>(at, i, f, beyond);
-    return held;
+    T row_sum = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
+    row_sum += couple<0, 0>(at, i, f, beyond) + couple<0, 1>(at, i, f, beyond);
+    row_sum += couple<1, 0>(at, i, f, beyond) + couple<1, 1>(at, i, f, beyond);
+    row_sum += couple<2, 0>(at, i, f, beyond) + couple<2, 1>(at, i, f, beyond);
+    return row_sum;
   }
   template <int axis, int end, class F, class Beyond>
   T couple(const G& at, int i, const F& f, const Beyond& beyond) const {
@@ -107,13 +107,13 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
       return 0;
     }
     if constexpr (side != kZeroSide && side != kRobinSide) return 0;
-    const T held = held_by<axis, end>(at, 2 * scale * kappa_[point]);
-    beyond(held, axis, cells);
-    return held;
+    const T conductance = side_conductance<axis, end>(at, 2 * scale * kappa_[point]);
+    beyond(conductance, axis, cells);
+    return conductance;
   }
   /// By the side, half a cell away.
   template <int axis, int end>
-  T held_by(const G& at, T within) const {
+  T side_conductance(const G& at, T within) const {
     constexpr int sides[] = {kSides...};
     if constexpr (sides[2 * axis + end] == kZeroSide) return within;
     constexpr int at_side = 2 * axis + end;

@@ -48,7 +48,7 @@ class HierarchyMaker {
     if (!scale_operator<T>(team_, a)) return 0;
     Stencil stencil = finest(a);
     for (int level = 0; level < kMostGrids; ++level) {
-      const double radius = radius_of(stencil);
+      const double radius = gershgorin_bound(stencil);
       if (!std::isfinite(radius)) return 0;
       if (level == 0) symmetric_ = is_symmetric(stencil);
       const kernels::Axes axes = axes_to_coarsen(stencil);
@@ -95,7 +95,7 @@ class HierarchyMaker {
     return made;
   }
 
-  /// To the last bit. It needs no barrier first: radius_of() has met since the coefficients were written.
+  /// To the last bit. It needs no barrier first: gershgorin_bound() has met since the coefficients were written.
   PRDP_ONCE bool is_symmetric(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
@@ -109,7 +109,7 @@ class HierarchyMaker {
   }
 
   /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero, or a number is not finite.
-  PRDP_ONCE double radius_of(const Stencil& a) {
+  PRDP_ONCE double gershgorin_bound(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
     return static_cast<double>(largest_of(team_, n, [&](int i) {
