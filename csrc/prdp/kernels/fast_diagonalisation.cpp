@@ -50,12 +50,11 @@ class Reader {
   bool row_sums_are_separable() const {
     if (!a_.has_row_sums()) return true;
     constexpr double slack = 16.0 * std::numeric_limits<T>::epsilon();
-    const int64_t z0 = middle(0), y0 = middle(1), x0 = middle(2);
-    const double there = a_.row_sum(z0 * n_[1] + y0, x0);
+    const double there = a_.row_sum(middle_row(), middle(2));
     for (int64_t r = 0; r < a_.rows(); ++r) {
-      const double z = a_.row_sum(r / n_[1] * n_[1] + y0, x0), y = a_.row_sum(z0 * n_[1] + r % n_[1], x0);
+      const double z = a_.row_sum(row_of(0, r / n_[1]), middle(2)), y = a_.row_sum(row_of(1, r % n_[1]), middle(2));
       for (int64_t i = 0; i < n_[2]; ++i) {
-        const double row_sum = a_.row_sum(r, i), x = a_.row_sum(z0 * n_[1] + y0, i);
+        const double row_sum = a_.row_sum(r, i), x = a_.row_sum(middle_row(), i);
         const double size = std::abs(row_sum) + std::abs(x) + std::abs(y) + std::abs(z) + std::abs(there);
         if (!(std::abs(row_sum - (x + y + z - 2.0 * there)) <= slack * size)) return false;
       }
@@ -80,16 +79,18 @@ class Reader {
  private:
   int64_t middle(int axis) const { return n_[axis] / 2; }
   int64_t middle_row() const { return middle(0) * n_[1] + middle(1); }
+  /// The row of point i on the line along an axis through the middle.
+  int64_t row_of(int axis, int64_t i) const {
+    return (axis == 0 ? i : middle(0)) * n_[1] + (axis == 1 ? i : middle(1));
+  }
   double at(int axis, int64_t i, int64_t k) const {
-    const int64_t row = (axis == 0 ? i : middle(0)) * n_[1] + (axis == 1 ? i : middle(1));
-    const int64_t x = axis == 2 ? i : middle(2);
+    const int64_t row = row_of(axis, i), x = axis == 2 ? i : middle(2);
     return k == 0 ? a_.diagonal(row, x) : static_cast<double>(a_.value(row, k, x));
   }
   /// The row sums of A_d, so that those of all axes add up to what is stored.
   double row_sum_along(int axis, int64_t i) const {
-    const int64_t row = (axis == 0 ? i : middle(0)) * n_[1] + (axis == 1 ? i : middle(1));
-    if (axis == 2) return a_.row_sum(row, i);
-    return a_.row_sum(row, middle(2)) - a_.row_sum(middle_row(), middle(2));
+    if (axis == 2) return a_.row_sum(middle_row(), i);
+    return a_.row_sum(row_of(axis, i), middle(2)) - a_.row_sum(middle_row(), middle(2));
   }
   /// How much a coefficient may differ from this one: where the row sums are stored it does not enter a diagonal,
   /// beside whose rounding it would have to count.

@@ -93,11 +93,28 @@ void accept_at_rounding_floor(Space& space, const Method& method, typename Space
   const auto is_above = [](const SampleState& s) { return s.answer != Answer::kLast; };
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto definite = space.surely_definite();
-  const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
+  const auto floors = rounding_floors(space, method);
   for (size_t i = 0; i < states.size(); ++i) {
-    const double floor2 = space.epsilon() * space.epsilon() * norm_a[i] * norm_a[i] * u2[i];
-    if (is_above(states[i]) && definite[i] && states[i].residual2 <= 64.0 * floor2) states[i].answer = Answer::kLast;
+    auto& s = states[i];
+    if (is_above(s) && definite[i] && s.residual2 <= 64.0 * floors[i] * floors[i]) s.answer = Answer::kLast;
   }
+}
+
+/// Hands out the last iterate: its residual is rounding.
+inline void accept_rounding(SampleState& s) {
+  s.answer = Answer::kLast;
+  s.status = SolveStatus::kStagnated;
+  s.floor2 = s.residual2;
+}
+
+/// Of the samples whose answer is zero, accepts those whose u the rounding of A moves by less than a thousandth.
+template <class Space, class Method>
+void accept_if_insensitive(Space& space, const Method& method, typename Space::States& states) {
+  constexpr double stays = 1e-3;  // far below 1, as the estimate may be too small
+  const auto u2 = space.values_of(space.solution2(method.x)), moved2 = space.values_of(space.skeel_estimate2(method.x));
+  for (size_t i = 0; i < states.size(); ++i)
+    if (states[i].answer == Answer::kZero && space.epsilon() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
+      accept_rounding(states[i]);
 }
 
 /// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖, and the residual exceeds 1e-2 ‖b‖: if the
@@ -107,21 +124,17 @@ template <class Space, class Method>
 void judge_numerical_singularity(Space& space, const Method& method, typename Space::States& states) {
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
-    const double epsilon = space.epsilon();
-    const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(method.x));
-    const auto moved2 = space.values_of(space.skeel_estimate2(method.x));
+    const auto floors = rounding_floors(space, method);
     const auto definite = space.surely_definite();
+    bool asks_for_estimate = false;
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
-      const double floor = epsilon * norm_a[i] * std::sqrt(u2[i]);
-      if (!is_doubtful(s) || !(floor > 0.25 * std::sqrt(s.b2))) continue;
-      s.answer = Answer::kZero;
-      constexpr double stays = 1e-3;  // far below 1, as moved2 comes of one choice of signs
-      if (!definite[i] && !(epsilon * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))) continue;
-      s.answer = Answer::kLast;
-      s.status = SolveStatus::kStagnated;
-      s.floor2 = s.residual2;
+      if (!is_doubtful(s) || !(floors[i] > 0.25 * std::sqrt(s.b2))) continue;
+      if (definite[i]) accept_rounding(s);
+      else s.answer = Answer::kZero;
+      asks_for_estimate = asks_for_estimate || !definite[i];
     }
+    if (asks_for_estimate) accept_if_insensitive(space, method, states);
   }
   for (auto& s : states)
     if (s.answer != Answer::kLast) s.status = SolveStatus::kBreakdown;

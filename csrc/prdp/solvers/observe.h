@@ -40,6 +40,15 @@ bool is_idle(const SampleState& s) {
   return (kTakesStrides<Method> || kContracts<Method>) && s.active && s.iterations - s.best > patience;
 }
 
+/// The floor ε ‖A‖ ‖u‖ of each sample: about what the rounding of a product with u leaves.
+template <class Space, class Method>
+auto rounding_floors(Space& space, const Method& method) {
+  const auto norm_a = space.operator_norm();
+  auto floors = space.values_of(space.solution2(method.x));
+  for (size_t i = 0; i < floors.size(); ++i) floors[i] = space.epsilon() * norm_a[i] * std::sqrt(floors[i]);
+  return floors;
+}
+
 /// Stops those of the `doubtful` samples whose residual is rounding: at most slack · floor, with floor = ε ‖A‖ ‖u‖. The
 /// slack is 1, or 8 where rtol lies below the floor, or below 8 floors for direct methods, which reach no lower; or 100
 /// where a space is exhausted. As the floor overstates the rounding where columns of A differ in size, the residual
@@ -51,8 +60,7 @@ template <class Space, class Method, class Predicate>
 PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
                                       const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
-  const auto norm_a = space.operator_norm();
-  const auto u2 = space.values_of(space.solution2(method.x));
+  const auto all_floors = rounding_floors(space, method);
   const auto slack_of = [&](const SampleState& s, double floor) {
     if (s.status == SolveStatus::kBreakdown) return 100.0;
     return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
@@ -61,7 +69,7 @@ PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typena
   auto floors = space.map(states, [](const SampleState&) { return 0.0; });
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
-    const double floor = space.epsilon() * norm_a[i] * std::sqrt(u2[i]), b = std::sqrt(s.b2);
+    const double floor = all_floors[i], b = std::sqrt(s.b2);
     const double residual = std::sqrt(s.residual2);
     const bool says_something = floor <= largest_floor * b && residual <= 0.1 * b;
     if (doubtful(s) && says_something && residual <= slack_of(s, floor) * floor) floors[i] = floor;
