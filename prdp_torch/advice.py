@@ -194,7 +194,7 @@ def advise_on(
         notes += _beside_solves(seconds_of_parts(step, sample), best)
     if best is not None and not isinstance(best.solver, Direct) and not isinstance(step, Flow):
         notes.append(_start_gain(best, measure_with_start(step, sample, best)))
-    words = _recommend(step, sample, rows, best, update) if best else _make_do(rows, twin, update, seconds)
+    words = _recommend(step, sample, rows, best, update) if best else _fallback(rows, twin, update, seconds)
     return Advice(rows + others, notes, words)
 
 
@@ -259,12 +259,12 @@ def _cheapest(step: Stepper, sample: Tensor, rows: Sequence[Row], best: Row, upd
     best if that is faster to the loosest tolerance by more than the noise."""
     loosest, finest = TOLERANCES
     solved = {(row.name, row.rtol): row for row in rows if row.solved}
-    rough = update.fastest([row for row in rows if not isinstance(row.solver, Direct) and is_useful(row)], loosest)
-    if rough is not None and rough.name != best.name:
-        own = best if isinstance(best.solver, Direct) else solved.get((best.name, loosest), best)
-        if update.physics(rough) < (1 - NOISE) * update.physics(own):
-            refined = solved.get((rough.name, finest), rough)
-            return refined, update.physics(rough), f"{rough.name} to {power(loosest)}"
+    candidate = update.fastest([row for row in rows if not isinstance(row.solver, Direct) and is_useful(row)], loosest)
+    if candidate is not None and candidate.name != best.name:
+        reference = best if isinstance(best.solver, Direct) else solved.get((best.name, loosest), best)
+        if update.physics(candidate) < (1 - NOISE) * update.physics(reference):
+            refined = solved.get((candidate.name, finest), candidate)
+            return refined, update.physics(candidate), f"{candidate.name} to {power(loosest)}"
     if isinstance(best.solver, Direct) or _most_iterations(best) == 1:
         return best, update.physics(best), ""
     return best, update.physics(measure_one_iteration(step, sample, best.solver)), "a single iteration"
@@ -292,19 +292,21 @@ def _most_iterations(row: Row) -> int:
     return max(solve.iterations for solve in row.solves)
 
 
-def _make_do(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:
+def _fallback(rows: Sequence[Row], twin: Row | None, update: Update, seconds: float) -> str:
     """The recommendation where no solver reaches the finest tolerance in the dtype of the sample."""
-    rough, fine = (power(rtol) for rtol in TOLERANCES)
+    loosest, finest = (power(rtol) for rtol in TOLERANCES)
     if twin is not None:
-        return f"Use {dtype_name(twin.dtype)} with {twin.name}: no solver reaches {fine} in the dtype of the sample."
+        return f"Use {dtype_name(twin.dtype)} with {twin.name}: no solver reaches {finest} in the dtype of the sample."
     best = update.fastest(rows, TOLERANCES[0])
     if best is not None:
-        return f"Use {best.name} with rtol={rough}, the fastest to it: no solver reaches {fine} within {seconds:g} s."
+        return (
+            f"Use {best.name} with rtol={loosest}, the fastest to it: no solver reaches {finest} within {seconds:g} s."
+        )
     is_single = rows[0].dtype == torch.float32
     stalled = [row.name for row in rows if is_single and row.status in ("STAGNATED", "BREAKDOWN")]
     other = f"try float64, as {listed(stalled)} stop at the rounding of float32; or " if stalled else ""
     return (
-        f"No solver reaches {rough} within {seconds:g} s: {other}take a shorter time step or a smaller grid, or look "
+        f"No solver reaches {loosest} within {seconds:g} s: {other}take a shorter time step or a smaller grid, or look "
         "for a mistake with prdp.check_operator."
     )
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import torch
 
 from prdp_torch import _C, data_parallel
+from prdp_torch.solve import SolveStatus
 from prdp_torch.types import Refinable
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 class Ended(NamedTuple):
     """How the last solves of the steppers ended, on the host."""
 
-    residuals: list[tuple[float, float]]  # of each stepper, the sum over its samples, and their number
+    residuals: list[tuple[float, float]]  # of each stepper, the sum over samples that did not fail, and their number
     idle: float  # the share of solves that took no iteration, though their residual is not small; the largest
 
     @classmethod
@@ -28,7 +29,8 @@ class Ended(NamedTuple):
             parts = torch.stack([part.double() for part in (info.residual, info.floor, info.iterations, info.status)])
             residual, floor, iterations, status = parts.cpu()  # one copy of a device
             residual = residual.masked_fill(floor > 0, 0.0)  # it is rounding alone
-            residuals.append((float(residual.sum()), float(residual.numel())))
+            counted = residual[status >= SolveStatus.STAGNATED]
+            residuals.append((float(counted.sum()), float(counted.numel())))
             is_idle = ((iterations == 0) & (status > 0) & (residual > _C.SMALL_RESIDUAL)).double()  # K may be 0
             idle.append(float(is_idle.mean()) if is_idle.numel() else 0.0)
         return cls(residuals, max(idle))
@@ -39,7 +41,7 @@ class Interval(NamedTuple):
 
     metric: float  # the mean over the processes, as `error` and `idle` are
     converged: bool  # in all processes
-    residual: float | None  # where the last solves ended: the mean over the samples, of several steppers the largest
+    residual: float | None  # where the last solves ended: the mean over the samples, the largest of several steppers
     error: float | None
     idle: float
 
@@ -60,4 +62,4 @@ class Interval(NamedTuple):
             error = error_sum / processes if known == processes else None
             residuals = list(zip(flat[::2], flat[1::2], strict=True))
         means = [total / samples for total, samples in residuals if samples]
-        return cls(metric, converged, max((m for m in means if math.isfinite(m)), default=None), error, idle)
+        return cls(metric, converged, max(means, default=None), error, idle)

@@ -162,7 +162,8 @@ def measure(step: Stepper, sample: Tensor, solvers: Sequence[Solver], seconds: f
     counted = (
         "A depends on the state or is trained, so each forward solve makes its factors or grids anew."
         if trial.renewed
-        else "A is the same in every update, so its factors and grids are made once and not counted."
+        else "Factors and grids of A are made once and not counted, as A depends on neither the state nor what is "
+        "trained; if it changes with time, add them."
     )
     return rows, [counted, *_refusals(refused, {type(row.solver) for row in rows})]
 

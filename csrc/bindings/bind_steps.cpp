@@ -3,6 +3,7 @@
 
 #include "bindings.h"
 #include "prdp/autograd/packed_options.h"
+#include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/steppers/equation.h"
 #include "prdp/steppers/memory_check.h"
@@ -67,9 +68,12 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
                              std::vector<int64_t> shape, std::vector<double> parameters, const SolveOptions& options,
                              int64_t max_iter, int64_t adjoint_log, const std::optional<py::object>& x0) {
   HANDLE_TH_ERRORS
-  if (!nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0))) return py::none();
+  const bool is_watched = !nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0));
   const OperatorSpec a{std::move(kind), std::move(shape), std::move(parameters), unwrapped(tensors)};
-  return report([&, rhs = THPVariable_Unpack(b.ptr()), start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
+  const auto rhs = THPVariable_Unpack(b.ptr());
+  if (is_watched && is_function(a) && in_vmap()) refuse_captured_transforms(a, rhs);  // as linear_solve() does
+  if (is_watched) return py::none();
+  return report([&, start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
     check_memory(options, rhs);
     return linear_solve(a, rhs, with(options, max_iter, adjoint_log), start);
   });

@@ -326,16 +326,19 @@ def _refinement(
     if constant is not None:
         return Refinement.constant(constant)
     if schedule is not None:
-        return Refinement.schedule(*_schedule(schedule), scene.max_iter)
+        return Refinement.schedule(*_schedule(schedule, scene.max_iter), scene.max_iter)
     return Refinement.exact() if direct else Refinement.auto()
 
 
-def _schedule(text: str) -> tuple[int, int]:
+def _schedule(text: str, max_iter: int) -> tuple[int, int]:
     parts = text.split(":")
     most = _C.MOST_COUNTED
     if len(parts) != 2 or not all(part.isdecimal() and len(part) < 20 and int(part) <= most for part in parts):
         raise ValueError(f"--schedule: expected START:STEP, two whole numbers up to {most}, got '{text}'")
-    return int(parts[0]), int(parts[1])
+    start, step = map(int, parts)
+    if start > max_iter:
+        raise ValueError(f"--schedule: START must be at most max_iter of the scene, {max_iter}, got {start}")
+    return start, step
 
 
 def main() -> None:

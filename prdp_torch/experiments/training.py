@@ -55,7 +55,7 @@ class Interval(NamedTuple):
 
 
 Callback: TypeAlias = Callable[[Interval], object]
-"""Stops the training if it returns True."""
+"""Stops the training if it returns True, of Python, numpy or torch."""
 
 
 class Curves(TypedDict):
@@ -92,7 +92,8 @@ def train(
     Args:
         scene: from `prdp_torch.experiments.scenes.load`.
         refinement: a `Refinement`, which chooses K and the tolerance.
-        seed: sets the initial weights of the network and the order of the batches; for the task "field", the noise.
+        seed: sets the initial weights of the network, the order of the batches and the random numbers of the training,
+            such as those of dropout; for the task "field", the noise.
             The data of a scene do not depend on it.
         network: any module that maps (batch, channels, *shape) to the same shape. None makes that of the scene.
         callbacks: functions that are called after each interval with an `Interval`. If one returns True, the
@@ -151,30 +152,38 @@ def train(
         check_tensors(network)
     found = [] if checkpoint is None else checkpoint.found()
     steppers = [make_stepper(scene, refinement.direct) for _ in range(scene.executions)]
-    run = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
+    training = _Run(scene, seed, steppers, refinement, checkpoint, callbacks)
     if scene.trains_network:
         data = data_parallel.first_before_others(functools.partial(datasets.of_scene, scene, data, on_data))
         task = network_task.make_task(scene, steppers, seed, network, data)
     else:
         task = (field_task if scene.task == "field" else parameter_task).make_task(scene, steppers, seed)
     try:
-        with _repeatable():
-            run.go(task, found)
+        with _repeatable(scene.device, seed):
+            training.run(task, found)
     except _Diverged as divergence:
-        run.give_up(str(divergence))
-    return cast(Curves, run.curves)
+        training.mark_diverged(str(divergence))
+    return cast(Curves, training.curves)
 
 
 @contextlib.contextmanager
-def _repeatable() -> Iterator[None]:
-    """Convolutions of GPUs that give the same bits each time: a training that continues then ends where it would
-    have."""
+def _repeatable(device: torch.device, seed: int) -> Iterator[None]:
+    """Convolutions of GPUs that give the same bits each time, and random numbers, as for dropout, that follow from the
+    seed: a training that runs again, or continues, ends where the first did. Outside, nothing changes."""
     before = torch.backends.cudnn.deterministic
     torch.backends.cudnn.deterministic = True
     try:
-        yield
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            yield
     finally:
         torch.backends.cudnn.deterministic = before
+
+
+def _is_true(value: object) -> bool:
+    """Whether it is True, or that of numpy or of torch."""
+    is_bool = isinstance(value, bool) or str(getattr(value, "dtype", "")) in ("bool", "torch.bool")
+    return is_bool and bool(value)
 
 
 class _Diverged(Exception):
@@ -198,7 +207,7 @@ class _Run:
         callbacks: list[Callback],
     ) -> None:
         self.who = f"{scene.name}, {refinement.label}, seed {seed}"
-        self.goes_on = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
+        self.tolerates_failures = scene.on_failure == "zero_grad"  # past solves that were given NaN or Inf
         self.intervals = scene.training.intervals
         self.device = scene.device
         self.steppers = steppers
@@ -208,27 +217,27 @@ class _Run:
         self.callbacks = callbacks
         self.curves: dict[str, Any] = {name: [] for name in ("update_loss", "metric", "error", *self.COSTS)}
 
-    def go(self, task: Task, found: Found) -> None:
+    def run(self, task: Task, found: Found) -> None:
         stopped = False
         if not self._restore(task, found):
             self._observe(task, 0)
         else:
             for number in range(1, self._done() + 1):
-                stopped = self._tell(number, resumed=True)
+                stopped = self._notify(number, resumed=True)
         while not stopped and self._done() < self.intervals:
             self._run_interval(task, self._done() + 1)
             self._observe(task, self._done())
             unfinished = self.checkpoint if self._done() < self.intervals else None
             kept = unfinished is not None and unfinished.due()
             if unfinished is not None and kept:
-                self._keep(task, unfinished)
-            stopped = self._tell(self._done())
+                self._save(task, unfinished)
+            stopped = self._notify(self._done())
             if stopped and unfinished is not None and not kept:
-                self._keep(task, unfinished)
+                self._save(task, unfinished)
         if self.controller.warning is not None:
             self.curves["warning"] = self.controller.warning
 
-    def _tell(self, number: int, resumed: bool = False) -> bool:
+    def _notify(self, number: int, resumed: bool = False) -> bool:
         """Call the callbacks with an interval. True if one of them stops the training."""
         curves, updates = self.curves, len(self.curves["update_loss"]) // self._done()
         losses = curves["update_loss"][(number - 1) * updates : number * updates]
@@ -242,13 +251,13 @@ class _Run:
             resumed=resumed,
             **costs,
         )
-        stopped = any([callback(interval) is True for callback in self.callbacks])  # a list: all of them are called
+        stopped = any([_is_true(callback(interval)) for callback in self.callbacks])  # a list: all of them are called
         return data_parallel.sums([stopped])[0] > 0
 
     def _done(self) -> int:
         return len(self.curves["seconds"])
 
-    def _keep(self, task: Task, checkpoint: Checkpoint) -> None:
+    def _save(self, task: Task, checkpoint: Checkpoint) -> None:
         tensors = {**task.state(), **random_states(self.device)}
         checkpoint.save(tensors, self.curves, self.controller.state_dict())
 
@@ -288,7 +297,7 @@ class _Run:
         if failures.count:
             print(f"prdp: {self.who}, {failures.line(number)}", file=sys.stderr)
 
-    def give_up(self, why: str) -> None:
+    def mark_diverged(self, why: str) -> None:
         """The curves end with the interval that was lost."""
         self.curves["diverged"] = why
         lost = max(1, len(self.curves["metric"]))
@@ -321,5 +330,5 @@ class _Run:
     def _check(self, loss: float, refused: float, number: int) -> None:
         if not math.isfinite(loss):
             raise _Diverged(f"interval {number}: the loss is {loss}")
-        if refused and not self.goes_on:
+        if refused and not self.tolerates_failures:
             raise _Diverged(f"interval {number}: the solver was given NaN or Inf")

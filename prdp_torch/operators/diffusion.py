@@ -15,7 +15,7 @@ Side: TypeAlias = Literal["zero", "flux", "periodic"] | tuple[Literal["robin"], 
 Sides: TypeAlias = Side | Sequence[Side | tuple[Side, Side] | list[Side]]
 """One for all sides, one for each axis, or a pair (low, high) for each axis."""
 
-OfSides: TypeAlias = Number | Sequence[Sequence[Number]]
+OfSides: TypeAlias = Number | Sequence[Sequence[Number | None]]
 """One for all sides, or a pair (low, high) for each axis."""
 
 KINDS = ("zero", "flux", "periodic", "robin")  # by the numbers that the compiled library gives them
@@ -33,9 +33,9 @@ class Diffusion(Operator):
         kappa: (batch, *shape), or (1, *shape) for all samples alike, κ > 0 in the centres of the cells; shape has 1 to
             3 axes. With per_axis (batch or 1, axes, *shape). Gets a gradient, which is formed from fluxes: in float32
             it keeps digits that the gradient of a `Stencil`'s coefficients loses.
-        shift: a number, or a tensor (batch or 1, *shape), which gets a gradient. With 1/dt, A is a step of
-            ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32 products are made of fluxes: for `CG` and
-            `Direct` a small shift, weak sides and jumps of κ are not lost in the rounding of a diagonal, though the
+        shift: a number, or a tensor (batch or 1, *shape) or (batch, 1, ...), which gets a gradient. With 1/dt, A is a
+            step of ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32 products are made of fluxes: for `CG`
+            and `Direct` a small shift, weak sides and jumps of κ are not lost in the rounding of a diagonal, though the
             residual may end at ε max κ Σ 2/dx² |u|, with a warning. `MINRES` and `GMRES`, which go by the residual,
             and the coarse grids of multigrid do lose what holds u by less than that.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
@@ -83,12 +83,14 @@ class Diffusion(Operator):
         sides = _sides(boundary, dim)
         self.boundary = [tuple(_kind(side) for side in pair) for pair in sides]
         self.length = tuple(_check.lengths("Diffusion", length, dim)) or (1.0,) * dim
-        if isinstance(shift, Tensor) and shift.dim() not in (0, 1 + dim):
-            like = (len(kappa), *shape)
-            raise ValueError(
-                f"Diffusion: shift must be a number or have the shape of {'a field of ' * per_axis}kappa, {like}, got "
-                f"{tuple(shift.shape)}"
-            )
+        if isinstance(shift, Tensor) and shift.dim() > 0:
+            if shift.shape[1:] == (1,) * dim:
+                shift = shift.expand(-1, *shape)
+            if shift.shape[1:] != shape:
+                raise ValueError(
+                    f"Diffusion: shift must be a number, one for each sample {('batch', *(1,) * dim)}, or a field "
+                    f"{('batch or 1', *shape)}, got {tuple(shift.shape)}".replace("'", "")
+                )
         given: dict[str, Number] = {"kappa": kappa, "shift": shift}
         for axis, pair in enumerate(sides):
             for end, side in zip(ENDS, pair, strict=True):
@@ -115,11 +117,11 @@ class Diffusion(Operator):
             values: u on the sides that are "zero", and u_ext of those that are "robin", where -κ ∂u/∂n is then
                 h (u - u_ext).
             fluxes: what flows in, κ ∂u/∂n with the normal n pointing outwards, on the sides that are "flux".
-                Each is one number for all sides, or a pair (low, high) for each axis; a number, or a tensor that
-                broadcasts to (batch or 1, *side), where side is shape without the axis.
+                Each is one for all sides, or a pair (low, high) for each axis; a number, or a tensor that broadcasts
+                to (batch or 1, *side), where side is shape without the axis. None is 0.
 
         Raises:
-            ValueError: one of them stands where no side takes it.
+            ValueError: a value that is not 0 stands at a side that takes none.
         """
         values, fluxes = self._of_sides("values", values, TAKE_VALUES), self._of_sides("fluxes", fluxes, ("flux",))
         kappa, robin = full_precision(self.kappa), iter(self.tensors[2:])
@@ -151,8 +153,9 @@ class Diffusion(Operator):
     def _of_sides(self, name: str, given: OfSides, kinds: tuple[str, ...]) -> Sequence[Sequence[Number]]:
         """A value for each side, (low, high) for each axis; only sides of these kinds take one that is not zero."""
         dim = len(self.shape)
+        pairs: Sequence[Sequence[Number | None]]
         if isinstance(given, (int, float, Tensor)):
-            pairs: Sequence[Sequence[Number]] = [(given, given)] * dim
+            pairs = [(given, given)] * dim
             stray = _is_given(given) and not any(side in kinds for sides in self.boundary for side in sides)
         else:
             pairs = given
@@ -163,7 +166,7 @@ class Diffusion(Operator):
                     f"{given!r:.80}"
                 )
             stray = any(
-                _is_given(value) and side not in kinds
+                value is not None and _is_given(value) and side not in kinds
                 for sides, pair in zip(self.boundary, pairs, strict=True)
                 for side, value in zip(sides, pair, strict=True)
             )
@@ -172,7 +175,7 @@ class Diffusion(Operator):
                 f"Diffusion: {name} belong to sides that are {' or '.join(map(repr, kinds))}; the boundary is "
                 f"{self.boundary}, in pairs (low, high), and {name} are {given!r:.80}"
             )
-        return pairs
+        return [[0.0 if value is None else value for value in pair] for pair in pairs]
 
 
 def _kind(side: Any) -> Any:

@@ -1,6 +1,7 @@
 """Products given by Python functions."""
 
 import copy
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -21,7 +22,7 @@ class Function(Operator):
 
     Args:
         matvec: `matvec(v, *tensors)` returns A v as a new tensor with the shape and dtype of v. It is made of torch
-            operations and linear in v. Samples may differ only through `tensors`.
+            operations and linear in v; constants belong to b. Samples may differ only through `tensors`.
         transpose: the same for Aᵀ v. None takes torch's own derivative of matvec.
         tensors: what A is made of, a tuple of tensors or a single one. They get gradients. A tensor that requires
             grad and reaches matvec in another way is refused.
@@ -66,6 +67,7 @@ class Function(Operator):
             None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
+            looks_at_zero=_is_new(matvec),
         )
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
@@ -83,6 +85,18 @@ class Function(Operator):
             return Function, (matvec, transpose, tuple(self.tensors), diagonal, symmetric)
         *tensors, right, left = self.tensors
         return Function, (matvec, transpose, tuple(tensors), diagonal, symmetric, right, left)
+
+
+_KNOWN: "weakref.WeakSet[Any]" = weakref.WeakSet()  # the code of products that solves have looked at
+
+
+def _is_new(matvec: Product) -> bool:
+    """Whether this product's code comes for the first time. A step that makes its operator anew has the same code."""
+    code = getattr(getattr(matvec, "__func__", matvec), "__code__", None)
+    if code is None or code in _KNOWN:
+        return code is None
+    _KNOWN.add(code)
+    return True
 
 
 def _tensor(name: str, value: object) -> Tensor:

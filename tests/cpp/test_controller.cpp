@@ -175,6 +175,16 @@ TEST(Controller, SetsTheBudgetOfASolveAndReadsHowItWent) {
   EXPECT_LE(steppers[0].adjoint_info()->residual.max().item<double>(), 0.2);
 }
 
+TEST(Controller, CountsTheResidualOfSamplesThatDidNotFail) {
+  std::vector<prdp::Stepper> steppers{prdp::Heat({30}, 1e-1, 1.0, prdp::Jacobi{.max_iter = 2})};
+  steppers[0].options().on_failure = prdp::OnFailure::kReturn;
+  auto u = at::randn({3, 1, 30}, at::kDouble);
+  u[1].fill_(NAN);
+  steppers[0](u);
+  const auto residual = steppers[0].info()->residual;
+  EXPECT_DOUBLE_EQ(*prdp::last_solves(steppers).residual, (residual[0] + residual[2]).item<double>() / 2);
+}
+
 TEST(Controller, WarnsWhereTheSolversErrorMakesUpWhatIsTrained) {
   PRDPController controller;
   EXPECT_FALSE(controller.warning().has_value());

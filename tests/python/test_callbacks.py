@@ -51,6 +51,12 @@ def test_a_callback_that_returns_true_stops_the_training_and_all_are_called():
     assert stopped["metric"] == whole["metric"][:3] and stopped["update_loss"] == whole["update_loss"][:16]
 
 
+@pytest.mark.parametrize("true", [np.bool_(True), torch.tensor(True)])
+def test_a_true_of_numpy_or_torch_stops_the_training_and_a_false_one_does_not(true):
+    stop = lambda interval: true if interval.number == 2 else ~true  # noqa: E731
+    assert len(train(short(4), Refinement.constant(3), callbacks=[stop])["seconds"]) == 2
+
+
 def test_a_stopped_training_can_be_gone_on_with(tmp_path, monkeypatch):
     monkeypatch.setenv("PRDP_CHECKPOINT_SECONDS", "3600")  # none is due by itself
     scene, checkpoint = short(), Checkpoint(tmp_path / "kept")

@@ -98,6 +98,10 @@ def test_scenes_are_listed(tmp_path):
             ["train", "heat_1d", "--schedule", "3"],
             "prdp: --schedule: expected START:STEP, two whole numbers up to 1000000000, got '3'",
         ),
+        (
+            ["train", "heat_1d", "--schedule", "30:1"],
+            "prdp: --schedule: START must be at most max_iter of the scene, 25, got 30",
+        ),
         (["train", "heat_1d", "--prdp", "--direct"], "give one of --auto, --prdp, --constant, --schedule and --direct"),
         (
             ["train", "heat_1d", "--backward", "both"],
@@ -162,6 +166,10 @@ def test_ctrl_c_while_torch_is_imported_is_quiet(tmp_path, ignored):
         (
             [ROOT / "examples/scenes/heat_1d.toml", "--schedule", "3"],
             "expected START:STEP, two whole numbers up to 1000000000, got '3'",
+        ),
+        (
+            [ROOT / "examples/scenes/heat_1d.toml", "--schedule", "30:1"],
+            "START must be at most max_iter of the scene, 25",
         ),
         ([ROOT / "examples/scenes/heat_1d.toml", "--out", "/proc/nothing"], "prdp_train: "),
     ],

@@ -22,6 +22,19 @@ def test_a_controller_warns_while_the_residual_makes_up_the_error():
     assert controller.warning is None
 
 
+def test_failed_samples_do_not_hide_the_residual_of_the_others():
+    u, residuals, warned = field((30,), 16), [], []
+    for failed in (0, 1, 16):
+        heat = prdp.Heat((30,), nu=1e-1, dt=1.0, solver=prdp.Jacobi(max_iter=2), on_failure="zero_grad")
+        controller = prdp.ToleranceController([heat], maximum=3)
+        heat(u.index_fill(0, torch.arange(failed), float("nan")))
+        controller.step(0.01)
+        residuals.append(controller.history[-1].residual)
+        warned.append(controller.warning is not None)
+        assert failed == 16 or residuals[-1] == float(heat.info.residual[failed:].mean())
+    assert residuals[2] is None and warned == [True, True, False]
+
+
 def test_a_tolerance_that_was_asked_for_is_no_warning():
     """For an error of 1 the controller asks for rtol = .1, whatever the error then is."""
     heat = heat_step()

@@ -138,6 +138,19 @@ def test_it_is_second_order_and_a_step_of_diffusion():
     assert 3.7 < errors[0] / errors[1] < 4.3
 
 
+def test_a_shift_for_each_sample():
+    kappa, b = rand(2, 4, 5), rand(2, 1, 4, 5)
+    shift = torch.tensor([1.0, 50.0], dtype=F64)[:, None, None].requires_grad_()
+    u, _ = prdp.linear_solve(Diffusion(kappa, shift), b, prdp.Direct())
+    (found,) = torch.autograd.grad(u.square().sum(), shift)
+    for i in range(2):
+        alone = shift[i, 0, 0].detach().requires_grad_()
+        u_alone, _ = prdp.linear_solve(Diffusion(kappa[i : i + 1], alone), b[i : i + 1], prdp.Direct())
+        (expected,) = torch.autograd.grad(u_alone.square().sum(), alone)
+        torch.testing.assert_close(u[i], u_alone[0])
+        torch.testing.assert_close(found[i, 0, 0], expected)
+
+
 def test_arguments_are_checked():
     kappa = rand(1, 4, 4)
     for arguments, message in (
@@ -147,7 +160,7 @@ def test_arguments_are_checked():
         ({"boundary": [("periodic", "zero"), "zero"]}, "both sides of an axis are periodic or none is"),
         ({"boundary": ["zero"]}, "for each of 2 axes"),
         ({"faces": "upwind"}, "faces must be 'harmonic' or 'arithmetic'"),
-        ({"shift": torch.ones(3)}, "shift must be a number or have the shape of kappa"),
+        ({"shift": torch.ones(3)}, "shift must be a number, one for each sample"),
         ({"length": 0.0}, "length"),
     ):
         with pytest.raises(ValueError, match=message):

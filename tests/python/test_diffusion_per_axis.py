@@ -136,7 +136,11 @@ def test_mistakes_are_named():
     for kappa, given, words in (
         (torch.ones(1, 4, 5), {}, r"kappa must have shape \(batch or 1, axes, \*shape\) .*, got \(1, 4, 5\)"),
         (torch.ones(1, 3, 4, 5), {}, r"kappa must have shape \(batch or 1, axes, \*shape\) .*, got \(1, 3, 4, 5\)"),
-        (torch.ones(1, 2, 4, 5), {"shift": torch.ones(1, 2, 4, 5)}, r"have the shape of a field of kappa, \(1, 4, 5\)"),
+        (
+            torch.ones(1, 2, 4, 5),
+            {"shift": torch.ones(1, 2, 4, 5)},
+            r"or a field \(batch or 1, 4, 5\), got \(1, 2, 4, 5\)",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             Diffusion(kappa, per_axis=True, **given)

@@ -36,6 +36,8 @@ def test_values_and_fluxes_at_the_sides():
     expected = torch.where(x < 0.5, 1 + flux * x, 3 - flux / 100 * (1 - x))
     torch.testing.assert_close(u[0, 0], expected[:, None].expand(n, 3), rtol=1e-10, atol=1e-10)
 
+    assert torch.equal(b, a.boundary_rhs(values=[(1.0, 3.0), (None, None)], fluxes=[(None, None), (0.0, None)]))
+
     a = Diffusion(torch.full((1, n), 2.0, dtype=F64), boundary=[("zero", "flux")], length=4.0)
     inflow = torch.tensor(0.5, dtype=F64, requires_grad=True)
     u, _ = prdp.linear_solve(a, a.boundary_rhs(values=1.0, fluxes=inflow), prdp.Direct())

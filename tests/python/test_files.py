@@ -77,6 +77,18 @@ def test_a_network_with_dropout_goes_on_bit_for_bit(tmp_path):
     assert rest["update_loss"] == alone["update_loss"] and rest["metric"] == alone["metric"]
 
 
+def test_a_network_with_dropout_follows_the_seed_and_leaves_the_generator_alone():
+    """Whatever was drawn before; the initial weights are set beside, so that only the dropout differs."""
+    losses = []
+    for seed in (0, 0, 1):
+        network = Dropout()
+        torch.rand(len(losses))
+        before = torch.get_rng_state()
+        losses.append(train(short(2), Refinement.constant(3), seed=seed, network=network)["update_loss"])
+        assert torch.equal(torch.get_rng_state(), before)
+    assert losses[0] == losses[1] != losses[2]
+
+
 def test_a_checkpoint_of_another_network_is_refused(tmp_path):
     scene, checkpoint = short(3), Checkpoint(tmp_path / "kept")
     train(scene, Refinement.prdp(scene), network=Dropout(), checkpoint=checkpoint)

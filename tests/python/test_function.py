@@ -280,6 +280,32 @@ def test_a_product_that_torch_cannot_differentiate_needs_a_transpose():
     torch.testing.assert_close(b.grad, torch.full_like(b, 0.5))
 
 
+def test_a_constant_in_the_product_is_refused_at_the_first_solve():
+    """Powers of two scale b, so that its residual would be that of another problem."""
+    diagonal = 2 + torch.rand(4, dtype=torch.float64)
+
+    def with_boundary(v):
+        return diagonal * v + 1
+
+    a = operators.Function(with_boundary, diagonal=lambda: diagonal)
+    with pytest.raises(ValueError, match=r"Function: matvec must be linear, but matvec\(0\) holds 1; constants"):
+        prdp.linear_solve(a, 4 * right_hand_side(), prdp.Jacobi(50))
+
+
+def test_only_the_first_operator_with_this_code_multiplies_a_zero():
+    def begins_with_zero(scale):
+        given = []
+
+        def product(v):
+            given.append(v.clone())
+            return scale * v
+
+        prdp.linear_solve(operators.Function(product), right_hand_side(), prdp.GMRES(2))
+        return not given[0].any()
+
+    assert [begins_with_zero(scale) for scale in (2.0, 3.0, 4.0)] == [True, False, False]
+
+
 def test_copies_and_pickles():
     a = operators.Function(shifted, shifted_transpose, tensors(), diagonal)
     v = right_hand_side()

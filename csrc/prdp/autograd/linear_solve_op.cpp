@@ -129,6 +129,7 @@ SolveOutputs solve_and_differentiate_null_space(const at::Tensor& b, const Opera
 /// else calls the op.
 SolveOutputs solve_or_dispatch(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                                const at::Tensor& x0) {
+  if (is_function(a) && in_vmap()) refuse_captured_transforms(a, b);  // its rule runs outside, where none has a meaning
   if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
   RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
   return solve_and_differentiate_null_space(b, a, options, x0);
@@ -163,7 +164,10 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   const auto a = checked_operator(spec, b, options, x0);
   const auto checks = checks_of(options.on_failure);
   a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);
-  if (!spec.transposed) a->check_null_spaces(b);  // an adjoint solve follows one
+  if (!spec.transposed) {  // an adjoint solve follows one
+    a->check_null_spaces(b);
+    if (is_function(spec)) refuse_constant_in_product(spec, b);
+  }
   const auto& s = options.solver;
   auto rhs = b;
   if (spec.transposed && is_singular(spec)) rhs = options.cotangent_is_in_range ? a->project(b) : reachable_part(*a, b);

@@ -20,17 +20,16 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
-  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve
-  // said are unrolled mode's. Where a failed sample may have passed, its status says so.
+  // u is kept only if A has a derivative; b and what the solve said are unrolled mode's. Where a failed sample may have
+  // passed, its status says so.
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);
     x0_ = SavedVariable(solved.x0, /*is_output=*/false);
     iterations_ = SavedVariable(solved.iterations, /*is_output=*/false);
     residual_ = SavedVariable(solved.residual, /*is_output=*/false);
-  } else if (any_requires_grad(a_.tensors)) {
-    u_ = SavedVariable(solved.u, /*is_output=*/true);
   }
+  if (any_requires_grad(a_.tensors)) u_ = SavedVariable(solved.u, /*is_output=*/true);
   if (unrolled || options_.on_failure != OnFailure::kRaise) status_ = SavedVariable(solved.status, /*is_output=*/false);
   for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
   a_.tensors.clear();

@@ -39,6 +39,14 @@ at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
   return largest(lambda) * largest(u) > 1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
 }
 
+/// Takes the samples whose ḡ may overflow out of λ and marks them, without a look by the host.
+void leave_out_overflow_on_device(at::Tensor& lambda, const at::Tensor& u, at::Tensor& status) {
+  const auto overflowing = may_overflow(lambda, u);
+  lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
+  status = status.masked_fill(overflowing & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
+                              static_cast<int64_t>(SolveStatus::kOverflow));
+}
+
 /// The report where ḡ of the samples that are not `finite` left the range of the dtype.
 void report_overflow(SolveInfo& info, const Rows& finite, const OperatorSpec& transpose, const at::Tensor& cotangent,
                      const SolveOptions& options) {
@@ -81,13 +89,8 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
   if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
-    // The host does not look: what may overflow is left out.
-    const auto overflowing = may_overflow(lambda, u);
-    lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
+    leave_out_overflow_on_device(lambda, u, found.info.status);
     if (needed[0]) found.gradients[0] = lambda;
-    auto& status = found.info.status;
-    status = status.masked_fill(overflowing & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
-                                static_cast<int64_t>(SolveStatus::kOverflow));
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
     products = of_tensors(lambda);
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at

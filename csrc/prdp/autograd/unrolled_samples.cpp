@@ -1,6 +1,7 @@
 #include "prdp/autograd/unrolled_samples.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 
 #include "prdp/autograd/adjoint_log.h"
@@ -81,6 +82,7 @@ class SampleVjps {
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
+  const std::vector<double> allowed_ = allowed_disagreement();
   const std::vector<int64_t> wanted_ = wanted();  // needed_, and b̄ where retry_implicitly() looks at it
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double judged_rtol_ =
@@ -158,20 +160,39 @@ class SampleVjps {
     }
   }
 
-  /// For solved samples. Iterations excite few eigenvectors, so their b̄ may be far from the solution's; their Ā may be
-  /// amplified rounding. Where either is further from the implicit gradient than zero is, that takes its place.
+  /// Those that met their tolerance, stagnated, or were left with little by max_iter.
+  Rows solved_samples() const {
+    Rows solved(batch_), stopped(batch_);
+    for (int64_t i = 0; i < batch_; ++i) {
+      if (derivatives_[i] != Derivative::kOfIterations || !finite_[i]) continue;
+      solved[i] = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
+      stopped[i] = status(i) == SolveStatus::kMaxIter;
+    }
+    if (!any(stopped)) return solved;
+    const auto done = left_little(*a_, solved_, stopped);
+    for (int64_t i = 0; i < batch_; ++i) solved[i] = solved[i] || done[i];
+    return solved;
+  }
+
+  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: further with a larger residual, as
+  /// the gradient of an iterate is not that of the solution, and never further than zero is.
+  std::vector<double> allowed_disagreement() const {
+    auto allowed = to_host<double>(solved_.residual, batch_);
+    for (auto& r : allowed) r = std::clamp(10.0 * std::sqrt(r), 1e-3, 1.0);
+    return allowed;
+  }
+
+  /// For solved samples. Iterations excite few eigenvectors, so their b̄ may be far from the solution's, and their Ā may
+  /// be amplified rounding, as both are where a recurrence comes near a breakdown. Then the implicit gradient takes
+  /// their place.
   void retry_implicitly() {
     if (!may_mislead_ || !gradients_[0].defined()) return;
-    Rows solved(batch_);
-    for (int64_t i = 0; i < batch_; ++i) {
-      const bool is_solved = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      solved[i] = is_solved && derivatives_[i] == Derivative::kOfIterations && finite_[i];
-    }
+    const auto solved = solved_samples();
     if (!any(solved)) return;
     const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
     Rows misleading(batch_), to_look_at(batch_);
     for (int64_t i = 0; i < batch_; ++i) {
-      misleading[i] = solved[i] && residual[i] > 1.0;
+      misleading[i] = solved[i] && residual[i] > allowed_[i];
       to_look_at[i] = solved[i] && !misleading[i];
     }
     if (needs_gradient_of_a_ && any(to_look_at)) mark_misleading_gradients_of_a(to_look_at, misleading);
@@ -188,7 +209,7 @@ class SampleVjps {
     return t.dim() > 0 && t.size(0) == batch_ && (!axes || (*axes)[k] == t.dim());
   }
 
-  /// Marks those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than its norm. Samples that
+  /// Marks those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than allowed. Samples that
   /// share a tensor of A are looked at together: it has the sum of their gradients.
   void mark_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
     bool no_other_contributes = true;
@@ -197,6 +218,7 @@ class SampleVjps {
     const auto found = no_other_contributes ? gradients_ : vjp_of_iterations(rows).gradients;
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
+    const auto allowed = at::tensor(allowed_, at::kDouble).to(u.device());
     const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);
     for (size_t k = 0; k < of_solution.size(); ++k) {
       if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
@@ -204,7 +226,7 @@ class SampleVjps {
       const auto right = of_solution[k].to(in_double), off = found[k + 1].detach() + right;
       const bool of_samples = is_of_samples(k);
       const auto mark_by = [&](const auto& norm) {
-        const auto is_misleading = norm(off).gt(norm(right)).expand({batch_}).contiguous();
+        const auto is_misleading = norm(off).gt(allowed * norm(right)).expand({batch_}).contiguous();
         const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch_);
         for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
       };
@@ -241,8 +263,9 @@ class SampleVjps {
     return info;
   }
 
-  /// u, solved for again, as it is not kept.
+  /// u; solved for again where it was not kept, as A has no derivative.
   const at::Tensor& solution() {
+    if (solved_.u.defined()) return solved_.u;
     auto silent = options_;
     silent.on_failure = OnFailure::kReturn;
     silent.adjoint_log = 0;

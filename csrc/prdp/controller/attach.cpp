@@ -1,7 +1,6 @@
 #include "prdp/controller/attach.h"
 
 #include <algorithm>
-#include <cmath>
 
 namespace prdp {
 
@@ -20,8 +19,11 @@ Solves last_solves(const std::vector<const StepperBase*>& steppers) {
     if (!stepper->info()) continue;
     const auto& info = *stepper->info();
     const auto beyond_rounding = info.residual.masked_fill(info.floor.gt(0), 0.0);
-    const auto residual = beyond_rounding.to(at::kDouble).mean().item<double>();
-    if (std::isfinite(residual)) solves.residual = std::max(residual, solves.residual.value_or(0.0));
+    const auto counts = info.status.ge(static_cast<int64_t>(SolveStatus::kStagnated));  // those that did not fail
+    const auto of_counted = beyond_rounding.masked_fill(counts.logical_not(), 0.0).to(at::kDouble).sum().item<double>();
+    const auto counted = counts.sum().item<int64_t>();
+    if (counted > 0)
+      solves.residual = std::max(of_counted / static_cast<double>(counted), solves.residual.value_or(0.0));
     const auto idle = info.iterations.eq(0) & info.status.gt(0) & (beyond_rounding > kSmallResidual);  // K may be 0
     solves.idle = std::max(solves.idle, idle.to(at::kDouble).mean().item<double>());
   }

@@ -14,7 +14,7 @@ inline constexpr double kSmallResidual = 1e-4;
 /// The outcome of the solves of an interval, and the error of what is trained.
 struct Solves {
   bool converged = false;            // whether all of them met their tolerance
-  std::optional<double> residual{};  // ‖b - A u‖ / ‖b‖ at their end, the mean over the samples
+  std::optional<double> residual{};  // ‖b - A u‖ / ‖b‖ at their end, the mean over the samples that did not fail
   /// The relative error of what is trained. For a network, ‖u - u_ref‖ / ‖u_ref‖ after one step: the square root of a
   /// normalised squared metric, divided by the number of steps. In an inverse problem, the relative misfit.
   std::optional<double> error{};

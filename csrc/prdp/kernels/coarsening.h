@@ -73,9 +73,16 @@ Axes axes_to_coarsen(const Shape& shape, int dim, const Couplings& couplings) {
 }
 
 /// A coarse diagonal below this many ε of the fine one is cancellation error, of a region that the coarse grid does not
-/// resolve; where nothing couples to the point, the errors of the whole region may have gathered there. The fine
-/// diagonal is kept in its place: there is nothing to correct, and nothing is divided by it.
-inline constexpr double kVanishing = 8.0, kVanishingAlone = 256.0;
+/// resolve; where nothing couples to the point, the errors of the whole region may have gathered there: `is_alone()`,
+/// asked where it decides. The fine diagonal is kept in its place: there is nothing to correct, and nothing is divided
+/// by it.
+template <class T, class IsAlone>
+T kept_diagonal(T coarse, T fine, const IsAlone& is_alone) {
+  constexpr T rounding = std::numeric_limits<T>::epsilon(), vanishing = T(8) * rounding, alone = T(256) * rounding;
+  const T size = std::abs(coarse);
+  if (size > alone * std::abs(fine)) return coarse;
+  return size <= vanishing * std::abs(fine) || is_alone() ? fine : coarse;
+}
 
 /// A step x ← x + p (x - x₋) + q D⁻¹(b - A x) of Chebyshev's iteration over [ρ/4, ρ].
 struct SmoothingStep {

@@ -130,7 +130,7 @@ class CoarseCoefficients {
   T* coarse_[3] = {};
 };
 
-/// See kVanishing in coarsening.h.
+/// See kept_diagonal().
 template <class T>
 void keep_vanishing_diagonals(const StencilFields<T>& a, int axis, StencilFields<T>& coarse) {
   const T* const fine = a.coefficients[StencilFields<T>::kCentre];
@@ -140,8 +140,6 @@ void keep_vanishing_diagonals(const StencilFields<T>& a, int axis, StencilFields
       if (k != StencilFields<T>::kCentre && coarse.coefficients[k] && coarse.coefficients[k][i] != T(0)) return false;
     return true;
   };
-  const auto roundings = [](double n) { return static_cast<T>(n) * std::numeric_limits<T>::epsilon(); };
-  const T tiny = roundings(kVanishing), tiny_alone = roundings(kVanishingAlone);
   const auto fine_index = [&](int d, int64_t i) { return d == axis ? 2 * i + !a.grid.periodic[d] : i; };
   const int64_t step = axis == 2 ? 2 : 1;
   for_each_row(coarse.grid, [&](const GridRow& row) {
@@ -149,9 +147,7 @@ void keep_vanishing_diagonals(const StencilFields<T>& a, int axis, StencilFields
         (fine_index(0, row.z) * a.grid.shape[1] + fine_index(1, row.y)) * a.grid.shape[2] + fine_index(2, 0);
     for (int64_t i = 0; i < coarse.grid.shape[2]; ++i) {
       T& own = diagonal[row.first + i];
-      const T kept = fine[first + step * i], size = std::abs(own);
-      if (size > tiny_alone * std::abs(kept)) continue;
-      if (size <= tiny * std::abs(kept) || is_alone(row.first + i)) own = kept;
+      own = kept_diagonal(own, fine[first + step * i], [&] { return is_alone(row.first + i); });
     }
   });
 }

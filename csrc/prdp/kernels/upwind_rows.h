@@ -64,11 +64,11 @@ PackedStencil<T> upwind_rows(std::shared_ptr<const StencilSparsity> pattern, con
   const double inverse_dx = static_cast<double>(nx) / terms.length_x;
   const double inverse_dy = static_cast<double>(ny) / terms.length_y;
   for (int64_t j = 0; j < ny; ++j) {
-    const auto couple = [&](int axis, double per_cell, T* below, T* above) {
+    const auto couple = [&](int axis, double inverse_width, T* below, T* above) {
       const WindRow<T> w = winds(axis, j, winds_memory);
-      loops.upwind_row(static_cast<T>(terms.advection * per_cell),
-                       static_cast<T>(terms.diffusion * per_cell * per_cell), w.before, w.here, w.after, below, above,
-                       a.coefficient(j, 0), nx);
+      loops.upwind_row(static_cast<T>(terms.advection * inverse_width),
+                       static_cast<T>(terms.diffusion * inverse_width * inverse_width), w.before, w.here, w.after,
+                       below, above, a.coefficient(j, 0), nx);
     };
     std::fill_n(a.coefficient(j, 0), nx, static_cast<T>(terms.shift));
     // What couples a point to its neighbour belongs to the neighbour in the transpose.

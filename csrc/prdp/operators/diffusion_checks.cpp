@@ -68,7 +68,7 @@ DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
   TORCH_CHECK_VALUE(
       shift.dim() == 0 || (shift.dim() == dim() + 1 &&
                            shift.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(shape_))),
-      "Diffusion: shift must be a number or have the shape of kappa, got ", shift.sym_sizes());
+      "Diffusion: shift must be a number or (batch or 1, *shape), got ", shift.sym_sizes());
   kappa_ = per_axis_ ? kappa : kappa.unsqueeze(1);
   shift_ = in_dtype(shift, kappa.scalar_type());
   if (shift.dim() > 0) shift_ = shift_.unsqueeze(1);

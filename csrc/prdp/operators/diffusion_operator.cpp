@@ -50,14 +50,24 @@ at::Tensor like(const at::Tensor& tensor, const at::Tensor& sum) {
   return tensor.size(0) == 1 && sum.size(0) != 1 ? sum.sum(0, /*keepdim=*/true) : sum;
 }
 
+/// v w, summed over the channels.
+at::Tensor over_channels(const at::Tensor& v, const at::Tensor& w) { return (v * w).sum(1, /*keepdim=*/true); }
+
+/// ∂ mean(a, b)/∂a; 0 in a sample whose κ is not finite, which was refused, so that its λ of 0 gives 0.
+at::Tensor derivative_of_mean(FaceMean mean, const at::Tensor& a, const at::Tensor& b) {
+  return mean == FaceMean::kHarmonic ? 2.0 * (b / (a + b)).square().nan_to_num(0.0) : at::full_like(a, 0.5);
+}
+
 }  // namespace
 
-double DiffusionOperator::per_cell(int64_t axis) const { return static_cast<double>(shape_[axis]) / lengths_[axis]; }
-double DiffusionOperator::per_cell2(int64_t axis) const { return per_cell(axis) * per_cell(axis); }
+double DiffusionOperator::inverse_width(int64_t axis) const {
+  return static_cast<double>(shape_[axis]) / lengths_[axis];
+}
+double DiffusionOperator::inverse_width2(int64_t axis) const { return inverse_width(axis) * inverse_width(axis); }
 
 std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) const {
   const int64_t d = 2 + axis;
-  const double scale = factor * per_cell2(axis);
+  const double scale = factor * inverse_width2(axis);
   const bool harmonic = mean_ == FaceMean::kHarmonic;
   const auto kappa = kappa_along(axis);
   const auto averaged = harmonic ? kappa.reciprocal() : kappa;
@@ -70,11 +80,11 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
     if (sides_[axis][end] == Side::kZero) return 2.0 * scale * cells;
     if (sides_[axis][end] != Side::kRobin) return at::zeros_like(cells);
     const auto& h = robin(axis, end);
-    const auto within = 2.0 * per_cell2(axis) * cells,
-               beyond = per_cell(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
+    const auto within = 2.0 * inverse_width2(axis) * cells,
+               beyond = inverse_width(axis) * (h.dim() == 0 ? h : or_nan(h, h.ge(0)));
     return factor * (within * (beyond / (within + beyond)));  // in series
   };
-  const auto around = is_closed(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
+  const auto around = wraps_around(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
   const auto low = around.defined() ? around : outer(0);
   const auto high = around.defined() ? around : outer(1);
   return {joined(low, inner, d), joined(inner, high, d)};
@@ -86,54 +96,55 @@ at::Tensor DiffusionOperator::apply(const at::Tensor& v) const {
     const int64_t d = v.dim() - dim() + axis;
     const auto [lower, upper] = faces(axis);
     const auto nothing = at::zeros_like(first(v, d));
-    const auto before = is_closed(axis) ? at::roll(v, 1, d) : at::cat({nothing, below(v, d)}, d);
-    const auto after = is_closed(axis) ? at::roll(v, -1, d) : at::cat({above(v, d), nothing}, d);
+    const auto before = wraps_around(axis) ? at::roll(v, 1, d) : at::cat({nothing, below(v, d)}, d);
+    const auto after = wraps_around(axis) ? at::roll(v, -1, d) : at::cat({above(v, d), nothing}, d);
     sum = sum + lower * (v - before) + upper * (v - after);
   }
   return sum;
 }
 
+DiffusionOperator::SideProducts DiffusionOperator::side_product_rule(int64_t axis, size_t end, const at::Tensor& lambda,
+                                                                     const at::Tensor& u) const {
+  const int64_t d = 2 + axis;
+  const auto at_side = [&](const at::Tensor& t) { return end == 0 ? first(t, d) : last(t, d); };
+  const auto side = sides_[axis][end];
+  if (side != Side::kZero && side != Side::kRobin) return {};
+  const auto product = inverse_width2(axis) * over_channels(at_side(u), at_side(lambda));
+  if (side == Side::kZero) return {2.0 * product, {}};
+  // Of within·beyond/(within + beyond), with within = 2κ/w² and beyond = h/w, where w is the width of a cell.
+  const auto within = 2.0 * inverse_width2(axis) * at_side(kappa_along(axis)),
+             beyond = inverse_width(axis) * robin(axis, end);
+  const auto of_within = (beyond / (within + beyond)).square().nan_to_num(0.0);
+  const auto of_beyond = (within / (within + beyond)).square().nan_to_num(0.0);
+  const auto h_bar = like(robin(axis, end), product * of_beyond / inverse_width(axis));
+  return {2.0 * product * of_within, h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1)};
+}
+
 std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   if (auto by_kernel = products_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
-  const auto shift_bar = like(shift_, (lambda * u).sum(1, /*keepdim=*/true));
+  const auto shift_bar = like(shift_, over_channels(lambda, u));
   std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const int64_t d = 2 + axis;
     auto& kappa_bar = kappa_bars[per_axis_ ? axis : 0];
     const auto kappa = kappa_along(axis);
-    const double scale = per_cell2(axis);
-    // ∂ mean(a, b)/∂a; 0 in a sample whose κ is not finite, which was refused, so that its λ of 0 gives 0.
-    const auto derivative = [&](const at::Tensor& a, const at::Tensor& b) {
-      return mean_ == FaceMean::kHarmonic ? 2.0 * (b / (a + b)).square().nan_to_num(0.0) : at::full_like(a, 0.5);
-    };
-    const auto couple = [&](const at::Tensor& du, const at::Tensor& dl) {
-      return scale * (du * dl).sum(1, /*keepdim=*/true);
-    };
-    const auto inner = couple(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
-    const auto lower = below(kappa, d), upper = above(kappa, d);
     // Fields that are zero but at the low, or the high end of the axis.
     const auto at_first = [&](const at::Tensor& t) { return padded(t, d, 0, shape_[axis] - t.size(d)); };
     const auto at_last = [&](const at::Tensor& t) { return padded(t, d, shape_[axis] - t.size(d), 0); };
-    add_to(kappa_bar, at_last(inner * derivative(upper, lower)));
-    add_to(kappa_bar, at_first(inner * derivative(lower, upper)));
-    if (is_closed(axis)) {
-      const auto around = couple(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
-      add_to(kappa_bar, at_first(around * derivative(first(kappa, d), last(kappa, d))));
-      add_to(kappa_bar, at_last(around * derivative(last(kappa, d), first(kappa, d))));
+    const auto inner =
+        inverse_width2(axis) * over_channels(above(u, d) - below(u, d), above(lambda, d) - below(lambda, d));
+    add_to(kappa_bar, at_last(inner * derivative_of_mean(mean_, above(kappa, d), below(kappa, d))));
+    add_to(kappa_bar, at_first(inner * derivative_of_mean(mean_, below(kappa, d), above(kappa, d))));
+    if (wraps_around(axis)) {
+      const auto around =
+          inverse_width2(axis) * over_channels(first(u, d) - last(u, d), first(lambda, d) - last(lambda, d));
+      add_to(kappa_bar, at_first(around * derivative_of_mean(mean_, first(kappa, d), last(kappa, d))));
+      add_to(kappa_bar, at_last(around * derivative_of_mean(mean_, last(kappa, d), first(kappa, d))));
     }
     for (size_t end = 0; end < 2; ++end) {
-      const auto at_side = [&](const at::Tensor& t) { return end == 0 ? first(t, d) : last(t, d); };
-      const auto at_end = [&](const at::Tensor& t) { return end == 0 ? at_first(t) : at_last(t); };
-      if (sides_[axis][end] == Side::kZero) add_to(kappa_bar, at_end(2.0 * couple(at_side(u), at_side(lambda))));
-      if (sides_[axis][end] != Side::kRobin) continue;
-      // Of within·beyond/(within + beyond), with within = 2κ/h² and beyond = h of the side over the width of a cell.
-      const auto within = 2.0 * scale * at_side(kappa), beyond = per_cell(axis) * robin(axis, end);
-      const auto of_within = (beyond / (within + beyond)).square().nan_to_num(0.0);
-      const auto of_beyond = (within / (within + beyond)).square().nan_to_num(0.0);
-      const auto product = couple(at_side(u), at_side(lambda));
-      add_to(kappa_bar, at_end(2.0 * product * of_within));
-      const auto h_bar = like(robin(axis, end), product * of_beyond / per_cell(axis));
-      robin_bar.push_back(h_bar.dim() == 0 ? h_bar : h_bar.squeeze(d).squeeze(1));
+      const auto [of_kappa, of_h] = side_product_rule(axis, end, lambda, u);
+      if (of_kappa.defined()) add_to(kappa_bar, end == 0 ? at_first(of_kappa) : at_last(of_kappa));
+      if (of_h.defined()) robin_bar.push_back(of_h);
     }
   }
   const auto kappa_bar = per_axis_ ? like(kappa_, at::cat(kappa_bars, 1)) : like(kappa_, kappa_bars[0]).squeeze(1);
@@ -159,7 +170,7 @@ at::Tensor DiffusionOperator::coefficients() const {
 
 OperatorSpec DiffusionOperator::as_stencil() const {
   std::vector<bool> periodic;
-  for (int64_t axis = 0; axis < dim(); ++axis) periodic.push_back(is_closed(axis));
+  for (int64_t axis = 0; axis < dim(); ++axis) periodic.push_back(wraps_around(axis));
   return nearest_stencil(coefficients(), shape_, periodic);
 }
 
@@ -222,7 +233,7 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
       if (d >= 0) on_side[2 + d] = 1;
       if (side == Side::kRobin) take(robin(d, end), on_side, 2 + 2 * axis + end, 4 + 2 * axis + end);
     }
-    view.numbers[1 + axis] = d < 0 ? 0.0 : per_cell(d);
+    view.numbers[1 + axis] = d < 0 ? 0.0 : inverse_width(d);
   }
   view.type = "Diffusion<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(shape_) + ", " +
               std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + sides + ">";

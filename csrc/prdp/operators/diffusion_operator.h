@@ -57,19 +57,24 @@ class DiffusionOperator final : public Operator {
 
  private:
   std::string remedy_for(const at::Tensor& b) const;
+  /// What a side adds to the product rule: to κ of its cells, and h̄. Either may be undefined.
+  struct SideProducts {
+    at::Tensor of_kappa, of_h;
+  };
+  SideProducts side_product_rule(int64_t axis, size_t end, const at::Tensor& lambda, const at::Tensor& u) const;
   /// The product rule in one launch on a GPU; nothing where there is no kernel.
   std::vector<at::Tensor> products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
   template <class T>
   std::vector<at::Tensor> products_of(const at::Tensor& lambda, const at::Tensor& u) const;
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
-  bool is_closed(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
+  bool wraps_around(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }
   /// Whether the loops make products of differences: in float32, the rounding of a diagonal would change what is slow
   /// to change, the mean of u first, in every solve.
   bool takes_differences() const { return kappa_.scalar_type() == at::kFloat; }
   at::Tensor kappa_along(int64_t axis) const { return per_axis_ ? kappa_.narrow(1, axis, 1) : kappa_; }
-  double per_cell(int64_t axis) const;   // 1/h
-  double per_cell2(int64_t axis) const;  // 1/h²
+  double inverse_width(int64_t axis) const;   // cells per unit of length
+  double inverse_width2(int64_t axis) const;  // its square
   /// The first number of a sample that is not finite or not allowed.
   struct Refused {
     const char* must;  // "kappa must be > 0"
@@ -80,8 +85,8 @@ class DiffusionOperator final : public Operator {
   void take_robin(const std::vector<at::Tensor>& tensors, int64_t axis, size_t end);
   const at::Tensor& robin(int64_t axis, size_t end) const;
   std::vector<std::pair<const char*, at::Tensor>> tensors() const;
-  /// Coefficients of the faces below and above each cell along an axis, times factor/h²; of a side with u = 0 twice
-  /// that of its cell, as it is half as far away; of a Robin side that and its h in series.
+  /// Coefficients of the faces below and above each cell along an axis, times factor over the squared width; of a side
+  /// with u = 0 twice that of its cell, as it is half as far away; of a Robin side that and its h in series.
   std::array<at::Tensor, 2> faces(int64_t axis, double factor = 1.0) const;
   /// Of that stencil: the diagonal, and for each axis what couples a cell to those below and above.
   at::Tensor coefficients() const;

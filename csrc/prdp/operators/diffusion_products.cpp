@@ -34,7 +34,7 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
   for (int64_t axis = 0; axis < 3; ++axis) {
     const int64_t d = axis - axis_of_kernel(0, dim());
     of.n[axis] = d < 0 ? 1 : static_cast<int>(shape_[d]);
-    of.per_cell[axis] = d < 0 ? 0.0 : per_cell(d);
+    of.inverse_width[axis] = d < 0 ? 0.0 : inverse_width(d);
     for (int64_t end = 0; end < 2; ++end)
       of.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
   }

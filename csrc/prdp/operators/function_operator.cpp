@@ -2,6 +2,7 @@
 
 #include <ATen/ExpandUtils.h>
 #include <ATen/TensorSubclassLikeUtils.h>
+#include <ATen/functorch/BatchedTensorImpl.h>
 #include <ATen/functorch/DynamicLayer.h>
 #include <torch/csrc/autograd/autograd.h>
 
@@ -63,6 +64,12 @@ void check_nothing_is_captured(const at::Tensor& result, bool reverse = true) {
                     "detach it");
 }
 
+/// A tensor that vmap maps over, for one of the samples.
+at::Tensor for_one_sample(at::Tensor t) {
+  while (const auto* mapped = at::functorch::maybeGetBatchedImpl(t)) t = mapped->value().select(mapped->bdim(), 0);
+  return t;
+}
+
 at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
   return solve_dense(matrix, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
@@ -105,10 +112,26 @@ void refuse_captured_gradients(const OperatorSpec& a) {
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
   if (a.transposed) return;  // of an adjoint solve, whose A was looked at
   auto constant = a;
-  for (auto& t : constant.tensors) t = primal(t).detach();
-  const auto v = primal(b).detach();
+  for (auto& t : constant.tensors) t = for_one_sample(primal(t)).detach();
+  const auto v = for_one_sample(primal(b)).detach();
   const bool reverse = at::GradMode::is_enabled();
-  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
+  const auto product = with_autograd([&] { return make_operator(constant)->apply(v); });
+  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(product),
+                    "Function: matvec uses a tensor that vmap maps over, but that is not among its tensors; hand it "
+                    "over in tensors");
+  check_nothing_is_captured(product, reverse);
+}
+
+void refuse_constant_in_product(const OperatorSpec& a, const at::Tensor& b) {
+  const auto registered = RegisteredProducts::find(a.shape.at(0));
+  const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
+  if (!can_look || !registered->looks_at_zero.exchange(false)) return;
+  const at::NoGradGuard no_grad;
+  const auto found = registered->products().apply(at::zeros_like(b).detach(), detached(a.tensors));
+  const auto constant = found.isfinite().logical_and(found.ne(0));
+  TORCH_CHECK_VALUE(!constant.any().item<bool>(), "Function: matvec must be linear, but matvec(0) holds ",
+                    found.masked_select(constant)[0].item<double>(),
+                    "; constants, such as values on the boundary, belong to b");
 }
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {

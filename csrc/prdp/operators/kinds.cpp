@@ -1,10 +1,11 @@
 #include "prdp/operators/kinds.h"
 
 #include "prdp/operators/burgers_operator.h"
+#include "prdp/operators/csr_operator.h"
+#include "prdp/operators/dense_operator.h"
 #include "prdp/operators/diffusion_operator.h"
 #include "prdp/operators/function_operator.h"
 #include "prdp/operators/laplacian_operator.h"
-#include "prdp/operators/matrix_operator.h"
 #include "prdp/operators/navier_stokes_operator.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/stencil_operator.h"

@@ -51,10 +51,10 @@ at::Tensor LaplacianOperator::solve_on_device(const at::Tensor& b) const {
   const auto real = b.options().dtype(widest_real(b.device()));
   constexpr int64_t longest_alone = 4096;  // a longer basis takes more memory than the vectors of a large batch
   if (grid_.dim() == 1 && grid_.shape()[0] > longest_alone) {
-    const double per_cell2 = 1.0 / (grid_.dx(0) * grid_.dx(0));
+    const double inverse_width2 = 1.0 / (grid_.dx(0) * grid_.dx(0));
     const auto of = [&](double x) { return symbol(at::full({1}, x, real)); };
-    const auto beside = (of(per_cell2) - of(0.0)).expand({grid_.shape()[0] - 1});
-    const auto coefficients = at::stack({of(-2.0 * per_cell2).expand({grid_.shape()[0]}),
+    const auto beside = (of(inverse_width2) - of(0.0)).expand({grid_.shape()[0] - 1});
+    const auto coefficients = at::stack({of(-2.0 * inverse_width2).expand({grid_.shape()[0]}),
                                          at::constant_pad_nd(beside, {1, 0}), at::constant_pad_nd(beside, {0, 1})});
     return CyclicReduction(coefficients.unsqueeze(0), 0.0).solve(b.to(real)).to(b.scalar_type());
   }
@@ -133,7 +133,7 @@ at::Tensor product_with_laplacian(const at::Tensor& lambda, const at::Tensor& u,
   for (int64_t d = 0; d < grid.dim(); ++d) {
     const int64_t axis = d + 3 - grid.dim();
     of.n[axis] = static_cast<int>(grid.shape()[d]);
-    of.per_cell2[axis] = 1.0 / (grid.dx(d) * grid.dx(d));
+    of.inverse_width2[axis] = 1.0 / (grid.dx(d) * grid.dx(d));
   }
   return gpu::each_point(u.device(), product_body<T>("LaplacianProducts"), of, sums.count()) ? sums.result(0)
                                                                                              : at::Tensor();

@@ -45,6 +45,11 @@ inline bool any_needs_derivative(at::TensorList tensors) {
 
 /// Whether a transform of torch.func is running.
 inline bool in_torch_func() { return at::functorch::maybeCurrentDynamicLayer().has_value(); }
+/// Whether the innermost of them is vmap.
+inline bool in_vmap() {
+  const auto layer = at::functorch::maybeCurrentDynamicLayer();
+  return layer && layer->key() == at::functorch::TransformType::Vmap;
+}
 
 /// backward(cotangent), a gradient for each input. Of the batch of cotangents that autograd.grad(is_grads_batched=True)
 /// makes, one is taken after the other, and the gradients are joined again.

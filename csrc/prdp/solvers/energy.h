@@ -35,7 +35,7 @@ inline bool energy_falls(const Energies& e, double epsilon, bool surely_definite
 template <class Space, class Method>
 void excuse_by_energy(Space& space, Method& method, typename Space::States& states) {
   const auto is_above = [](const SampleState& s) {
-    return s.answer != Answer::kLast && s.status != SolveStatus::kBreakdown;
+    return s.returned != Returned::kLast && s.status != SolveStatus::kBreakdown;
   };
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto before = states;
@@ -57,7 +57,7 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
       s.applications = before[i].applications;
       continue;
     }
-    s.answer = Answer::kLast;
+    s.returned = Returned::kLast;
     const Energies e{xb[i],   xr[i],   rb[i], rr[i],  bb[i],
                      x_ar[i], r_ar[i], xx[i], ar2[i], norm_a[i] * std::sqrt(u2[i] * xx[i])};
     if (!energy_falls(e, space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;

@@ -90,30 +90,30 @@ PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& st
 /// last iterate is as good as the dtype allows.
 template <class Space, class Method>
 void accept_at_rounding_floor(Space& space, const Method& method, typename Space::States& states) {
-  const auto is_above = [](const SampleState& s) { return s.answer != Answer::kLast; };
+  const auto is_above = [](const SampleState& s) { return s.returned != Returned::kLast; };
   if (std::none_of(states.begin(), states.end(), is_above)) return;
   const auto definite = space.surely_definite();
   const auto floors = rounding_floors(space, method);
   for (size_t i = 0; i < states.size(); ++i) {
     auto& s = states[i];
-    if (is_above(s) && definite[i] && s.residual2 <= 64.0 * floors[i] * floors[i]) s.answer = Answer::kLast;
+    if (is_above(s) && definite[i] && s.residual2 <= 64.0 * floors[i] * floors[i]) s.returned = Returned::kLast;
   }
 }
 
 /// Hands out the last iterate: its residual is rounding.
 inline void accept_rounding(SampleState& s) {
-  s.answer = Answer::kLast;
+  s.returned = Returned::kLast;
   s.status = SolveStatus::kStagnated;
   s.floor2 = s.residual2;
 }
 
-/// Of the samples whose answer is zero, accepts those whose u the rounding of A moves by less than a thousandth.
+/// Of the samples that return zero, accepts those whose u the rounding of A moves by less than a thousandth.
 template <class Space, class Method>
 void accept_if_insensitive(Space& space, const Method& method, typename Space::States& states) {
   constexpr double stays = 1e-3;  // far below 1, as the estimate may be too small
   const auto u2 = space.values_of(space.solution2(method.x)), moved2 = space.values_of(space.skeel_estimate2(method.x));
   for (size_t i = 0; i < states.size(); ++i)
-    if (states[i].answer == Answer::kZero && space.epsilon() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
+    if (states[i].returned == Returned::kZero && space.epsilon() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
       accept_rounding(states[i]);
 }
 
@@ -131,13 +131,13 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
       auto& s = states[i];
       if (!is_doubtful(s) || !(floors[i] > 0.25 * std::sqrt(s.b2))) continue;
       if (definite[i]) accept_rounding(s);
-      else s.answer = Answer::kZero;
+      else s.returned = Returned::kZero;
       asks_for_estimate = asks_for_estimate || !definite[i];
     }
     if (asks_for_estimate) accept_if_insensitive(space, method, states);
   }
   for (auto& s : states)
-    if (s.answer != Answer::kLast) s.status = SolveStatus::kBreakdown;
+    if (s.returned != Returned::kLast) s.status = SolveStatus::kBreakdown;
 }
 
 /// Which iterate each sample is to hand out; returns whether all hand out their last.
@@ -145,19 +145,19 @@ template <class Space, class Method>
 bool choose_answers(Space& space, Method& method, typename Space::States& states, bool track) {
   for (auto& s : states) {
     const bool may_be_worse = is_unsolved(s.status) || s.status == SolveStatus::kBreakdown;
-    s.answer = may_be_worse && is_above_b(s, space.epsilon()) ? Answer::kBestOrZero : Answer::kLast;
+    s.returned = may_be_worse && is_above_b(s, space.epsilon()) ? Returned::kBestOrZero : Returned::kLast;
   }
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
   if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
   bool all_last = true;
   for (auto& s : states) {
-    if (s.answer == Answer::kLast) {
-      if (ran_away(s)) s.answer = Answer::kBestOrZero;
-      else if (left_rounding_of_b(s)) s.answer = Answer::kBest;
-      else if (!track && s.status == SolveStatus::kBreakdown) s.answer = Answer::kBeforeBreakdown;
+    if (s.returned == Returned::kLast) {
+      if (ran_away(s)) s.returned = Returned::kBestOrZero;
+      else if (left_rounding_of_b(s)) s.returned = Returned::kBest;
+      else if (!track && s.status == SolveStatus::kBreakdown) s.returned = Returned::kBeforeBreakdown;
     }
-    all_last = all_last && s.answer == Answer::kLast;
+    all_last = all_last && s.returned == Returned::kLast;
   }
   return all_last;
 }
@@ -168,7 +168,7 @@ template <class Space, class Method, class Limit>
 void run_again(Space& space, Method& method, typename Space::States& states, double rtol, bool track,
                const Limit& iteration_limit) {
   for (size_t i = 0; i < states.size(); ++i)
-    states[i].rewind(states[i].answer == Answer::kLast ? 0 : iteration_limit(i));
+    states[i].rewind(states[i].returned == Returned::kLast ? 0 : iteration_limit(i));
   space.reset();
   run(space, method, states, rtol, track);
 }
@@ -178,7 +178,7 @@ void run_again(Space& space, Method& method, typename Space::States& states, dou
 template <class Space, class Method>
 void take_least_of_halves(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   const auto is_worse = [&](const SampleState& s) {
-    return s.answer == Answer::kBestOrZero && is_above_b(s, space.epsilon());
+    return s.returned == Returned::kBestOrZero && is_above_b(s, space.epsilon());
   };
   if (std::none_of(states.begin(), states.end(), is_worse)) return;
   const auto full_run = states;
@@ -215,13 +215,13 @@ void replay(Space& space, Method& method, typename Space::States& states, double
   if (!track) run_again(space, method, states, rtol, /*track=*/true, [&](size_t i) { return first[i].cap; });
   const auto tracked = states;
   run_again(space, method, states, rtol, track, [&](size_t i) {
-    if (tracked[i].answer == Answer::kZero) return int64_t{0};
-    return tracked[i].answer == Answer::kBeforeBreakdown ? tracked[i].iterations : tracked[i].best;
+    if (tracked[i].returned == Returned::kZero) return int64_t{0};
+    return tracked[i].returned == Returned::kBeforeBreakdown ? tracked[i].iterations : tracked[i].best;
   });
   conclude(space, method, states, rtol);
   take_least_of_halves(space, method, states, rtol, track);
 
-  const auto is_remade = space.map(states, [](const SampleState& s) { return s.answer != Answer::kLast; });
+  const auto is_remade = space.map(states, [](const SampleState& s) { return s.returned != Returned::kLast; });
   for (size_t i = 0; i < states.size(); ++i) {
     if (is_remade[i]) states[i].status = first[i].status;
     else states[i] = first[i];
@@ -233,7 +233,7 @@ void replay(Space& space, Method& method, typename Space::States& states, double
 
 /// Solves every sample that `states` holds active, from zero or the space's start. The result is method.x, to which the
 /// caller adds the start. With `guarded`, a sample whose last iterate is of no use is run again, to the iterate that
-/// its Answer names.
+/// its Returned names.
 template <LoopSpace Space, class Method>
 void iterate(Space& space, Method& method, typename Space::States& states, double rtol, bool guarded) {
   const bool track = rtol > 0.0;

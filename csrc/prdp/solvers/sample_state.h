@@ -15,7 +15,7 @@
 namespace prdp {
 
 /// Which iterate of a sample is handed out.
-enum class Answer {
+enum class Returned {
   kLast,
   kBeforeBreakdown,  // the one before an iteration that broke down where nobody looked
   kBest,             // the one of least residual: b's own rounding was reached and lost again
@@ -44,7 +44,7 @@ struct SampleState {
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at rounding, the square of that: ε ‖A‖ ‖u‖, or what verdicts.h takes for it
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
-  Answer answer = Answer::kLast;
+  Returned returned = Returned::kLast;
 
   void note(double fresh2) {
     residual2 = fresh2;

@@ -125,7 +125,11 @@ prdp::train::Refinement refinement_of(const Options& options, const prdp::Scene&
   if (options.prdp) return prdp::train::prdp(scene);
   if (options.schedule.empty()) return prdp::train::automatic();
   const auto [start, step] = parse_schedule(options.schedule);
-  return prdp::train::schedule(start, step, scene.solver.max_iter.expect_int());
+  const int64_t most = scene.solver.max_iter.expect_int();
+  if (start > most)
+    throw std::runtime_error("--schedule: START must be at most max_iter of the scene, " + std::to_string(most) +
+                             ", got " + std::to_string(start));
+  return prdp::train::schedule(start, step, most);
 }
 
 /// Why a training is lost; empty if it is not.

@@ -49,12 +49,12 @@ struct Cycle {
 
   /// z = M⁻¹ r; x, y and spare are scratch.
   PRDP_ONCE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* spare) const {
-    Walk walk{*this, team, a, r, {nullptr, x, y}, spare};
+    VCycle cycle{*this, team, a, r, {nullptr, x, y}, spare};
     const int coarsest = static_cast<int>(grids().count) - 1;
-    for (int level = 0; level < coarsest; ++level) walk.go_down(level);
-    walk.solve_coarsest(coarsest);
-    const T* found = walk.vectors.x;
-    for (int level = coarsest - 1; level >= 0; --level) found = walk.go_up(level, found);
+    for (int level = 0; level < coarsest; ++level) cycle.go_down(level);
+    cycle.solve_coarsest(coarsest);
+    const T* found = cycle.vectors.x;
+    for (int level = coarsest - 1; level >= 0; --level) found = cycle.go_up(level, found);
     team.each(A::kUnknowns, [&](int i) { return found[i]; }, [&](int i, T value) { z[i] = value; });
   }
 
@@ -106,7 +106,7 @@ struct Cycle {
   };
 
   /// One application of M⁻¹, from grid to grid.
-  struct Walk {
+  struct VCycle {
     const Cycle& cycle;
     TeamOfSample& team;
     const A& a;

@@ -22,7 +22,7 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     kappa_ = field(0);
     shift_ = field(1);
     shift_number_ = static_cast<T>(a.numbers[0]);
-    for (int axis = 0; axis < 3; ++axis) per_cell_[axis] = static_cast<T>(a.numbers[1 + axis]);
+    for (int axis = 0; axis < 3; ++axis) inverse_width_[axis] = static_cast<T>(a.numbers[1 + axis]);
     for (int side = 0; side < 6; ++side) {
       robin_[side] = field(2 + side);
       robin_number_[side] = static_cast<T>(a.numbers[4 + side]);
@@ -96,7 +96,7 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     constexpr int sides[] = {kSides...};
     constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
-    const T scale = per_cell_[axis] * per_cell_[axis];
+    const T scale = inverse_width_[axis] * inverse_width_[axis];
     constexpr int cells = end == 0 ? -1 : 1;
     constexpr bool closed = side == kPeriodicSide && n > 1;
     const int next = moved<n, cells, closed>(here);
@@ -120,13 +120,13 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     const int on_side = axis == 0 ? at.y * G::kX + at.x : axis == 1 ? at.z * G::kX + at.x : at.z * G::kY + at.y;
     const T h = robin_[at_side] ? robin_[at_side][on_side] : robin_number_[at_side];
     if (h < T(0)) return std::numeric_limits<T>::quiet_NaN();  // not allowed
-    const T outside = per_cell_[axis] * h;
+    const T outside = inverse_width_[axis] * h;
     return within * (outside / (within + outside));  // in series
   }
   static T mean(T a, T b) { return kHarmonic ? 2 * a * (b / (a + b)) : (a + b) / 2; }
 
   const T *kappa_, *shift_, *robin_[6];
-  T shift_number_, per_cell_[3], robin_number_[6];
+  T shift_number_, inverse_width_[3], robin_number_[6];
 };
 
 }  // namespace prdp::gpu

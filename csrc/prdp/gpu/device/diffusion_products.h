@@ -23,7 +23,7 @@ struct DiffusionProducts {
   static constexpr int kSums = 7;
   PairOfVectors<T> pair;  // for the sets of κ
   int batch, n[3], sides[6];
-  double per_cell[3];
+  double inverse_width[3];
   bool harmonic;
   const T* kappa;
   T* of_kappa;
@@ -45,7 +45,7 @@ struct DiffusionProducts {
   }
 
  private:
-  T scale(int axis) const { return static_cast<T>(per_cell[axis] * per_cell[axis]); }
+  T scale(int axis) const { return static_cast<T>(inverse_width[axis] * inverse_width[axis]); }
   T product(int s, int channel, int point) const {
     const int64_t k = (static_cast<int64_t>(s) * pair.channels + channel) * pair.points + point;
     return pair.lambda[k] * pair.u[k];
@@ -92,7 +92,7 @@ struct DiffusionProducts {
     const int axis = side / 2;
     const int on_side = axis == 0 ? at[1] * n[2] + at[2] : axis == 1 ? at[0] * n[2] + at[2] : at[0] * n[1] + at[1];
     const T within = 2 * scale(axis) * kappa_at(s, point);
-    const T beyond = static_cast<T>(per_cell[axis]) * robin[side].at(s, on_side);
+    const T beyond = static_cast<T>(inverse_width[axis]) * robin[side].at(s, on_side);
     const T part = (of_side ? beyond : within) / (within + beyond);
     return part == part ? part * part : T(0);
   }
@@ -108,7 +108,7 @@ struct DiffusionProducts {
       int place[3] = {at[2], at[3], at[4]};
       place[axis] = side % 2 ? n[axis] - 1 : 0;
       const int point = (place[0] * n[1] + place[1]) * n[2] + place[2];
-      return static_cast<T>(per_cell[axis]) * product(at[0], at[1], point) *
+      return static_cast<T>(inverse_width[axis]) * product(at[0], at[1], point) *
              squared_share(at[0], side, place, point, /*of_side=*/false);
     });
   }

@@ -259,15 +259,15 @@ class HierarchyMaker {
     });
     keep_vanishing_diagonal(entry[kCentre * n + fine_points[1]], i, points, to);
   }
-  /// See kernels::kVanishing.
+  /// See kernels::kept_diagonal().
   static void keep_vanishing_diagonal(T fine, int i, int points, T* to) {
-    constexpr T rounding = std::numeric_limits<T>::epsilon();
+    const auto is_alone = [&] {
+      for (int k = 0; k < kOffsets; ++k)
+        if (k != kCentre && to[k * points + i] != T(0)) return false;
+      return true;
+    };
     T& diagonal = to[kCentre * points + i];
-    const T size = std::abs(diagonal);
-    if (size > static_cast<T>(kernels::kVanishingAlone) * rounding * std::abs(fine)) return;
-    bool is_alone = true;
-    for (int k = 0; k < kOffsets; ++k) is_alone = is_alone && (k == kCentre || to[k * points + i] == T(0));
-    if (is_alone || size <= static_cast<T>(kernels::kVanishing) * rounding * std::abs(fine)) diagonal = fine;
+    diagonal = kernels::kept_diagonal(diagonal, fine, is_alone);
   }
 
   /// Whether it could be inverted, or where it is singular within the nullity, pseudo-inverted.

@@ -58,7 +58,7 @@ template <class T>
 struct LaplacianProducts {
   PairOfVectors<T> pair;
   int n[3];
-  double per_cell2[3];
+  double inverse_width2[3];
   SharedSum shared;
   double* out;
 
@@ -71,7 +71,7 @@ struct LaplacianProducts {
       for (int a = 0; a < 3; ++a) {
         const T low = at[2 + a] > 0 ? pair.u[here - strides[a]] : T(0);
         const T high = at[2 + a] + 1 < n[a] ? pair.u[here + strides[a]] : T(0);
-        sum += static_cast<T>(per_cell2[a]) * ((low - pair.u[here]) + (high - pair.u[here]));
+        sum += static_cast<T>(inverse_width2[a]) * ((low - pair.u[here]) + (high - pair.u[here]));
       }
       return pair.lambda[here] * sum;
     });

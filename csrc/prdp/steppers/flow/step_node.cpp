@@ -21,13 +21,13 @@ namespace {
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-enum class Returned { kNext, kNextAndPressure, kStates };
+enum class Output { kNext, kNextAndPressure, kStates };
 
 /// What travels from the forward to the backward pass beside tensors.
 struct Call : torch::CustomClassHolder {
   FlowEquation equation;
   int64_t steps;
-  Returned returned;
+  Output output;
   SolveOptions options;
   std::shared_ptr<const RegisteredProducts> products;  // of the preconditioner
 };
@@ -47,12 +47,12 @@ std::vector<at::Tensor> or_undefined(at::TensorList given) {
 
 at::Tensor with_pressure(const FlowStep& step, double dt) { return at::cat({step.u, step.potential / dt}, 1); }
 
-/// What is to be returned, and the reports of the steps.
-SolveResult run(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Returned returned,
-                const SolveOptions& options) {
-  if (returned != Returned::kStates) {
+/// What is asked for, and the reports of the steps.
+SolveResult forward_steps(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Output output,
+                          const SolveOptions& options) {
+  if (output != Output::kStates) {
     auto step = flow_step(equation, u, options);
-    return {returned == Returned::kNext ? step.u : with_pressure(step, equation.dt), step.info};
+    return {output == Output::kNext ? step.u : with_pressure(step, equation.dt), step.info};
   }
   auto sizes = u.sizes().vec();
   sizes.insert(sizes.begin() + 1, steps + 1);
@@ -78,11 +78,11 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
                                const c10::intrusive_ptr<Call>& call) {
     const at::AutoDispatchBelowADInplaceOrView below;
     const auto equation = call->equation.with_tensors(or_undefined(tensors));
-    const auto [out, info] = run(equation, u, call->steps, call->returned, call->options);
+    const auto [out, info] = forward_steps(equation, u, call->steps, call->output, call->options);
     ctx->mark_non_differentiable({info.iterations, info.residual, info.status, info.operator_applications, info.floor});
     ctx->set_materialize_grads(false);
     const bool may_have_failed = call->options.on_failure != OnFailure::kRaise;
-    variable_list saved{call->returned == Returned::kStates ? out : u, may_have_failed ? info.status : at::Tensor()};
+    variable_list saved{call->output == Output::kStates ? out : u, may_have_failed ? info.status : at::Tensor()};
     saved.insert(saved.end(), tensors.begin(), tensors.end());
     ctx->save_for_backward(std::move(saved));
     ctx->saved_data["call"] = c10::IValue::make_capsule(call);
@@ -99,9 +99,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     std::vector<int64_t> needed(tensors.size() + 1);
     for (size_t i = 0; i < needed.size(); ++i) needed[i] = ctx->needs_input_grad(i);
     const auto of_cotangent = [&](const at::Tensor& cotangent) {
-      return call->returned == Returned::kStates
-                 ? back_through_all(equation, saved[0], saved[1], cotangent, *call, needed)
-                 : back(equation, saved[0], saved[1], cotangent, *call, needed);
+      return call->output == Output::kStates ? states_vjp(equation, saved[0], saved[1], cotangent, *call, needed)
+                                             : step_vjp(equation, saved[0], saved[1], cotangent, *call, needed);
     };
     const WithoutAutocast full_precision;
     const auto found = for_each_cotangent(grads[0], of_cotangent);
@@ -110,11 +109,11 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   }
 
  private:
-  static std::vector<at::Tensor> back(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& status,
-                                      const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
+  static std::vector<at::Tensor> step_vjp(const FlowEquation& equation, const at::Tensor& u, const at::Tensor& status,
+                                          const at::Tensor& cotangent, const Call& call, at::IntArrayRef needed) {
     SolveInfo info;
     FlowCotangent of_step{without_lost_of(cotangent, status, call)};
-    if (call.returned == Returned::kNextAndPressure) {
+    if (call.output == Output::kNextAndPressure) {
       const int64_t d = u.size(1);
       of_step = {of_step.u.narrow(1, 0, d), of_step.u.narrow(1, d, 1) / equation.dt};
     }
@@ -123,9 +122,9 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
     return found;
   }
 
-  static std::vector<at::Tensor> back_through_all(const FlowEquation& equation, const at::Tensor& states,
-                                                  const at::Tensor& status, const at::Tensor& cotangent,
-                                                  const Call& call, at::IntArrayRef needed) {
+  static std::vector<at::Tensor> states_vjp(const FlowEquation& equation, const at::Tensor& states,
+                                            const at::Tensor& status, const at::Tensor& cotangent, const Call& call,
+                                            at::IntArrayRef needed) {
     std::vector<at::Tensor> sums(needed.size());
     auto bar = cotangent.select(1, call.steps);
     const int64_t log = at::GradMode::is_enabled() ? 0 : call.options.adjoint_log;
@@ -150,8 +149,8 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   }
 };
 
-SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Returned returned,
-                   const SolveOptions& options) {
+SolveResult apply_node(const FlowEquation& equation, const at::Tensor& u, int64_t steps, Output output,
+                       const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
   const WithoutAutocast full_precision;
@@ -160,13 +159,13 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
     differentiable = differentiable || (at::GradMode::is_enabled() && t.defined() && t.requires_grad());
   if (!differentiable || options.backward == Backward::kNone) {
     const at::NoGradGuard no_grad;
-    return run(equation, u.detach(), steps, returned, options);
+    return forward_steps(equation, u.detach(), steps, output, options);
   }
   auto call = c10::make_intrusive<Call>();
   const auto tensors = or_empty(equation.tensors(), u);
   call->equation = equation.with_tensors(std::vector<at::Tensor>(tensors.size()));
   call->steps = steps;
-  call->returned = returned;
+  call->output = output;
   call->options = options;
   call->products = products_of(options.solver.preconditioner.spec());
   const auto out = FlowSteps::apply(u, at::TensorList(tensors), call);
@@ -175,17 +174,17 @@ SolveResult record(const FlowEquation& equation, const at::Tensor& u, int64_t st
 
 /// A step whose solves have nodes of their own.
 SolveResult unrolled_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options,
-                          Returned returned = Returned::kNext) {
+                          Output output = Output::kNext) {
   const auto step = flow_step(equation, u, options);
-  const auto out = returned == Returned::kNext ? step.u : with_pressure(step, equation.dt);
+  const auto out = output == Output::kNext ? step.u : with_pressure(step, equation.dt);
   return {options.on_failure == OnFailure::kZeroGrad ? detach_failed(out, step.info.status) : out, step.info};
 }
 
-SolveResult next(const FlowEquation& equation, const at::Tensor& u, Returned returned, const SolveOptions& options) {
-  if (options.backward != Backward::kUnrolled) return record(equation, u, 1, returned, options);
+SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, Output output, const SolveOptions& options) {
+  if (options.backward != Backward::kUnrolled) return apply_node(equation, u, 1, output, options);
   options.check("Flow");
   equation.check(u);
-  return unrolled_step(equation, u, options, returned);
+  return unrolled_step(equation, u, options, output);
 }
 
 /// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it.
@@ -193,7 +192,8 @@ bool is_diffused_with_pressure(const FlowEquation& e) {
   return e.diffusion == FlowDiffusion::kImplicit && !e.box->fields(e.nu.options()).free.defined();
 }
 
-SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t steps, const SolveOptions& options) {
+SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
+                             const SolveOptions& options) {
   options.check("Flow");
   equation.check(u);
   return solve_by_solve(u, steps, 1,
@@ -203,11 +203,11 @@ SolveResult unrolled(const FlowEquation& equation, const at::Tensor& u, int64_t 
 }  // namespace
 
 SolveResult flow_next(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  return next(equation, u, Returned::kNext, options);
+  return one_step(equation, u, Output::kNext, options);
 }
 
 SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
-  auto found = next(equation, u, Returned::kNextAndPressure, options);
+  auto found = one_step(equation, u, Output::kNextAndPressure, options);
   if (!is_diffused_with_pressure(equation)) return found;
   const int64_t d = equation.box->dim();
   const auto p = found.u.narrow(1, d, 1);  // φ/Δt of the projection; the pressure is (I - ν Δt L) φ/Δt
@@ -219,8 +219,8 @@ SolveResult flow_next_and_pressure(const FlowEquation& equation, const at::Tenso
 SolveResult flow_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,
                          const SolveOptions& options) {
   TORCH_CHECK_VALUE(steps >= 0, "rollout: steps must be >= 0, got ", steps);
-  if (options.backward == Backward::kUnrolled) return unrolled(equation, u, steps, options);
-  auto found = record(equation, u, steps, Returned::kStates, options);
+  if (options.backward == Backward::kUnrolled) return unrolled_rollout(equation, u, steps, options);
+  auto found = apply_node(equation, u, steps, Output::kStates, options);
   if (options.backward == Backward::kNone) found.u = from_state(u, found.u);
   return found;
 }

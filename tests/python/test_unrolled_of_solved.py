@@ -1,0 +1,132 @@
+"""Samples whose unrolled derivative would mislead get the implicit one; truncated iterations keep their own."""
+
+import pytest
+import torch
+from helpers import field, statuses
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+
+@pytest.mark.parametrize("form", ["loops", "tensors", "recorded", "A alone"])
+@pytest.mark.parametrize(
+    "solver", [prdp.CG(1000), prdp.BiCGStab(1000), prdp.GMRES(40, restart=10), prdp.SteepestDescent(20000)], ids=repr
+)
+def test_of_a_right_hand_side_of_few_eigenvectors_the_iterations_have_no_useful_derivative(solver, form):
+    """A constant b and a layered medium: u is solved along one axis, and the cotangent points at one cell."""
+    n = 10
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    kappa = (1 + 9 * (x > 0.5).double()).expand(1, n, n).contiguous().requires_grad_()
+    diffusion = operators.Diffusion(kappa)
+    a = operators.Function(lambda v, k: operators.Diffusion(k).apply(v), tensors=kappa, symmetric=True)
+    b = torch.ones(2, 1, n, n, dtype=torch.float64)
+    b[1] = field((n, n), 1)[0]  # of all eigenvectors
+    b.requires_grad_(form != "A alone")
+    inputs = [kappa] if form == "A alone" else [b, kappa]
+    gradients = {}
+    for backward in ("implicit", "unrolled"):
+        u, info = prdp.linear_solve(a if form == "tensors" else diffusion, b, solver, backward=backward)
+        assert info.solved.all()
+        found = torch.autograd.grad(u[:, 0, 5, 7].sum(), inputs, create_graph=form == "recorded")
+        gradients[backward] = [g.detach() for g in found]
+    for implicit, unrolled in zip(gradients["implicit"], gradients["unrolled"], strict=True):
+        assert (implicit - unrolled).norm() < 0.2 * implicit.norm()
+    assert info.adjoint.residual[0] < 1e-5
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("solver", [prdp.CG(200, rtol=1e-3), prdp.MINRES(200, rtol=1e-3)], ids=repr)
+def test_rounding_that_recurrences_amplify_is_no_gradient_of_a_solved_sample(solver, shared):
+    """A κ of 32² cells and a rough b: the derivative of the iterations is off by factors of a million and more."""
+    n, batch = 32, 2
+    noise = torch.randn(batch + 2, 1, n, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    b, weights = noise[:batch], noise[-1]
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    kappa = torch.exp(0.5 * torch.sin(2 * torch.pi * x)[:, None] * torch.cos(torch.pi * x)).expand(batch, n, n)
+    kappa = (kappa[:1] if shared else kappa).clone().requires_grad_()
+
+    def gradient(solver, backward):
+        u, info = prdp.linear_solve(operators.Diffusion(kappa), b, solver, backward=backward)
+        (found,) = torch.autograd.grad((u * weights).sum(), kappa)
+        return found, info
+
+    truth, _ = gradient(prdp.Direct(2), "implicit")
+    found, info = gradient(solver, "unrolled")
+    assert info.solved.all() and (info.adjoint.residual < 1e-3).all()
+    assert (found - truth).norm() < 0.1 * truth.norm()
+
+
+@pytest.mark.parametrize("solver", [prdp.CG(50), prdp.MINRES(50)], ids=repr)
+@pytest.mark.parametrize("kind", ["csr", "function"])
+def test_a_gradient_of_rounding_is_found_beside_any_neighbour(kind, solver):
+    """Each sample has its own values: one of them is off by 400 %, which a neighbour's larger gradient would hide."""
+    generator = torch.Generator().manual_seed(17)
+    size, n = 6, 10
+    square = torch.randn(size, n, n, generator=generator, dtype=torch.float64) * 0.3 + 2 * torch.eye(n)
+    matrices, b = square @ square.mT, torch.randn(size, n, generator=generator, dtype=torch.float64)
+
+    def gradient(rows):
+        values = matrices[rows].flatten(1).clone().requires_grad_()
+        if kind == "csr":
+            pattern = torch.arange(0, n * n + 1, n), torch.arange(n).repeat(n)
+            a = operators.Matrix.csr(*pattern, values, (len(rows), n, n))
+        else:
+            a = operators.Function(lambda v, w: (w.unflatten(1, (n, n)) @ v[..., None])[..., 0], tensors=(values,))
+        u, info = prdp.linear_solve(a, b[rows], solver, backward="unrolled")
+        assert info.solved.all()
+        return torch.autograd.grad(u.sin().sum(), values)[0]
+
+    leaves = matrices.clone().requires_grad_()
+    (truth,) = torch.autograd.grad(torch.linalg.solve(leaves, b).sin().sum(), leaves)
+    for rows in ([0], [0, 5], list(range(size))):
+        error = (gradient(rows) - truth[rows].flatten(1)).norm(dim=1)
+        assert (error < 0.1 * truth[rows].flatten(1).norm(dim=1)).all()
+
+
+@pytest.mark.parametrize("h", [1e-2, 1e-6])
+@pytest.mark.parametrize("max_iter", [300, 2000])
+def test_iterations_that_go_on_after_the_solution_is_found_give_its_gradient(max_iter, h):
+    """With rtol=0 all of them run, and float32 amplifies their rounding: κ̄ was off by 2e2 and 2e6 times its size."""
+    generator = torch.Generator().manual_seed(0)
+    kappa = torch.rand(1, 32, 32, generator=generator, dtype=torch.float64) * 0.9 + 0.1
+    b, weights = torch.randn(2, 2, 1, 32, 32, generator=generator, dtype=torch.float64)
+
+    def gradients(dtype, solver, backward):
+        leaves = [kappa.to(dtype).requires_grad_(), b.to(dtype).requires_grad_()]
+        a = operators.Diffusion(leaves[0], boundary=["flux", [("robin", h), "flux"]])
+        u, info = prdp.linear_solve(a, leaves[1], solver, backward=backward)
+        return torch.autograd.grad((u * weights.to(dtype)).sum(), leaves), info
+
+    solver = prdp.CG(max_iter, rtol=0.0)
+    implicit, _ = gradients(torch.float32, solver, "implicit")
+    unrolled, info = gradients(torch.float32, solver, "unrolled")
+    assert statuses(info) == ["MAX_ITER"] * 2
+    (_, of_b), _ = gradients(torch.float64, prdp.CG(5000, rtol=1e-13), "implicit")
+    assert (unrolled[1] - of_b).norm() < 1e-3 * of_b.norm()
+    # Where h holds u by 1e-6, differences of u in float32 have no digit left for a gradient of kappa.
+    assert (unrolled[0] - implicit[0]).norm() < 0.1 * implicit[0].norm()
+
+
+def test_a_recurrence_near_a_breakdown_gives_the_gradient_of_the_solution():
+    """The residual of 3e-13 is right, and the derivative of the iterations was off by 10 to 40 %: no more than zero."""
+    generator = torch.Generator().manual_seed(290)
+    b = torch.randn(1, 1, 24, dtype=torch.float64, generator=generator).requires_grad_()
+    coefficients = torch.tensor([1.0576, -3.0288, 2.9712], dtype=torch.float64)
+    coefficients = coefficients[None, :, None].expand(1, 3, 24).clone().requires_grad_()
+    a = operators.Stencil(coefficients, [(0,), (-1,), (1,)], "periodic")
+    weights = torch.randn(8, 24, dtype=torch.float64, generator=generator.manual_seed(1))
+    for w in weights:
+        gradients = []
+        for solver, backward in ((prdp.Direct(), "implicit"), (prdp.BiCGStab(500, rtol=1e-12), "unrolled")):
+            u, info = prdp.linear_solve(a, b, solver, backward=backward)
+            gradients.append(torch.autograd.grad((u * w).sum(), (b, coefficients)))
+        assert statuses(info) == ["CONVERGED"]
+        for truth, found in zip(*gradients, strict=True):
+            assert (found - truth).norm() < 1e-2 * truth.norm()
+
+
+def test_truncated_iterations_keep_their_own_derivative():
+    a, b = operators.Poisson((30,)), torch.ones(1, 1, 30, dtype=torch.float64, requires_grad=True)
+    u, info = prdp.linear_solve(a, b, prdp.CG(3, rtol=0.0), backward="unrolled")
+    u[0, 0, 3].backward()
+    assert info.adjoint.residual.isnan().all() and statuses(info) == ["MAX_ITER"]
