@@ -1,6 +1,7 @@
 #include "prdp/autograd/solve_node.h"
 
 #include "prdp/operators/autocast.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/kept_hierarchy.h"
@@ -20,17 +21,20 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
-  // u is kept only if A has a derivative; b and what the solve said are unrolled mode's. Where a failed sample may have
-  // passed, its status says so.
+  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve
+  // said are unrolled mode's. Where a failed sample may have passed, its status says so.
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);
     x0_ = SavedVariable(solved.x0, /*is_output=*/false);
     iterations_ = SavedVariable(solved.iterations, /*is_output=*/false);
     residual_ = SavedVariable(solved.residual, /*is_output=*/false);
+  } else if (any_requires_grad(a_.tensors)) {
+    u_ = SavedVariable(solved.u, /*is_output=*/true);
   }
-  if (any_requires_grad(a_.tensors)) u_ = SavedVariable(solved.u, /*is_output=*/true);
   if (unrolled || options_.on_failure != OnFailure::kRaise) status_ = SavedVariable(solved.status, /*is_output=*/false);
+  const bool can_differ = is_function(a_) && !is_singular(a_) && all_plain(a_.tensors);
+  if (can_differ && !unrolled && waits_for_report(options_)) identity_.keep(b, solved);
   for (const auto& t : a_.tensors) tensors_.emplace_back(t, /*is_output=*/false);
   a_.tensors.clear();
 }
@@ -39,6 +43,7 @@ void SolveNode::release_variables() {
   const std::lock_guard lock(mutex_);
   for (auto* saved : {&b_, &x0_, &u_, &iterations_, &status_, &residual_}) saved->reset_data();
   for (auto& saved : tensors_) saved.reset_data();
+  identity_.release();
   if (options_.hierarchy) options_.hierarchy->let_go();
 }
 
@@ -66,8 +71,16 @@ variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& so
   for (size_t i = 0; i < needed.size(); ++i) needed[i] = task_should_compute_output(i);
   const bool by_kernel = !at::GradMode::is_enabled() && is_plain(cotangent) && all_plain(a.tensors) &&
                          !has_tangent(cotangent) && !any_tangent(a.tensors);
-  return solve_vjp(cotangent, solved, a, options_, needed, by_kernel ? linear_solve_unrecorded : linear_solve)
-      .gradients;
+  const auto vjp = [&](at::IntArrayRef wanted) {
+    return solve_vjp(cotangent, solved, a, options_, wanted, by_kernel ? linear_solve_unrecorded : linear_solve);
+  };
+  if (!by_kernel || !identity_.has_kept()) return vjp(needed).gradients;
+  auto with_lambda = needed;
+  with_lambda[0] = 1;
+  auto found = vjp(with_lambda);
+  identity_.check(cotangent, found.gradients[0], found.info);
+  if (!needed[0]) found.gradients[0] = at::Tensor();
+  return std::move(found.gradients);
 }
 
 }  // namespace prdp

@@ -1,6 +1,7 @@
 #pragma once
 #include <torch/csrc/autograd/saved_variable.h>
 
+#include "prdp/autograd/adjoint_identity.h"
 #include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/solve_vjp.h"
 #include "prdp/operators/function_operator.h"
@@ -30,6 +31,7 @@ class SolveNode final : public torch::autograd::Node {
   SolveOptions options_;
   std::shared_ptr<const RegisteredProducts> products_, products_of_inverse_;  // of A and of its preconditioner
   std::pair<int64_t, int64_t> step_ = FailuresOfStep::now();  // of a rollout, for what the backward pass reports
+  AdjointIdentity identity_;  // of a Function
   std::vector<torch::autograd::SavedVariable> tensors_;
   torch::autograd::SavedVariable b_, x0_, u_, iterations_, status_, residual_;
 };

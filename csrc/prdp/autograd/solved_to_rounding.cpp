@@ -23,11 +23,6 @@ std::vector<double> growth(const at::Tensor& u, const at::Tensor& b) {
   return to_host<double>(u_norm / b_norm * (u_largest / b_largest), b.size(0));
 }
 
-/// What rounding leaves of a residual, relative to b.
-double left_by_rounding(double norm_of_a, double u_over_b, double epsilon) {
-  return kRoundings * epsilon / 2 * (norm_of_a * u_over_b + 1.0);
-}
-
 /// Those of the candidates whose residual is no more than the rounding errors of computing it, and less than √ε; where
 /// one may be, u is asked for.
 Rows within_rounding(const Operator& a, const Solved& solved, const Rows& candidates, const MakeSolution& make_u) {
@@ -45,7 +40,7 @@ Rows within_rounding(const Operator& a, const Solved& solved, const Rows& candid
   if (!any(near)) return rows;
   const auto norm = to_host<double>(a.norm(), batch), u_over_b = growth(make_u(), solved.b);
   for (int64_t i = 0; i < batch; ++i)
-    rows[i] = rows[i] || (near[i] && residual[i] <= left_by_rounding(norm[i], u_over_b[i], epsilon));
+    rows[i] = rows[i] || (near[i] && residual[i] <= kRoundings * epsilon / 2 * (norm[i] * u_over_b[i] + 1.0));
   return rows;
 }
 
@@ -70,25 +65,6 @@ Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& s
     const auto sufficed = within_rounding(a, before, rows, [&] { return one_less.u; });
     for (int64_t i = 0; i < batch; ++i) rows[i] = rows[i] && (iterations[i] != unknowns || sufficed[i]);
   }
-  return rows;
-}
-
-// The true residual grows where iterations go on after the solution was found.
-constexpr double kDrift = 16.0;
-
-Rows left_little(const Operator& a, const Solved& solved, const Rows& candidates) {
-  const int64_t batch = solved.b.size(0);
-  const double epsilon = epsilon_of(solved.b);
-  const auto residual = to_host<double>(solved.residual, batch);
-  Rows rows(batch, false), above(batch, false);
-  for (int64_t i = 0; i < batch; ++i) {
-    rows[i] = candidates[i] && residual[i] <= std::sqrt(epsilon);
-    above[i] = candidates[i] && !rows[i];
-  }
-  if (!solved.u.defined() || !any(above)) return rows;
-  const auto norm = to_host<double>(a.norm(), batch), u_over_b = growth(solved.u, solved.b);
-  for (int64_t i = 0; i < batch; ++i)
-    rows[i] = rows[i] || (above[i] && residual[i] <= kDrift * left_by_rounding(norm[i], u_over_b[i], epsilon));
   return rows;
 }
 

@@ -16,7 +16,4 @@ using MakeSolution = std::function<at::Tensor()>;
 /// up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
 Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeSolution& make_u);
 
-/// Those of `candidates` whose residual is at most √ε ‖b‖, or where u was kept, at most what rounding leaves of it.
-Rows left_little(const Operator& a, const Solved& solved, const Rows& candidates);
-
 }  // namespace prdp

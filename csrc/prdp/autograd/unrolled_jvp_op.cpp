@@ -14,23 +14,21 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor? u, Tensor iterations, Tensor status, Tensor residual, int[] "
+    "unrolled_jvp(Tensor[] tangents, Tensor b, Tensor iterations, Tensor status, Tensor residual, int[] "
     "needed, " PRDP_SOLVE_SCHEMA ") -> Tensor";
-using Signature = WithSolve<at::Tensor(at::TensorList, const at::Tensor&, const OptionalTensor&, const at::Tensor&,
-                                       const at::Tensor&, const at::Tensor&, at::IntArrayRef)>;
+using Signature = WithSolve<at::Tensor(at::TensorList, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                       const at::Tensor&, at::IntArrayRef)>;
 
 /// The product with the cotangent is linear in it; the transpose of that is the product with the tangents.
 template <class... Args>
-at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const OptionalTensor& u,
-                      const at::Tensor& iterations, const at::Tensor& status, const at::Tensor& residual,
-                      at::IntArrayRef needed, Args... args) {
+at::Tensor jvp_kernel(at::TensorList tangents, const at::Tensor& b, const at::Tensor& iterations,
+                      const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, Args... args) {
   auto call = unpack_solve(args...);
   call.options.adjoint_log = 0;
   return with_autograd([&] {
     const auto leaf = [](const at::Tensor& t, bool wanted) { return t.detach().requires_grad_(wanted); };
-    const Solved solved{leaf(b, needed[0]), u ? u->detach() : at::Tensor(),
-                        iterations,         status,
-                        residual,           call.x0.defined() ? call.x0.detach() : call.x0};
+    const Solved solved{
+        leaf(b, needed[0]), {}, iterations, status, residual, call.x0.defined() ? call.x0.detach() : call.x0};
     auto& tensors = call.a.tensors;
     for (size_t i = 0; i < tensors.size(); ++i) tensors[i] = leaf(tensors[i], needed[i + 1]);
     const auto cotangent = at::ones_like(b).requires_grad_();  // any: the map is linear
@@ -87,8 +85,8 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
 at::Tensor unrolled_jvp(at::TensorList tangents, const Solved& solved, const OperatorSpec& a,
                         const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_jvp", "").typed<Signature>();
-  return call_with_solve(op, a, solved.x0, options, tangents, solved.b, or_none(solved.u), solved.iterations,
-                         solved.status, solved.residual, needed);
+  return call_with_solve(op, a, solved.x0, options, tangents, solved.b, solved.iterations, solved.status,
+                         solved.residual, needed);
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

@@ -15,11 +15,11 @@ namespace prdp {
 namespace {
 
 constexpr const char* kSchema =
-    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor? u, Tensor iterations, Tensor status, Tensor residual, "
+    "unrolled_vjp(Tensor cotangent, Tensor b, Tensor iterations, Tensor status, Tensor residual, "
     "int[] needed, " PRDP_SOLVE_SCHEMA ") -> (Tensor[] gradients, " PRDP_REPORT_SCHEMA ")";
 using Outputs = std::tuple<std::vector<at::Tensor>, at::Tensor, at::Tensor, at::Tensor, at::Tensor, at::Tensor>;
-using Signature = WithSolve<Outputs(const at::Tensor&, const at::Tensor&, const OptionalTensor&, const at::Tensor&,
-                                    const at::Tensor&, const at::Tensor&, at::IntArrayRef)>;
+using Signature = WithSolve<Outputs(const at::Tensor&, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                                    const at::Tensor&, at::IntArrayRef)>;
 
 /// The iterations, run again and taken back.
 UnrolledVjp run_iterations_back(const at::Tensor& cotangent, const at::Tensor& b, const UnrolledSolve& solve,
@@ -59,15 +59,14 @@ UnrolledVjp record_iterations(const at::Tensor& cotangent, const at::Tensor& b, 
 }
 
 template <class... Args>
-Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const OptionalTensor& u,
-                   const at::Tensor& iterations, const at::Tensor& status, const at::Tensor& residual,
-                   at::IntArrayRef needed, Args... args) {
+Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::Tensor& iterations,
+                   const at::Tensor& status, const at::Tensor& residual, at::IntArrayRef needed, Args... args) {
   const at::NoGradGuard no_grad;
   auto [a, options, x0] = unpack_solve(args...);
   for (auto& t : a.tensors) t = t.detach();
   make_operator(a)->check_parameters(checks_of(options.on_failure));
-  const auto found = vjp_of_samples(cotangent, {b.detach(), u.value_or(at::Tensor()), iterations, status, residual, x0},
-                                    a, options, needed, run_iterations_back, linear_solve_unrecorded);
+  const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
+                                    run_iterations_back, linear_solve_unrecorded);
   std::vector<at::Tensor> gradients;
   for (size_t i = 0; i < needed.size(); ++i)
     if (needed[i]) gradients.push_back(found.gradients[i]);
@@ -78,8 +77,8 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const Optio
 }
 
 template <class... Others>
-Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const OptionalTensor&, const at::Tensor&, const at::Tensor&,
-                    const at::Tensor&, at::IntArrayRef needed, at::TensorList tensors, Others...) {
+Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
+                    at::IntArrayRef needed, at::TensorList tensors, Others...) {
   std::vector<at::Tensor> gradients;
   if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
   for (size_t i = 0; i < tensors.size(); ++i)
@@ -93,9 +92,8 @@ Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const OptionalTensor
 SolveVjp unrolled_vjp(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
                       const SolveOptions& options, at::IntArrayRef needed) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::unrolled_vjp", "").typed<Signature>();
-  const auto [gradients, iterations, residual, status, applications, floor] =
-      call_with_solve(op, a, solved.x0, options, cotangent, solved.b, or_none(solved.u), solved.iterations,
-                      solved.status, solved.residual, needed);
+  const auto [gradients, iterations, residual, status, applications, floor] = call_with_solve(
+      op, a, solved.x0, options, cotangent, solved.b, solved.iterations, solved.status, solved.residual, needed);
   const auto or_nan = residual.masked_fill(residual.lt(0), std::numeric_limits<double>::quiet_NaN());
   return {in_places(gradients, needed), {iterations, or_nan, status, applications, floor}};
 }

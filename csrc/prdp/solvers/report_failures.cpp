@@ -234,6 +234,17 @@ void warn_of_constant_cycles() {
   });
 }
 
+void warn_of_another_transpose(int64_t sample, double of_solve, double of_adjoint) {
+  warn_once("another transpose", 0.0, [&](std::ostream& text) {
+    text << "adjoint solve: the gradient of sample " << sample
+         << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
+         << " and ⟨u, ū⟩ = " << of_adjoint
+         << " should be equal. Is `transpose` right, or A symmetric where symmetric=True? Do the functions still see "
+            "the "
+            "tensors that they captured? prdp.check_operator tells";
+  });
+}
+
 void raise_or_warn(const std::string& text, OnFailure on_failure) {
   std::ostringstream whole;
   whole << of_step() << text;

@@ -1,0 +1,51 @@
+#include "prdp/autograd/adjoint_identity.h"
+
+#include <cmath>
+
+#include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/raise_or_warn.h"
+
+namespace prdp {
+
+namespace {
+
+int64_t writes_to(const at::Tensor& b, const at::Tensor& u) {
+  return static_cast<int64_t>(b._version()) + static_cast<int64_t>(u._version());
+}
+
+at::Tensor norm_of(const at::Tensor& v) {
+  return at::linalg_vector_norm(v.flatten(1), 2, at::IntArrayRef{1}, /*keepdim=*/false, at::kDouble);
+}
+at::Tensor inner_product(const at::Tensor& v, const at::Tensor& w) {
+  return (v.to(at::kDouble) * w.to(at::kDouble)).flatten(1).sum(1);
+}
+
+}  // namespace
+
+void AdjointIdentity::keep(const at::Tensor& b, const Solved& solved) {
+  const bool can_look =
+      b.is_cpu() && is_plain(b) && is_plain(solved.u) && !b.is_inference() && !solved.u.is_inference();
+  if (!can_look) return;
+  b_ = b.detach();
+  u_ = solved.u.detach();
+  residual_ = solved.residual.detach();
+  writes_ = writes_to(b_, u_);
+}
+
+void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint) const {
+  if (writes_to(b_, u_) != writes_) return;
+  const at::NoGradGuard no_grad;
+  const auto forward_size = norm_of(lambda) * norm_of(b_), adjoint_size = norm_of(u_) * norm_of(cotangent);
+  const auto forward = inner_product(lambda, b_), backward = inner_product(u_, cotangent);
+  const auto of_residuals =
+      4.0 * (forward_size * residual_.to(at::kDouble) + adjoint_size * adjoint.residual.to(at::kDouble));
+  const auto of_rounding = std::sqrt(epsilon_of(lambda)) * (forward_size + adjoint_size);
+  const auto differs = (forward - backward).abs().gt(of_residuals + of_rounding) & forward.isfinite() &
+                       backward.isfinite() & adjoint.status.ge(static_cast<int64_t>(SolveStatus::kStagnated));
+  if (!differs.any().item<bool>()) return;
+  const auto sample = differs.nonzero()[0].item<int64_t>();
+  warn_of_another_transpose(sample, forward[sample].item<double>(), backward[sample].item<double>());
+}
+
+}  // namespace prdp

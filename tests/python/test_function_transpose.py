@@ -1,0 +1,109 @@
+"""The adjoint solve of a Function is compared with its solve: <lambda, b> = <u, u_bar> but for their residuals."""
+
+import warnings
+
+import pytest
+import torch
+
+import prdp_torch as prdp
+from prdp_torch import operators
+
+SAYS = "this Function's transpose is not that of the A that was solved"
+
+
+def matrix(n=12, dtype=torch.float64, seed=0, skew=1.0):
+    noise = torch.randn(n, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return (6 * torch.eye(n, dtype=torch.float64) + skew * noise / 2).to(dtype)
+
+
+def gradient(a, solver, inputs=None, dtype=torch.float64, n=12, seed=1, on_failure="raise"):
+    b, weights = torch.randn(2, 3, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    b.requires_grad_(inputs is None)
+    u, _ = prdp.linear_solve(a, b, solver, on_failure=on_failure)
+    return torch.autograd.grad((u * weights).sum(), b if inputs is None else inputs)[0]
+
+
+@pytest.fixture
+def always():
+    """A warning that is said once is said in each of these tests."""
+    torch.set_warn_always(True)
+    yield
+    torch.set_warn_always(False)
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("wrong", ["symmetric", "transpose", "captured", "tensors alone"])
+def test_a_wrong_transpose_is_said(wrong):
+    m = matrix()
+    scale = torch.tensor(1.0, dtype=torch.float64)
+    calls = 0
+
+    def product(v):
+        nonlocal calls
+        calls += 1
+        return v @ m.mT
+
+    if wrong == "symmetric":
+        a = operators.Function(product, symmetric=True)
+    elif wrong == "transpose":
+        a = operators.Function(product, transpose=lambda v: 2 * (v @ m))
+    elif wrong == "captured":
+        a = operators.Function(product, transpose=lambda v: v @ (m + 0.5 * torch.eye(12, dtype=m.dtype)))
+    else:
+        scale.requires_grad_()
+        a = operators.Function(lambda v, s: s * v @ m.mT, tensors=scale, symmetric=True)
+    with pytest.warns(UserWarning, match=SAYS):
+        gradient(a, prdp.GMRES(9, restart=12), scale if wrong == "tensors alone" else None)
+
+
+@pytest.mark.usefixtures("always")
+def test_a_buffer_that_is_back_in_its_place_is_said():
+    """functional_call() swaps tensors for the call alone; the adjoint solve comes after it."""
+
+    class Scaled(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.register_buffer("k", torch.tensor(2.0, dtype=torch.float64))
+
+        def forward(self, b):
+            return prdp.linear_solve(operators.Function(lambda v: self.k * v), b, prdp.GMRES(3))[0]
+
+    b = torch.ones(1, 4, dtype=torch.float64, requires_grad=True)
+    u = torch.func.functional_call(Scaled(), {"k": torch.tensor(3.0, dtype=torch.float64)}, b)
+    with pytest.warns(UserWarning, match=SAYS):
+        u.sum().backward()
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    "solver",
+    [prdp.GMRES(2, restart=3), prdp.GMRES(9, rtol=1e-2), prdp.BiCGStab(4), prdp.BiCGStab(60), prdp.Direct(),
+     prdp.Jacobi(3), prdp.Jacobi(80), prdp.SteepestDescent(5, rtol=0.0)],
+    ids=repr,
+)  # fmt: skip
+def test_a_right_one_says_nothing_however_few_iterations_ran(solver, dtype):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=f".*{SAYS}")
+        for seed in range(20):
+            m = matrix(dtype=dtype, seed=seed, skew=1.0 if seed % 2 else 1e-3)
+            if seed % 3 == 0:  # rows of any size
+                m = m * torch.logspace(0, -5, 12, dtype=dtype)[:, None]
+            scale = torch.tensor(1.0, dtype=dtype, requires_grad=True)
+            a = operators.Function(
+                lambda v, s, m=m: s * (v @ m.mT), lambda v, s, m=m: s * (v @ m), scale, lambda s, m=m: s * m.diagonal()
+            )
+            gradient(a, solver, scale if seed % 2 else None, dtype, seed=seed + 100, on_failure="warn")
+
+
+def test_what_was_written_to_is_not_compared():
+    m = matrix()
+    b = torch.ones(1, 12, dtype=torch.float64)
+    scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    u, _ = prdp.linear_solve(operators.Function(lambda v, s: s * v @ m.mT, tensors=scale), b, prdp.GMRES(5, restart=12))
+    b.zero_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=f".*{SAYS}")
+        u.sum().backward()
