@@ -71,7 +71,7 @@ py::object call_linear_solve(const py::object& b, const std::vector<py::object>&
   const bool is_watched = !nobody_in_python_watches(b, tensors) || (x0 && !is_exact(*x0));
   const OperatorSpec a{std::move(kind), std::move(shape), std::move(parameters), unwrapped(tensors)};
   const auto rhs = THPVariable_Unpack(b.ptr());
-  if (is_watched && is_function(a) && in_vmap()) refuse_captured_transforms(a, rhs);  // as linear_solve() does
+  if (is_watched && is_function(a) && in_vmap()) refuse_mapped_captures(a, rhs);  // as linear_solve() does
   if (is_watched) return py::none();
   return report([&, start = x0 ? THPVariable_Unpack(x0->ptr()) : at::Tensor()] {
     check_memory(options, rhs);

@@ -182,8 +182,8 @@ def _repeatable(device: torch.device, seed: int) -> Iterator[None]:
 
 def _is_true(value: object) -> bool:
     """Whether it is True, or that of numpy or of torch."""
-    is_bool = isinstance(value, bool) or str(getattr(value, "dtype", "")) in ("bool", "torch.bool")
-    return is_bool and bool(value)
+    is_of_array = getattr(value, "ndim", None) == 0 and str(getattr(value, "dtype", "")) in ("bool", "torch.bool")
+    return (isinstance(value, bool) or is_of_array) and bool(value)
 
 
 class _Diverged(Exception):

@@ -118,7 +118,7 @@ class Diffusion(Operator):
                 h (u - u_ext).
             fluxes: what flows in, κ ∂u/∂n with the normal n pointing outwards, on the sides that are "flux".
                 Each is one for all sides, or a pair (low, high) for each axis; a number, or a tensor that broadcasts
-                to (batch or 1, *side), where side is shape without the axis. None is 0.
+                to (batch or 1, *side), where side is shape without the axis. In a pair, None is 0.
 
         Raises:
             ValueError: a value that is not 0 stands at a side that takes none.

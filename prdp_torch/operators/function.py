@@ -34,7 +34,8 @@ class Function(Operator):
             axes, they have that of b without its batch axis.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
-    the functions with each other. A `Function` cannot be created inside `torch.compile`.
+    the functions with each other; on the CPU the backward pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A
+    `Function` cannot be created inside `torch.compile`.
     """
 
     kind = "function"
@@ -67,7 +68,7 @@ class Function(Operator):
             None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
-            looks_at_zero=_is_new(matvec),
+            _looks_at(matvec),
         )
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
@@ -87,16 +88,13 @@ class Function(Operator):
         return Function, (matvec, transpose, tuple(tensors), diagonal, symmetric, right, left)
 
 
-_KNOWN: "weakref.WeakSet[Any]" = weakref.WeakSet()  # the code of products that solves have looked at
+_LOOKS: "weakref.WeakKeyDictionary[Any, _C.LooksAtZero]" = weakref.WeakKeyDictionary()
 
 
-def _is_new(matvec: Product) -> bool:
-    """Whether this product's code comes for the first time. A step that makes its operator anew has the same code."""
+def _looks_at(matvec: Product) -> _C.LooksAtZero:
+    """One for all products with this code: a step that makes its operator anew is looked at once."""
     code = getattr(getattr(matvec, "__func__", matvec), "__code__", None)
-    if code is None or code in _KNOWN:
-        return code is None
-    _KNOWN.add(code)
-    return True
+    return _C.LooksAtZero() if code is None else _LOOKS.setdefault(code, _C.LooksAtZero())
 
 
 def _tensor(name: str, value: object) -> Tensor:

@@ -288,8 +288,19 @@ def test_a_constant_in_the_product_is_refused_at_the_first_solve():
         return diagonal * v + 1
 
     a = operators.Function(with_boundary, diagonal=lambda: diagonal)
-    with pytest.raises(ValueError, match=r"Function: matvec must be linear, but matvec\(0\) holds 1; constants"):
-        prdp.linear_solve(a, 4 * right_hand_side(), prdp.Jacobi(50))
+    for _ in range(2):  # nor does it pass the second time
+        with pytest.raises(ValueError, match=r"Function: matvec must be linear, but matvec\(0\) holds ±1; constants"):
+            prdp.linear_solve(a, 4 * right_hand_side(), prdp.Jacobi(50))
+
+
+@pytest.mark.parametrize("dtype, step", [(torch.float32, 1e-2), (torch.float64, 1e-6)])
+def test_rounding_in_the_product_of_zero_is_no_constant(dtype, step):
+    """A Jacobian by differences: F is evaluated for the whole batch, and F(u0) in another way."""
+    u0 = torch.linspace(1, 2, 4, dtype=dtype)
+    at_u0 = u0**3 * (1 + torch.finfo(dtype).eps)
+    a = operators.Function(lambda v: ((u0 + step * v) ** 3 - at_u0) / step)
+    u, _ = prdp.linear_solve(a, right_hand_side().to(dtype), prdp.GMRES(9, rtol=1e-2))
+    assert (u * 3 * u0**2 - right_hand_side()).norm() < 0.1 * right_hand_side().norm()
 
 
 def test_only_the_first_operator_with_this_code_multiplies_a_zero():

@@ -139,6 +139,17 @@ def test_what_a_transform_follows_and_a_product_captures_is_refused(transform):
     of_captured(k)  # nothing follows it here
 
 
+def test_vmap_without_gradients_may_capture_a_parameter_and_map_over_nothing():
+    k = torch.nn.Parameter(torch.rand(4, dtype=torch.float64) + 1)
+
+    def solution(b):
+        a = operators.Function(lambda v: k * v, symmetric=True)
+        return prdp.linear_solve(a, b, prdp.CG(9, rtol=1e-10), backward="none")[0]
+
+    assert torch.allclose(torch.func.vmap(solution)(B[None]), B / k)
+    assert torch.func.vmap(solution)(B[None].expand(0, -1, -1)).shape == (0, 3, 4)
+
+
 @pytest.mark.parametrize("mapped", ["what is captured", "that and b", "b", "a tensor"])
 def test_what_vmap_maps_over_and_a_product_captures_is_refused(mapped):
     def solution(k, b, scale):

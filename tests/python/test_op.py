@@ -61,7 +61,7 @@ def test_matrices_and_the_other_ops_pass_opcheck():
         (torch.ops.prdp.rhs, (b, "poisson", [5], [])),
         (
             torch.ops.prdp.unrolled_vjp,
-            (b.detach(), b.detach(), None, torch.tensor([4, 4]), torch.tensor([-1, -1]),
+            (b.detach(), b.detach(), torch.tensor([4, 4]), torch.tensor([-1, -1]),
              torch.full((2,), 0.1, dtype=torch.float64), [1, 1], [nu.detach()], "heat", [5], [1.0], False, None,
              *packed_options("cg", 4, 1e-5, 3, None, "unrolled")),
         ),

@@ -129,7 +129,7 @@ SolveOutputs solve_and_differentiate_null_space(const at::Tensor& b, const Opera
 /// else calls the op.
 SolveOutputs solve_or_dispatch(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& options,
                                const at::Tensor& x0) {
-  if (is_function(a) && in_vmap()) refuse_captured_transforms(a, b);  // its rule runs outside, where none has a meaning
+  if (is_function(a) && in_vmap()) refuse_mapped_captures(a, b);  // its rule runs outside, where none has a meaning
   if (!no_mode_but_a_profiler_is_on() || !is_plain_solve(b, a, options, x0)) return call_op(b, a, options, x0);
   RECORD_FUNCTION("prdp::linear_solve", c10::ArrayRef<const c10::IValue>());  // as the dispatcher does
   return solve_and_differentiate_null_space(b, a, options, x0);

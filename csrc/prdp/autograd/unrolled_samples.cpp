@@ -80,6 +80,7 @@ class SampleVjps {
   // Of the forward solve.
   const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
+  const std::vector<double> residuals_ = to_host<double>(solved_.residual, batch_);
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
   const std::vector<double> allowed_ = allowed_disagreement();
@@ -160,34 +161,31 @@ class SampleVjps {
     }
   }
 
-  /// Those that met their tolerance, stagnated, or were left with little by max_iter.
-  Rows solved_samples() const {
-    Rows solved(batch_), stopped(batch_);
-    for (int64_t i = 0; i < batch_; ++i) {
-      if (derivatives_[i] != Derivative::kOfIterations || !finite_[i]) continue;
-      solved[i] = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated;
-      stopped[i] = status(i) == SolveStatus::kMaxIter;
-    }
-    if (!any(stopped)) return solved;
-    const auto done = left_little(*a_, solved_, stopped);
-    for (int64_t i = 0; i < batch_; ++i) solved[i] = solved[i] || done[i];
-    return solved;
+  /// Those that met their tolerance or stagnated, or whose last iteration left no more than √ε ‖b‖. Without an
+  /// iteration there is nothing to mislead: the derivative is zero.
+  bool is_solved(int64_t i) const {
+    const bool left_little = status(i) == SolveStatus::kMaxIter && residuals_[i] <= std::sqrt(epsilon_of(solved_.b));
+    const bool met = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated || left_little;
+    return met && counts_[i] > 0;
   }
 
-  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: further with a larger residual, as
-  /// the gradient of an iterate is not that of the solution, and never further than zero is.
+  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: no further than zero is. Those of
+  /// BiCGStab, whose recurrence amplifies rounding wherever it comes near a breakdown, no further than the gradient of
+  /// an iterate with this residual may be from that of the solution.
   std::vector<double> allowed_disagreement() const {
-    auto allowed = to_host<double>(solved_.residual, batch_);
-    for (auto& r : allowed) r = std::clamp(10.0 * std::sqrt(r), 1e-3, 1.0);
+    std::vector<double> allowed(batch_, 1.0);
+    if (options_.solver.method != Method::kBiCGStab) return allowed;
+    for (int64_t i = 0; i < batch_; ++i) allowed[i] = std::clamp(10.0 * std::sqrt(residuals_[i]), 1e-3, 1.0);
     return allowed;
   }
 
   /// For solved samples. Iterations excite few eigenvectors, so their b̄ may be far from the solution's, and their Ā may
-  /// be amplified rounding, as both are where a recurrence comes near a breakdown. Then the implicit gradient takes
-  /// their place.
+  /// be amplified rounding. Then the implicit gradient takes their place.
   void retry_implicitly() {
     if (!may_mislead_ || !gradients_[0].defined()) return;
-    const auto solved = solved_samples();
+    Rows solved(batch_);
+    for (int64_t i = 0; i < batch_; ++i)
+      solved[i] = is_solved(i) && derivatives_[i] == Derivative::kOfIterations && finite_[i];
     if (!any(solved)) return;
     const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
     Rows misleading(batch_), to_look_at(batch_);
@@ -216,6 +214,7 @@ class SampleVjps {
     for (int64_t i = 0; i < batch_; ++i)
       no_other_contributes = no_other_contributes && (rows[i] || !finite_[i] || derivatives_[i] == Derivative::kNone);
     const auto found = no_other_contributes ? gradients_ : vjp_of_iterations(rows).gradients;
+    if (!found[0].defined()) return;  // no iteration ran
     const auto u = only(solution().detach(), rows);
     const at::NoGradGuard no_grad;
     const auto allowed = at::tensor(allowed_, at::kDouble).to(u.device());
@@ -263,9 +262,8 @@ class SampleVjps {
     return info;
   }
 
-  /// u; solved for again where it was not kept, as A has no derivative.
+  /// u, solved for again, as it is not kept.
   const at::Tensor& solution() {
-    if (solved_.u.defined()) return solved_.u;
     auto silent = options_;
     silent.on_failure = OnFailure::kReturn;
     silent.adjoint_log = 0;

@@ -7,12 +7,15 @@
 #include <torch/csrc/autograd/autograd.h>
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <mutex>
 #include <unordered_map>
 
 #include "prdp/operators/dense.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/tensors.h"
 #include "prdp/operators/with_autograd.h"
 
 namespace prdp {
@@ -64,9 +67,12 @@ void check_nothing_is_captured(const at::Tensor& result, bool reverse = true) {
                     "detach it");
 }
 
-/// A tensor that vmap maps over, for one of the samples.
-at::Tensor for_one_sample(at::Tensor t) {
-  while (const auto* mapped = at::functorch::maybeGetBatchedImpl(t)) t = mapped->value().select(mapped->bdim(), 0);
+/// A tensor that vmap maps over, for one of the entries; undefined where there is none.
+at::Tensor for_one_entry(at::Tensor t) {
+  while (const auto* mapped = at::functorch::maybeGetBatchedImpl(t)) {
+    if (mapped->value().size(mapped->bdim()) == 0) return {};
+    t = mapped->value().select(mapped->bdim(), 0);
+  }
   return t;
 }
 
@@ -112,26 +118,38 @@ void refuse_captured_gradients(const OperatorSpec& a) {
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
   if (a.transposed) return;  // of an adjoint solve, whose A was looked at
   auto constant = a;
-  for (auto& t : constant.tensors) t = for_one_sample(primal(t)).detach();
-  const auto v = for_one_sample(primal(b)).detach();
+  for (auto& t : constant.tensors) t = primal(t).detach();
+  const auto v = primal(b).detach();
   const bool reverse = at::GradMode::is_enabled();
-  const auto product = with_autograd([&] { return make_operator(constant)->apply(v); });
-  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(product),
+  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
+}
+
+void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
+  auto of_one = a;
+  for (auto& t : of_one.tensors) t = for_one_entry(primal(t).detach());
+  const auto v = for_one_entry(primal(b).detach());
+  const auto is_there = [](const at::Tensor& t) { return t.defined(); };
+  if (a.transposed || !v.defined() || !std::all_of(of_one.tensors.begin(), of_one.tensors.end(), is_there)) return;
+  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(make_operator(of_one)->apply(v)),
                     "Function: matvec uses a tensor that vmap maps over, but that is not among its tensors; hand it "
                     "over in tensors");
-  check_nothing_is_captured(product, reverse);
 }
 
 void refuse_constant_in_product(const OperatorSpec& a, const at::Tensor& b) {
   const auto registered = RegisteredProducts::find(a.shape.at(0));
   const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
-  if (!can_look || !registered->looks_at_zero.exchange(false)) return;
+  if (!can_look || !*registered->looks_at_zero) return;
   const at::NoGradGuard no_grad;
-  const auto found = registered->products().apply(at::zeros_like(b).detach(), detached(a.tensors));
-  const auto constant = found.isfinite().logical_and(found.ne(0));
-  TORCH_CHECK_VALUE(!constant.any().item<bool>(), "Function: matvec must be linear, but matvec(0) holds ",
-                    found.masked_select(constant)[0].item<double>(),
+  auto constant = a;
+  constant.tensors = detached(a.tensors);
+  const auto found = make_operator(constant)->apply(at::zeros_like(b).detach());
+  const auto largest = found.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>();
+  // Beside b, as products by differences leave rounding.
+  const double rounding = 32.0 * std::sqrt(epsilon_of(b)) * b.abs().max().to(at::kDouble).item<double>();
+  TORCH_CHECK_VALUE(largest == 0.0 || largest <= rounding || !std::isfinite(rounding),
+                    "Function: matvec must be linear, but matvec(0) holds ±", largest,
                     "; constants, such as values on the boundary, belong to b");
+  *registered->looks_at_zero = false;
 }
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {

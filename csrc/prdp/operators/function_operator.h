@@ -37,8 +37,8 @@ class RegisteredProducts {
   const Products& products() const { return products_; }
   /// Whether the next product below autograd looks for captured tensors (see refuse_captured_gradients).
   mutable std::atomic<bool> looks_for_captures{false};
-  /// Whether the next solve looks for a constant (see refuse_constant_in_product).
-  mutable std::atomic<bool> looks_at_zero{true};
+  /// Whether solves look for a constant (see refuse_constant_in_product), shared by what has the same code.
+  std::shared_ptr<std::atomic<bool>> looks_at_zero = std::make_shared<std::atomic<bool>>(true);
   /// The operator, for linear_solve.
   OperatorSpec spec(std::vector<at::Tensor> tensors) const { return {"function", {number_}, {}, std::move(tensors)}; }
 
@@ -59,9 +59,11 @@ std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a);
 /// recording it. Each differentiable solve asks anew: a parameter may have been frozen before.
 void refuse_captured_gradients(const OperatorSpec& a);
 /// The same of what a transform of torch.func follows at its level, where b is: by a product that is not used.
+/// refuse_mapped_captures() looks for what vmap maps over alone.
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
-/// Raises ValueError where A 0 is not zero, as a solver would solve another problem than was meant. It looks at the
-/// first solve with these products, on the CPU.
+void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b);
+/// Raises ValueError where A 0 is no rounding beside b, as a solver would solve another problem than was meant. It
+/// looks until a solve on the CPU was right.
 void refuse_constant_in_product(const OperatorSpec& a, const at::Tensor& b);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
