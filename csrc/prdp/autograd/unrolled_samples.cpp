@@ -169,12 +169,12 @@ class SampleVjps {
     return met && counts_[i] > 0;
   }
 
-  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: no further than zero is. Those of
-  /// BiCGStab, whose recurrence amplifies rounding wherever it comes near a breakdown, no further than the gradient of
-  /// an iterate with this residual may be from that of the solution.
+  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: no further than zero is. Those of a
+  /// recurrence that may have come near a breakdown, no further than the gradient of an iterate with this residual may
+  /// be from that of the solution.
   std::vector<double> allowed_disagreement() const {
     std::vector<double> allowed(batch_, 1.0);
-    if (options_.solver.method != Method::kBiCGStab) return allowed;
+    if (!traits(options_.solver.method).nears_breakdowns) return allowed;
     for (int64_t i = 0; i < batch_; ++i) allowed[i] = std::clamp(10.0 * std::sqrt(residuals_[i]), 1e-3, 1.0);
     return allowed;
   }

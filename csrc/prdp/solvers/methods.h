@@ -45,6 +45,7 @@ struct MethodTraits {
   /// fixes. Then u is smooth in A and linear in b, and the transposed map is as many iterations with Aᵀ and M⁻ᵀ.
   bool is_polynomial = false;
   bool ends_at_unknowns = false;  // exact after as many iterations as unknowns, and smooth up to there
+  bool nears_breakdowns = false;  // its recurrence may, even where A is well conditioned, and amplify rounding there
   /// Whether unrolled iterations in the CPU loops are differentiated there, operation by operation (autograd/tape.h);
   /// else autograd does it, in plain tensor operations.
   bool has_tape = true;
@@ -118,6 +119,7 @@ inline constexpr std::tuple kMethods{
         .vectors = 6,
         .takes_preconditioner = true,
         .nanoseconds = 0.8,
+        .nears_breakdowns = true,
         .kernel = "BiCGStabMethod",
         .kernel_header = "bicgstab.h",
     }},
