@@ -153,20 +153,19 @@ class Diffusion(Operator):
     def _of_sides(self, name: str, given: OfSides, kinds: tuple[str, ...]) -> Sequence[Sequence[Number]]:
         """A value for each side, (low, high) for each axis; only sides of these kinds take one that is not zero."""
         dim = len(self.shape)
-        pairs: Sequence[Sequence[Number | None]]
         if isinstance(given, (int, float, Tensor)):
-            pairs = [(given, given)] * dim
+            pairs: Sequence[Sequence[Number]] = [(given, given)] * dim
             stray = _is_given(given) and not any(side in kinds for sides in self.boundary for side in sides)
         else:
-            pairs = given
             of_axes = isinstance(given, (tuple, list)) and len(given) == dim
             if not of_axes or any(not isinstance(pair, (tuple, list)) or len(pair) != 2 for pair in given):
                 raise ValueError(
                     f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes, got "
                     f"{given!r:.80}"
                 )
+            pairs = [[0.0 if value is None else value for value in pair] for pair in given]
             stray = any(
-                value is not None and _is_given(value) and side not in kinds
+                _is_given(value) and side not in kinds
                 for sides, pair in zip(self.boundary, pairs, strict=True)
                 for side, value in zip(sides, pair, strict=True)
             )
@@ -175,7 +174,7 @@ class Diffusion(Operator):
                 f"Diffusion: {name} belong to sides that are {' or '.join(map(repr, kinds))}; the boundary is "
                 f"{self.boundary}, in pairs (low, high), and {name} are {given!r:.80}"
             )
-        return [[0.0 if value is None else value for value in pair] for pair in pairs]
+        return pairs
 
 
 def _kind(side: Any) -> Any:
