@@ -217,6 +217,7 @@ def _zoom(errors: np.ndarray, spreads: np.ndarray) -> Limits | None:
     return lowest / margin, (errors + spreads)[near].max() * margin
 
 
+ABOVE = {"*": 4, "X": 5}  # auto and PRDP are often one point: the small mark above the large one
 MARKERS = {"auto": "X", "tolerance": "v", "prdp": "*", "growth": "^", "direct": "D", "converged": "s", "schedule": "P"}
 
 
@@ -240,7 +241,7 @@ def accuracy_against_cost(scene: _C.Scene, table: list[Entry]) -> Figure:
             x_spread, y_spread = _spreads(entry, name)
             axes.errorbar(
                 x, y, y_spread, x_spread, fmt=marker, color=colour, ms=13 if marker == "*" else 8, lw=1,
-                mec="white", mew=0.6, zorder=4 if marker == "*" else 3, label=entry["title"],
+                mec="white", mew=0.6, zorder=ABOVE.get(marker, 3), label=entry["title"],
             )  # fmt: skip
         right = 1.05 * cost.max()
         front = [i for i in pareto_front(cost, error) if not limits or error[i] <= limits[1]]

@@ -16,6 +16,7 @@ from prdp_torch.experiments.datasets import OnData
 from prdp_torch.experiments.network_task import error, propagator
 from prdp_torch.experiments.networks import make_network
 
+_SHOWN = ("converged", "auto", "prdp")  # kinds of rows
 _FURTHER = 4  # the pictures go on to this many times the step of the metric
 
 
@@ -42,14 +43,14 @@ class Trajectories:
 
 
 def collect(scene: _C.Scene, rows: list[Row], folder: Path, on_data: OnData | None = None) -> Trajectories | None:
-    """Follow the validation samples with the networks of converged training and of PRDP, whose weights lie
-    beside their records in `folder`. None for a task without a network or without time, or if there are no weights.
+    """Follow the validation samples with the networks of converged training, of auto and of PRDP, whose weights
+    lie beside their records in `folder`. None for a task without a network or without time, or if there are no weights.
 
     on_data: called while the reference is made with (steps of a sample done, all of them).
     """
     if not scene.trains_network or scene.physics.equation == "darcy":
         return None
-    rows = [row for row in rows if row.kind in ("converged", "prdp")]
+    rows = [row for row in rows if row.kind in _SHOWN]
     networks = {row.label: _networks(scene, row, folder) for row in rows}
     if not any(networks.values()):
         return None

@@ -67,9 +67,9 @@ def space_time(scene: _C.Scene, shown: Trajectories) -> Figure:
     reference = field(scene, shown.reference[0]).numpy()
     states = [(_name(scene, course), field(scene, course.states[0]).numpy()) for course in shown.courses]
     differences = [(f"{name}\nminus reference", state - reference) for name, state in states]
-    if len(states) == 2:
-        (converged, u), (prdp, v) = states
-        differences.insert(0, (f"{prdp}\nminus {converged}", v - u))
+    if len(states) > 1:
+        first, last = shown.courses[0].title, shown.courses[-1].title
+        differences.insert(0, (f"{last}\nminus {first}", states[-1][1] - states[0][1]))
     scale = _scale(reference[scene.data.trained_steps :])
     farthest = min(scale, max(_scale(content) for _, content in differences))  # one may have blown up
     figure, panels = _grid(2, 1 + len(states), height=6.6)

@@ -85,7 +85,7 @@ def test_the_error_at_the_step_of_the_metric_is_the_recorded_metric(tmp_path, ma
     rows, shown = trained(make(tmp_path), tmp_path, seeds=2)
     recorded = {row.title: row.final() for row in rows}
     courses = [course for course in shown.courses if course.kind != "coarse"]
-    assert [course.kind for course in courses] == ["converged", "prdp"] and not shown.missing
+    assert [course.kind for course in courses] == ["converged", "auto", "prdp"] and not shown.missing
     for course in courses:
         assert course.errors.shape == (2, 4 * metric)
         np.testing.assert_allclose(course.errors[:, metric - 1], recorded[course.title], rtol=1e-9)
@@ -95,7 +95,7 @@ def test_corrected_and_coarse_solver_are_told_apart(tmp_path):
     """Both against exact steps, written out here."""
     scene = flow(tmp_path, ("rtol = 1e-5", "rtol = 1e-12"), ("valid_max_iter = 120", "valid_max_iter = 400"))
     _, shown = trained(scene, tmp_path)
-    coarse, converged, _ = shown.courses
+    coarse, converged, *_ = shown.courses
     exact = prdp.NavierStokes([8, 8], 1e-4, 0.1, prdp.Direct())
     torch.testing.assert_close(coarse.states, fields.rollout(exact, shown.reference[:, 0], 20), rtol=0, atol=1e-8)
     network = make_network(scene, 0)
@@ -127,9 +127,10 @@ def test_trainings_without_weights_or_that_diverged_are_left_out_and_named(tmp_p
     rows, _ = trained(scene, tmp_path)
     (tmp_path / "prdp/seed_0.pt").unlink()  # as records of the C++ trainer, or of an older version
     shown = trajectories.collect(scene, rows, tmp_path)
-    assert [course.kind for course in shown.courses] == ["converged"] and shown.missing == ["PRDP"]
+    assert [course.kind for course in shown.courses] == ["converged", "auto"] and shown.missing == ["PRDP"]
     drawn = trajectory_charts.pictures(scene, shown)
     assert len(drawn) == 2 and all("Left out, for want of weights: PRDP." in caption for _, _, caption in drawn)
+    (tmp_path / "auto/seed_0.pt").unlink()
     next(row for row in rows if row.kind == "converged").curves[0]["diverged"] = "interval 1: the loss is nan"
     assert trajectories.collect(scene, rows, tmp_path) is None
     assert trajectories.collect(scenes.load("poisson_1p"), [], tmp_path) is None
@@ -160,21 +161,22 @@ def images(figure):
 def test_space_time_shows_the_first_sample_and_the_differences(tmp_path):
     scene = heat(tmp_path)
     _, shown = trained(scene, tmp_path)
-    converged, by_prdp = shown.courses
-    u, v, w = (states[0, :, 0].numpy() for states in (shown.reference, converged.states, by_prdp.states))
+    runs = (shown.reference, *(course.states for course in shown.courses))
+    u, converged, by_auto, by_prdp = (states[0, :, 0].numpy() for states in runs)
     drawn = images(trajectory_charts.space_time(scene, shown))
-    for image, expected in zip(drawn, [u, v, w, w - v, v - u, w - u], strict=True):
+    wanted = [u, converged, by_auto, by_prdp, by_prdp - converged, converged - u, by_auto - u, by_prdp - u]
+    for image, expected in zip(drawn, wanted, strict=True):
         np.testing.assert_array_equal(image.get_array(), expected)
         # A pixel's centre is its unknown's place and its step.
         np.testing.assert_allclose(image.get_extent(), [0.5 / 31, 30.5 / 31, -0.5, 8.5])
-    assert len({image.get_clim() for image in drawn[:3]}) == 1 == len({image.get_clim() for image in drawn[3:]})
+    assert len({image.get_clim() for image in drawn[:4]}) == 1 == len({image.get_clim() for image in drawn[4:]})
 
 
 def test_snapshots_show_the_vorticity_each_time_in_the_scale_of_the_reference(tmp_path):
     scene = flow(tmp_path)
     _, shown = trained(scene, tmp_path)
     drawn = images(trajectory_charts.snapshots(scene, shown))
-    panels = np.array(drawn, dtype=object).reshape(4, 4)
+    panels = np.array(drawn, dtype=object).reshape(5, 4)
     for run, line in zip([shown.reference, *(course.states for course in shown.courses)], panels, strict=True):
         for u, image, above in zip(run[0, [2, 5, 10, 20]].numpy(), line, panels[0], strict=True):
             vorticity = 8 * ((u[1] - np.roll(u[1], 1, 1)) - (u[0] - np.roll(u[0], 1, 0)))
