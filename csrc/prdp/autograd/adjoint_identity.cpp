@@ -14,9 +14,6 @@ int64_t writes_to(const at::Tensor& b, const at::Tensor& u) {
   return static_cast<int64_t>(b._version()) + static_cast<int64_t>(u._version());
 }
 
-at::Tensor norm_of(const at::Tensor& v) {
-  return at::linalg_vector_norm(v.flatten(1), 2, at::IntArrayRef{1}, /*keepdim=*/false, at::kDouble);
-}
 at::Tensor inner_product(const at::Tensor& v, const at::Tensor& w) {
   return (v.to(at::kDouble) * w.to(at::kDouble)).flatten(1).sum(1);
 }
@@ -36,7 +33,8 @@ void AdjointIdentity::keep(const at::Tensor& b, const Solved& solved) {
 void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint) const {
   if (writes_to(b_, u_) != writes_) return;
   const at::NoGradGuard no_grad;
-  const auto forward_size = norm_of(lambda) * norm_of(b_), adjoint_size = norm_of(u_) * norm_of(cotangent);
+  const auto forward_size = sample_norms(lambda) * sample_norms(b_),
+             adjoint_size = sample_norms(u_) * sample_norms(cotangent);
   const auto forward = inner_product(lambda, b_), backward = inner_product(u_, cotangent);
   const auto of_residuals =
       4.0 * (forward_size * residual_.to(at::kDouble) + adjoint_size * adjoint.residual.to(at::kDouble));

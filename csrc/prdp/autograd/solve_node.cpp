@@ -52,6 +52,7 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
   if (!cotangent.defined()) return variable_list(tensors_.size() + 1);
   auto a = a_;
   Solved solved;
+  AdjointIdentity identity;
   {
     const std::lock_guard lock(mutex_);
     // The function that torch.func.vjp returns runs after its transform: the wrappers are dead by then.
@@ -59,14 +60,16 @@ variable_list SolveNode::apply(variable_list&& cotangents) {
       return at::functorch::unwrapIfDead(saved.unpack(std::move(of)));
     };
     solved = {unpack(b_), unpack(u_, getptr()), unpack(iterations_), unpack(status_), unpack(residual_), unpack(x0_)};
+    identity = identity_;
     for (const auto& saved : tensors_) a.tensors.push_back(unpack(saved));
   }
   const WithoutAutocast full_precision;
   const FailuresOfStep here(step_.first, step_.second);
-  return for_each_cotangent(cotangent, [&](const at::Tensor& one) { return gradients(one, solved, a); });
+  return for_each_cotangent(cotangent, [&](const at::Tensor& one) { return gradients(one, solved, a, identity); });
 }
 
-variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a) const {
+variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
+                                   const AdjointIdentity& identity) const {
   std::vector<int64_t> needed(a.tensors.size() + 1);
   for (size_t i = 0; i < needed.size(); ++i) needed[i] = task_should_compute_output(i);
   const bool by_kernel = !at::GradMode::is_enabled() && is_plain(cotangent) && all_plain(a.tensors) &&
@@ -74,11 +77,11 @@ variable_list SolveNode::gradients(const at::Tensor& cotangent, const Solved& so
   const auto vjp = [&](at::IntArrayRef wanted) {
     return solve_vjp(cotangent, solved, a, options_, wanted, by_kernel ? linear_solve_unrecorded : linear_solve);
   };
-  if (!by_kernel || !identity_.has_kept()) return vjp(needed).gradients;
+  if (!by_kernel || !identity.has_kept()) return vjp(needed).gradients;
   auto with_lambda = needed;
   with_lambda[0] = 1;
   auto found = vjp(with_lambda);
-  identity_.check(cotangent, found.gradients[0], found.info);
+  identity.check(cotangent, found.gradients[0], found.info);
   if (!needed[0]) found.gradients[0] = at::Tensor();
   return std::move(found.gradients);
 }

@@ -24,8 +24,8 @@ class SolveNode final : public torch::autograd::Node {
   const SolveOptions& options() const { return options_; }
 
  private:
-  torch::autograd::variable_list gradients(const at::Tensor& cotangent, const Solved& solved,
-                                           const OperatorSpec& a) const;
+  torch::autograd::variable_list gradients(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& a,
+                                           const AdjointIdentity& identity) const;
 
   OperatorSpec a_;  // its tensors are among the saved ones
   SolveOptions options_;

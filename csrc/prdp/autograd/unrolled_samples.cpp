@@ -30,9 +30,7 @@ enum class Derivative {
 /// ‖ū - Aᵀ b̄‖ / ‖ū‖ of each sample, within the range of Aᵀ, where A is singular; 0 where ū is.
 std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotangent, const at::Tensor& b_bar) {
   const at::NoGradGuard no_grad;
-  const auto norm = [](const at::Tensor& v) {
-    return to_host<double>(v.flatten(1).to(at::kDouble).norm(2, 1), v.size(0));
-  };
+  const auto norm = [](const at::Tensor& v) { return to_host<double>(sample_norms(v), v.size(0)); };
   const auto product = apply_on_loops(a, b_bar.detach().contiguous(), /*transposed=*/true);
   const auto left = norm(a.project_solution(cotangent.detach() - product)), whole = norm(cotangent.detach());
   std::vector<double> residuals(whole.size());

@@ -38,6 +38,11 @@ std::vector<T> to_host(const at::Tensor& t, int64_t batch) {
   return {flat.template const_data_ptr<T>(), flat.template const_data_ptr<T>() + batch};
 }
 
+/// ‖v‖ of each sample, (batch,) in float64.
+inline at::Tensor sample_norms(const at::Tensor& v) {
+  return at::linalg_vector_norm(v.flatten(1), 2, at::IntArrayRef{1}, /*keepdim=*/false, at::kDouble);
+}
+
 /// The powers of two that bring these magnitudes to the order of one.
 inline at::Tensor power_of_two_scale(const at::Tensor& magnitude) {
   const int limit = magnitude.scalar_type() == at::kFloat ? 126 : 1022;

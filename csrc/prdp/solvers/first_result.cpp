@@ -10,9 +10,8 @@ namespace {
 
 Trust trust_by_samples(const Operator& a, const at::Tensor& b, const at::Tensor& solution, const at::Tensor& residual) {
   constexpr double share = 0.25, roundings = 200.0, least = 1e-15, most = 1e15;
-  const auto norm = [](const at::Tensor& v) { return v.to(at::kDouble).flatten(1).norm(2, 1); };
-  const auto size = norm(b), whole = norm(a.project(b)), u = norm(solution);
-  const auto found = norm(a.project(b - a.apply(solution))) / whole;
+  const auto size = sample_norms(b), whole = sample_norms(a.project(b)), u = sample_norms(solution);
+  const auto found = sample_norms(a.project(b - a.apply(solution))) / whole;
   const auto told = residual.to(at::kDouble);
   const auto rounding = roundings * epsilon_of(b) * (a.norm().to(at::kDouble).reshape({-1}) * u / whole + 1.0);
   const auto judged = (size > least) & (size < most) & (u < most) & (whole > 1e-3 * size);

@@ -19,7 +19,7 @@ at::Tensor constant_shares(const at::Tensor& v) {
   const auto scale = power_of_two_scale(largest_magnitude(v));  // squares of small numbers are zero
   const auto channels = by_channel(v * per_sample(scale, v));
   const auto sums = channels.sum(-1, /*keepdim=*/false, at::kDouble).view({v.size(0), -1}).norm(2, 1);
-  const auto whole = at::linalg_vector_norm(channels.flatten(1), 2, 1, /*keepdim=*/false, at::kDouble);
+  const auto whole = sample_norms(channels);
   const auto part = sums / std::sqrt(static_cast<double>(channels.size(-1)));
   return at::where(part <= rounding_of_least_numbers(scale, v), 0.0, part / whole);
 }
