@@ -2,7 +2,7 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'LooksAtZero', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_lost', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'LooksAtZero', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_failed', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
 class LooksAtZero:
     def __init__(self) -> None:
         ...
@@ -119,7 +119,7 @@ def batched_axes(kind: str, axes: typing.SupportsInt | typing.SupportsIndex, ten
     """
     The number of axes of each of so many tensors of an operator where it has one for the batch, on a grid of so many axes: 0 if all samples share it. None if that is not known.
     """
-def block_gradients_of_lost(u: torch.Tensor, status: torch.Tensor, on_failure: str) -> None:
+def block_gradients_of_failed(u: torch.Tensor, status: torch.Tensor, on_failure: str) -> None:
     """
     No gradient passes through a state u from here on, for samples whose solve has none.
     """

@@ -166,15 +166,17 @@ class PRDPController(_C.PRDPController, _Attached):
     Args:
         steppers: the steppers whose `max_iter` is set to K, now and after each refinement. It may be empty; then
             read `.max_iter` yourself.
-        tau_step: τ_step. The metric is on a plateau where L̃[-1]/L̃[-δ] > tau_step. L̃ is its exponential mean.
-        tau_stop: τ_stop. On a plateau K is raised if L̃[-1] < tau_stop · (L̃ at the last refinement), or if the
+        tau_step: τ_step, 0.95 by default. The metric is on a plateau where L̃[-1]/L̃[-δ] > tau_step. L̃ is its
+            exponential mean.
+        tau_stop: τ_stop, 0.9. On a plateau K is raised if L̃[-1] < tau_stop · (L̃ at the last refinement), or if the
             metric has grown since then.
-        delta: δ >= 2, how many values the plateau test looks back.
-        window: length of the exponential mean L̃, with α = 2/(window + 1). 1 does not smooth.
-        initial, increment: K at the start, and how much a refinement adds.
-        maximum: K is never raised beyond it. None sets no limit.
-        growth: a refinement raises K to growth·K where that is more than K + increment.
-        adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations. None leaves them to the stepper.
+        delta: δ >= 2, 3 by default: how many values the plateau test looks back.
+        window: length of the exponential mean L̃, with α = 2/(window + 1); 6 by default, and 1 does not smooth.
+        initial, increment: K at the start, and how much a refinement adds; both 1.
+        maximum: K is never raised beyond it. None, the default, sets no limit.
+        growth: a refinement raises K to growth·K where that is more than K + increment; 1.0.
+        adjoint_ratio: the adjoint solve gets ⌈adjoint_ratio·K⌉ iterations. None, the default, leaves them to the
+            stepper.
         process_group: a group of torch.distributed; None takes the default one. If torch.distributed is initialised,
             `step` is a collective call. Every process calls it with the metric of its own samples, all of them see the
             mean, and they refine in the same interval. On a single process it has no effect.
@@ -186,7 +188,7 @@ class PRDPController(_C.PRDPController, _Attached):
     `UserWarning`, once, if it lasts five intervals without a refinement, or thirty with some:
 
     - The solves stop so far from the solution that their error dominates what is trained.
-    - Most of the last solves took no iteration, so that steps pass their start on.
+    - Most of the last solves took no iteration though their residual is above 1e-4: steps pass their start on.
     - The metric grows: it was more than twice its least value, three times in a row.
     - The last `step` raised an error for its metric.
     - Of a `ToleranceController`: the error has not fallen in twenty calls, and adjoint solves are loose.
@@ -238,7 +240,7 @@ class PRDPController(_C.PRDPController, _Attached):
 
 
 class ToleranceController(_C.ToleranceController, _Attached):
-    """Tie the tolerance of the solves to the error of what is trained. There is nothing to tune.
+    """Tie the tolerance of the solves to the error of what is trained. Its defaults need no tuning.
 
     While a network is wrong by a fifth, a solve with a relative residual of a fiftieth is accurate enough. As the
     error falls, the tolerance follows. Use this controller unless you have tuned `PRDPController` for your problem.
@@ -246,13 +248,14 @@ class ToleranceController(_C.ToleranceController, _Attached):
     Args:
         steppers: the steppers whose `rtol`, `adjoint_rtol`, `max_iter` and `adjoint_max_iter` are set, now and
             after every step. It may be empty; then read `.rtol`, `.adjoint_rtol` and `.max_iter` yourself.
-        ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1); 1e-3 before the first `step`.
+        ratio: rtol = ratio · min(1, smallest relative error so far), in (0, 1), 0.1 by default; rtol is 1e-3 before the
+            first `step`.
         adjoint_ratio: the rtol of the adjoint solve is rtol / adjoint_ratio, at most 1/2, and its K is
-            ⌈adjoint_ratio·K⌉; in (0, 1].
-        floor: the smallest rtol; > 0. In float32 solves reach about 1e-5.
-        adjoint_floor: the smallest rtol of the adjoint solve; > 0. That rtol is relative to a cotangent that shrinks
-            with the error, and a descent needs no better gradient late than early.
-        maximum: K >= 1. It is only a limit, which the solves should not reach.
+            ⌈adjoint_ratio·K⌉; in (0, 1], 0.1 by default.
+        floor: the smallest rtol; > 0, 1e-5 by default, which solves in float32 reach.
+        adjoint_floor: the smallest rtol of the adjoint solve; > 0, 0.01 by default. That rtol is relative to a
+            cotangent that shrinks with the error, and a descent needs no better gradient late than early.
+        maximum: K >= 1, 10,000 by default. It is only a limit, which the solves should not reach.
         process_group: as for `PRDPController`. The error is averaged over the processes.
 
     Raises:
@@ -311,7 +314,15 @@ class LinearSchedule(_C.LinearSchedule, _Attached):
     """A manual schedule: K = initial + increment·(calls of step), at most `maximum`. increment = 0 keeps K constant.
 
     Its `step`, `state_dict` and `warning` are those of `PRDPController`; it ignores the metric and keeps no history.
-    `adjoint_ratio` and `process_group` have the same meaning."""
+    `adjoint_ratio` and `process_group` have the same meaning.
+
+    Raises:
+        ValueError, TypeError: a setting is out of range or of a wrong type.
+
+    Examples:
+        >>> schedule = prdp.LinearSchedule([heat], initial=2, increment=1, maximum=20)
+        >>> schedule.step(0.0)  # after each epoch
+    """
 
     def __init__(
         self,

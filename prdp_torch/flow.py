@@ -34,7 +34,8 @@ class Flow(HoldsTensors, Stepper):
         shape: the cells, (Ny, Nx) or (Nz, Ny, Nx), at least 3 per axis.
         nu: viscosity >= 0, length²/time. A 0-dimensional tensor gets a gradient. A Parameter becomes one of the module,
             and another tensor a buffer. The same holds for `force`, `inflow` and `wall_velocity`.
-        dt: time step > 0. The advection needs dt Σ |u|/dx <= 1; a longer step raises an error.
+        dt: time step > 0. The advection needs dt Σ |u|/dx <= 1, or with central advection and implicit diffusion at
+            most √(nu dt Σ 2/(d dx²)) where that is larger; a longer step raises an error.
         boundary: one for all axes, or one per axis in the order of `shape`.
             "periodic".
             "wall": no slip at both ends. The low face of the first cell lies on the wall.
@@ -137,6 +138,7 @@ class Flow(HoldsTensors, Stepper):
 
     @property
     def wall_velocity(self) -> Mapping[Side, Tensor]:
+        """The velocity of each wall that was given one, by its side, such as (0, "high")."""
         places: tuple[dict[str, Any], ...] = self.__dict__, self._parameters, self._buffers
         values: dict[Side, Tensor] = {}
         for side, name in flow_walls.NAMES.items():
@@ -152,6 +154,7 @@ class Flow(HoldsTensors, Stepper):
 
     @property
     def start(self) -> Start:
+        """Always "zero": the solves are for changes."""
         return "zero"
 
     @start.setter
@@ -162,6 +165,10 @@ class Flow(HoldsTensors, Stepper):
     @not_in_graphs
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
+        """Return the velocity after one step, of the shape and dtype of u, (batch, d, *shape). Call the module instead.
+
+        Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
+        where a sample fails, as in a step that is too long."""
         u = _field("Flow", "u", u)
         log = self._adjoint_log.number
         found: Solution = self._equation().step(u, self._options_kept(), self._max_iter, log)
@@ -198,8 +205,8 @@ class Flow(HoldsTensors, Stepper):
 
     @not_in_graphs
     def project(self, u: Tensor) -> Tensor:
-        """Return the velocity nearest to u that has the boundary values and no divergence. NaN in u remains, and `info`
-        stays that of the last step."""
+        """Return the velocity nearest to u, (batch, d, *shape), with the boundary values and without divergence. NaN
+        in u remains, and `info` stays that of the last step."""
         return self._equation().project(_field("Flow", "u", u), self._options_kept(), self._max_iter)
 
     @not_in_graphs

@@ -62,24 +62,29 @@ class AdjointLogs(list[AdjointLog]):
 
 class SolveInfo(NamedTuple):
     """The report of a solve, with one value per sample: tensors of shape (batch,). The report of a rollout has one
-    value per sample and step: (batch, steps)."""
+    value per sample and step: (batch, steps).
+
+    Attributes:
+        iterations: those that produced the returned u (int64).
+        residual: ‖b - A u‖ / ‖b‖, recomputed from the returned u (dtype of u).
+        status: why the solve stopped (int64). `SolveStatus(int(info.status[0])).name` is its name.
+        operator_applications: the number of products with A (int64).
+        floor: where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖. Such
+            a sample is STAGNATED: its residual is as small as the dtype allows. u may be further off where A is badly
+            conditioned; float64 tells. 0 for all other samples, those that failed among them.
+        log: for `adjoint`.
+        way: how it was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors", in operations of
+            torch, which are slow on a GPU. Empty where that is not known: in an adjoint's report, and under
+            `torch.compile`.
+    """
 
     iterations: Tensor
-    """Iterations that produced the returned u (int64)."""
     residual: Tensor
-    """‖b - A u‖ / ‖b‖, recomputed from the returned u (dtype of u)."""
     status: Tensor
-    """Why the solve stopped (int64). `SolveStatus(int(info.status[0])).name` is its name."""
     operator_applications: Tensor
-    """Number of products with A (int64)."""
     floor: Tensor
-    """Where the dtype cannot reach rtol, the relative residual that its rounding leaves, ε ‖A‖ ‖u‖ / ‖b‖.
-    Such a sample is STAGNATED: its residual is as small as the dtype allows. u may be further off where A is badly
-    conditioned; float64 tells. 0 for all other samples, those that failed among them."""
     log: AdjointLog | AdjointLogs | None = None
     way: str = ""
-    """How it was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors", in operations of torch,
-    which are slow on a GPU. Empty where that is not known: in an adjoint's report, and under `torch.compile`."""
 
     def __repr__(self) -> str:
         if self.status.is_meta:

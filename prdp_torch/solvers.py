@@ -25,8 +25,9 @@ class Solver:
     """The base of all solvers, whose arguments every solver takes.
 
     Args:
-        max_iter: K >= 0, the maximum number of iterations.
-        rtol: >= 0. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, exactly max_iter iterations run.
+        max_iter: K >= 0, the maximum number of iterations. With a tolerance it is a limit that solves should not reach,
+            such as 1000.
+        rtol: >= 0, 1e-5 by default. A sample stops when ‖b - A u‖ <= rtol ‖b‖. With 0, all max_iter iterations run.
         preconditioner: only for `CG`, `BiCGStab`, `GMRES` and `MINRES`. M ≈ A, whose inverse they apply in every
             iteration: None; "diagonal"; "multigrid", or a `Multigrid` with settings of its own; or an operator of
             `prdp_torch.operators` whose product is M⁻¹ r, such as `Function(apply, transpose)`. The adjoint solve
@@ -137,7 +138,7 @@ class Jacobi(Solver):
 
 @dataclass
 class Chebyshev(Solver):
-    """Chebyshev's semi-iteration over Jacobi's method. It takes two to three times fewer iterations than `Jacobi`,
+    """Chebyshev's semi-iteration over Jacobi's method. It takes fewer iterations than `Jacobi`, about √n in place of n,
     and an iteration costs the same. Its weights need the spectrum of A, which is known for `Heat` and `Poisson`
     only.
 
@@ -196,7 +197,8 @@ class MINRES(Solver):
 
 @dataclass(kw_only=True)
 class GMRES(Solver):
-    """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, and `max_iter` counts cycles.
+    """Restarted GMRES(m), for any operator. A cycle has m = `restart` products, 10 by default, and `max_iter` counts
+    cycles.
 
     The residual never grows. In float32 unrolled gradients can be far off, so prefer implicit ones. A preconditioner
     is applied from the right, so the residual stays that of A u = b.
@@ -220,8 +222,9 @@ class Multigrid(Solver):
 
     An iteration is one V-cycle. It is for `Heat`, `Poisson`, `Burgers`, `Diffusion`, and for `Stencil` with neighbours
     at most one cell away, in one to three dimensions, of any size and with any coefficients. As a preconditioner of
-    `CG`, or of `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust; there,
-    `max_iter` and `rtol` have no influence. Unrolled gradients of A take the cycles for constants.
+    `CG` and `MINRES`, or of `GMRES` and `BiCGStab` if A is not symmetric, it takes fewer cycles and is more robust;
+    `NavierStokes` takes it so, too. There, `max_iter` and `rtol` have no influence. Unrolled gradients of A take the
+    cycles for constants.
 
     Args:
         max_iter, rtol: as those of every `Solver`; a cycle counts as an iteration.
@@ -250,8 +253,12 @@ class Multigrid(Solver):
 
 @dataclass
 class Direct(Solver):
-    """The cheapest exact method of the operator: Thomas in 1D, sine transform in 2D and 3D, LU for
-    matrices. An iteration is one direct solve; those after the first refine its result."""
+    """The cheapest exact method of the operator: Thomas' algorithm in 1D; sine transforms, FFT or products along the
+    axes for constant coefficients in a box; else LU or Cholesky, sparse or dense. It takes no preconditioner.
+
+    Args:
+        max_iter: 1 by default. An iteration is one direct solve; those after the first refine its result.
+    """
 
     max_iter: int = 1
 

@@ -89,6 +89,10 @@ class Stepper(HasSettings):
 
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
+        """Return the next state, of the shape and dtype of u, (batch, channel, *shape). Call the module instead.
+
+        Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
+        where a sample fails."""
         found = self._solve(u, self._adjoint_log)
         self._keep(found[1:], self._adjoint_log, found[0])
         return found[0]
@@ -181,7 +185,7 @@ class Stepper(HasSettings):
         # another order. On the CPU, where looking is free, u becomes one only once a sample was refused.
         state = u.view_as(u)
         found = self._solve_from(state, log)
-        _C.block_gradients_of_lost(state, found[3], self.on_failure)
+        _C.block_gradients_of_failed(state, found[3], self.on_failure)
         return found
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
@@ -211,6 +215,7 @@ class Stepper(HasSettings):
 
     @property
     def adjoint_info(self) -> SolveInfo | None:
+        """The `SolveInfo` of the last backward pass; None before the first."""
         return self._last_log.read()
 
     @property

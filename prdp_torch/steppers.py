@@ -117,6 +117,10 @@ class EquationStepper(HoldsTensors, Stepper):
 
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
+        """Return the next state, of the shape and dtype of u, (batch, channel, *shape). Call the module instead.
+
+        Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
+        where a sample fails."""
         found: Solution | None = None
         if not torch.compiler.is_compiling():
             _check.dense(type(self).__name__, "u", u)

@@ -33,11 +33,12 @@ class Diffusion(Operator):
         kappa: (batch, *shape), or (1, *shape) for all samples alike, κ > 0 in the centres of the cells; shape has 1 to
             3 axes. With per_axis (batch or 1, axes, *shape). Gets a gradient, which is formed from fluxes: in float32
             it keeps digits that the gradient of a `Stencil`'s coefficients loses.
-        shift: a number, or a tensor (batch or 1, *shape) or (batch, 1, ...), which gets a gradient. With 1/dt, A is a
-            step of ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with b = u/dt. In float32 products are made of fluxes: for `CG`
-            and `Direct` a small shift, weak sides and jumps of κ are not lost in the rounding of a diagonal, though the
-            residual may end at ε max κ Σ 2/dx² |u|, with a warning. `MINRES` and `GMRES`, which go by the residual,
-            and the coarse grids of multigrid do lose what holds u by less than that.
+        shift: a number, or a tensor, which gets a gradient: a field (batch or 1, *shape), or a number for each sample,
+            (batch, 1) in 1D, (batch, 1, 1) in 2D. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with
+            b = u/dt. In float32 products are made of fluxes: for `CG` and `Direct` a small shift, weak sides and jumps
+            of κ are not lost in the rounding of a diagonal, though the residual may end at ε max κ Σ 2/dx² |u|, with a
+            warning. `MINRES` and `GMRES`, which go by the residual, and the coarse grids of multigrid do lose what
+            holds u by less than that.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
             ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
             one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor
@@ -105,6 +106,7 @@ class Diffusion(Operator):
 
     @property
     def kappa(self) -> Tensor:
+        """κ as it was given."""
         return self.tensors[0]
 
     def boundary_rhs(self, values: OfSides = 0.0, fluxes: OfSides = 0.0) -> Tensor:

@@ -20,8 +20,7 @@ from prdp_torch.experiments import cli, scenes
 ROOT = Path(__file__).parents[2]
 PAGES = {str(path.relative_to(ROOT)): path.read_text() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))}
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SHOWN = [("docs/cpp.md", "examples/cpp/CMakeLists.txt"), ("docs/cpp.md", "examples/cpp/heat_gradient.cpp"),
-         ("docs/flows.md", "examples/flow_around_cylinder.py")]  # fmt: skip
+SHOWN = [("docs/cpp.md", "examples/cpp/CMakeLists.txt"), ("docs/cpp.md", "examples/cpp/heat_gradient.cpp")]
 COMMAND = typer.main.get_command(cli.app)
 
 
