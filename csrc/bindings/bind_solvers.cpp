@@ -215,9 +215,9 @@ void bind_solvers(py::module_& m) {
   m.def("kernels_made", &gpu::kernels_made, "The kernels of GPUs that this process has made, by name.");
   m.def("any_nonfinite", &any_nonfinite, py::arg("status"), "Whether a sample was refused for a NaN or Inf in b or A.");
   m.def(
-      "block_gradients_of_lost",
+      "block_gradients_of_failed",
       [](const at::Tensor& u, const at::Tensor& status, const std::string& on_failure) {
-        block_gradients_of_lost(u, status, on_failure_from_name(on_failure));
+        block_gradients_of_failed(u, status, on_failure_from_name(on_failure));
       },
       py::arg("u"), py::arg("status"), py::arg("on_failure"),
       "No gradient passes through a state u from here on, for samples whose solve has none.");

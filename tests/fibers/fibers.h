@@ -27,13 +27,14 @@
 #define __launch_bounds__(threads)
 #define __shared__ static thread_local
 #define PRDP_UNROLL
-#define PRDP_ONCE
-#define PRDP_ROLLED
+#define PRDP_NOINLINE
+#define PRDP_NO_UNROLL
 #define PRDP_SPIN fibers::spin(since)
 #define PRDP_BLOCK_MEMORY(name) double* const name = reinterpret_cast<double*>(fibers::block->memory.data())
 // One barrier may be left out, to see that a test notices: that of a line of team.h, or of a line that calls meet().
 #define __syncthreads() (__LINE__ == fibers::left_out ? void() : fibers::meet(__LINE__))
 #define PRDP_LEAVES_OUT(line) fibers::leaves_out(line)
+#define __trap() std::abort()
 #define __threadfence() std::atomic_thread_fence(std::memory_order_seq_cst)
 
 // Under ThreadSanitizer, fibers are threads that only barriers and shuffles put into an order. What this file keeps for

@@ -29,9 +29,9 @@ bool any_nonfinite(const at::Tensor& status) {
   return status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)).any().item<bool>();
 }
 
-void block_gradients_of_lost(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure) {
+void block_gradients_of_failed(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure) {
   if (on_failure == OnFailure::kRaise || !u.requires_grad() || in_torch_func()) return;
-  u.register_hook([status, on_failure](const at::Tensor& u_bar) { return without_lost(u_bar, status, on_failure); });
+  u.register_hook([status, on_failure](const at::Tensor& u_bar) { return without_failed(u_bar, status, on_failure); });
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def("detach_failed(Tensor u, Tensor status) -> Tensor", detach_failed); }

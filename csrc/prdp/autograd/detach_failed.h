@@ -16,6 +16,6 @@ bool any_nonfinite(const at::Tensor& status);
 /// From here on no gradient passes through a state u that A(u) and b(u) were made of, for samples whose solve has none:
 /// their zero cotangent times an infinite derivative of A or b would be NaN, which weights are shared by. Nothing with
 /// kRaise.
-void block_gradients_of_lost(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure);
+void block_gradients_of_failed(const at::Tensor& u, const at::Tensor& status, OnFailure on_failure);
 
 }  // namespace prdp

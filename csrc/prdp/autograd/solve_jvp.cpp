@@ -28,10 +28,10 @@ at::Tensor tangent_rhs(const at::Tensor& b, const at::Tensor& u, const OperatorS
 at::Tensor implicit(const at::Tensor& b, const Solved& solved, const OperatorSpec& a, SolveOptions options) {
   const auto spec = without_tangents(a);
   auto rhs = tangent_rhs(b, solved.u, a);
-  rhs = without_lost(rhs, solved.status, options.on_failure);
+  rhs = without_failed(rhs, solved.status, options.on_failure);
   options.adjoint_log = 0;  // it is the primal solve's
   const auto tangent = linear_solve(spec, reachable_part(*make_operator(spec), rhs), options);
-  return options.on_failure == OnFailure::kZeroGrad ? without_lost(tangent.u, tangent.info.status, options.on_failure)
+  return options.on_failure == OnFailure::kZeroGrad ? without_failed(tangent.u, tangent.info.status, options.on_failure)
                                                     : tangent.u;
 }
 
@@ -46,8 +46,8 @@ at::Tensor unrolled(const at::Tensor& b, const Solved& solved, const OperatorSpe
   for (const auto& t : a.tensors) take(t);
   auto plain = solved;
   plain.b = primal(b);
-  return without_lost(unrolled_jvp(tangents, plain, without_tangents(a), options, needed), solved.status,
-                      options.on_failure);
+  return without_failed(unrolled_jvp(tangents, plain, without_tangents(a), options, needed), solved.status,
+                        options.on_failure);
 }
 
 }  // namespace

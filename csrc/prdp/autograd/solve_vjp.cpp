@@ -12,7 +12,7 @@
 
 namespace prdp {
 
-at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure) {
+at::Tensor without_failed(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure) {
   if (on_failure == OnFailure::kRaise) return derivative;
   const bool all_failures = on_failure == OnFailure::kZeroGrad;
   if (status.is_cpu() && !at::isTensorSubclassLike(status)) {  // numbers that can be read
@@ -35,8 +35,8 @@ namespace {
 
 /// Samples whose share of ḡ may leave the range of the dtype, told by the largest numbers of λ and u.
 at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
-  const auto largest = [](const at::Tensor& v) { return v.detach().abs().flatten(1).amax(1).to(at::kDouble); };
-  return largest(lambda) * largest(u) > 1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
+  return sample_maxima(lambda.detach()) * sample_maxima(u.detach()) >
+         1e-3 * limits_of(lambda).largest / static_cast<double>(lambda.numel());
 }
 
 /// Takes the samples whose ḡ may overflow out of λ and marks them, without a look by the host.
@@ -74,7 +74,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   if (o.adjoint_rtol || o.traced_adjoint_rtol.is_symbolic()) o.traced_rtol = o.traced_adjoint_rtol;
   o.solver.preconditioner = o.solver.preconditioner.transposed();
   auto [lambda, info] = adjoint_solve(transpose, cotangent, o, /*x0=*/{});
-  if (o.on_failure == OnFailure::kZeroGrad) lambda = without_lost(lambda, info.status, o.on_failure);
+  if (o.on_failure == OnFailure::kZeroGrad) lambda = without_failed(lambda, info.status, o.on_failure);
 
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;
@@ -109,7 +109,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
 
 SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpec& a, const SolveOptions& options,
                    at::IntArrayRef needed, decltype(linear_solve)& adjoint_solve) {
-  cotangent = without_lost(cotangent, solved.status, options.on_failure);
+  cotangent = without_failed(cotangent, solved.status, options.on_failure);
   if (options.backward == Backward::kImplicit)
     return implicit_vjp(cotangent, solved.u, a, options, needed, adjoint_solve);
   // With create_graph=True the derivative is itself recorded; else it is one op, as a compiled graph and

@@ -23,7 +23,7 @@ SolveVjp solve_vjp(at::Tensor cotangent, const Solved& solved, const OperatorSpe
 
 /// A cotangent or tangent with zeros for the samples that carry none: the refused ones, whose u is the constant
 /// zero, and with kZeroGrad all that failed. With kRaise there are no such samples.
-at::Tensor without_lost(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure);
+at::Tensor without_failed(const at::Tensor& derivative, const at::Tensor& status, OnFailure on_failure);
 /// The implicit one: Aᵀ λ = ū; b̄ = λ; ḡ = -∂⟨λ, A(g) u⟩/∂g. Without u, b̄ alone. A sample whose share of ḡ
 /// leaves the range of the dtype fails: OVERFLOW, and zeros.
 SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const OperatorSpec& a,

@@ -4,7 +4,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/upwind_kernels.h"
-#include "prdp/operators/upwind_products.h"
+#include "prdp/operators/upwind_rule_kernel.h"
 
 namespace prdp {
 
@@ -25,7 +25,7 @@ const AdvectionDiffusion& BurgersOperator::block() const {
 }
 
 std::vector<at::Tensor> BurgersOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (auto found = burgers_products(grid_, winds_, step_.dt, lambda, u))
+  if (auto found = burgers_rule_by_kernel(grid_, winds_, step_.dt, lambda, u))
     return {found->winds, found->nu.to(step_.nu.options())};
   const auto [faces, nu] = block().product_rule(lambda, u);
   std::vector<at::Tensor> channels;

@@ -8,7 +8,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/matrix_checks.h"
 #include "prdp/operators/plain_tensors.h"
-#include "prdp/operators/products_by_kernel.h"
+#include "prdp/operators/product_rule_kernels.h"
 
 namespace prdp {
 
@@ -146,25 +146,26 @@ int64_t step(const at::Tensor& t) { return t.dim() == 2 && t.size(0) > 1 ? t.str
 
 /// The cotangent of the values in one launch; undefined where there is no kernel.
 template <class T>
-at::Tensor products_by_kernel(const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& crow,
-                              const at::Tensor& col, const at::Tensor& values) {
+at::Tensor product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& crow,
+                                  const at::Tensor& col, const at::Tensor& values) {
   const auto out = at::empty(values.sizes(), values.options());
   const int64_t sets = values.dim() == 2 ? values.size(0) : 1;
-  const gpu::CsrProducts<T> of{pair_of<T>(lambda.unsqueeze(1), u.unsqueeze(1), sets),
-                               static_cast<int>(values.size(-1)),
-                               crow.const_data_ptr<int64_t>(),
-                               col.const_data_ptr<int64_t>(),
-                               step(crow),
-                               step(col),
-                               out.mutable_data_ptr<T>()};
-  return gpu::each_point(out.device(), product_body<T>("CsrProducts"), of, out.numel()) ? out : at::Tensor();
+  const gpu::CsrProductRule<T> of{pair_of<T>(lambda.unsqueeze(1), u.unsqueeze(1), sets),
+                                  static_cast<int>(values.size(-1)),
+                                  crow.const_data_ptr<int64_t>(),
+                                  col.const_data_ptr<int64_t>(),
+                                  step(crow),
+                                  step(col),
+                                  out.mutable_data_ptr<T>()};
+  return gpu::each_point(out.device(), product_rule_body<T>("CsrProductRule"), of, out.numel()) ? out : at::Tensor();
 }
 
 }  // namespace
 
 std::vector<at::Tensor> CsrOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (has_product_kernel(lambda, u) && values_.numel() > 0) {
-    const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
+  if (has_product_rule_kernel(lambda, u) && values_.numel() > 0) {
+    const auto by_kernel =
+        lambda.scalar_type() == at::kFloat ? product_rule_by_kernel<float> : product_rule_by_kernel<double>;
     const auto all = by_kernel(lambda.contiguous(), u.contiguous(), shared_or_own(crow_), shared_or_own(col_), values_);
     if (all.defined()) return {at::Tensor(), at::Tensor(), had_axis_of_one_ ? all.unsqueeze(0) : all};
   }

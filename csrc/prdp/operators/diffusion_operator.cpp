@@ -121,7 +121,7 @@ DiffusionOperator::SideProducts DiffusionOperator::side_product_rule(int64_t axi
 }
 
 std::vector<at::Tensor> DiffusionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (auto by_kernel = products_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
+  if (auto by_kernel = product_rule_by_kernel(lambda, u); !by_kernel.empty()) return by_kernel;
   const auto shift_bar = like(shift_, over_channels(lambda, u));
   std::vector<at::Tensor> kappa_bars(per_axis_ ? dim() : 1), robin_bar;
   for (int64_t axis = 0; axis < dim(); ++axis) {

@@ -63,7 +63,7 @@ class DiffusionOperator final : public Operator {
   };
   SideProducts side_product_rule(int64_t axis, size_t end, const at::Tensor& lambda, const at::Tensor& u) const;
   /// The product rule in one launch on a GPU; nothing where there is no kernel.
-  std::vector<at::Tensor> products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
+  std::vector<at::Tensor> product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
   template <class T>
   std::vector<at::Tensor> products_of(const at::Tensor& lambda, const at::Tensor& u) const;
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }

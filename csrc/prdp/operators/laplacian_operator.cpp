@@ -8,12 +8,12 @@
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/kernels/laplacian.h"
 #include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/broadcast_sums.h"
 #include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/plain_tensors.h"
-#include "prdp/operators/products_by_kernel.h"
-#include "prdp/operators/shared_sums.h"
+#include "prdp/operators/product_rule_kernels.h"
+#include "prdp/operators/separable_inverse.h"
 #include "prdp/operators/sums_in_order.h"
-#include "prdp/operators/tensor_axes.h"
 
 namespace prdp {
 
@@ -127,23 +127,23 @@ namespace {
 template <class T>
 at::Tensor product_with_laplacian(const at::Tensor& lambda, const at::Tensor& u, const Grid& grid,
                                   const at::Tensor& nu) {
-  SharedSums sums(lambda);
-  gpu::LaplacianProducts<T> of{pair_of<T>(lambda, u, /*sets=*/1), {1, 1, 1}, {}, sums.add(nu), nullptr};
+  BroadcastSums sums(lambda);
+  gpu::LaplacianProductRule<T> of{pair_of<T>(lambda, u, /*sets=*/1), {1, 1, 1}, {}, sums.add(nu), nullptr};
   of.out = sums.memory(0);
   for (int64_t d = 0; d < grid.dim(); ++d) {
     const int64_t axis = d + 3 - grid.dim();
     of.n[axis] = static_cast<int>(grid.shape()[d]);
     of.inverse_width2[axis] = 1.0 / (grid.dx(d) * grid.dx(d));
   }
-  return gpu::each_point(u.device(), product_body<T>("LaplacianProducts"), of, sums.count()) ? sums.result(0)
-                                                                                             : at::Tensor();
+  return gpu::each_point(u.device(), product_rule_body<T>("LaplacianProductRule"), of, sums.count()) ? sums.result(0)
+                                                                                                     : at::Tensor();
 }
 
 }  // namespace
 
 std::vector<at::Tensor> HeatOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, u - ν Δt L u⟩/∂ν = -Δt ⟨λ, L u⟩
-  if (has_product_kernel(lambda, u)) {
+  if (has_product_rule_kernel(lambda, u)) {
     const auto by_kernel =
         u.scalar_type() == at::kFloat ? product_with_laplacian<float> : product_with_laplacian<double>;
     const auto product = by_kernel(lambda.contiguous(), u.contiguous(), grid_, step_.nu);

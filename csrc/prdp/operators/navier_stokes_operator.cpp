@@ -5,7 +5,7 @@
 #include "prdp/operators/dense.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/upwind_kernels.h"
-#include "prdp/operators/upwind_products.h"
+#include "prdp/operators/upwind_rule_kernel.h"
 
 namespace prdp {
 
@@ -83,7 +83,7 @@ at::Tensor NavierStokesOperator::norm() const {
 }
 
 std::vector<at::Tensor> NavierStokesOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (auto found = navier_stokes_products(grid_, winds_, lambda, u))
+  if (auto found = navier_stokes_rule_by_kernel(grid_, winds_, lambda, u))
     return {found->winds, found->nu.to(step_.nu.options())};
   const auto& [c1, c2] = momentum();
   const auto g1 = c1.product_rule(part(lambda, 0), part(u, 0));

@@ -118,9 +118,6 @@ at::Tensor SingularOperator::without(const Basis& basis, const at::Tensor& v) co
 
 namespace {
 
-/// max |v| of each sample.
-at::Tensor largest_of_samples(const at::Tensor& v) { return v.abs().flatten(1).amax(1).to(at::kDouble); }
-
 /// ‖A‖∞ of each sample or of all, by the CPU loops where there are some.
 at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
   const auto kernels = b.is_cpu() ? a.kernels(b, /*transposed=*/false) : nullptr;
@@ -143,7 +140,7 @@ at::Tensor norm_of(const Operator& a, const at::Tensor& b) {
 at::Tensor size_of_products(const Operator& a, const at::Tensor& b) {
   const auto norm = norm_of(a, b);
   if (!norm.eq(0).all().item<bool>()) return norm;
-  return largest_of_samples(apply_on_loops(a, unstructured_like(b).sign().contiguous(), /*transposed=*/false));
+  return sample_maxima(apply_on_loops(a, unstructured_like(b).sign().contiguous(), /*transposed=*/false));
 }
 
 }  // namespace
@@ -154,7 +151,7 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
   const double rounding = 200.0 * epsilon_of(b);
   for (int64_t k = 0; k < q.size(0); ++k) {
     const auto v = (q[k] / q[k].abs().amax()).expand_as(by_vector(b, basis.spans_channels(b))).reshape_as(b);
-    const auto left = largest_of_samples(apply_on_loops(*a_, v, transposed));
+    const auto left = sample_maxima(apply_on_loops(*a_, v, transposed));
     const auto wrong = (left > rounding * size).logical_and(left.isfinite());  // what is not finite, its status says
     TORCH_CHECK_VALUE(!wrong.any().item<bool>(), title_, ": vector ", k, " of ",
                       transposed ? "left_nullspace" : "nullspace", " is not in the null space of ",

@@ -11,8 +11,8 @@
 #include "prdp/operators/cyclic_reduction.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/remembered.h"
+#include "prdp/operators/separability.h"
 #include "prdp/operators/stencil_operator.h"
-#include "prdp/operators/sum_on_host.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
@@ -60,7 +60,7 @@ FastSolve solve_line(const at::Tensor& coefficients, const NamedNullSpace& null_
   });
 }
 
-using Inverse = std::shared_ptr<const TensorAxes>;
+using Inverse = std::shared_ptr<const SeparableInverse>;
 
 /// The keys of what the last few coefficients led to on this thread, which need not be looked at again: those of a flow
 /// are the same tensors in every step.
@@ -72,8 +72,8 @@ class RecentFactors {
       if (known.null_vectors != null_vectors || !known.of.matches(a, a.tensors[0].scalar_type())) continue;
       std::vector<Inverse> inverses;
       for (const auto& key : known.keys)
-        if (auto kept = factor_cache::find(key, typeid(TensorAxes)))
-          inverses.push_back(std::static_pointer_cast<const TensorAxes>(std::move(kept)));
+        if (auto kept = factor_cache::find(key, typeid(SeparableInverse)))
+          inverses.push_back(std::static_pointer_cast<const SeparableInverse>(std::move(kept)));
       if (inverses.size() == known.keys.size()) return inverses;
     }
     return {};
@@ -100,13 +100,13 @@ class RecentFactors {
 };
 
 /// Null if the sample is no such sum.
-Inverse inverse_of(const SumOnHost& separable, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
+Inverse inverse_of(const Separability& separable, int64_t s, const kernels::FactorKey& key, int64_t null_vectors,
                    const at::TensorOptions& options) {
   const auto sum = separable.is_finite(s) ? separable.sum(s) : std::nullopt;
   if (!sum) return nullptr;
-  return factor_cache::find_or_make<TensorAxes>(key, [&] {
-    return std::make_shared<TensorAxes>(kernels::diagonalise(*sum, separable.epsilon(), null_vectors),
-                                        separable.inner_box(s), options);
+  return factor_cache::find_or_make<SeparableInverse>(key, [&] {
+    return std::make_shared<SeparableInverse>(kernels::diagonalise(*sum, separable.epsilon(), null_vectors),
+                                              separable.inner_box(s), options);
   });
 }
 
@@ -134,7 +134,7 @@ FastSolve solve_sum(const OperatorSpec& a, int64_t null_vectors) {
     const auto coefficients =
         StencilOperator(detached(a)).nearest_coefficients(/*transposed=*/false);  // sums are symmetric
     if (!coefficients.defined()) return {};
-    const SumOnHost separable(coefficients, periodic_axes(a));
+    const Separability separable(coefficients, periodic_axes(a));
     std::vector<kernels::FactorKey> keys;
     for (int64_t s = 0; s < separable.samples(); ++s) {
       keys.push_back(separable.key(s, null_vectors, coefficients.options()));

@@ -17,13 +17,14 @@ struct Energies {
 /// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, or x·A x is the rounding of
 /// A x, x lies almost in the null space of A, and says nothing, unless A has none for sure.
 inline bool energy_falls(const Energies& e, double epsilon, bool surely_definite) {
+  constexpr double roundings = 2e3;  // of a product of vectors, with much to spare
   const auto positive = [](double v) { return std::max(v, 0.0); };
   const double scale =
       std::sqrt(e.rr) * std::sqrt(positive(e.bb - 2 * e.rb + e.rr)) + std::sqrt(e.xx) * std::sqrt(e.ar2);
-  const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - 2e3 * epsilon * scale);
-  const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= 2e3 * epsilon * scale;
+  const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - roundings * epsilon * scale);
+  const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= roundings * epsilon * scale;
   const bool nearer = e.xb * e.xb > e.xr * e.xr;
-  const double rounding = std::max(2e3 * std::abs(e.xb), surely_definite ? 0.0 : e.largest);
+  const double rounding = std::max(roundings * std::abs(e.xb), surely_definite ? 0.0 : e.largest);
   const bool not_rounding = std::abs(energy) > epsilon * rounding;
   const bool definite = e.r_ar * energy > across * across;
   return symmetric && definite && nearer && not_rounding;
@@ -33,7 +34,7 @@ inline bool energy_falls(const Energies& e, double epsilon, bool surely_definite
 /// DIVERGED. One that broke down is left alone: its A is not definite, and the energy says nothing. For a method whose
 /// residual is the true one. One product of the whole batch, which counts for these samples alone.
 template <class Space, class Method>
-void excuse_by_energy(Space& space, Method& method, typename Space::States& states) {
+void accept_by_energy(Space& space, Method& method, typename Space::States& states) {
   const auto is_above = [](const SampleState& s) {
     return s.returned != Returned::kLast && s.status != SolveStatus::kBreakdown;
   };
@@ -58,8 +59,16 @@ void excuse_by_energy(Space& space, Method& method, typename Space::States& stat
       continue;
     }
     s.returned = Returned::kLast;
-    const Energies e{xb[i],   xr[i],   rb[i], rr[i],  bb[i],
-                     x_ar[i], r_ar[i], xx[i], ar2[i], norm_a[i] * std::sqrt(u2[i] * xx[i])};
+    const Energies e{.xb = xb[i],
+                     .xr = xr[i],
+                     .rb = rb[i],
+                     .rr = rr[i],
+                     .bb = bb[i],
+                     .x_ar = x_ar[i],
+                     .r_ar = r_ar[i],
+                     .xx = xx[i],
+                     .ar2 = ar2[i],
+                     .largest = norm_a[i] * std::sqrt(u2[i] * xx[i])};
     if (!energy_falls(e, space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
   }
 }

@@ -34,7 +34,8 @@ Trust trust_by_failed(const Operator& a, const at::Tensor& b, const SolveRequest
 
 }  // namespace
 
-Trust trust_by(const Operator& a, const at::Tensor& b, const SolveRequest& request, const SolveResult& result) {
+Trust verify_first_result(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+                          const SolveResult& result) {
   const at::NoGradGuard no_grad;
   const auto& info = result.info;
   // Tensor operations may not be able to read the A of others.

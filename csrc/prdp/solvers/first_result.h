@@ -4,9 +4,10 @@
 
 namespace prdp::gpu {
 
-/// What a result tells of its kernel: whether the residuals that it reports are those of its solutions, which tensor
-/// operations compute from A, to rounding; nothing where numbers may leave the range of the dtype. And whether samples
-/// that failed by a NaN or Inf fail without the kernel, too.
-Trust trust_by(const Operator& a, const at::Tensor& b, const SolveRequest& request, const SolveResult& result);
+/// Checks the first result of a kernel against tensor operations: the residuals that it reports are those of its
+/// solutions, to rounding, and samples that failed by a NaN or Inf fail without the kernel, too. Trust::kUnknown where
+/// numbers may leave the range of the dtype.
+Trust verify_first_result(const Operator& a, const at::Tensor& b, const SolveRequest& request,
+                          const SolveResult& result);
 
 }  // namespace prdp::gpu

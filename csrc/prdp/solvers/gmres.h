@@ -42,7 +42,7 @@ class GmresMethod {
     for (int64_t j = 1; j <= m_; ++j) u_[j] = space.vector();
   }
 
-  PRDP_ONCE void start() {
+  PRDP_NOINLINE void start() {
     space_.fill_zero(x);
     space_.copy(space_.b(), r_);
     residual2_ = space_.b2();
@@ -50,7 +50,7 @@ class GmresMethod {
     ready_ = true;
     confirmed_ = !space_.started();
   }
-  PRDP_ONCE void step() {
+  PRDP_NOINLINE void step() {
     residual2();
     space_.copy(x, kept_x_);
     space_.advance(r_, kept_r_);
@@ -62,7 +62,7 @@ class GmresMethod {
     confirmed_ = true;
   }
   /// ‖b - A x‖². A cycle that made it grow was rounding errors and is taken back.
-  PRDP_ONCE auto residual2() {
+  PRDP_NOINLINE auto residual2() {
     if (ready_) return residual2_;
     Scalar fresh = space_.residual(x, r_);
     grew_ = space_.is_larger(fresh, residual2_);
@@ -73,7 +73,7 @@ class GmresMethod {
     ready_ = true;
     return residual2_;
   }
-  PRDP_ONCE auto recompute_residual() {
+  PRDP_NOINLINE auto recompute_residual() {
     if (confirmed_) return residual2();
     confirmed_ = true;
     return residual2_ = space_.residual(x, r_);
@@ -93,7 +93,7 @@ class GmresMethod {
 
  protected:
   /// v₀ = r/‖r‖ and A v_j = Σ h_ij v_i, the h rotated into R as they come. Returns how many columns there are.
-  PRDP_ONCE int64_t extend_basis() {
+  PRDP_NOINLINE int64_t extend_basis() {
     using std::sqrt;
     problem_.begin(space_.constant(sqrt(residual2_)));
     loss_ = Scalar{};
@@ -108,14 +108,14 @@ class GmresMethod {
   }
 
   /// u_{j+1} = A v_j - Σ h_ij v_i, where A u_j was; fills column j of h. Returns the length of A v_j.
-  PRDP_ONCE Scalar orthogonalise(int64_t j) {
+  PRDP_NOINLINE Scalar orthogonalise(int64_t j) {
     using std::sqrt;
     Scalar* column = problem_.column(j);
     auto [left2, taken2] = take_off_basis(problem_.inverse_length(j), j, column);
     const Scalar length = sqrt(taken2 + left2);
     if (space_.lost_orthogonality(left2, taken2, loss_)) {
       left2 = take_off_basis(one_, j, again_.data())[0];
-      PRDP_ROLLED for (int64_t i = 0; i <= j; ++i) column[i] = column[i] + again_[i];
+      PRDP_NO_UNROLL for (int64_t i = 0; i <= j; ++i) column[i] = column[i] + again_[i];
     }
     column[j + 1] = sqrt(left2);
     return length;
@@ -123,10 +123,10 @@ class GmresMethod {
 
   /// w = factor u_{j+1}; along_i = v_i·w and u_{j+1} ← w - Σ along_i v_i, for i ≤ j. Returns the squares of u_{j+1}
   /// and of what was taken off.
-  PRDP_ONCE std::array<Scalar, 2> take_off_basis(const Scalar& factor, int64_t j, Scalar* along) {
+  PRDP_NOINLINE std::array<Scalar, 2> take_off_basis(const Scalar& factor, int64_t j, Scalar* along) {
     space_.dots(u_, j + 1, factor, u_[j + 1], along);
     Scalar taken2{};
-    PRDP_ROLLED for (int64_t i = 0; i <= j; ++i) {
+    PRDP_NO_UNROLL for (int64_t i = 0; i <= j; ++i) {
       along[i] = along[i] * problem_.inverse_length(i);
       weights_[i] = along[i] * problem_.inverse_length(i);
       taken2 = i == 0 ? along[i] * along[i] : taken2 + along[i] * along[i];
@@ -134,7 +134,7 @@ class GmresMethod {
     return {space_.subtract_combination(weights_.data(), u_, j + 1, factor, u_[j + 1]), taken2};
   }
   /// x += M⁻¹ Σ weights_j u_j
-  PRDP_ONCE void move_along_basis(int64_t columns) {
+  PRDP_NOINLINE void move_along_basis(int64_t columns) {
     if (!space_.is_preconditioned()) return space_.add_combination(weights_.data(), u_, columns, x);
     space_.fill_zero(sum_);
     space_.add_combination(weights_.data(), u_, columns, sum_);
@@ -143,11 +143,11 @@ class GmresMethod {
   }
   /// The weights of the u_j that belong to y.
   void weigh(int64_t columns) {
-    PRDP_ROLLED for (int64_t j = 0; j < columns; ++j) weights_[j] = problem_.y(j) * problem_.inverse_length(j);
+    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) weights_[j] = problem_.y(j) * problem_.inverse_length(j);
   }
 
   /// y = argmin ‖r - A V y‖; its derivative is that of a constant where it is damped.
-  PRDP_ONCE void minimise(int64_t columns) {
+  PRDP_NOINLINE void minimise(int64_t columns) {
     using std::sqrt;
     problem_.minimise(columns, space_.constant(sqrt(residual2_)), one_);
     for (int derivative = 1; derivative <= space_.derivatives(); ++derivative) {

@@ -38,7 +38,7 @@ class HessenbergProblem {
   /// Where h_0j … h_{j+1,j} go.
   Scalar* column(int64_t j) { return &h(0, j); }
   /// Takes column j, once it is filled; `length` is ‖A v_j‖.
-  PRDP_ONCE void add_column(int64_t j, const Scalar& length) {
+  PRDP_NOINLINE void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
     exhausted_ = exhausted_ + numbers_.is_zero(numbers_.inverse(h(j + 1, j), scale_));
     h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(numbers_.inverse(h(j + 1, j), scale_ * kOneUnit));
@@ -47,12 +47,12 @@ class HessenbergProblem {
     columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(columns_[j + 1].g));
   }
   /// Where y takes a step so long that its rounding exceeds ‖r‖ = size, A is singular to the dtype, and y is damped.
-  PRDP_ONCE void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
+  PRDP_NOINLINE void minimise(int64_t columns, const Scalar& size, const Scalar& one) {
     Scalar short_enough = one;
-    PRDP_ROLLED for (int64_t j = columns - 1; j >= 0; --j) {
+    PRDP_NO_UNROLL for (int64_t j = columns - 1; j >= 0; --j) {
       Column& c = columns_[j];
       c.y = c.g;
-      PRDP_ROLLED for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
+      PRDP_NO_UNROLL for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
       c.y = c.y * c.inverse;
       short_enough = short_enough * numbers_.is_not_zero(numbers_.inverse(size, scale_ * c.y));
     }
@@ -60,12 +60,12 @@ class HessenbergProblem {
   }
   /// z ← (RᵀR)⁻¹ z
   void solve_normal(Scalar* z, int64_t columns) {
-    PRDP_ROLLED for (int64_t j = 0; j < columns; ++j) {
-      PRDP_ROLLED for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
+    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
+      PRDP_NO_UNROLL for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
       z[j] = z[j] * columns_[j].inverse;
     }
-    PRDP_ROLLED for (int64_t j = columns - 1; j >= 0; --j) {
-      PRDP_ROLLED for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
+    PRDP_NO_UNROLL for (int64_t j = columns - 1; j >= 0; --j) {
+      PRDP_NO_UNROLL for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
       z[j] = z[j] * columns_[j].inverse;
     }
   }
@@ -103,7 +103,7 @@ class HessenbergProblem {
   /// Turns column j of h into one of R, and g along with it.
   void rotate(int64_t j) {
     using std::sqrt;
-    PRDP_ROLLED for (int64_t i = 0; i < j; ++i) {
+    PRDP_NO_UNROLL for (int64_t i = 0; i < j; ++i) {
       const Column& c = columns_[i];
       const Scalar upper = c.cos * h(i, j) + c.sin * h(i + 1, j);
       h(i + 1, j) = c.cos * h(i + 1, j) - c.sin * h(i, j);
@@ -121,9 +121,9 @@ class HessenbergProblem {
   /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being a few rounding errors of A: the next cycles
   /// recover what that holds back of a regular A, and along the null space of a singular one y stays short.
   void damp(int64_t columns, const Scalar& short_enough) {
-    PRDP_ROLLED for (int64_t j = 0; j < columns; ++j) rhs_[j] = columns_[j].g, damped_[j] = columns_[j].y;
+    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) rhs_[j] = columns_[j].g, damped_[j] = columns_[j].y;
     numbers_.damp(h_.data(), m_ + 1, rhs_.data(), columns, scale_ * 4, short_enough, damped_.data());
-    PRDP_ROLLED for (int64_t j = 0; j < columns; ++j) {
+    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
       columns_[j].y = damped_[j];
       columns_[j].inverse = columns_[j].inverse * short_enough;
     }

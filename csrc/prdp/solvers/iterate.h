@@ -26,7 +26,7 @@ int64_t stride(const States& states, bool track) {
 /// At most `cap` iterations of each active sample. With `track`, every residual is looked at that may be
 /// small enough.
 template <class Space, class Method>
-PRDP_ONCE void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
+PRDP_NOINLINE void run(Space& space, Method& method, typename Space::States& states, double rtol, bool track) {
   method.start();
   if (track) observe(space, method, states, rtol);
   for (;;) {
@@ -62,7 +62,7 @@ void repeat_iteration(Method& method, double rtol, int64_t done, const Confirm& 
 
 /// Recomputes the residual of each sample that is not concluded, and sets its status.
 template <class Space, class Method>
-PRDP_ONCE void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
+PRDP_NOINLINE void conclude(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto open = [](const SampleState& s) { return !s.concluded; };
   if (std::none_of(states.begin(), states.end(), open)) return;
   space.freeze_unless(states, open);
@@ -149,7 +149,7 @@ bool choose_answers(Space& space, Method& method, typename Space::States& states
   }
   accept_at_rounding_floor(space, method, states);
   if constexpr (kIsExact<Method>) judge_numerical_singularity(space, method, states);
-  if constexpr (kDescendsEnergy<Method>) excuse_by_energy(space, method, states);
+  if constexpr (kDescendsEnergy<Method>) accept_by_energy(space, method, states);
   bool all_last = true;
   for (auto& s : states) {
     if (s.returned == Returned::kLast) {

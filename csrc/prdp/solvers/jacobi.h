@@ -74,12 +74,12 @@ class JacobiMethod {
   /// ω of n iterations after the first `first`, which is at least one; null without acceleration.
   const Scalar* weights(int64_t first, int64_t n) {
     if (!accelerated_) return nullptr;
-    if (at_ == 0 || first < at_) {
+    if (first_weight_ == 0 || first < first_weight_) {
       radius2_ = space_.radius2();
       omega_[0] = 1 / (1 - radius2_ / 2);
-      at_ = 1;
+      first_weight_ = 1;
     }
-    for (; at_ < first; ++at_) omega_[0] = 1 / (1 - radius2_ * omega_[0] / 4);
+    for (; first_weight_ < first; ++first_weight_) omega_[0] = 1 / (1 - radius2_ * omega_[0] / 4);
     for (int64_t i = 1; i < n; ++i) omega_[i] = 1 / (1 - radius2_ * omega_[i - 1] / 4);
     return omega_.data();
   }
@@ -91,8 +91,8 @@ class JacobiMethod {
   bool ready_ = false;  // next_ and residual2_ belong to x
   int64_t done_ = 0;
   Scalar radius2_{};                 // ρ²
-  ArrayOf<Space, Scalar> omega_;     // of some iterations, the first of which is
-  int64_t at_ = 0;                   // this one, counted from zero; 0: there are none yet
+  ArrayOf<Space, Scalar> omega_;     // of some iterations
+  int64_t first_weight_ = 0;         // the iteration of omega_[0], counted from zero; 0: there are none yet
 };
 
 template <SweepingSpace Space>

@@ -57,8 +57,8 @@ auto rounding_floors(Space& space, const Method& method) {
 /// 1e-5 ‖b‖ is taken for rounding: there u is that of a singular system, which a null vector that nobody named has made
 /// large.
 template <class Space, class Method, class Predicate>
-PRDP_ONCE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states, double rtol,
-                                      const Predicate& doubtful) {
+PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
+                                          double rtol, const Predicate& doubtful) {
   if (std::none_of(states.begin(), states.end(), doubtful)) return;
   const auto all_floors = rounding_floors(space, method);
   const auto slack_of = [&](const SampleState& s, double floor) {
@@ -163,7 +163,7 @@ void confirm_candidates(Space& space, Method& method, typename Space::States& st
 
 /// Looks at the residuals of the active samples, and stops those that are done or lost.
 template <class Space, class Method>
-PRDP_ONCE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
+PRDP_NOINLINE void observe(Space& space, Method& method, typename Space::States& states, double rtol) {
   const auto exhausted = exhausted_of(space, method);
   const bool any_candidates = judge_known_residuals(space, method, states, rtol, exhausted);
   stop_stalled(space, method, states, rtol);

@@ -2,7 +2,6 @@
 
 #include <ATen/TensorSubclassLikeUtils.h>
 
-#include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/methods.h"
@@ -67,45 +66,9 @@ at::Tensor largest_magnitude(const at::Tensor& b) {
                                                 : plain.abs().flatten(1).amax(1);
 }
 
-at::Tensor rounding_of_least_numbers(const at::Tensor& scale, const at::Tensor& b) {
+at::Tensor subnormal_rounding(const at::Tensor& scale, const at::Tensor& b) {
   return scale.flatten() * limits_of(b).least *
          std::sqrt(static_cast<double>(b.numel() / std::max<int64_t>(b.size(0), 1)));
-}
-
-bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
-
-TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
-  const auto of_order_one = [](const at::Tensor& v) {
-    const auto magnitude = largest_magnitude(v);
-    const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
-    return scale_rhs(v, magnitude, usable);
-  };
-  const auto y = of_order_one(x0.detach()).b;
-  auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
-  auto z = a.project_solution(y);
-  if (a.needs_projection()) {
-    takes_product = takes_product.logical_and(
-        only_rounding_is_left(dot_in_order(z, z), dot_in_order(y, y), epsilon_of(b)).logical_not());
-    z = at::where(takes_product, z, at::zeros_like(z));
-  }
-  const auto [product, scale] = of_order_one(a.project(a.apply(z)));
-  const auto product2 = dot_in_order(product, product);
-  const auto alpha = dot_in_order(b, product) / at::where(product2.gt(0), product2, at::ones_like(product2));
-  const auto x = z * scale * alpha, r = b - alpha * product;
-  auto better = dot_in_order(r, r).lt(dot_in_order(b, b)).logical_and(per_sample(x.isfinite().flatten(1).all(1), b));
-  if (a.may_be_singular()) {
-    const auto b2 = dot_in_order(b, b), left2 = dot_in_order(r, r);
-    const auto much = left2.le(0.25 * b2);
-    auto norm = per_sample(a.norm().detach().reshape({-1}).to(b.options()).nan_to_num(0.0), b);
-    const bool may_read = b.is_cpu() && !at::isTensorSubclassLike(b);
-    if (may_read && !norm.any().item<bool>() && !much.all().item<bool>()) {  // not known of a Function
-      const auto of_b = a.apply(b.detach());
-      norm = (dot_in_order(of_b, of_b) / b2).sqrt().nan_to_num(0.0);
-    }
-    const auto size = norm * (scale * alpha).abs() * dot_in_order(z, z).sqrt();
-    better = better & (much | start_gains_more_than_rounding(b2, left2, 0.5 * epsilon_of(b) * size));
-  }
-  return {at::where(better, x, at::zeros_like(x)).detach(), at::where(better, r, b).detach(), takes_product};
 }
 
 PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
@@ -116,7 +79,7 @@ PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveR
   auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
   const auto [whole, scale] = scale_rhs(b, magnitude, takes_part);
   const auto rhs = a.project(whole);
-  const auto rounding = rounding_of_least_numbers(scale, b);
+  const auto rounding = subnormal_rounding(scale, b);
   auto inconsistent = at::zeros_like(takes_part);
   if (a.needs_projection()) {
     const auto outside = outside_range(whole, rhs, solver.rtol, rounding);

@@ -1,21 +1,16 @@
 #pragma once
 #include "prdp/solvers/solve.h"
+#include "prdp/solvers/tensor_start.h"
 
 /// A batch of systems before its first iteration, in plain tensor operations.
 namespace prdp {
-
-/// Where the iterations of a batch start, and whether that took a product. All undefined: at zero.
-struct TensorStart {
-  at::Tensor x, r;     // r = b - A x
-  at::Tensor applied;  // (batch, 1, …)
-};
 
 struct PreparedBatch {
   at::Tensor status;        // (batch,): MAX_ITER of the samples that are not settled yet
   at::Tensor takes_part;    // (batch,): those
   at::Tensor inconsistent;  // (batch,): those of them whose b lies outside the range of A, beyond rtol
   at::Tensor rhs, scale;    // b, scaled and within the range of A; its scale, (batch, 1, …)
-  at::Tensor rounding;      // (batch,): rounding_of_least_numbers() in the scaled b
+  at::Tensor rounding;      // (batch,): subnormal_rounding() in the scaled b
   TensorStart start;
 };
 
@@ -28,13 +23,9 @@ struct ScaledRhs {
 };
 ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part = {});
 
-bool takes_start(Method method, const at::Tensor& x0);
-/// As start_from() (solve_sample.h); b is scaled and within the range of A. A constant: but autograd stays on, as an
-/// operator keeps what it computes first, for later products as well.
-TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0);
 /// max |b| of each sample, (batch,).
 at::Tensor largest_magnitude(const at::Tensor& b);
-/// rounding_of_least_numbers() of vectors like b that were multiplied by `scale`, (batch,).
-at::Tensor rounding_of_least_numbers(const at::Tensor& scale, const at::Tensor& b);
+/// subnormal_rounding() of vectors like b that were multiplied by `scale`, (batch,).
+at::Tensor subnormal_rounding(const at::Tensor& scale, const at::Tensor& b);
 
 }  // namespace prdp

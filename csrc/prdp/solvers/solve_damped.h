@@ -24,15 +24,15 @@ T hypotenuse(T a, T b) {
 template <class T>
 void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y, T* work) {
   T *a = work, *rhs = a + n * n, *row = rhs + n;
-  PRDP_ROLLED for (int64_t j = 0; j < n; ++j) {
+  PRDP_NO_UNROLL for (int64_t j = 0; j < n; ++j) {
     rhs[j] = g[j];
-    PRDP_ROLLED for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+    PRDP_NO_UNROLL for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
   }
-  PRDP_ROLLED for (int64_t k = 0; k < n; ++k) {
-    PRDP_ROLLED for (int64_t j = 0; j < n; ++j) row[j] = 0;
+  PRDP_NO_UNROLL for (int64_t k = 0; k < n; ++k) {
+    PRDP_NO_UNROLL for (int64_t j = 0; j < n; ++j) row[j] = 0;
     row[k] = tau;
     T of_row = 0;
-    PRDP_ROLLED for (int64_t i = k; i < n; ++i) {
+    PRDP_NO_UNROLL for (int64_t i = k; i < n; ++i) {
       const T length = hypotenuse(a[i * n + i], row[i]);
       if (length == T(0)) continue;
       const T cos = a[i * n + i] / length, sin = row[i] / length;
@@ -41,13 +41,13 @@ void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y
         lower = cos * lower - sin * upper;
         upper = rotated;
       };
-      PRDP_ROLLED for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
+      PRDP_NO_UNROLL for (int64_t j = i; j < n; ++j) rotate(a[i * n + j], row[j]);
       rotate(rhs[i], of_row);
     }
   }
-  PRDP_ROLLED for (int64_t i = n - 1; i >= 0; --i) {
+  PRDP_NO_UNROLL for (int64_t i = n - 1; i >= 0; --i) {
     T sum = rhs[i];
-    PRDP_ROLLED for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
+    PRDP_NO_UNROLL for (int64_t j = i + 1; j < n; ++j) sum -= a[i * n + j] * y[j];
     y[i] = a[i * n + i] == T(0) ? T(0) : sum / a[i * n + i];
   }
 }

@@ -154,7 +154,7 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
     const bool looks = trust == Trust::kUnknown && request.guarded && prepared->kernel->looks < few;
     if (looks && prepared->kernel->may_wait()) {
       ++prepared->kernel->looks;
-      trust = trust_by(a, rhs, request, found);
+      trust = verify_first_result(a, rhs, request, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     }
     return found;

@@ -6,9 +6,9 @@
 
 // Functions that a kernel of a GPU holds once, and loops that it does not unroll: copied, they take a minute to compile
 // there.
-#ifndef PRDP_ONCE
-#define PRDP_ONCE
-#define PRDP_ROLLED
+#ifndef PRDP_NOINLINE
+#define PRDP_NOINLINE
+#define PRDP_NO_UNROLL
 #endif
 
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:

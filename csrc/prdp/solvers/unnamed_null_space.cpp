@@ -21,7 +21,7 @@ at::Tensor constant_shares(const at::Tensor& v) {
   const auto sums = channels.sum(-1, /*keepdim=*/false, at::kDouble).view({v.size(0), -1}).norm(2, 1);
   const auto whole = sample_norms(channels);
   const auto part = sums / std::sqrt(static_cast<double>(channels.size(-1)));
-  return at::where(part <= rounding_of_least_numbers(scale, v), 0.0, part / whole);
+  return at::where(part <= subnormal_rounding(scale, v), 0.0, part / whole);
 }
 
 constexpr int64_t kFewProducts = 32, kManyProducts = 256;

@@ -91,7 +91,7 @@ T consistency_bound(double rtol) {
 /// How far, in norm, rounding to denormal numbers may have moved a vector of so many unknowns that was then multiplied
 /// by `scale`: half a denorm_min for each entry, doubled.
 template <class T>
-double rounding_of_least_numbers(double scale, int64_t unknowns) {
+double subnormal_rounding(double scale, int64_t unknowns) {
   return static_cast<double>(std::numeric_limits<T>::denorm_min()) * scale * std::sqrt(static_cast<double>(unknowns));
 }
 

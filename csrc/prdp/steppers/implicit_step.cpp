@@ -29,7 +29,7 @@ SolveResult ImplicitStep::solve(const at::Tensor& u, int64_t adjoint_log) const 
   // On the CPU not before a sample is refused: gradients that go through a view are summed in another order.
   const auto state = at::alias(u);
   auto result = solve_from(state, adjoint_log);
-  block_gradients_of_lost(state, result.info.status, options_.on_failure);
+  block_gradients_of_failed(state, result.info.status, options_.on_failure);
   return result;
 }
 

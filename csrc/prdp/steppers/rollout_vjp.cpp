@@ -52,7 +52,7 @@ std::vector<at::Tensor> vjp_of_solves(const at::Tensor& cotangent, const KeptSol
   solve_by_solve_back(cotangent, picard, options.adjoint_log, [&](int64_t s) {
     const int64_t first = s - s % picard;
     if (options.on_failure == OnFailure::kZeroGrad && s == first + picard - 1)  // whichever solve of the step failed
-      bars[s + 1] = without_lost(bars[s + 1], kept.status.slice(1, first, s + 1).amin(1), options.on_failure);
+      bars[s + 1] = without_failed(bars[s + 1], kept.status.slice(1, first, s + 1).amin(1), options.on_failure);
     const auto a = equation_operator(equation, at_solve(kept.solutions, s));
     Solved solved{{},
                   at_solve(kept.solutions, s + 1),

@@ -59,14 +59,14 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   void take_b() { b2_ = dot(b(), b()); }
   /// A as it will be used; false where it is not finite.
-  PRDP_ONCE bool prepare_operator() {
+  PRDP_NOINLINE bool prepare_operator() {
     if (!scale_operator<T>(team_, a_)) return false;
     factor_ = a_.factor();
     norm_ = largest_over_rows([&](int i) { return a_.norm_of_row(i); });
     return true;
   }
   T factor() const { return factor_; }
-  PRDP_ONCE bool has_zero_diagonal() {
+  PRDP_NOINLINE bool has_zero_diagonal() {
     return largest_over_rows([&](int i) { return T(a_.diagonal(i) == T(0)); }) != 0;
   }
   /// project: orthogonal projection onto range(A), returns the norm of what it removes. project_solution: onto the
@@ -77,7 +77,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   Vector start() { return own(Vectors::kStart); }
   Vector original_b() { return own(Vectors::kOriginalB); }
   /// From here on b() is what start() leaves of it, which is in original_b(); they change places.
-  PRDP_ONCE void shift_to_start(T left2) {
+  PRDP_NOINLINE void shift_to_start(T left2) {
     this->template each<1>([&](int i) { return Pair{b()[i], original_b()[i]}; },
                            [&](int i, Pair both) {
                              original_b()[i] = both.first;
@@ -94,7 +94,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   // ---- what space.h asks for
   Vector b() { return own(Vectors::kB); }
   Scalar b2() const { return b2_; }
-  PRDP_ONCE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
+  PRDP_NOINLINE Scalar update_iterate_and_residual(Scalar alpha, const T* p, const T* q, Vector x, Vector r) {
     T s[2] = {0, 0};
     const bool on_one = projects_on_one();
     each([&](int i) { return Pair{x[i] + alpha * p[i], r[i] - alpha * q[i]}; },
@@ -107,14 +107,14 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     sum_with_part(s);
     return needs_projection_ ? projected(r, s[0], s[1]) : s[0];  // no product takes away what rounding leaves there
   }
-  PRDP_ONCE void apply(const T* v, Vector out) {
+  PRDP_NOINLINE void apply(const T* v, Vector out) {
     product(v, [&](int i, T value) { out[i] = value; });
     if (needs_projection_) project(out);
   }
   void keep_in_range(Vector v) {
     if (needs_projection_) project(v);
   }
-  PRDP_ONCE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
+  PRDP_NOINLINE std::array<Scalar, 2> apply_with_dots(const T* v, Vector out) {
     T s[3] = {0, 0, 0};
     const bool on_one = projects_on_one();
     product(v, [&](int i, T value) {
@@ -128,7 +128,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     return {s[0], needs_projection_ ? projected(out, s[1], s[2]) : s[1]};
   }
   /// r = b - A u, within the range of A, where u is x and the start; returns ‖r‖².
-  PRDP_ONCE Scalar residual(const T* x, Vector r) {
+  PRDP_NOINLINE Scalar residual(const T* x, Vector r) {
     const T* const of = started_ ? original_b() : b();
     T s = 0;
     product<1>(solution(x), [&](int i, T value) {
@@ -145,7 +145,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     const T* u = solution(x);
     return dot(u, u);
   }
-  PRDP_ONCE Scalar componentwise_scale2(const T* x) {
+  PRDP_NOINLINE Scalar componentwise_scale2(const T* x) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
     this->template each<1>([&](int i) { return is_negated(i) ? -u[i] : u[i]; }, into(signed_u));
@@ -156,7 +156,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
 
   static constexpr bool is_preconditioned() { return S::kByDiagonal || S::Cycles::kAny; }
-  PRDP_ONCE Scalar precondition(const T* v, Vector out) {
+  PRDP_NOINLINE Scalar precondition(const T* v, Vector out) {
     T s = 0;
     if constexpr (S::Cycles::kAny) {
       if constexpr (std::is_same<A, typename A::Cycled>::value)
@@ -178,13 +178,13 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   /// Whether there is a preconditioner of the kind that is asked for.
   bool has_preconditioner() const { return cycle_.exists(); }
 
-  PRDP_ONCE void divide_by_diagonal(const T* x, Vector y) {
+  PRDP_NOINLINE void divide_by_diagonal(const T* x, Vector y) {
     each([&](int i) { return x[i] / a_.diagonal(i); }, into(y));
   }
-  PRDP_ONCE void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
+  PRDP_NOINLINE void sweeps(const T* c, Vector& x, Vector& next, int64_t n, const T* omega) {
     for (int64_t k = 0; k < n; ++k, std::swap(x, next)) sweep(c, x, next, omega ? omega + k : nullptr, [](int, T) {});
   }
-  PRDP_ONCE Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
+  PRDP_NOINLINE Scalar measured_sweep(const T* c, const T* x, Vector next, const T* omega) {
     T s = 0;
     sweep(c, x, next, omega, [&](int i, T change) {
       const T left = change * a_.diagonal(i);
@@ -196,8 +196,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   static constexpr bool sweeps_are_log_convex() { return A::kKnowsRadius; }
 
   /// Seldom: one thread computes it.
-  PRDP_ONCE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
-                      Scalar* y) const {
+  PRDP_NOINLINE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
+                          Scalar* y) const {
     if (keep != 0) return;
     T* const work = beyond_ + Vectors::kDampingAt;
     T* const found = work + numbers_of_solve_damped(n);
@@ -246,7 +246,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if constexpr (kAtOnce == 1) this->template each<1>([&](int i) { return entry_of_product(v, i); }, store);
     else this->template each<kAtOnce>([&](int i) { return a_.product(Shared<S::kBlocks, T>{v}, i); }, store);
   }
-  PRDP_ONCE T entry_of_product(const T* v, int i) const { return a_.product(Shared<S::kBlocks, T>{v}, i); }
+  PRDP_NOINLINE T entry_of_product(const T* v, int i) const { return a_.product(Shared<S::kBlocks, T>{v}, i); }
   /// next = x + c - D⁻¹A x; with omega, next = next + omega (that - next). tell(i, c_i - (D⁻¹A x)_i)
   template <class Tell>
   void sweep(const T* c, const T* x, Vector next, const T* omega, const Tell& tell) {
@@ -265,7 +265,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     return space.basis ? space.basis[k * length + at] : constant_;
   }
   /// Parts no larger than `negligible` stay.
-  PRDP_ONCE T project(const NullSpaceArguments<T>& space, Vector v, T negligible = 0) {
+  PRDP_NOINLINE T project(const NullSpaceArguments<T>& space, Vector v, T negligible = 0) {
     double part2 = 0;
     for (int field = 0; field < static_cast<int>(space.fields); ++field)
       for (int k = 0; k < static_cast<int>(space.count); ++k) {
@@ -294,14 +294,14 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   }
   /// Removes the component of v in null(Aᵀ) if it is above ε/8 ‖v‖, where ‖v‖² = vv; returns the new ‖v‖². `along`: the
   /// component along the vector, where there is only one.
-  PRDP_ONCE T projected(Vector v, T vv, T along) {
+  PRDP_NOINLINE T projected(Vector v, T vv, T along) {
     const T negligible = std::numeric_limits<T>::epsilon() / 8 * std::sqrt(vv);
     if (!projects_on_one()) along = project(left_null_space_, v, negligible);
     else if (!(std::abs(along) <= negligible)) take_off(left_null_space_, 0, 0, along, v);
     else return vv;
     return along * along < vv / 2 ? vv - along * along : dot(v, v);
   }
-  PRDP_ONCE const T* solution(const T* x) {
+  PRDP_NOINLINE const T* solution(const T* x) {
     if (!started_) return x;
     this->template each<1>([&](int i) { return x[i] + start()[i]; }, into(scratch()));
     return scratch();

@@ -32,7 +32,7 @@ class BlockVectors {
   // ---- a sample (solve_sample.h)
 
   /// y = factor x, where one of the two is no vector of the space.
-  PRDP_ONCE void load(const T* x, T factor, Vector y) {
+  PRDP_NOINLINE void load(const T* x, T factor, Vector y) {
     each<1>([&](int i) { return factor * x[i]; }, into(y));
   }
   T store(const T* x, T factor, T* u) {
@@ -41,42 +41,46 @@ class BlockVectors {
   }
   /// Of an array that is no vector of the space; only spaces that pad their vectors tell the two apart.
   T largest_given(const T* x) { return largest_magnitude(x); }
-  PRDP_ONCE T largest_magnitude(const T* x) {
+  PRDP_NOINLINE T largest_magnitude(const T* x) {
     return largest_over_rows([&](int i) { return std::abs(x[i]); });
   }
   void scale(T factor, Vector x) { load(x, factor, x); }
-  PRDP_ONCE void axpy(T alpha, const T* x, Vector y) {
+  PRDP_NOINLINE void axpy(T alpha, const T* x, Vector y) {
     each<1>([&](int i) { return y[i] + alpha * x[i]; }, into(y));
   }
 
   // ---- primitives
 
-  Vector vector() { return vector_at(S::Cycles::kVectors + used_++); }
+  Vector vector() {
+    require(S::Cycles::kVectors + used_ < S::kVectors);
+    return vector_at(S::Cycles::kVectors + used_++);
+  }
   Vector scratch() { return own(kScratch); }
   static constexpr int64_t unknowns() { return A::kUnknowns; }
   template <class X>
   Slice<X> array(int64_t n) const {
     auto* first = reinterpret_cast<X*>(numbers_ + used_numbers_);
     used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
+    require(used_numbers_ <= S::kNumbers);
     return {first, n};
   }
-  PRDP_ONCE void fill_zero(Vector v) {
+  PRDP_NOINLINE void fill_zero(Vector v) {
     each<1>([](int) { return T(0); }, into(v));
   }
-  PRDP_ONCE void copy(const T* from, Vector to) {
+  PRDP_NOINLINE void copy(const T* from, Vector to) {
     each([&](int i) { return from[i]; }, into(to));
   }
   void advance(Vector& x, Vector& next) { std::swap(x, next); }
-  PRDP_ONCE void add(const T* d, Vector x) {
+  PRDP_NOINLINE void add(const T* d, Vector x) {
     each<1>([&](int i) { return x[i] + d[i]; }, into(x));
   }
-  PRDP_ONCE void xpby(const T* x, Scalar beta, Vector y) {
+  PRDP_NOINLINE void xpby(const T* x, Scalar beta, Vector y) {
     each([&](int i) { return x[i] + beta * y[i]; }, into(y));
   }
-  PRDP_ONCE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
+  PRDP_NOINLINE Scalar xpby_with_square(const T* x, Scalar beta, Vector y) {
     return square_of([&](int i) { return x[i] + beta * y[i]; }, y);
   }
-  PRDP_ONCE Scalar dot(const T* v, const T* w) {
+  PRDP_NOINLINE Scalar dot(const T* v, const T* w) {
     T s = 0;
     each([&](int i) { return v[i] * w[i]; }, [&](int, T value) { s += value; });
     return team_.sum(s);
@@ -84,7 +88,7 @@ class BlockVectors {
 
   // ---- GMRES
 
-  PRDP_ONCE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
+  PRDP_NOINLINE void dots(const Slice<Vector>& v, int64_t count, Scalar factor, const T* w, Scalar* h) {
     for (int64_t j = 0; j < count; j += kMostAtOnce) {
       T s[kMostAtOnce] = {};
       const int some = static_cast<int>(count - j < kMostAtOnce ? count - j : kMostAtOnce);
@@ -96,21 +100,21 @@ class BlockVectors {
       for (int k = 0; k < some; ++k) h[j + k] = s[k];
     }
   }
-  PRDP_ONCE Scalar subtract_combination(const Scalar* h, const Slice<Vector>& v, int64_t count, Scalar factor,
-                                        Vector w) {
+  PRDP_NOINLINE Scalar subtract_combination(const Scalar* h, const Slice<Vector>& v, int64_t count, Scalar factor,
+                                            Vector w) {
     return square_of(
         [&](int i) {
           T sum = factor * w[i];
-          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum -= h[j] * v[j][i];
+          PRDP_NO_UNROLL for (int j = 0; j < static_cast<int>(count); ++j) sum -= h[j] * v[j][i];
           return sum;
         },
         w);
   }
-  PRDP_ONCE void add_combination(const Scalar* y, const Slice<Vector>& v, int64_t count, Vector x) {
+  PRDP_NOINLINE void add_combination(const Scalar* y, const Slice<Vector>& v, int64_t count, Vector x) {
     each(
         [&](int i) {
           T sum = x[i];
-          PRDP_ROLLED for (int j = 0; j < static_cast<int>(count); ++j) sum += y[j] * v[j][i];
+          PRDP_NO_UNROLL for (int j = 0; j < static_cast<int>(count); ++j) sum += y[j] * v[j][i];
           return sum;
         },
         into(x));
@@ -155,6 +159,11 @@ class BlockVectors {
   T *in_block_, *beyond_;
 
  private:
+  /// A method takes no more than solve_kernel() made room for.
+  static void require(bool has_room) {
+    if (!has_room) __trap();
+  }
+
   int used_ = kOwnVectors;
   alignas(8) mutable char numbers_[S::kNumbers > 0 ? S::kNumbers : 1];
   mutable int64_t used_numbers_ = 0;

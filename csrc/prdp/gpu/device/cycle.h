@@ -48,7 +48,7 @@ struct Cycle {
   bool exists() const { return grids().count > 0; }
 
   /// z = M⁻¹ r; x, y and spare are scratch.
-  PRDP_ONCE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* spare) const {
+  PRDP_NOINLINE void apply(TeamOfSample& team, const A& a, const T* r, T* z, T* x, T* y, T* spare) const {
     VCycle cycle{*this, team, a, r, {nullptr, x, y}, spare};
     const int coarsest = static_cast<int>(grids().count) - 1;
     for (int level = 0; level < coarsest; ++level) cycle.go_down(level);
@@ -118,7 +118,7 @@ struct Cycle {
     // ---- from grid to grid
 
     /// Smooths, and takes the residual to the right-hand side of the next grid, one axis after the other.
-    PRDP_ONCE void go_down(int level) {
+    PRDP_NOINLINE void go_down(int level) {
       const CoarseGrid& here = grid(level);
       smooth(level, /*from_zero=*/true);
       take_residual(level);
@@ -134,7 +134,7 @@ struct Cycle {
         from = to;
       }
     }
-    PRDP_ONCE void solve_coarsest(int level) {
+    PRDP_NOINLINE void solve_coarsest(int level) {
       const T* const b = right_hand_side(level);
       const T* const inverse = cycle.numbers(cycle.grids().inverse);
       const int n = grid(level).points();
@@ -145,12 +145,13 @@ struct Cycle {
       team.for_each(kFields * n, [&](int at) {
         const int i = at % n;
         T sum = 0;
-        PRDP_ROLLED for (int j = 0; j < n; ++j) sum += inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
+        PRDP_NO_UNROLL for (int j = 0; j < n; ++j) sum +=
+            inverse[by_columns ? j * n + i : i * n + j] * given[at - i + j];
         x[at] = sum;
       });
     }
     /// Adds the solution of the coarser grid to that of this one, smooths, and returns it.
-    PRDP_ONCE const T* go_up(int level, const T* coarse) {
+    PRDP_NOINLINE const T* go_up(int level, const T* coarse) {
       vectors = level == 0 ? finest : vectors_of(level);
       // On the way down smooth() swapped x and y once for each step but the first.
       if (level > 0 && cycle.hierarchy.smoothing % 2 == 0) std::swap(vectors.x, vectors.y);
@@ -169,7 +170,7 @@ struct Cycle {
     // ---- on a grid
 
     /// Steps towards A x = b, from x = 0 with `from_zero`, else from x. y is scratch.
-    PRDP_ONCE void smooth(int level, bool from_zero) {
+    PRDP_NOINLINE void smooth(int level, bool from_zero) {
       kernels::SmoothingSteps steps(grid(level).radius);
       for (int64_t s = 0; s < cycle.hierarchy.smoothing; ++s) {
         const kernels::SmoothingStep step = steps.next();
@@ -182,7 +183,7 @@ struct Cycle {
       }
     }
     /// x = q D⁻¹ b, and y = 0, the iterate before it.
-    PRDP_ONCE void begin(int level, T q) {
+    PRDP_NOINLINE void begin(int level, T q) {
       const T *const b = right_hand_side(level), *const diagonal = diagonals(level);
       T *const x = vectors.x, *const y = vectors.y;
       const int n = grid(level).points();
@@ -195,7 +196,7 @@ struct Cycle {
     void take_residual(int level) { relax(level, T(0), T(0)); }
     /// y = x + p (x - y) + q D⁻¹(b - A x); with q = 0, y = b - A x: products are most of what there is to compile, so
     /// there is one text of both.
-    PRDP_ONCE void relax(int level, T p, T q) {
+    PRDP_NOINLINE void relax(int level, T p, T q) {
       if (level == 0) return relax(OnFinest{a, diagonals(0)}, r, A::kUnknowns, p, q);
       const CoarseGrid& here = grid(level);
       const int n = here.points();
@@ -204,7 +205,7 @@ struct Cycle {
       relax(coarse, vectors.b, kFields * n, p, q);
     }
     template <class Level>
-    PRDP_ONCE void relax(const Level& level, const T* b, int n, T p, T q) {
+    PRDP_NOINLINE void relax(const Level& level, const T* b, int n, T p, T q) {
       const T* const x = vectors.x;
       T* const y = vectors.y;
       team.meet();
@@ -222,14 +223,14 @@ struct Cycle {
 
     // ---- between grids, along one axis
 
-    PRDP_ONCE void restrict(const CoarseGrid& here, int axis, const T* fine, T* coarse) {
+    PRDP_NOINLINE void restrict(const CoarseGrid& here, int axis, const T* fine, T* coarse) {
       const CoarsenedAxis line = line_of(here, axis);
       const Weights w = weights(here, axis, line, /*of_restriction=*/true);
       const auto given = shared(fine);
       team.for_each(kFields * line.coarse_entries(),
                     [&](int i) { coarse[i] = line.restricted(given, w.left, w.right, i); });
     }
-    PRDP_ONCE void interpolate(const CoarseGrid& here, int axis, const T* coarse, T* fine, bool adds) {
+    PRDP_NOINLINE void interpolate(const CoarseGrid& here, int axis, const T* coarse, T* fine, bool adds) {
       const CoarsenedAxis line = line_of(here, axis);
       const Weights w = weights(here, axis, line, /*of_restriction=*/false);
       const auto given = shared(coarse);

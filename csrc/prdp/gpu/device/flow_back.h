@@ -1,6 +1,6 @@
 #pragma once
+#include "prdp/gpu/device/broadcast_sum.h"
 #include "prdp/gpu/device/flow.h"
-#include "prdp/gpu/device/shared_sum.h"
 
 /// The reverse of the explicit part: each cotangent gathers from the points that read its value.
 namespace prdp::gpu {
@@ -176,7 +176,7 @@ struct FlowBars {
   FlowStateBars<T> state;
   int of_state, ends;
   FlowEndBars<T> end[kMostEnds];
-  SharedSum force, of_nu;  // of none: without terms
+  BroadcastSum force, of_nu;  // of none: without terms
   FlowViscosityBars<T> nu;
   double *force_out, *nu_out;
 
@@ -188,7 +188,7 @@ struct FlowBars {
       i -= end[k].count;
     }
     const auto& reverse = state.reverse;
-    using At = int[SharedSum::kAxes];
+    using At = int[BroadcastSum::kAxes];
     if (i < force.count) {
       force_out[i] = force.sum(i, [&](const At& at) { return reverse.given(at[0], at[1], {{at[2], at[3], at[4]}}); });
       return;

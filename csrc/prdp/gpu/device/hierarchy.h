@@ -79,7 +79,7 @@ class HierarchyMaker {
   static auto shared(const T* v) { return Shared<S::kBlocks, T>{v}; }
 
   /// The coefficients of A itself.
-  PRDP_ONCE Stencil finest(const A& a) {
+  PRDP_NOINLINE Stencil finest(const A& a) {
     Stencil made{nullptr, {A::Points::kZ, A::Points::kY, A::Points::kX}};
     constexpr int n = A::Points::kPoints;
     T* const to = take(int64_t{kOffsets} * n);
@@ -96,7 +96,7 @@ class HierarchyMaker {
   }
 
   /// To the last bit. It needs no barrier first: gershgorin_bound() has met since the coefficients were written.
-  PRDP_ONCE bool is_symmetric(const Stencil& a) {
+  PRDP_NOINLINE bool is_symmetric(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
     T differs = 0;
@@ -109,7 +109,7 @@ class HierarchyMaker {
   }
 
   /// Σ_k |a_k| / |a_0|, the largest of all points; infinite where a diagonal is zero, or a number is not finite.
-  PRDP_ONCE double gershgorin_bound(const Stencil& a) {
+  PRDP_NOINLINE double gershgorin_bound(const Stencil& a) {
     const int n = a.points();
     const auto entry = shared(a.coefficients);
     return static_cast<double>(largest_of(team_, n, [&](int i) {
@@ -120,7 +120,7 @@ class HierarchyMaker {
   }
 
   /// Estimated from at most 8,191 of the points, an odd number apart, so that no axis shows the same places alone.
-  PRDP_ONCE kernels::Axes axes_to_coarsen(const Stencil& a) {
+  PRDP_NOINLINE kernels::Axes axes_to_coarsen(const Stencil& a) {
     const int n = a.points(), step = (n / 4096 > 1 ? n / 4096 : 1) | 1;
     const auto entry = shared(a.coefficients);
     double along[4] = {}, net[4] = {};  // of each axis; and of the rows
@@ -147,7 +147,7 @@ class HierarchyMaker {
   }
 
   /// The weights of the axis, which are kept, and the operator on the coarse points.
-  PRDP_ONCE Stencil galerkin_product(const Stencil& a, int axis) {
+  PRDP_NOINLINE Stencil galerkin_product(const Stencil& a, int axis) {
     const CoarsenedAxis line(a.shape, axis, A::periodic(axis));
     T* const weights = take(int64_t{symmetric_ ? 2 : 4} * line.weights());
     make_weights(a, line, axis, weights);
@@ -169,7 +169,7 @@ class HierarchyMaker {
 
   /// Of a symmetric operator, interpolation and restriction are the same; else interpolation comes from the symmetric
   /// part and restriction from the transpose (Dendy 1983).
-  PRDP_ONCE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
+  PRDP_NOINLINE void make_weights(const Stencil& a, const CoarsenedAxis& line, int axis, T* to) {
     const int n = a.points(), weights = line.weights();
     const auto entry = shared(a.coefficients);
     team_.for_each(weights, [&](int w) {
@@ -271,7 +271,7 @@ class HierarchyMaker {
   }
 
   /// Whether it could be inverted, or where it is singular within the nullity, pseudo-inverted.
-  PRDP_ONCE bool invert_coarsest(const Stencil& a) {
+  PRDP_NOINLINE bool invert_coarsest(const Stencil& a) {
     const int n = a.points();
     if (n > kMostOfCoarsest) return false;
     T* const inverse = take(int64_t{n} * n);

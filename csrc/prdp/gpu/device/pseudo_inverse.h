@@ -107,7 +107,7 @@ struct OrthogonalDecomposition {
   }
 
   /// What R has beside its first columns goes into them: each thread has rows of its own.
-  void take_in_the_rest() {
+  void annihilate_trailing_columns() {
     for (int k = rank < n ? rank - 1 : -1; k >= 0; --k) {
       __syncthreads();
       double beyond = 0;
@@ -169,11 +169,11 @@ struct OrthogonalDecomposition {
 /// many are left out, unless the null vectors of pockets are gone on so coarse a grid. Returns the largest number that
 /// this thread wrote.
 template <int threads, class T>
-PRDP_ONCE T pseudo_inverse(int n, double* work, int nullity, double tiny, T* out) {
+PRDP_NOINLINE T pseudo_inverse(int n, double* work, int nullity, double tiny, T* out) {
   OrthogonalDecomposition<threads> of(n, work);
   of.balance();
   of.triangularise(nullity, tiny);
-  of.take_in_the_rest();
+  of.annihilate_trailing_columns();
   T largest = 0;
   for (int j = of.t; j < n; j += threads) {
     of.solve_for_column(j);

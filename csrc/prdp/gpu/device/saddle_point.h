@@ -19,7 +19,7 @@ struct SaddlePoint {
   T* memory[6];
 
   /// z = M⁻¹ r. That of Aᵀ is made of Aᵀ, as on the CPU.
-  PRDP_ONCE void apply(const T* r, T* z) const {
+  PRDP_NOINLINE void apply(const T* r, T* z) const {
     T *const c = memory[3], *const p = memory[4] + kVelocity;
     team.meet();
     const Shared<S::kBlocks, T> given{r};
@@ -41,7 +41,7 @@ struct SaddlePoint {
     bool is_pressure;
     T operator[](int i) const { return (i >= kVelocity) == is_pressure ? v[i] : T(0); }
   };
-  PRDP_ONCE T product(const Part& v, int row) const { return a.product(v, row); }
+  PRDP_NOINLINE T product(const Part& v, int row) const { return a.product(v, row); }
 
   void solve_schur(const T* r, T* p) const {
     cycle.apply(team, a.laplacian(), r, p, memory[0], memory[1], memory[2]);
@@ -49,14 +49,14 @@ struct SaddlePoint {
     team.for_each(kPressure, [&](int i) { p[i] = of_laplacian * p[i] + of_identity * r[i]; });
   }
   /// Sweeps from zero; returns the vector that holds the result.
-  PRDP_ONCE const T* solve_velocity(const T* c) const {
+  PRDP_NOINLINE const T* solve_velocity(const T* c) const {
     T *x = memory[4], *next = memory[5], *const diagonal = memory[0];
     team.for_each(kVelocity, [&](int i) {
       diagonal[i] = a.diagonal(i);
       x[i] = c[i] / diagonal[i];
     });
     constexpr int64_t sweeps_per_smoothing = 2;
-    PRDP_ROLLED for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
+    PRDP_NO_UNROLL for (int64_t s = 1; s < sweeps_per_smoothing * cycle.hierarchy.smoothing; ++s, std::swap(x, next)) {
       team.meet();
       const Part velocity{{x}, /*is_pressure=*/false};
       team.for_each(kVelocity, [&](int i) { next[i] = x[i] + (c[i] - product(velocity, i)) / diagonal[i]; });

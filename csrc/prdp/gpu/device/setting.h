@@ -26,7 +26,7 @@ struct Setting {
 template <class X>
 class Slice {
  public:
-  Slice(X* first, int64_t n) : first_(first) { PRDP_ROLLED for (int64_t i = 0; i < n; ++i) first_[i] = X{}; }
+  Slice(X* first, int64_t n) : first_(first) { PRDP_NO_UNROLL for (int64_t i = 0; i < n; ++i) first_[i] = X{}; }
   X& operator[](int64_t i) { return first_[i]; }
   const X& operator[](int64_t i) const { return first_[i]; }
   X* data() { return first_; }

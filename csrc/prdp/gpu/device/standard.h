@@ -6,9 +6,9 @@ using int32_t = int;
 using uint64_t = unsigned long;
 
 #define PRDP_UNROLL _Pragma("unroll")
-#define PRDP_ROLLED _Pragma("unroll 1")
+#define PRDP_NO_UNROLL _Pragma("unroll 1")
 /// Functions that are not copied to where they are called: else a kernel takes a minute to compile.
-#define PRDP_ONCE __noinline__
+#define PRDP_NOINLINE __noinline__
 #define PRDP_SPIN \
   {               \
   }

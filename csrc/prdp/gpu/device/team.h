@@ -43,8 +43,8 @@ class Team {
   template <int kAtOnce = kCellsAtOnce, class F, class Store>
   void each(int n, const F& f, const Store& store) const {
     const Share mine = share_of(n);
-    PRDP_ROLLED for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end;
-                     first += kThreads * kAtOnce) {
+    PRDP_NO_UNROLL for (int first = mine.begin + static_cast<int>(threadIdx.x); first < mine.end;
+                        first += kThreads * kAtOnce) {
       decltype(f(0)) value[kAtOnce];
       PRDP_UNROLL for (int k = 0; k < kAtOnce; ++k) if (first + k * kThreads < mine.end) value[k] =
           f(first + k * kThreads);
@@ -57,7 +57,7 @@ class Team {
   template <class F>
   void for_each(int n, const F& f) const {
     const Share mine = share_of(n);
-    PRDP_ROLLED for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
+    PRDP_NO_UNROLL for (int i = mine.begin + static_cast<int>(threadIdx.x); i < mine.end; i += kThreads) f(i);
   }
 
   /// Waits for all threads of the team, and sees what they wrote. Tests leave out the one of a line, and must notice.
@@ -116,7 +116,7 @@ class Team {
 
   /// join(v, 0) must be v.
   template <int n, class T, class Join>
-  PRDP_ONCE void reduce(T (&s)[n], const Join& join) {
+  PRDP_NOINLINE void reduce(T (&s)[n], const Join& join) {
     static_assert(n <= kMostAtOnce);
     // Two of each, in turn: the next sum may begin while a slow thread still reads this one.
     __shared__ T of_warps[2][n][kWarp];

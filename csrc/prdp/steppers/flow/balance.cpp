@@ -24,7 +24,7 @@ double largest_viscosity(const FlowEquation& e) {
 Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOptions& options, CombinedInfo& info) {
   if (!is_incremental(e)) return {change, {}};
   const double limit = largest_viscosity(e);
-  if (flow_kernels::take(change)) {
+  if (flow_kernels::can_run(change)) {
     const ByKernels by{
         {.added = {change}}, {.added = {change}, .share_by_nu = e.nu, .largest_nu = limit}, {.factor = -1.0}};
     if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u, found->potential};
@@ -40,7 +40,7 @@ namespace {
 FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const at::Tensor& potential_bar,
                       const SolveOptions& options, CombinedInfo& info) {
   const double limit = largest_viscosity(e);
-  if (flow_kernels::take(cotangent[0])) {
+  if (flow_kernels::can_run(cotangent[0])) {
     const ByKernels by{{.added = cotangent, .potential_bar = potential_bar, .share_by_nu = e.nu, .largest_nu = limit},
                        {.added = cotangent},
                        {.factor = scale_of_pressure(*e.box)},

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/diffusion.h"
 
+#include "prdp/operators/stencil_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/steppers/flow/kernels.h"
 #include "prdp/steppers/flow/stencil_of.h"
@@ -8,7 +9,7 @@ namespace prdp {
 
 std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::Tensor& like) {
   const auto& patterns = e.box->fields(like.options()).diffusion;
-  const auto made = flow_kernels::take(like) ? flow_kernels::diffusion_coefficients(e, like) : at::Tensor();
+  const auto made = flow_kernels::can_run(like) ? flow_kernels::diffusion_coefficients(e, like) : at::Tensor();
   std::vector<OperatorSpec> operators;
   for (size_t k = 0; k < patterns.size(); ++k) {
     if (made.defined()) {
@@ -23,13 +24,9 @@ std::vector<OperatorSpec> diffusion_operators(const FlowEquation& e, const at::T
 }
 
 OperatorSpec stencil_of(const FlowBox& box, const at::Tensor& coefficients) {
-  OperatorSpec spec{"stencil", box.shape(), {}, {coefficients}};
-  const int64_t d = box.dim();
-  for (int64_t axis = 0; axis < d; ++axis) spec.parameters.push_back(box.boundary(axis) == FlowBoundary::kPeriodic);
-  for (int64_t k = 0; k <= 2 * d; ++k)
-    for (int64_t axis = 0; axis < d; ++axis)
-      spec.parameters.push_back(k > 0 && (k - 1) / 2 == axis ? (k % 2 ? -1.0 : 1.0) : 0.0);
-  return spec;
+  std::vector<bool> periodic;
+  for (int64_t axis = 0; axis < box.dim(); ++axis) periodic.push_back(box.boundary(axis) == FlowBoundary::kPeriodic);
+  return nearest_stencil(coefficients, box.shape(), periodic);
 }
 
 FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>& operators, const at::Tensor& change,
@@ -39,7 +36,7 @@ FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>&
   for (size_t k = 0; k < operators.size(); ++k)
     parts.push_back(solve(operators[k], change.narrow(1, static_cast<int64_t>(k) * width, width), options, info));
   const auto& free = equation.box->fields(change.options()).free;
-  if (flow_kernels::take(change)) return parts;
+  if (flow_kernels::can_run(change)) return parts;
   const auto all = joined(parts);
   return {free.defined() ? all * free : all};  // a preconditioner may leave something on the faces of solids
 }
@@ -61,7 +58,7 @@ DiffuseVjp diffuse_vjp(const FlowEquation& equation, const std::vector<OperatorS
     const auto share = total(found.coefficients * patterns[k]) * equation.dt;
     nu = nu.defined() ? nu + share : share;
   }
-  if (!flow_kernels::take(cotangent)) parts = {joined(parts)};
+  if (!flow_kernels::can_run(cotangent)) parts = {joined(parts)};
   return {parts, nu};
 }
 

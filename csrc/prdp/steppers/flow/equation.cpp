@@ -129,7 +129,7 @@ void FlowEquation::check(const at::Tensor& u) const {
 FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
   auto all = tensors();
   // Kernels take a number of the host as it is: a copy would make the host wait.
-  const bool stays = nu.is_cpu() && flow_kernels::take(u);
+  const bool stays = nu.is_cpu() && flow_kernels::can_run(u);
   all[0] = stays ? nu.to(u.scalar_type()) : nu.to(u.options());
   for (size_t i = 1; i < all.size(); ++i) {
     if (i > 2 && all[i].defined() && all[i].dim() > 1) all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - 3) / 2);

@@ -13,7 +13,7 @@ namespace {
 constexpr const char *kFlow = "prdp/gpu/device/flow.h", *kPressure = "prdp/gpu/device/flow_pressure.h";
 
 template <class T>
-gpu::FlowVelocity<T> velocity_of(const FlowBox& box, const Correction& of, const at::Tensor& like) {
+gpu::FlowVelocity<T> velocity_of(const FlowBox& box, const UncorrectedVelocity& of, const at::Tensor& like) {
   return {.grid = grid_of(box),
           .base = field_of<const T>(of.base),
           .added = field_of<const T>(of.added),
@@ -30,26 +30,26 @@ gpu::FlowClosedParts<T> parts_of(const FlowBox& box, const at::Tensor& like) {
 }
 
 template <class T>
-gpu::FlowShare<T> share_of(const Correction& of) {
+gpu::FlowShare<T> share_of(const UncorrectedVelocity& of) {
   return {number_of<T>(of.share_by_nu), of.largest_nu};
 }
 
-const at::Tensor& velocity_like(const Correction& of) { return of.base.defined() ? of.base : of.added[0]; }
+const at::Tensor& velocity_like(const UncorrectedVelocity& of) { return of.base.defined() ? of.base : of.added[0]; }
 
 }  // namespace
 
-bool take(const at::Tensor& u) {
+bool can_run(const at::Tensor& u) {
   return gpu::runtime_of(u.device()) && !at::GradMode::is_enabled() && is_plain(u) && u.numel() > 0;
 }
 
-std::optional<Start> start(const FlowEquation& e, const at::Tensor& u) {
-  if (!take(u)) return std::nullopt;
+std::optional<PaddedVelocity> pad_velocity(const FlowEquation& e, const at::Tensor& u) {
+  if (!can_run(u)) return std::nullopt;
   const auto& box = *e.box;
   const auto& fields = box.fields(u.options());
   const int64_t d = box.dim(), batch = u.size(0);
   std::vector<int64_t> sizes{batch, d};
   for (const int64_t n : box.shape()) sizes.push_back(n + 2);
-  Start found{{}, at::empty(sizes, u.options()), at::empty({batch}, u.options().dtype(at::kLong))};
+  PaddedVelocity found{{}, at::empty(sizes, u.options()), at::empty({batch}, u.options().dtype(at::kLong))};
   found.velocity = found.padded;
   for (int64_t axis = 0; axis < d; ++axis) found.velocity = found.velocity.narrow(axis + 2, 1, box.shape()[axis]);
   const bool grows_with_nu = e.advection == FlowAdvection::kCentral && e.diffusion == FlowDiffusion::kImplicit;
@@ -74,7 +74,7 @@ std::optional<Start> start(const FlowEquation& e, const at::Tensor& u) {
   return launched ? std::optional(found) : std::nullopt;
 }
 
-at::Tensor change(const FlowEquation& e, const Start& start) {
+at::Tensor change(const FlowEquation& e, const PaddedVelocity& start) {
   const auto out = by_channels(start.velocity, *e.box);
   const bool launched = each_point({"FlowChange", kFlow}, out, out.numel(), [&]<class T>(T) {
     return gpu::FlowChange<T>{.terms = terms_of<T>(e, start.padded),
@@ -85,7 +85,7 @@ at::Tensor change(const FlowEquation& e, const Start& start) {
   return launched ? out : at::Tensor();
 }
 
-at::Tensor divergence(const FlowBox& box, const Correction& correction, double factor, bool for_a_solve) {
+at::Tensor divergence(const FlowBox& box, const UncorrectedVelocity& correction, double factor, bool for_a_solve) {
   const auto& like = velocity_like(correction);
   const auto& fields = box.fields(like.options());
   const auto b = at::empty(sizes_of_potential(like, box), like.options());
@@ -102,8 +102,8 @@ at::Tensor divergence(const FlowBox& box, const Correction& correction, double f
   return launched ? b : at::Tensor();
 }
 
-std::optional<Corrected> correct(const FlowBox& box, const Correction& correction, const at::Tensor& found,
-                                 const How& how) {
+std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& correction, const at::Tensor& found,
+                                 const CorrectionOptions& how) {
   const auto& like = velocity_like(correction);
   const auto solution = found.contiguous(), phi = at::empty_like(solution);
   const auto before = how.before.defined() ? how.before.contiguous() : how.before;
@@ -147,7 +147,7 @@ at::Tensor diffusion_coefficients(const FlowEquation& e, const at::Tensor& like)
 
 std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, const at::Tensor& refused) {
   const auto& first = infos[0];
-  if (!take(first.residual) || infos.size() > gpu::FlowReport<float>::kMost) return std::nullopt;
+  if (!can_run(first.residual) || infos.size() > gpu::FlowReport<float>::kMost) return std::nullopt;
   const auto like = [](const at::Tensor& t) { return at::empty_like(t, at::MemoryFormat::Contiguous); };
   SolveInfo all{like(first.iterations), like(first.residual), like(first.status), like(first.operator_applications),
                 like(first.floor)};

@@ -11,20 +11,20 @@ namespace prdp::flow_kernels {
 
 /// Whether kernels may compute a step and its gradient: for plain tensors on a device that has a runtime, where
 /// autograd does not record.
-bool take(const at::Tensor& u);
+bool can_run(const at::Tensor& u);
 
 /// u with its boundary values, (batch, d, *shape), inside of the same with ghosts; and for each sample 0, or the
 /// SolveStatus why it cannot be advected: then all its values are zero.
-struct Start {
+struct PaddedVelocity {
   at::Tensor velocity, padded, status;
 };
-std::optional<Start> start(const FlowEquation& equation, const at::Tensor& u);
+std::optional<PaddedVelocity> pad_velocity(const FlowEquation& equation, const at::Tensor& u);
 
 /// dt (-(u·∇)u + ν Δu + f) on the free faces.
-at::Tensor change(const FlowEquation& equation, const Start& start);
+at::Tensor change(const FlowEquation& equation, const PaddedVelocity& start);
 
-/// What a correction by the pressure is for.
-struct Correction {
+/// What the pressure is to correct.
+struct UncorrectedVelocity {
   at::Tensor base = {};         // a velocity; undefined: none
   FlowParts added = {};         // to which this is added on the free faces; empty: nothing
   at::Tensor potential_bar = {}; // for the reverse: the cotangent of the potential; undefined: none
@@ -33,20 +33,21 @@ struct Correction {
   double largest_nu = 0;
 };
 
-/// factor · div of it in the cells whose pressure is unknown, (batch, 1, *shape). For a solve: without its means.
-at::Tensor divergence(const FlowBox& box, const Correction& of, double factor, bool for_a_solve);
+/// factor · div u in the cells whose pressure is unknown, (batch, 1, *shape). For a solve: without its means.
+at::Tensor divergence(const FlowBox& box, const UncorrectedVelocity& of, double factor, bool for_a_solve);
 
-/// The velocity of a Correction with factor · grad φ, where φ is what the solve found without its means.
+/// u - factor · grad φ, where φ is what the solve found, without its means.
 struct Corrected {
   at::Tensor u, on_free_faces, potential;
 };
-struct How {
+struct CorrectionOptions {
   double factor;
   bool on_all_faces = false;       // else on the free ones
   bool wants_on_free_faces = false;
   at::Tensor before = {};          // is added to the potential; undefined: nothing
 };
-std::optional<Corrected> correct(const FlowBox& box, const Correction& of, const at::Tensor& found, const How& how);
+std::optional<Corrected> correct(const FlowBox& box, const UncorrectedVelocity& of, const at::Tensor& found,
+                                 const CorrectionOptions& how);
 
 /// The coefficients of I - ν dt Δ, (patterns, 2 d + 1, *shape).
 at::Tensor diffusion_coefficients(const FlowEquation& equation, const at::Tensor& like);
@@ -65,7 +66,7 @@ struct ImplicitPart {
 
 /// The cotangents of u and of what the equation is made of, in the order of its tensors, from those of the velocity and
 /// of its change: as `needed` says, u first. With all their axes, in one launch.
-std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const Start& start,
+std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const PaddedVelocity& start,
                                                     const at::Tensor& velocity_bar, const FlowParts& change_bar,
                                                     const ImplicitPart& part, at::IntArrayRef needed);
 

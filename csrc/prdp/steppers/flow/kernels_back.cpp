@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "prdp/gpu/device/flow_back.h"
-#include "prdp/operators/shared_sums.h"
+#include "prdp/operators/broadcast_sums.h"
 #include "prdp/steppers/flow/kernel_fields.h"
 
 namespace prdp::flow_kernels {
@@ -66,7 +66,7 @@ gpu::FlowViscosityBars<T> bars_of(const FlowBox& box, const ImplicitPart& part) 
 
 }  // namespace
 
-std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const Start& start,
+std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation, const PaddedVelocity& start,
                                                     const at::Tensor& velocity_bar, const FlowParts& change_bar,
                                                     const ImplicitPart& part, at::IntArrayRef needed) {
   const auto& box = *equation.box;
@@ -77,8 +77,8 @@ std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation
   for (size_t i = 0; i < found.size(); ++i) wanted[i] = needed[i] && (i == 0 || given[i - 1].defined());
   if (wanted[0]) found[0] = by_channels(like, box);
   const auto ends = ends_of(box, like, wanted);
-  SharedSums sums(like);
-  const auto nothing = gpu::SharedSum{};
+  BroadcastSums sums(like);
+  const auto nothing = gpu::BroadcastSum{};
   const auto of_nu = wanted[1] ? sums.add(equation.nu) : nothing;
   const auto force = wanted[2] ? sums.add(equation.force) : nothing;
   int64_t count = sums.count() + (wanted[0] ? found[0].numel() : 0);

@@ -42,7 +42,7 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
 
 /// Divergences that the dtype has no normal numbers for are rounding, and nothing to do: they are zero to the solve,
 /// which knows no null space and could not tell their mean from what rounding leaves of it.
-at::Tensor without_least_numbers(const at::Tensor& b) {
+at::Tensor flush_subnormals(const at::Tensor& b) {
   const double normal =
       b.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
   const auto rows = largest_magnitude(b) < normal;
@@ -75,7 +75,7 @@ at::Tensor add_gradient(const FlowBox& box, const at::Tensor& u, const at::Tenso
 double scale_of_pressure(const FlowBox& box) { return box.dx(box.dim() - 1) * box.dx(box.dim() - 1); }
 
 at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double factor) {
-  if (flow_kernels::take(u)) {
+  if (flow_kernels::can_run(u)) {
     const auto b = flow_kernels::divergence(box, {.base = u}, factor, /*for_a_solve=*/false);
     if (b.defined()) return b;
   }
@@ -103,7 +103,7 @@ std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, co
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(u.options());
-  const auto b = without_least_numbers(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
+  const auto b = flush_subnormals(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
   // A preconditioner may leave something in the cells of solids.
   const auto found = masked(solve(pressure_operator(box, u), b, for_pressure(box, b, options), info), fields.cells);
   const auto phi = without_means(box, found);
@@ -112,9 +112,9 @@ Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& o
 
 Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
                   const SolveOptions& options, CombinedInfo& info) {
-  const bool by_kernels = flow_kernels::take(u);
+  const bool by_kernels = flow_kernels::can_run(u);
   if (by_kernels) {
-    const flow_kernels::Correction of{.base = u, .added = added};
+    const flow_kernels::UncorrectedVelocity of{.base = u, .added = added};
     if (const auto found = project_by_kernels(box, {of, of, {.factor = -1.0, .before = potential}}, options, info))
       return {found->u, found->potential};
   }
@@ -128,8 +128,9 @@ Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& adde
 ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor potential_bar, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(cotangent.options());
-  if (flow_kernels::take(cotangent)) {
-    const flow_kernels::How how{scale_of_pressure(box), /*on_all_faces=*/true, /*wants_on_free_faces=*/true};
+  if (flow_kernels::can_run(cotangent)) {
+    const flow_kernels::CorrectionOptions how{scale_of_pressure(box), /*on_all_faces=*/true,
+                                              /*wants_on_free_faces=*/true};
     const ByKernels by{{.added = {cotangent}, .potential_bar = potential_bar, .refused = refused},
                        {.base = cotangent, .refused = refused},
                        how,
@@ -146,7 +147,7 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   phi_bar = without_means(box, phi_bar);
   // What a potential's cotangent leaves may be its mean and little else. What rounding leaves of the mean counts then.
   if (potential_bar.defined()) phi_bar = without_means(box, phi_bar);
-  phi_bar = without_least_numbers(phi_bar);
+  phi_bar = flush_subnormals(phi_bar);
   const auto a = pressure_operator(box, cotangent);
   const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
   const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});

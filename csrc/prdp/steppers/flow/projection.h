@@ -29,8 +29,8 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
 /// A projection of which all but the solve are two launches; nothing where there are no kernels. `given` is projected,
 /// `corrected` what the gradient is added to. In reverse by an adjoint solve.
 struct ByKernels {
-  flow_kernels::Correction given, corrected;
-  flow_kernels::How how;
+  flow_kernels::UncorrectedVelocity given, corrected;
+  flow_kernels::CorrectionOptions how;
   bool reverse = false;
 };
 std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ByKernels& by,

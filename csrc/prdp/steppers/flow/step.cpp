@@ -49,7 +49,7 @@ ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundar
 struct Beginning {
   at::Tensor velocity;
   RefusedSamples refused;                           // with kernels, only where the host looks
-  std::optional<flow_kernels::Start> of_kernels{};  // its status names the refused, whose values are zero
+  std::optional<flow_kernels::PaddedVelocity> of_kernels{};  // its status names the refused, whose values are zero
 
   /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
   at::Tensor to_clear() const { return of_kernels ? at::Tensor() : refused.mask; }
@@ -60,7 +60,7 @@ struct Beginning {
   }
 };
 Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks) {
-  if (auto start = flow_kernels::start(e, u))
+  if (auto start = flow_kernels::pad_velocity(e, u))
     return {start->velocity, looks ? refused_by(start->status) : RefusedSamples{}, start};
   const auto velocity = with_boundary_values(e, u);
   return {velocity, find_refused(e, velocity.detach())};

@@ -145,7 +145,7 @@ class FlowSteps : public torch::autograd::Function<FlowSteps> {
   }
 
   static at::Tensor without_lost_of(const at::Tensor& cotangent, const at::Tensor& status, const Call& call) {
-    return status.defined() ? without_lost(cotangent, status, call.options.on_failure) : cotangent;
+    return status.defined() ? without_failed(cotangent, status, call.options.on_failure) : cotangent;
   }
 };
 

@@ -23,12 +23,13 @@ struct InnerBox {
   at::Tensor of(at::Tensor t) const;
 };
 
-/// The inverse of a sum of operators along the axes (kernels/fast_diagonalisation.h) as tensor operations.
-class TensorAxes {
+/// The inverse of a sum of operators along the axes, by their eigenvectors or by FFT, as tensor operations. On the CPU:
+/// kernels/fast_diagonalisation.h.
+class SeparableInverse {
  public:
   /// `a` is the sum on the inner points of the grid; A is diagonal on the others, as where a wall says the velocity.
   /// For vectors with the dtype and device of `options`.
-  TensorAxes(const kernels::DiagonalisedSum& a, InnerBox box, const at::TensorOptions& options);
+  SeparableInverse(const kernels::DiagonalisedSum& a, InnerBox box, const at::TensorOptions& options);
 
   /// A⁻¹ b, or its pseudo-inverse where null vectors were named, for b (batch, channel, *shape) and the diagonal of A;
   /// NaN if A is singular.

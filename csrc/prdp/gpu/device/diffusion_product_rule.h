@@ -1,7 +1,7 @@
 #pragma once
+#include "prdp/gpu/device/broadcast_sum.h"
 #include "prdp/gpu/device/diffusion.h"
-#include "prdp/gpu/device/products.h"
-#include "prdp/gpu/device/shared_sum.h"
+#include "prdp/gpu/device/product_rules.h"
 
 /// ∂⟨λ, A u⟩ for what shift·u - ∇·(κ ∇u) is made of, as in diffusion.h.
 namespace prdp::gpu {
@@ -19,7 +19,7 @@ struct SideField {
 
 /// Of κ, (batch or 1, *shape), then of the shift and of h of each Robin side, in one loop. Axes are z, y and x.
 template <class T>
-struct DiffusionProducts {
+struct DiffusionProductRule {
   static constexpr int kSums = 7;
   PairOfVectors<T> pair;  // for the sets of κ
   int batch, n[3], sides[6];
@@ -28,7 +28,7 @@ struct DiffusionProducts {
   const T* kappa;
   T* of_kappa;
   SideField<T> robin[6];
-  SharedSum sums[kSums];  // the shift's, and each side's; of a side, the axis across it has one point
+  BroadcastSum sums[kSums];  // the shift's, and each side's; of a side, the axis across it has one point
   double* of_sums[kSums];
 
   void operator()(int i) const {
@@ -98,13 +98,13 @@ struct DiffusionProducts {
   }
 
   double shift_bar(int i) const {
-    return sums[0].sum(i, [&](const int (&at)[SharedSum::kAxes]) {
+    return sums[0].sum(i, [&](const int (&at)[BroadcastSum::kAxes]) {
       return product(at[0], at[1], (at[2] * n[1] + at[3]) * n[2] + at[4]);
     });
   }
   double robin_bar(int side, int i) const {
     const int axis = side / 2;
-    return sums[1 + side].sum(i, [&](const int (&at)[SharedSum::kAxes]) {
+    return sums[1 + side].sum(i, [&](const int (&at)[BroadcastSum::kAxes]) {
       int place[3] = {at[2], at[3], at[4]};
       place[axis] = side % 2 ? n[axis] - 1 : 0;
       const int point = (place[0] * n[1] + place[1]) * n[2] + place[2];

@@ -1,4 +1,4 @@
-#include "prdp/operators/tensor_axes.h"
+#include "prdp/operators/separable_inverse.h"
 
 #include <numeric>
 
@@ -39,7 +39,7 @@ at::Tensor InnerBox::of(at::Tensor t) const {
   return t;
 }
 
-TensorAxes::TensorAxes(const kernels::DiagonalisedSum& a, InnerBox box, const at::TensorOptions& options)
+SeparableInverse::SeparableInverse(const kernels::DiagonalisedSum& a, InnerBox box, const at::TensorOptions& options)
     : box_(std::move(box)) {
   if (!a.inverse) return;
   const auto here = at::tensor(*a.inverse, at::kDouble).view(box_.shape);
@@ -53,7 +53,7 @@ TensorAxes::TensorAxes(const kernels::DiagonalisedSum& a, InnerBox box, const at
   }
 }
 
-at::Tensor TensorAxes::solve(const at::Tensor& b, const at::Tensor& diagonal) const {
+at::Tensor SeparableInverse::solve(const at::Tensor& b, const at::Tensor& diagonal) const {
   const auto inside = box_.of(b);
   if (inside.sizes() == b.sizes()) return solve_inside(b);
   auto u = b / diagonal;
@@ -61,7 +61,7 @@ at::Tensor TensorAxes::solve(const at::Tensor& b, const at::Tensor& diagonal) co
   return u;
 }
 
-at::Tensor TensorAxes::solve_inside(const at::Tensor& b) const {
+at::Tensor SeparableInverse::solve_inside(const at::Tensor& b) const {
   if (!inverse_.defined()) return at::full_like(b, std::numeric_limits<double>::quiet_NaN());
   if (!eigenvectors_.empty())
     return along_axes(along_axes(b, eigenvectors_, /*transposed=*/true) * inverse_, eigenvectors_, false)
@@ -71,7 +71,7 @@ at::Tensor TensorAxes::solve_inside(const at::Tensor& b) const {
   return at::fft_irfftn(at::fft_rfftn(b, std::nullopt, axes) * inverse_, at::IntArrayRef(box_.shape), axes);
 }
 
-int64_t TensorAxes::bytes() const {
+int64_t SeparableInverse::bytes() const {
   auto sum = static_cast<int64_t>(inverse_.defined() ? inverse_.nbytes() : 0);
   for (const auto& q : eigenvectors_) sum += static_cast<int64_t>(q.nbytes());
   return sum;

@@ -3,19 +3,19 @@
 
 #include <vector>
 
-#include "prdp/gpu/device/shared_sum.h"
+#include "prdp/gpu/device/broadcast_sum.h"
 
 namespace prdp {
 
 /// The cotangents of tensors that share products (batch, channels, *shape), as a kernel sums them up: where the memory
 /// of its sums is, and what they are.
-class SharedSums {
+class BroadcastSums {
  public:
-  explicit SharedSums(const at::Tensor& products) : like_(products) {}
+  explicit BroadcastSums(const at::Tensor& products) : like_(products) {}
 
   /// For a tensor with the axes of the products, each of the same extent or of one; or without axes. The products
   /// have one point along the axis `across` of the grid, if there is such an axis.
-  gpu::SharedSum add(const at::Tensor& of, int64_t across = -1);
+  gpu::BroadcastSum add(const at::Tensor& of, int64_t across = -1);
   /// Of all sums.
   int64_t count() const { return count_; }
   /// Where the kernel puts the k-th sum. All have been added.

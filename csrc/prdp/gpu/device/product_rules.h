@@ -2,7 +2,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "prdp/gpu/device/shared_sum.h"
+#include "prdp/gpu/device/broadcast_sum.h"
 
 /// ∂⟨λ, A(g) u⟩/∂g for the fields that operators are made of: each entry sums over the channels, and over the samples
 /// that share it, in their order.
@@ -30,7 +30,7 @@ struct PairOfVectors {
 
 /// Of the coefficients of a stencil, (batch or 1, count, *shape).
 template <class T>
-struct StencilProducts {
+struct StencilProductRule {
   static constexpr int kMost = 125;
   PairOfVectors<T> pair;
   int n[3];
@@ -55,15 +55,15 @@ struct StencilProducts {
 
 /// Of a number that the Laplacian of a box is multiplied by, as in views.h: Σ λ L u.
 template <class T>
-struct LaplacianProducts {
+struct LaplacianProductRule {
   PairOfVectors<T> pair;
   int n[3];
   double inverse_width2[3];
-  SharedSum shared;
+  BroadcastSum shared;
   double* out;
 
   void operator()(int i) const {
-    out[i] = shared.sum(i, [&](const int (&at)[SharedSum::kAxes]) {
+    out[i] = shared.sum(i, [&](const int (&at)[BroadcastSum::kAxes]) {
       const int strides[3] = {n[2] * n[1], n[2], 1};
       const int64_t here =
           (static_cast<int64_t>(at[0]) * n[0] + at[2]) * strides[0] + static_cast<int64_t>(at[3]) * n[2] + at[4];
@@ -81,7 +81,7 @@ struct LaplacianProducts {
 /// Of the values of matrices by compressed rows, (batch or 1, stored). λ and u have one channel of as many points as a
 /// matrix has rows. 0 where the pattern is none: such a matrix was refused.
 template <class T>
-struct CsrProducts {
+struct CsrProductRule {
   PairOfVectors<T> pair;
   int stored;
   const int64_t *crow, *col;

@@ -1,4 +1,4 @@
-#include "prdp/operators/sum_on_host.h"
+#include "prdp/operators/separability.h"
 
 #include <algorithm>
 #include <cmath>
@@ -19,7 +19,7 @@ at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
 
 }  // namespace
 
-SumOnHost::SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic)
+Separability::Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic)
     : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
   std::vector<at::Tensor> lines, told;
   for (int64_t axis = 0; axis < dim(); ++axis) {
@@ -46,14 +46,14 @@ SumOnHost::SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& pe
   host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
 }
 
-at::Tensor SumOnHost::middle_line(const at::Tensor& coefficients, int64_t axis) const {
+at::Tensor Separability::middle_line(const at::Tensor& coefficients, int64_t axis) const {
   auto line = coefficients;
   for (int64_t d = dim() - 1; d >= 0; --d)
     if (d != axis) line = line.select(2 + d, middle(d));
   return line;
 }
 
-at::Tensor SumOnHost::decoupled_ends(const at::Tensor& coefficients, int64_t axis) const {
+at::Tensor Separability::decoupled_ends(const at::Tensor& coefficients, int64_t axis) const {
   if (periodic_[axis]) return at::zeros({coefficients.size(0), 2}, coefficients.options().dtype(at::kBool));
   std::vector<at::Tensor> ends;
   for (const int64_t end : {0, 1}) {
@@ -65,7 +65,7 @@ at::Tensor SumOnHost::decoupled_ends(const at::Tensor& coefficients, int64_t axi
   return at::stack(ends, 1);
 }
 
-at::Tensor SumOnHost::distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const {
+at::Tensor Separability::distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const {
   at::Tensor diagonal;
   std::vector<at::Tensor> apart;
   for (int64_t axis = 0; axis < dim(); ++axis) {
@@ -78,14 +78,14 @@ at::Tensor SumOnHost::distance_from_sum(const at::Tensor& coefficients, const st
   return at::stack(apart, 1).abs().amax(1);
 }
 
-SumOnHost::Sizes SumOnHost::sizes(int64_t s) const {
+Separability::Sizes Separability::sizes(int64_t s) const {
   const double* of = of_sample(s + 1) - kSizes;
   return {of[0], of[1], of[2], of[3], of[4]};
 }
 
-bool SumOnHost::is_finite(int64_t s) const { return std::isfinite(sizes(s).largest); }
+bool Separability::is_finite(int64_t s) const { return std::isfinite(sizes(s).largest); }
 
-std::optional<kernels::SumOverAxes> SumOnHost::sum(int64_t s) const {
+std::optional<kernels::SumOverAxes> Separability::sum(int64_t s) const {
   const auto [distance, norm, diagonal, inverse_diagonal, largest] = sizes(s);
   const double slack = kernels::slack_of_sum(norm, epsilon_);
   const auto box = inner_box(s);
@@ -97,7 +97,7 @@ std::optional<kernels::SumOverAxes> SumOnHost::sum(int64_t s) const {
   return std::all_of(a.begin(), a.end(), is_symmetric) ? std::optional(a) : std::nullopt;
 }
 
-InnerBox SumOnHost::inner_box(int64_t s) const {
+InnerBox Separability::inner_box(int64_t s) const {
   InnerBox box{std::vector<int64_t>(dim()), shape_};
   for (int64_t axis = 0; axis < dim(); ++axis) {
     box.first[axis] = ends(s)[2 * axis] != 0.0;
@@ -106,7 +106,7 @@ InnerBox SumOnHost::inner_box(int64_t s) const {
   return box;
 }
 
-kernels::FactorKey SumOnHost::key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
+kernels::FactorKey Separability::key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
   kernels::FactorKeyMaker key;
   key.add(of_sample(s), host_.size(1) - kSizes).add(shape_.data(), dim()).add(null_vectors);
   for (const bool closed : periodic_) key.add(int64_t{closed});
@@ -115,7 +115,7 @@ kernels::FactorKey SumOnHost::key(int64_t s, int64_t null_vectors, const at::Ten
   return key.add(static_cast<int64_t>(device.type())).add(int64_t{device.index()}).key();
 }
 
-kernels::SumOverAxes SumOnHost::sum_of_lines(int64_t s, const InnerBox& box) const {
+kernels::SumOverAxes Separability::sum_of_lines(int64_t s, const InnerBox& box) const {
   kernels::SumOverAxes sum;
   const double* line = of_sample(s);
   for (int64_t axis = dim() - 3; axis < dim(); ++axis) {

@@ -1,5 +1,5 @@
 #pragma once
-#include "prdp/gpu/device/products.h"
+#include "prdp/gpu/device/product_rules.h"
 
 /// ∂⟨λ, A u⟩ for the winds and for ν of upwind differences on periodic grids, as in upwind.h: α I + β (Γ - ν L).
 namespace prdp::gpu {
@@ -29,7 +29,7 @@ T slope_of_negative(T w) {
 
 /// Of the winds of Burgers, (batch or 1, axes, *shape), whose means at the faces carry every channel.
 template <class T>
-struct BurgersProducts {
+struct BurgersProductRule {
   PairOfVectors<T> pair;
   PeriodicGrid<T> grid;
   T beta;
@@ -57,7 +57,7 @@ struct BurgersProducts {
 
 /// Of the winds of Navier-Stokes, (batch or 1, 2 or 3, *shape), at the points of u₁ and u₂; a pressure blows nowhere.
 template <class T>
-struct NavierStokesProducts {
+struct NavierStokesProductRule {
   PairOfVectors<T> pair;  // of three channels
   PeriodicGrid<T> grid;
   int channels;
@@ -103,7 +103,7 @@ struct NavierStokesProducts {
 
 /// Of ν, a number for each sample: -β Σ λ L u over its first channels.
 template <class T>
-struct ViscosityProducts {
+struct ViscosityProductRule {
   PairOfVectors<T> pair;
   PeriodicGrid<T> grid;
   T beta;

@@ -3,18 +3,19 @@
 #include <vector>
 
 #include "prdp/kernels/factor_cache.h"
-#include "prdp/operators/tensor_axes.h"
+#include "prdp/operators/separable_inverse.h"
 
 namespace prdp {
 
-/// What the host reads of the coefficients of stencils, by one copy, to tell which of them are sums of operators along
-/// the axes: those on the line through the middle point along each axis, on which planes at the ends of the axes A is
-/// diagonal, and how far, at most, A is from the sum that the lines tell on the other points, which are the inner ones.
-class SumOnHost {
+/// Whether stencils are sums of operators along the axes (separable), decided on the host from one copy: of the
+/// coefficients on the line through the middle point along each axis, of whether A is diagonal on the planes at the
+/// ends of the axes, and of the largest distance, on the other, inner points, between A and the sum that the lines
+/// give.
+class Separability {
  public:
   /// `coefficients`: (batch or 1, 1 + 2 dim, *shape) as StencilOperator::nearest_coefficients() orders them, with at
   /// least 3 points along each axis.
-  SumOnHost(const at::Tensor& coefficients, const std::vector<bool>& periodic);
+  Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic);
 
   int64_t samples() const { return host_.size(0); }
   bool is_finite(int64_t s) const;

@@ -6,7 +6,7 @@ namespace prdp::gpu {
 
 /// Numbers (batch, channels, z, y, x), of which a tensor has an entry for each along the axes that are its own: those
 /// along the others add up. A sum of many is left in parts, in an order that the sizes alone tell.
-struct SharedSum {
+struct BroadcastSum {
   static constexpr int kAxes = 5;
   int n[kAxes];
   bool own[kAxes];

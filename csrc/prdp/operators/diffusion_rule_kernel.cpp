@@ -1,8 +1,7 @@
-#include "prdp/gpu/device/diffusion_products.h"
-
+#include "prdp/gpu/device/diffusion_product_rule.h"
+#include "prdp/operators/broadcast_sums.h"
 #include "prdp/operators/diffusion_operator.h"
-#include "prdp/operators/products_by_kernel.h"
-#include "prdp/operators/shared_sums.h"
+#include "prdp/operators/product_rule_kernels.h"
 
 /// The product rule of a Diffusion in one launch on a GPU.
 namespace prdp {
@@ -25,7 +24,7 @@ template <class T>
 std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto kappa = kappa_.detach().contiguous(), l = lambda.contiguous(), v = u.contiguous();
   const auto of_kappa = at::empty_like(kappa);
-  gpu::DiffusionProducts<T> of{};
+  gpu::DiffusionProductRule<T> of{};
   of.pair = pair_of<T>(l, v, kappa.size(0));
   of.batch = static_cast<int>(l.size(0));
   of.harmonic = mean_ == FaceMean::kHarmonic;
@@ -38,7 +37,7 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
     for (int64_t end = 0; end < 2; ++end)
       of.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
   }
-  SharedSums sums(l);
+  BroadcastSums sums(l);
   of.sums[0] = sums.add(shift_);
   std::vector<at::Tensor> h;
   for (int64_t axis = 0; axis < dim(); ++axis)
@@ -53,7 +52,8 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
   for (int k = 0; k < of.kSums; ++k)
     if (of.sums[k].count > 0) of.of_sums[k] = sums.memory(next++);
   const int64_t count = of_kappa.numel() + sums.count();
-  if (!gpu::each_point(l.device(), product_body<T>("DiffusionProducts", "prdp/gpu/device/diffusion_products.h"), of,
+  if (!gpu::each_point(l.device(),
+                       product_rule_body<T>("DiffusionProductRule", "prdp/gpu/device/diffusion_product_rule.h"), of,
                        count))
     return {};
   next = 0;
@@ -68,8 +68,8 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
   return found;
 }
 
-std::vector<at::Tensor> DiffusionOperator::products_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (per_axis_ || !has_product_kernel(lambda, u)) return {};
+std::vector<at::Tensor> DiffusionOperator::product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
+  if (per_axis_ || !has_product_rule_kernel(lambda, u)) return {};
   return u.scalar_type() == at::kFloat ? products_of<float>(lambda, u) : products_of<double>(lambda, u);
 }
 

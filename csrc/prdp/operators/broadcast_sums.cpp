@@ -1,4 +1,4 @@
-#include "prdp/operators/shared_sums.h"
+#include "prdp/operators/broadcast_sums.h"
 
 #include <ATen/Parallel.h>
 
@@ -19,13 +19,13 @@ int64_t parts_of(int64_t terms, int64_t entries) {
 
 }  // namespace
 
-gpu::SharedSum SharedSums::add(const at::Tensor& of, int64_t across) {
-  gpu::SharedSum sum{{1, 1, 1, 1, 1}, {}, 1, 0};
+gpu::BroadcastSum BroadcastSums::add(const at::Tensor& of, int64_t across) {
+  gpu::BroadcastSum sum{{1, 1, 1, 1, 1}, {}, 1, 0};
   int64_t entries = 1, terms = 1;
   for (int64_t axis = 0; axis < like_.dim(); ++axis) {
     const int64_t n = axis == 2 + across && across >= 0 ? 1 : like_.size(axis);
     const bool own = of.dim() > 0 && of.size(axis) == n;
-    const auto place = axis < 2 ? axis : axis + gpu::SharedSum::kAxes - like_.dim();
+    const auto place = axis < 2 ? axis : axis + gpu::BroadcastSum::kAxes - like_.dim();
     sum.n[place] = static_cast<int>(n);
     sum.own[place] = own;
     (own ? entries : terms) *= n;
@@ -38,12 +38,12 @@ gpu::SharedSum SharedSums::add(const at::Tensor& of, int64_t across) {
   return sum;
 }
 
-double* SharedSums::memory(size_t k) {
+double* BroadcastSums::memory(size_t k) {
   if (!memory_.defined()) memory_ = at::empty({count_}, like_.options().dtype(at::kDouble));
   return memory_.mutable_data_ptr<double>() + sums_[k].first;
 }
 
-at::Tensor SharedSums::result(size_t k) const {
+at::Tensor BroadcastSums::result(size_t k) const {
   const auto& of = sums_[k];
   auto sum = memory_.narrow(0, of.first, of.count).view({-1, of.parts});
   if (of.parts > 1) sum = sum_in_order(sum, {-1});

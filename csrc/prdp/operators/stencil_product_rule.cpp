@@ -1,11 +1,10 @@
-#include "prdp/kernels/stencil_products.h"
-
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
 #include <algorithm>
 
-#include "prdp/operators/products_by_kernel.h"
+#include "prdp/kernels/stencil_products.h"
+#include "prdp/operators/product_rule_kernels.h"
 #include "prdp/operators/stencil_operator.h"
 #include "prdp/threads/interruption.h"
 
@@ -37,10 +36,10 @@ void add_all_products(const kernels::StencilSparsity& pattern, const at::Tensor&
 
 /// The same in one launch; undefined where there is no kernel.
 template <class T>
-at::Tensor products_by_kernel(const kernels::StencilSparsity& pattern, const std::vector<kernels::Offset>& offsets,
-                              const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& coefficients) {
+at::Tensor product_rule_by_kernel(const kernels::StencilSparsity& pattern, const std::vector<kernels::Offset>& offsets,
+                                  const at::Tensor& lambda, const at::Tensor& u, const at::Tensor& coefficients) {
   const auto out = at::empty(coefficients.sizes(), coefficients.options());
-  gpu::StencilProducts<T> of{};
+  gpu::StencilProductRule<T> of{};
   of.pair = pair_of<T>(lambda, u, out.size(0));
   of.count = static_cast<int>(offsets.size());
   of.out = out.mutable_data_ptr<T>();
@@ -49,15 +48,16 @@ at::Tensor products_by_kernel(const kernels::StencilSparsity& pattern, const std
     of.periodic[axis] = pattern.grid.periodic[axis];
     for (size_t k = 0; k < offsets.size(); ++k) of.offsets[k][axis] = static_cast<signed char>(offsets[k].along[axis]);
   }
-  const bool launched = gpu::each_point(out.device(), product_body<T>("StencilProducts"), of, out.numel());
+  const bool launched = gpu::each_point(out.device(), product_rule_body<T>("StencilProductRule"), of, out.numel());
   return launched ? out : at::Tensor();
 }
 
 }  // namespace
 
 std::vector<at::Tensor> StencilOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
-  if (has_product_kernel(lambda, u)) {
-    const auto by_kernel = lambda.scalar_type() == at::kFloat ? products_by_kernel<float> : products_by_kernel<double>;
+  if (has_product_rule_kernel(lambda, u)) {
+    const auto by_kernel =
+        lambda.scalar_type() == at::kFloat ? product_rule_by_kernel<float> : product_rule_by_kernel<double>;
     const kernels::StencilSparsity pattern(grid_, offsets_);
     const auto all = by_kernel(pattern, offsets_, lambda.contiguous(), u.contiguous(), coefficients_);
     if (all.defined()) return {all};

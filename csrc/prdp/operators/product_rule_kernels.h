@@ -4,7 +4,7 @@
 
 #include <limits>
 
-#include "prdp/gpu/device/products.h"
+#include "prdp/gpu/device/product_rules.h"
 #include "prdp/gpu/launch.h"
 #include "prdp/gpu/operator_view.h"
 #include "prdp/operators/plain_tensors.h"
@@ -12,7 +12,7 @@
 /// Product rules in one launch on a GPU: for plain tensors, where autograd does not record.
 namespace prdp {
 
-inline bool has_product_kernel(const at::Tensor& lambda, const at::Tensor& u) {
+inline bool has_product_rule_kernel(const at::Tensor& lambda, const at::Tensor& u) {
   return gpu::runtime_of(lambda.device()) && !at::GradMode::is_enabled() && is_plain(lambda) && is_plain(u) &&
          lambda.numel() > 0 && lambda.numel() <= std::numeric_limits<int>::max() / 2;  // kernels count by int
 }
@@ -26,7 +26,7 @@ gpu::PairOfVectors<T> pair_of(const at::Tensor& lambda, const at::Tensor& u, int
 }
 
 template <class T>
-gpu::Body product_body(const char* name, const char* header = "prdp/gpu/device/products.h") {
+gpu::Body product_rule_body(const char* name, const char* header = "prdp/gpu/device/product_rules.h") {
   return {std::string(name) + (std::is_same_v<T, float> ? "<float>" : "<double>"), header};
 }
 
