@@ -2,12 +2,12 @@ from __future__ import annotations
 import collections.abc
 import torch
 import typing
-__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'LinearSchedule', 'LooksAtZero', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_failed', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
-class LooksAtZero:
+__all__: list[str] = ['AdjointLog', 'CHECKPOINT_SQRT', 'Controller', 'DEFAULT_RESTART', 'DEFAULT_RTOL', 'Equation', 'FlowBox', 'FlowEquation', 'FunctionCode', 'LinearSchedule', 'PRDPController', 'PRDP_DEFAULTS', 'RegisteredProducts', 'SMALL_RESIDUAL', 'SOLVE_STATUSES', 'SolveOptions', 'StepOfRollout', 'TOLERANCE_DEFAULTS', 'ToleranceController', 'VERSION', 'any_nonfinite', 'batched_axes', 'block_gradients_of_failed', 'bytes_of_factorisations', 'check_operator', 'check_start', 'clear_factorisations', 'count_factorisations', 'is_sum_over_axes', 'join_adjoint_logs', 'kernels_made', 'linear_solve', 'physical_memory', 'product_rule', 'read_adjoint_log', 'sentence', 'solve_with_tensors', 'step', 'way_of_last_solve']
+class FunctionCode:
     def __init__(self) -> None:
         ...
 class RegisteredProducts:
-    def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable, looks: LooksAtZero) -> None:
+    def __init__(self, apply: collections.abc.Callable, apply_transpose: collections.abc.Callable | None, diagonal: collections.abc.Callable | None, transpose_in_transforms: collections.abc.Callable, product_rule: collections.abc.Callable, code: FunctionCode) -> None:
         ...
     @property
     def number(self) -> int:

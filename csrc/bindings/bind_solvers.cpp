@@ -108,28 +108,23 @@ void check_signals() {
   if (PyErr_CheckSignals() != 0) throw py::error_already_set();
 }
 
-/// Whether solves look at a Function's product of zero, for all that have the same code.
-struct LooksAtZero {
-  std::atomic<bool> value{true};
-};
-
 void bind_operators(py::module_& m) {
-  py::class_<LooksAtZero, std::shared_ptr<LooksAtZero>>(m, "LooksAtZero").def(py::init<>());
+  py::class_<FunctionCode, std::shared_ptr<FunctionCode>>(m, "FunctionCode").def(py::init<>());
   py::class_<RegisteredProducts, std::shared_ptr<RegisteredProducts>>(m, "RegisteredProducts",
                                                                       py::custom_type_setup(collect_products))
       .def(py::init([](py::function apply, std::optional<py::function> apply_transpose,
                        std::optional<py::function> diagonal, py::function transpose_in_transforms,
-                       py::function product_rule, std::shared_ptr<LooksAtZero> looks) {
+                       py::function product_rule, std::shared_ptr<FunctionCode> code) {
              auto made = RegisteredProducts::make(
                  {PythonFunction<at::Tensor>(apply), optional_function<Products::Product>(apply_transpose),
                   optional_function<Products::Diagonal>(diagonal), PythonFunction<at::Tensor>(transpose_in_transforms),
                   PythonFunction<std::vector<at::Tensor>>(product_rule)});
              auto products = std::const_pointer_cast<RegisteredProducts>(made);
-             products->looks_at_zero = {looks, &looks->value};
+             products->code = std::move(code);
              return products;
            }),
            py::arg("apply"), py::arg("apply_transpose"), py::arg("diagonal"), py::arg("transpose_in_transforms"),
-           py::arg("product_rule"), py::arg("looks"))
+           py::arg("product_rule"), py::arg("code"))
       .def_property_readonly("number", &RegisteredProducts::number);
   m.def("batched_axes", &batched_axes, py::arg("kind"), py::arg("axes"), py::arg("tensors"),
         "The number of axes of each of so many tensors of an operator where it has one for the batch, on a grid of so "

@@ -5,6 +5,7 @@
 namespace py = pybind11;
 
 PYBIND11_MODULE(_C, m) {
+  prdp::speak_python();
   translate_errors();
   m.attr("VERSION") = PRDP_VERSION;
   m.def("sentence", &prdp::sentence, py::arg("what"));

@@ -1,8 +1,13 @@
 #include "prdp/error_text.h"
 
 #include <algorithm>
+#include <atomic>
 
 namespace prdp {
+
+namespace {
+std::atomic<bool> speaks_python = false;
+}
 
 std::string sentence(std::string_view what) {
   what = what.substr(0, what.find("\nException raised from"));
@@ -17,5 +22,9 @@ std::string sentence(std::string_view what) {
   std::replace(line.begin(), line.end(), '\n', ' ');
   return line;
 }
+
+void speak_python() { speaks_python = true; }
+
+const char* in_language(const char* python, const char* cpp) { return speaks_python ? python : cpp; }
 
 }  // namespace prdp

@@ -1,9 +1,9 @@
 """The command `prdp`: scenes, trainings, comparisons, advice, data and benchmarks."""
 
+import contextlib
 import functools
 import importlib
 import json
-import os
 import subprocess
 import sys
 import warnings
@@ -22,7 +22,7 @@ from prdp_torch.experiments import compare as comparison
 from prdp_torch.experiments import scenes as scene_files
 from prdp_torch.experiments.refinement import Refinement
 from prdp_torch.experiments.tensorboard import TensorBoard
-from prdp_torch.experiments.terminal import console, counted_bar, print_table, progress_bars
+from prdp_torch.experiments.terminal import Output, console, counted_bar, print_table, progress_bars
 from prdp_torch.experiments.training import Callback, Interval
 
 app = typer.Typer(
@@ -68,13 +68,13 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
             with data_parallel.joined(), warnings.catch_warnings():
                 warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
-                function(*args, **kwargs)
+                with contextlib.redirect_stdout(cast(IO[str], Output(sys.stdout))):
+                    function(*args, **kwargs)
+                    sys.stdout.flush()
         except KeyboardInterrupt:
             kept = "--resume keeps finished trainings and goes on from the last checkpoint"
             print(f"prdp: interrupted; {kept}", file=sys.stderr)
             raise typer.Exit(130) from None
-        except BrokenPipeError:  # whoever read the output has left
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         except (typer.Exit, typer.Abort):  # both are RuntimeErrors, which the next clause would take
             raise
         except (ValueError, TypeError, OSError, ImportError, RuntimeError, OverflowError, MemoryError) as error:
@@ -206,6 +206,8 @@ def export(
 ) -> None:
     """Write the trajectories of a scene as HDF5 or .npz, in PDEBench's layout."""
     loaded = scene_files.load(scene)
+    if not loaded.trains_network:
+        raise ValueError(f"export: the scene {loaded.name} trains no network, and has no trajectories")
     path = out or Path(f"{loaded.name}.h5")
     array_files.check_name(path)
     records.prepare_folder(path.parent)

@@ -220,7 +220,7 @@ def _replaced(path: Path, scene: _C.Scene, resume: bool) -> list[str]:
     if there == here:
         return [] if resume else [f"'{path}', of the same settings"]
     same = {**there, "intervals": here["intervals"]} == here
-    return [] if resume and same else [f"'{path}', whose {difference(there, here)}"]
+    return [] if resume and same else [f"'{path}' ({difference(there, here)})"]
 
 
 def _files_of(

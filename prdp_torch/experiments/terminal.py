@@ -1,6 +1,10 @@
 """What the command `prdp` shows in a terminal: bars while it works, and the table of a comparison."""
 
-from collections.abc import Callable
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import IO, Any
 
 from rich import box
 from rich.console import Console
@@ -19,6 +23,34 @@ from prdp_torch.experiments import _C, report
 from prdp_torch.experiments.compare import Entry
 
 console = Console(highlight=False, markup=False, emoji=False)  # paths and titles are printed as they are
+
+
+class Output:
+    """Standard output whose reader may leave, or whose disk may be full: the work goes on without it."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with self._which_may_end():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with self._which_may_end():
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @contextlib.contextmanager
+    def _which_may_end(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if not isinstance(error, BrokenPipeError):
+                print(f"prdp: warning: standard output: {error.strerror}; the work goes on without it", file=sys.stderr)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 def progress_bars() -> Progress:

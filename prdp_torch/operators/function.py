@@ -1,6 +1,7 @@
 """Products given by Python functions."""
 
 import copy
+import functools
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -34,8 +35,8 @@ class Function(Operator):
             axes, they have that of b without its batch axis.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
-    the functions with each other; on the CPU the backward pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A
-    `Function` cannot be created inside `torch.compile`.
+    the functions with each other. On the CPU, the first solve refuses a product that is not linear, and the backward
+    pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A `Function` cannot be created inside `torch.compile`.
     """
 
     kind = "function"
@@ -68,7 +69,7 @@ class Function(Operator):
             None if diagonal is None else lambda given: _tensor("diagonal", diagonal(*given)),
             lambda v, given: batching.transposed(matvec, v, given),
             lambda cotangent, u, given: batching.product_rule(matvec, cotangent, u, given),
-            _looks_at(matvec),
+            _shared_code(matvec, transpose),
         )
         null_spaces = null_spaces_of("Function", nullspace, left_nullspace, None)
         given = {f"tensors_{i}": t for i, t in enumerate(tensors)}
@@ -88,13 +89,19 @@ class Function(Operator):
         return Function, (matvec, transpose, tuple(tensors), diagonal, symmetric, right, left)
 
 
-_LOOKS: "weakref.WeakKeyDictionary[Any, _C.LooksAtZero]" = weakref.WeakKeyDictionary()
+_CODES: "weakref.WeakKeyDictionary[Any, dict[int, _C.FunctionCode]]" = weakref.WeakKeyDictionary()
 
 
-def _looks_at(matvec: Product) -> _C.LooksAtZero:
-    """One for all products with this code: a step that makes its operator anew is looked at once."""
-    code = getattr(getattr(matvec, "__func__", matvec), "__code__", None)
-    return _C.LooksAtZero() if code is None else _LOOKS.setdefault(code, _C.LooksAtZero())
+def _code(function: Product | None) -> Any:
+    """What all functions with the same text have in common."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(getattr(function, "__func__", function), "__code__", type(function))
+
+
+def _shared_code(matvec: Product, transpose: Product | None) -> _C.FunctionCode:
+    """One for all operators that are made of the same code, as those of a step that makes its operator anew."""
+    return _CODES.setdefault(_code(matvec), {}).setdefault(hash(_code(transpose)), _C.FunctionCode())
 
 
 def _tensor(name: str, value: object) -> Tensor:

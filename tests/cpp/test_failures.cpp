@@ -43,7 +43,8 @@ TEST(Failures, NameOperatorSampleAndRemedy) {
   expect_said(prdp::matrix(swap), e1, prdp::Jacobi{5}, {"ZERO_DIAGONAL in row (0)", "take GMRES"});
   expect_said(prdp::matrix(swap), e1, prdp::CG{.max_iter = 5},
               {"BREAKDOWN", "CG on Matrix:", "A is symmetric but not definite; take MINRES"});
-  expect_said(prdp::matrix(turn), e1, prdp::SteepestDescent{5}, {"BREAKDOWN", "A is not symmetric"});
+  expect_said(prdp::matrix(turn), e1, prdp::SteepestDescent{5},
+              {"BREAKDOWN", "A is not symmetric", "With OnFailure::kReturn, what there is"});  // in C++'s words
   expect_said(prdp::matrix(ones), e1, prdp::GMRES{.restart = 2, .max_iter = 9},
               {"BREAKDOWN", "GMRES(2) on Matrix:", "b lies outside its range"});
   expect_said(prdp::matrix(ones), e1, prdp::Direct{}, {"BREAKDOWN", "Direct on Matrix: A is singular"});
@@ -58,6 +59,12 @@ TEST(Failures, NameOperatorSampleAndRemedy) {
   const prdp::OperatorSpec heat{"heat", {4}, {1.0}, {at::scalar_tensor(1e-3, at::kDouble)}};
   expect_said(heat, at::full({1, 1, 4}, infinity, at::kDouble), prdp::Jacobi{5},
               {"NONFINITE_INPUT at index (0, 0)", "Jacobi on Heat: the right-hand side is NaN or Inf there"});
+}
+
+TEST(Failures, AnUndefinedTensorIsAnErrorInWords) {
+  const prdp::OperatorSpec heat{"heat", {4}, {1.0}, {at::Tensor()}};
+  EXPECT_THROW(linear_solve(heat, at::ones({1, 1, 4}), {prdp::Jacobi{5}}), c10::ValueError);
+  EXPECT_THROW(prdp::last_solves({nullptr}), c10::ValueError);
 }
 
 TEST(Failures, HandOutNoGradientWithZeroGrad) {

@@ -327,6 +327,9 @@ class Instructions:
 
     _exit = _ret
 
+    def _trap(self, parts, kinds, args):
+        return "std::abort();"
+
     def _call(self, parts, kinds, args):
         *result, name = args[: 2 if args[0].startswith("(") else 1]
         given = split(args[len(result) + 1].strip("() ")) if len(args) > len(result) + 1 else []

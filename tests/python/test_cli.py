@@ -12,6 +12,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
+from helpers import tiny
 
 from prdp_torch.experiments import records
 
@@ -139,6 +140,33 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
     assert process.returncode == 130 and b"interrupted" in errors
     assert json.loads(first.read_text())["curves"]["metric"]
     assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
+    """As `prdp compare … | head`, and with a disk that is full."""
+    command = [
+        *PRDP,
+        "compare",
+        str(tiny(tmp_path)),
+        "--intervals",
+        "1",
+        "--seeds",
+        "1",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    if full:
+        with open("/dev/full", "w") as output:
+            done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True)
+    else:
+        read, write = os.pipe()
+        os.close(read)
+        done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+        os.close(write)
+    lost = "prdp: warning: standard output: No space left on device; the work goes on without it\n"
+    assert (done.returncode, done.stderr) == (0, lost if full else "")
+    assert (tmp_path / "run/report.html").exists()
 
 
 @pytest.mark.parametrize("ignored", [False, True])

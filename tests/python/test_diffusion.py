@@ -242,3 +242,25 @@ def test_a_kappa_that_is_not_positive_is_refused_within_a_transform_as_well():
     b, kappa = torch.ones(2, 1, 4), torch.tensor([[1.0, 1, 1, 1], [1, -1, 1, 1]])
     with pytest.raises(ValueError, match=r"Diffusion: kappa must be > 0, got -1 in sample 1 at index \[1\]"):
         torch.func.grad(lambda k: prdp.linear_solve(Diffusion(k), b, prdp.CG(20))[0].sum())(kappa)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("jump", [1e4, 1e10, 1e12, 1e16, 1e18, 1e20, 1e25])
+def test_direct_fails_where_the_rounding_of_its_factors_moves_u(jump, dtype):
+    """A stiff inclusion is one unknown, in the limit."""
+    n, inside = 8, torch.zeros(8, 8, dtype=torch.bool)
+    inside[2:5, 2:5] = True
+    whole = prdp.operators.Diffusion(torch.ones(1, n, n, dtype=torch.float64)).dense()
+    interface = inside.flatten()[:, None] != inside.flatten()[None]
+    twice = torch.where(interface, 2 * whole, whole).fill_diagonal_(0.0)  # the mean of 1 and a large number is 2
+    system = twice + torch.diag(whole.sum(1) - twice.sum(1))  # what the sides hold, and the links
+    joined = torch.cat([torch.eye(n * n, dtype=torch.float64)[:, ~inside.flatten()], inside.flatten()[:, None]], 1)
+    expected = joined @ torch.linalg.solve(joined.T @ system @ joined, joined.sum(0))
+
+    kappa = torch.where(inside, jump, 1.0).to(dtype)[None]
+    u, info = prdp.linear_solve(
+        prdp.operators.Diffusion(kappa), torch.ones(1, 1, n, n, dtype=dtype), prdp.Direct(), on_failure="return"
+    )
+    error = (u.flatten().double() - expected).norm() / expected.norm()
+    assert info.failed.all() or error < 2 / jump + 2e-3
+    assert jump > 1e12 or not info.failed.any()

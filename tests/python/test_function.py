@@ -303,7 +303,7 @@ def test_rounding_in_the_product_of_zero_is_no_constant(dtype, step):
     assert (u * 3 * u0**2 - right_hand_side()).norm() < 0.1 * right_hand_side().norm()
 
 
-def test_only_the_first_operator_with_this_code_multiplies_a_zero():
+def test_the_first_second_and_fourth_solve_with_this_code_look_whether_it_is_linear():
     def begins_with_zero(scale):
         given = []
 
@@ -314,7 +314,26 @@ def test_only_the_first_operator_with_this_code_multiplies_a_zero():
         prdp.linear_solve(operators.Function(product), right_hand_side(), prdp.GMRES(2))
         return not given[0].any()
 
-    assert [begins_with_zero(scale) for scale in (2.0, 3.0, 4.0)] == [True, False, False]
+    assert [begins_with_zero(scale) for scale in (2.0, 3.0, 4.0, 5.0, 6.0)] == [True, True, False, True, False]
+
+
+def test_a_product_that_is_not_linear_is_refused():
+    """As the residual of Newton's method in place of its derivative."""
+    b = right_hand_side()
+    for product in (lambda v: v + 0.1 * v**3, lambda v: v + v**2, lambda v: v.abs() + v.clamp(max=0.3)):
+        for _ in range(2):  # nor does it pass the second time
+            with pytest.raises(ValueError, match=r"must be linear, but matvec\(2 b\) and 2 matvec\(b\) differ by"):
+                prdp.linear_solve(operators.Function(product), b, prdp.GMRES(9))
+
+
+def test_a_constant_that_appears_later_is_refused_too():
+    def solve(at_the_boundary):
+        a = operators.Function(lambda v: 2 * v + at_the_boundary)
+        return prdp.linear_solve(a, right_hand_side(), prdp.GMRES(2))
+
+    solve(0.0)
+    with pytest.raises(ValueError, match=r"matvec\(0\) holds ±0.1"):
+        solve(0.1)
 
 
 def test_copies_and_pickles():

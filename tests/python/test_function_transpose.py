@@ -107,3 +107,20 @@ def test_what_was_written_to_is_not_compared():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message=f".*{SAYS}")
         u.sum().backward()
+
+
+def test_another_wrong_transpose_is_said_again():
+    """Each code has a warning of its own: one that was mended wrongly is not silent."""
+    m = matrix()
+
+    def solve(transpose):
+        gradient(operators.Function(lambda v: v @ m.mT, transpose=transpose), prdp.GMRES(9, restart=12))
+
+    with pytest.warns(UserWarning, match=SAYS):
+        solve(lambda v: 2 * (v @ m))
+    with pytest.warns(UserWarning, match=SAYS):
+        solve(lambda v: v @ m.mT)
+    for _ in range(2):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            solve(lambda v: v @ m)

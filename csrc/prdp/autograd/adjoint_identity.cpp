@@ -30,7 +30,8 @@ void AdjointIdentity::keep(const at::Tensor& b, const Solved& solved) {
   writes_ = writes_to(b_, u_);
 }
 
-void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint) const {
+void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint,
+                            const FunctionCode* code) const {
   if (writes_to(b_, u_) != writes_) return;
   const at::NoGradGuard no_grad;
   const auto forward_size = sample_norms(lambda) * sample_norms(b_),
@@ -43,7 +44,7 @@ void AdjointIdentity::check(const at::Tensor& cotangent, const at::Tensor& lambd
                        backward.isfinite() & adjoint.status.ge(static_cast<int64_t>(SolveStatus::kStagnated));
   if (!differs.any().item<bool>()) return;
   const auto sample = differs.nonzero()[0].item<int64_t>();
-  warn_of_another_transpose(sample, forward[sample].item<double>(), backward[sample].item<double>());
+  warn_of_another_transpose(code, sample, forward[sample].item<double>(), backward[sample].item<double>());
 }
 
 }  // namespace prdp

@@ -1,5 +1,6 @@
 #pragma once
 #include "prdp/autograd/solve_vjp.h"
+#include "prdp/operators/function_operator.h"
 
 namespace prdp {
 
@@ -10,9 +11,10 @@ class AdjointIdentity {
  public:
   /// Keeps b, u and the residual without a copy; on the CPU, where the host can look.
   void keep(const at::Tensor& b, const Solved& solved);
-  /// Warns of the first sample where the two differ by more than both residuals explain. Says nothing where b or u
-  /// was written to since, or the adjoint solve failed.
-  void check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint) const;
+  /// Warns, once for this `code`, of the first sample where the two differ by more than both residuals explain. Says
+  /// nothing where b or u was written to since, or the adjoint solve failed.
+  void check(const at::Tensor& cotangent, const at::Tensor& lambda, const SolveInfo& adjoint,
+             const FunctionCode* code) const;
   bool has_kept() const { return b_.defined(); }
   void release() { b_ = u_ = residual_ = at::Tensor(); }
 

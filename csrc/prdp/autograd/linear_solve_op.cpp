@@ -166,7 +166,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
   a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);
   if (!spec.transposed) {  // an adjoint solve follows one
     a->check_null_spaces(b);
-    if (is_function(spec)) refuse_constant_in_product(spec, b);
+    if (is_function(spec)) refuse_nonlinear_product(spec, b);
   }
   const auto& s = options.solver;
   auto rhs = b;

@@ -7,6 +7,7 @@
 #include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/unrolled_vjp.h"
+#include "prdp/error_text.h"
 #include "prdp/operators/plain_tensors.h"
 
 namespace prdp {
@@ -55,16 +56,17 @@ at::Tensor fake_kernel(at::TensorList, const at::Tensor& b, Others...) {
 
 /// The ops of first derivatives have none themselves: backward through them raises, and so does a tangent.
 void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack* stack) {
-  constexpr const char* kRefusal =
-      "linear_solve: backward=\"unrolled\" has no second derivatives under torch.func or in forward mode; "
-      "take backward=\"implicit\", or torch.autograd.grad with create_graph=True";
+  const std::string refusal = c10::str("linear_solve: ", in_language("backward=\"unrolled\"", "Backward::kUnrolled"),
+                                       " has no second derivatives under torch.func or in forward mode; take ",
+                                       in_language("backward=\"implicit\"", "Backward::kImplicit"),
+                                       ", or torch.autograd.grad with create_graph=True");
   std::vector<at::Tensor> inputs;
   for (const auto& argument : torch::jit::last(*stack, op.schema().arguments().size())) {
     if (argument.isTensor()) inputs.push_back(argument.toTensor());
     if (argument.isTensorList())
       for (const at::Tensor& t : argument.toTensorVector()) inputs.push_back(t);
   }
-  TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(inputs), kRefusal);
+  TORCH_CHECK_NOT_IMPLEMENTED(!any_tangent(inputs), refusal);
   const bool record = at::GradMode::is_enabled() && std::any_of(inputs.begin(), inputs.end(), [](const at::Tensor& t) {
                         return t.defined() && t.requires_grad();
                       });
@@ -73,11 +75,11 @@ void refuse_second_derivatives(const c10::OperatorHandle& op, torch::jit::Stack*
     op.callBoxed(stack);
   }
   if (!record) return;
-  const auto refusal =
-      make_node<torch::autograd::Error>(kRefusal, torch::autograd::collect_next_edges(at::TensorList(inputs)));
+  const auto node =
+      make_node<torch::autograd::Error>(refusal, torch::autograd::collect_next_edges(at::TensorList(inputs)));
   const auto& derivatives = torch::jit::peek(*stack, 0, op.schema().returns().size());  // the first result
-  if (derivatives.isTensor()) torch::autograd::set_history(derivatives.toTensor(), refusal);
-  else torch::autograd::set_history(derivatives.toTensorVector(), refusal);
+  if (derivatives.isTensor()) torch::autograd::set_history(derivatives.toTensor(), node);
+  else torch::autograd::set_history(derivatives.toTensorVector(), node);
 }
 
 }  // namespace

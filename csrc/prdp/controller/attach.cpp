@@ -15,6 +15,7 @@ void set_budget(StepperBase& stepper, const Budget& budget) {
 Solves last_solves(const std::vector<const StepperBase*>& steppers) {
   Solves solves(!steppers.empty());
   for (const auto* stepper : steppers) {
+    TORCH_CHECK_VALUE(stepper, "last_solves: a stepper is null");
     solves.converged = solves.converged && stepper->converged();
     if (!stepper->info()) continue;
     const auto& info = *stepper->info();

@@ -23,8 +23,9 @@ struct Solves {
 
   Solves() = default;
   /// From a bool alone: an error or a residual in its place would pass for true.
-  Solves(std::same_as<bool> auto converged, std::optional<double> residual = {}, std::optional<double> error = {})
-      : converged(converged), residual(residual), error(error) {}
+  Solves(std::same_as<bool> auto all_converged, std::optional<double> mean_residual = {},
+         std::optional<double> relative_error = {})
+      : converged(all_converged), residual(mean_residual), error(relative_error) {}
 };
 
 /// Limits of the solves of the next interval. A stepper keeps its own value where none is given.

@@ -7,11 +7,13 @@
 #include <torch/csrc/autograd/autograd.h>
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <limits>
 #include <mutex>
 #include <unordered_map>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/dense.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
@@ -58,10 +60,13 @@ bool holds_numbers(const at::Tensor& t) {
   return at::isFloatingType(t.scalar_type()) || at::isComplexType(t.scalar_type());
 }
 
+const char* product_name() { return in_language("matvec", "apply"); }
+const char* transpose_name() { return in_language("transpose", "apply_transpose"); }
+
 /// Raises ValueError if a product of constants has a derivative, in reverse mode only if that is asked for.
 void check_nothing_is_captured(const at::Tensor& result, bool reverse = true) {
-  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result),
-                    "Function: matvec uses a tensor that requires grad",
+  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result), "Function: ", product_name(),
+                    " uses a tensor that requires grad",
                     has_tangent(result) || in_torch_func() ? ", or that forward mode or torch.func follows," : "",
                     " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
                     "detach it");
@@ -130,26 +135,40 @@ void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
   const auto v = for_one_entry(primal(b).detach());
   const auto is_there = [](const at::Tensor& t) { return t.defined(); };
   if (a.transposed || !v.defined() || !std::all_of(of_one.tensors.begin(), of_one.tensors.end(), is_there)) return;
-  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(make_operator(of_one)->apply(v)),
-                    "Function: matvec uses a tensor that vmap maps over, but that is not among its tensors; hand it "
+  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(make_operator(of_one)->apply(v)), "Function: ", product_name(),
+                    " uses a tensor that vmap maps over, but that is not among its tensors; hand it "
                     "over in tensors");
 }
 
-void refuse_constant_in_product(const OperatorSpec& a, const at::Tensor& b) {
-  const auto registered = RegisteredProducts::find(a.shape.at(0));
+void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
+  const auto code = RegisteredProducts::find(a.shape.at(0))->code;
   const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
-  if (!can_look || !*registered->looks_at_zero) return;
-  const at::NoGradGuard no_grad;
-  auto constant = a;
-  constant.tensors = detached(a.tensors);
-  const auto found = make_operator(constant)->apply(at::zeros_like(b).detach());
-  const auto largest = found.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>();
-  // Beside b, as products by differences leave rounding.
-  const double rounding = 32.0 * std::sqrt(epsilon_of(b)) * b.abs().max().to(at::kDouble).item<double>();
-  TORCH_CHECK_VALUE(largest == 0.0 || largest <= rounding || !std::isfinite(rounding),
-                    "Function: matvec must be linear, but matvec(0) holds ±", largest,
-                    "; constants, such as values on the boundary, belong to b");
-  *registered->looks_at_zero = false;
+  if (!can_look) return;
+  const auto solves = static_cast<uint64_t>(code->solves) + 1;
+  if (std::has_single_bit(solves)) {
+    const at::NoGradGuard no_grad;
+    auto constant = a;
+    constant.tensors = detached(a.tensors);
+    const auto of = make_operator(constant);
+    const auto largest = [](const at::Tensor& v) {
+      return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>();
+    };
+    const auto v = b.detach();
+    const double at_zero = largest(of->apply(at::zeros_like(v)));
+    // Beside b, as products by differences leave rounding.
+    const double rounding = 32.0 * std::sqrt(epsilon_of(b)) * largest(v);
+    TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
+                      " must be linear, but ", product_name(), "(0) holds ±", at_zero,
+                      "; constants, such as values on the boundary, belong to b");
+    const auto once = of->apply(v);
+    const double size = largest(once), off = largest(of->apply(2.0 * v) - 2.0 * once);
+    // A derivative by differences is not quite linear.
+    TORCH_CHECK_VALUE(off <= 0.1 * size + rounding || !std::isfinite(off), "Function: ", product_name(),
+                      " must be linear, but ", product_name(), "(2 b) and 2 ", product_name(), "(b) differ by ", off,
+                      "; in Newton's method it is the derivative, as ",
+                      in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
+  }
+  ++code->solves;
 }
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
@@ -170,12 +189,12 @@ void FunctionOperator::check_vector(const at::Tensor& b) const {
 
 at::Tensor FunctionOperator::apply(const at::Tensor& v) const {
   if (registered_->looks_for_captures && !at::GradMode::is_enabled()) return product_without_captures(v);
-  return product(registered_->products().apply, v, tensors_, "matvec");
+  return product(registered_->products().apply, v, tensors_, product_name());
 }
 
 at::Tensor FunctionOperator::apply_transpose(const at::Tensor& v) const {
   const auto& [apply, transpose, diagonal, transpose_in_transforms, rule] = registered_->products();
-  if (transpose) return product(transpose, v, tensors_, "transpose");
+  if (transpose) return product(transpose, v, tensors_, transpose_name());
   const bool dual = has_tangent(v) || any_tangent(tensors_);
   if (transpose_in_transforms && in_transform(v) && !dual) return transpose_in_transforms(v, tensors_);
   return derivative_transposed(v);
@@ -201,8 +220,8 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
 }
 
 at::Tensor FunctionOperator::product_without_captures(const at::Tensor& v) const {
-  const auto result =
-      with_autograd([&] { return product(registered_->products().apply, v.detach(), detached(tensors_), "matvec"); });
+  const auto result = with_autograd(
+      [&] { return product(registered_->products().apply, v.detach(), detached(tensors_), product_name()); });
   check_nothing_is_captured(result);
   registered_->looks_for_captures = false;
   return result;  // no graph hangs on it
@@ -216,16 +235,17 @@ at::Tensor FunctionOperator::derivative_transposed(const at::Tensor& v) const {
     if (!at_zero || at_zero->point.sizes() != v.sizes() || at_zero->point.dtype() != v.dtype()) {
       const auto point = at::zeros_like(v).detach().requires_grad_();
       const auto tensors = create_graph ? tensors_ : detached(tensors_);
-      at_zero = Recorded{point, product(registered_->products().apply, point, tensors, "matvec")};
+      at_zero = Recorded{point, product(registered_->products().apply, point, tensors, product_name())};
       if (!create_graph) recorded_ = at_zero;
     }
     if (!at_zero->product.requires_grad()) return {};
     return torch::autograd::grad({at_zero->product}, {at_zero->point}, {create_graph ? v : v.detach()},
                                  /*retain_graph=*/true, create_graph, /*allow_unused=*/true)[0];
   });
-  TORCH_CHECK_VALUE(found.defined(),
-                    "Function: torch cannot differentiate matvec with respect to its vector; make "
-                    "it of torch operations, or give transpose");
+  TORCH_CHECK_VALUE(found.defined(), "Function: torch cannot differentiate ", product_name(),
+                    " with respect to its vector; make it of "
+                    "torch operations, or give ",
+                    transpose_name());
   return found;
 }
 
@@ -268,7 +288,7 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
     }
     std::vector<at::Tensor> gradients(tensors_.size());
     if (wanted.empty()) return gradients;
-    const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, "matvec");
+    const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, product_name());
     if (!made.requires_grad()) return gradients;
     const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()}, create_graph,
                                              create_graph, /*allow_unused=*/true);

@@ -25,6 +25,11 @@ struct Products {
   ProductRule product_rule{};
 };
 
+/// What is shared by all products that are made of the same code, as those of a step that makes its operator anew.
+struct FunctionCode {
+  std::atomic<int64_t> solves{0};  // see refuse_nonlinear_product
+};
+
 /// Keeps products alive under a number, because functions cannot pass through torch's dispatcher but numbers can.
 class RegisteredProducts {
  public:
@@ -37,8 +42,7 @@ class RegisteredProducts {
   const Products& products() const { return products_; }
   /// Whether the next product below autograd looks for captured tensors (see refuse_captured_gradients).
   mutable std::atomic<bool> looks_for_captures{false};
-  /// Whether solves look for a constant (see refuse_constant_in_product), shared by what has the same code.
-  std::shared_ptr<std::atomic<bool>> looks_at_zero = std::make_shared<std::atomic<bool>>(true);
+  std::shared_ptr<FunctionCode> code = std::make_shared<FunctionCode>();
   /// The operator, for linear_solve.
   OperatorSpec spec(std::vector<at::Tensor> tensors) const { return {"function", {number_}, {}, std::move(tensors)}; }
 
@@ -62,9 +66,9 @@ void refuse_captured_gradients(const OperatorSpec& a);
 /// refuse_mapped_captures() looks for what vmap maps over alone.
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
 void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b);
-/// Raises ValueError where A 0 is no rounding beside b, as a solver would solve another problem than was meant. It
-/// looks until a solve on the CPU was right.
-void refuse_constant_in_product(const OperatorSpec& a, const at::Tensor& b);
+/// Raises ValueError where A 0 is not 0, or A (2 b) not about 2 A b, as a solver would solve another problem than was meant. It looks on
+/// the CPU, in the first solve with this code, and in the 2nd, 4th, 8th, …: what a function captures may change.
+void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
 /// from autograd through `apply`. The exact solve multiplies A with unit vectors, so it is for small n.

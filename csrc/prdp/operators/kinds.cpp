@@ -59,6 +59,7 @@ std::optional<std::vector<int64_t>> batched_axes(const std::string& kind, int64_
 
 void check_devices(const OperatorSpec& a, const at::Tensor& b) {
   for (const auto& t : a.tensors) {
+    TORCH_CHECK_VALUE(t.defined(), operator_kind(a.kind).title, ": one of its tensors is undefined");
     const bool beside = t.device() == b.device() || (t.dim() == 0 && t.is_cpu()) || t.sym_numel() == 0 ||
                         (is_function(a) && t.is_meta() == b.is_meta());
     TORCH_CHECK_VALUE(beside, operator_kind(a.kind).title, ": one of its tensors is on ", t.device(),

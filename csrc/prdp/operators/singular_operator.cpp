@@ -2,6 +2,7 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include "prdp/error_text.h"
 #include "prdp/gpu/operator_view.h"
 #include "prdp/gpu/part_of.h"
 #include "prdp/kernels/kernel.h"
@@ -153,11 +154,13 @@ void SingularOperator::check_is_mapped_to_zero(const Basis& basis, const at::Ten
     const auto v = (q[k] / q[k].abs().amax()).expand_as(by_vector(b, basis.spans_channels(b))).reshape_as(b);
     const auto left = sample_maxima(apply_on_loops(*a_, v, transposed));
     const auto wrong = (left > rounding * size).logical_and(left.isfinite());  // what is not finite, its status says
-    TORCH_CHECK_VALUE(!wrong.any().item<bool>(), title_, ": vector ", k, " of ",
-                      transposed ? "left_nullspace" : "nullspace", " is not in the null space of ",
-                      transposed ? "Aᵀ" : "A", ": a product has entries of ",
-                      left.masked_fill(wrong.logical_not(), 0.0).amax().item<double>(), " where ‖v‖∞ is 1",
-                      transposed ? "; give left_nullspace= if A is not symmetric" : "");
+    TORCH_CHECK_VALUE(
+        !wrong.any().item<bool>(), title_, ": vector ", k, " of ",
+        in_language(transposed ? "left_nullspace" : "nullspace", transposed ? "the left ones" : "those"),
+        " is not in the null space of ", transposed ? "Aᵀ" : "A", ": a product has entries of ",
+        left.masked_fill(wrong.logical_not(), 0.0).amax().item<double>(), " where ‖v‖∞ is 1",
+        transposed ? c10::str("; give ", in_language("left_nullspace=", "the left one, too,"), " if A is not symmetric")
+                   : std::string());
   }
 }
 

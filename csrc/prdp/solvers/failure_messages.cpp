@@ -7,6 +7,7 @@
 #include <limits>
 #include <sstream>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/singular_operator.h"
@@ -140,10 +141,12 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
 std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (traits(solver.method).is_direct)
     return std::string("A is singular") + (b.scalar_type() == at::kFloat ? " to float32; take float64, or" : ";") +
-           " GMRES solves it for any b in the range of A, and Direct where nullspace names all null vectors";
+           " GMRES solves it for any b in the range of A, and Direct where all null vectors are named";
   if (traits(solver.method).made_for == MadeFor::kDefinite && solver.preconditioner.is_operator())
-    return "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, "
-           "or A is not; prdp.check_operator(A, b, solver) looks at both";
+    return std::string(
+               "r·M⁻¹ r, or p·A p for a direction p, is zero or changes its sign: its preconditioner is not definite, "
+               "or A is not") +
+           in_language("; prdp.check_operator(A, b, solver) looks at both", "");
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
   if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(solver, a, b, sample);
@@ -173,6 +176,10 @@ std::string stopped(const Solver& solver, const Operator& a, const at::Tensor& b
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric)
     if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+  const bool is_symmetric = solver.preconditioner.is_multigrid() && asymmetric(a, b, sample).empty();
+  if (is_symmetric && b.scalar_type() == at::kFloat)
+    return "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or "
+           "float64";
   if (solver.preconditioner.is_multigrid())
     return "its cycles may not be made for this A, as for a wind in central differences that is strong beside the "
            "diffusion; take upwind differences, leave out multigrid, or take Direct";
@@ -196,12 +203,16 @@ std::string zero_diagonal(const SolveRole& role, const Operator& a, const at::Te
                     : "; take GMRES");
 }
 
+std::string name_the_null_space() {
+  return std::string("give ") + in_language("nullspace=\"constant\" to the operator", "prdp::with_null_space(a)") +
+         ", or all vectors if it maps more to zero";
+}
+
 std::string inconsistent(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!knows_null_space(role))
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
            (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
-           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") +
-           "give nullspace=\"constant\" to the operator, or all vectors if it maps more to zero";
+           " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") + name_the_null_space();
   const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
   const auto share = number(100.0 * outside) + " % of ";
   if (!operator_kind(role.a.kind).has_pressure)
@@ -221,9 +232,10 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
   const auto why = [&]() -> std::string {
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         has_undeclared_constant_null_space(role, a, b, sample))
-      return "A maps the constant to zero, so it is singular; give nullspace=\"constant\", or all vectors if it maps "
-             "more "
-             "to zero";
+      return "A maps the constant to zero, so it is singular; " + name_the_null_space();
+    if (status == SolveStatus::kBreakdown && traits(role.solver.method).is_direct && !a.may_be_singular())
+      return "the rounding of A may move u by more than a thousandth, as its entries differ too much in size; bring "
+             "them, such as the largest and the smallest κ, nearer to each other";
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {

@@ -6,6 +6,7 @@
 #include <sstream>
 #include <utility>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/failure_messages.h"
 #include "prdp/solvers/raise_or_warn.h"
@@ -229,19 +230,21 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
 
 void warn_of_constant_cycles() {
   warn_once("constant cycles", 0.0, [](std::ostream& text) {
-    text << "backward=\"unrolled\": the gradient of A leaves out how the cycles of multigrid depend on A, which is all "
-            "of it after one iteration; take backward=\"implicit\"";
+    text << in_language("backward=\"unrolled\"", "Backward::kUnrolled")
+         << ": the gradient of A leaves out how the cycles of multigrid depend on A, which is all of it after one "
+            "iteration; take "
+         << in_language("backward=\"implicit\"", "Backward::kImplicit");
   });
 }
 
-void warn_of_another_transpose(int64_t sample, double of_solve, double of_adjoint) {
-  warn_once("another transpose", 0.0, [&](std::ostream& text) {
+void warn_of_another_transpose(const void* code, int64_t sample, double of_solve, double of_adjoint) {
+  warn_once(c10::str("another transpose ", code), 0.0, [&](std::ostream& text) {
     text << "adjoint solve: the gradient of sample " << sample
          << " is wrong, as this Function's transpose is not that of the A that was solved: ⟨λ, b⟩ = " << of_solve
-         << " and ⟨u, ū⟩ = " << of_adjoint
-         << " should be equal. Is `transpose` right, or A symmetric where symmetric=True? Do the functions still see "
-            "the "
-            "tensors that they captured? prdp.check_operator tells";
+         << " and ⟨u, ū⟩ = " << of_adjoint << " should be equal. Is "
+         << in_language("`transpose` right, or A symmetric where symmetric=True", "`apply_transpose` right")
+         << "? Do the functions still see the tensors that they captured?"
+         << in_language(" prdp.check_operator tells", "");
   });
 }
 
@@ -249,9 +252,10 @@ void raise_or_warn(const std::string& text, OnFailure on_failure) {
   std::ostringstream whole;
   whole << of_step() << text;
   if (on_failure == OnFailure::kRaise)
-    whole
-        << ". With on_failure=\"return\", what there is comes back with the status of each sample; with \"zero_grad\" "
-           "the failed ones have no gradient, and a training goes on";
+    whole << ". With " << in_language("on_failure=\"return\"", "OnFailure::kReturn")
+          << ", what there is comes back with the status of each sample; with "
+          << in_language("\"zero_grad\"", "OnFailure::kZeroGrad")
+          << " the failed ones have no gradient, and a training goes on";
   TORCH_CHECK_LINALG(on_failure != OnFailure::kRaise, whole.str());
   warning_sink()(whole.str());
 }

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "prdp/error_text.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/prepared_batch.h"
@@ -50,7 +51,7 @@ void TensorSpace::check_scale(const at::Tensor& scale) const {
   const double most = b_.scalar_type() == at::kFloat ? 60.0 : 500.0;
   TORCH_CHECK_VALUE(exponent <= most, "linear_solve: unrolled in ", b_.scalar_type(),
                     ", A may change the size of a vector by a factor of 2^", most, ", got 2^", exponent,
-                    "; scale A and b, or take backward=\"implicit\"");
+                    "; scale A and b, or take ", in_language("backward=\"implicit\"", "Backward::kImplicit"));
 }
 
 TensorSpace::Scalar TensorSpace::update_iterate_and_residual(const Scalar& alpha, const Vector& p, const Vector& q,
@@ -153,18 +154,19 @@ at::Tensor signs_like(const at::Tensor& v, int64_t first, int64_t pattern) {
 
 }  // namespace
 
-TensorSpace::Scalar TensorSpace::skeel_estimate2(const Vector& x) const {
-  const auto u = solution(x).detach();
+std::vector<double> TensorSpace::skeel_estimates(const Vector& x) const {
+  const auto given = solution(x).detach();
+  const auto u = scale_rhs(given, largest_magnitude(given)).b;
   const int64_t n = u.numel() / std::max<int64_t>(u.size(0), 1);
-  at::Tensor scale2, largest;  // of |A| |u|; of all solves
-  for (int64_t p = 0; p < kSignPatterns; ++p) add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).square());
-  const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt();
+  at::Tensor scale2, moved;  // of |A| |u|; the largest of all solves
+  for (int64_t p = 0; p < kSignPatterns; ++p)
+    add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).to(at::kDouble).square());
+  const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt().to(u.scalar_type());
   for (int64_t p = 0; p < kSignPatterns; ++p) {
-    const auto moved = laid_out(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
-    const auto square = dot(moved, moved);
-    largest = largest.defined() ? at::maximum(largest, square) : square;  // NaN stays
+    const auto size = sample_norms(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
+    moved = moved.defined() ? at::maximum(moved, size) : size;  // NaN stays
   }
-  return largest;
+  return to_host<double>(moved / sample_norms(u), u.size(0));
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {

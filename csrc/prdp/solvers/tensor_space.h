@@ -145,7 +145,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   // ---- direct methods
 
   void solve_directly(const Vector& r, Vector& d);
-  Scalar skeel_estimate2(const Vector& x) const;
+  std::vector<double> skeel_estimates(const Vector& x) const;
 
   // ---- the loop around the methods
 

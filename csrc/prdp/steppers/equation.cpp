@@ -6,6 +6,7 @@
 #include <algorithm>
 
 #include "prdp/autograd/detach_failed.h"
+#include "prdp/operators/kinds.h"
 #include "prdp/steppers/equation_kinds.h"
 #include "prdp/steppers/memory_check.h"
 #include "prdp/steppers/packed_equation.h"
@@ -22,15 +23,16 @@ at::Tensor state_at_rest(const Equation& equation) {
   // A negative extent is left for the operator to refuse.
   for (const int64_t n : equation.shape) sizes.push_back(std::max<int64_t>(n, 0));
   uint64_t numbers = 0;
-  TORCH_CHECK_VALUE(!c10::safe_multiplies_u64(sizes, &numbers) && numbers < uint64_t{1} << 63, equation.kind,
-                    ": a state of shape ", at::IntArrayRef(equation.shape), " has more than 2**63 numbers");
+  TORCH_CHECK_VALUE(!c10::safe_multiplies_u64(sizes, &numbers) && numbers < uint64_t{1} << 63,
+                    operator_kind(equation.kind).title, ": a state of shape ", at::IntArrayRef(equation.shape),
+                    " has more than 2**63 numbers");
   return at::zeros({1}).expand(sizes);  // of any size in the memory of one number
 }
 
 }  // namespace
 
 void Equation::check_picard_steps() const {
-  TORCH_CHECK_VALUE(picard_steps >= 1, kind, ": picard_steps must be >= 1, got ", picard_steps);
+  TORCH_CHECK_VALUE(picard_steps >= 1, operator_kind(kind).title, ": picard_steps must be >= 1, got ", picard_steps);
 }
 
 void Equation::check() const {

@@ -39,7 +39,7 @@ SolveOutputs call_solves(const Equation& e, const at::Tensor& u, const c10::SymI
 void check_rollout(const Equation& equation, const at::Tensor& u, const c10::SymInt& solves,
                    const SolveOptions& options) {
   equation.check_picard_steps();
-  options.check(equation.kind.c_str());
+  options.check(operator_kind(equation.kind).title);
   check_memory(options, u);
   TORCH_CHECK_VALUE(solves.is_symbolic() || solves.expect_int() >= 0, "rollout: steps must be >= 0, got ",
                     solves / equation.picard_steps);

@@ -191,6 +191,7 @@ int run(const Options& options, const std::string& command) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  prdp::speak_python();  // as the keys of scenes do
   CLI::App app("Train a scene through differentiable physics that stops early, in C++.");
   Options options;
   const auto positive = CLI::Range(int64_t{1}, prdp::kMostCounted);

@@ -210,7 +210,7 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (where != 0) copy(from, to);
   }
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
-  Scalar skeel_estimate2(const T*) const { return 0; }
+  std::array<double, 1> skeel_estimates(const T*) const { return {0.0}; }
 
   // ---- what iterate.h asks for
   std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
