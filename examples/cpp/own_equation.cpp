@@ -10,8 +10,8 @@ constexpr double kDt = 0.1;
 
 /// Implicit in the diffusion, explicit in the reaction. κ (1, N) is read anew in every step.
 prdp::ImplicitStep make_step(const std::function<at::Tensor()>& kappa) {
-  const auto diffusion = [kappa](const at::Tensor& u) {
-    return prdp::diffusion(kappa(), at::full({}, 1 / kDt, u.options()), {{prdp::Side::kFlux, prdp::Side::kFlux}});
+  const auto diffusion = [kappa](const at::Tensor&) {
+    return prdp::diffusion(kappa(), 1 / kDt, {{prdp::Side::kFlux, prdp::Side::kFlux}});
   };
   const auto rhs = [](const at::Tensor& u) { return u / kDt + u - u.pow(3); };
   return {diffusion, rhs, prdp::CG{.max_iter = 100, .rtol = 1e-5}};

@@ -156,8 +156,12 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 }
 
 /// Why the residual fell no further, far above what was asked for.
-std::string stagnated(const Solver& solver, const at::Tensor& b) {
+std::string stagnated(const SolveRole& role, const at::Tensor& b) {
+  const auto& solver = role.solver;
   const bool single = b.scalar_type() == at::kFloat;
+  if (single && role.a.kind.starts_with("diffusion") && solver.method == Method::kConjugateGradient)
+    return "the residual falls no further in float32; where κ jumps, u may be right all the same: solve it once with "
+           "Direct to see, and if it is, stay there";
   if (traits(solver.method).counts == Counts::kCycles)
     return "its cycles take nothing more off the residual; take a larger restart, " +
            std::string(solver.preconditioner.is_multigrid() ? "no multigrid" : "a preconditioner") + ", or Direct" +
@@ -255,7 +259,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
         if (const auto refused = a.refusal(sample); !refused.empty())
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
-      case SolveStatus::kStagnated: return stagnated(role.solver, b);
+      case SolveStatus::kStagnated: return stagnated(role, b);
       case SolveStatus::kMaxIter: return stopped(role.solver, a, b, sample);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
