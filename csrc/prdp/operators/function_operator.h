@@ -66,8 +66,9 @@ void refuse_captured_gradients(const OperatorSpec& a);
 /// refuse_mapped_captures() looks for what vmap maps over alone.
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
 void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b);
-/// Raises ValueError where A 0 is not 0, or A (2 b) not about 2 A b, as a solver would solve another problem than was meant. It looks on
-/// the CPU, in the first solve with this code, and in the 2nd, 4th, 8th, …: what a function captures may change.
+/// Raises ValueError where A 0 is not 0, or A (2 b) not about 2 A b, as a solver would solve another problem than was
+/// meant. It looks on the CPU, in the first solve with this code, and in the 2nd, 4th, 8th, …: what a function captures
+/// may change.
 void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come
