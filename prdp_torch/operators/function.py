@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import types
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -92,16 +93,21 @@ class Function(Operator):
 _CODES: "weakref.WeakKeyDictionary[Any, dict[int, _C.FunctionCode]]" = weakref.WeakKeyDictionary()
 
 
-def _code(function: Product | None) -> Any:
-    """What all functions with the same text have in common."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    return getattr(getattr(function, "__func__", function), "__code__", type(function))
+def _code(function: Any) -> Any:
+    """What all functions with the same text have in common; of a callable object, the object."""
+    while isinstance(function, functools.partial) or hasattr(function, "__wrapped__"):
+        function = function.func if isinstance(function, functools.partial) else function.__wrapped__
+    code = getattr(getattr(function, "__func__", function), "__code__", None)
+    return code if isinstance(code, types.CodeType) else function
 
 
 def _shared_code(matvec: Product, transpose: Product | None) -> _C.FunctionCode:
     """One for all operators that are made of the same code, as those of a step that makes its operator anew."""
-    return _CODES.setdefault(_code(matvec), {}).setdefault(hash(_code(transpose)), _C.FunctionCode())
+    try:
+        of_matvec = _CODES.setdefault(_code(matvec), {})
+    except TypeError:  # neither code nor an object that can be referred to weakly
+        return _C.FunctionCode()
+    return of_matvec.setdefault(id(_code(transpose)), _C.FunctionCode())
 
 
 def _tensor(name: str, value: object) -> Tensor:

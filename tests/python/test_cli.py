@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -167,6 +168,11 @@ def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
     lost = "prdp: warning: standard output: No space left on device; the work goes on without it\n"
     assert (done.returncode, done.stderr) == (0, lost if full else "")
     assert (tmp_path / "run/report.html").exists()
+
+
+def test_a_closed_standard_output_is_no_error():
+    done = subprocess.run(f"{shlex.join(PRDP)} scenes >&-", shell=True, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("ignored", [False, True])

@@ -264,3 +264,11 @@ def test_direct_fails_where_the_rounding_of_its_factors_moves_u(jump, dtype):
     error = (u.flatten().double() - expected).norm() / expected.norm()
     assert info.failed.all() or error < 2 / jump + 2e-3
     assert jump > 1e12 or not info.failed.any()
+
+
+@pytest.mark.parametrize("h, n", [(1e-10, 40), (1e-8, 1000)])
+def test_direct_keeps_a_weak_side_in_float32(h, n):
+    """Its residual is all rounding, and no doubt about its factors."""
+    a = prdp.operators.Diffusion(torch.ones(1, n), boundary=[("flux", ("robin", h))])
+    u, info = prdp.linear_solve(a, torch.ones(1, 1, n), prdp.Direct())
+    assert info.solved.all() and abs(u.mean().item() * h - 1) < 1e-4

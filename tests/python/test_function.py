@@ -322,8 +322,33 @@ def test_a_product_that_is_not_linear_is_refused():
     b = right_hand_side()
     for product in (lambda v: v + 0.1 * v**3, lambda v: v + v**2, lambda v: v.abs() + v.clamp(max=0.3)):
         for _ in range(2):  # nor does it pass the second time
-            with pytest.raises(ValueError, match=r"must be linear, but matvec\(2 b\) and 2 matvec\(b\) differ by"):
+            with pytest.raises(ValueError, match=r"must be linear, but matvec\(2 v\) and 2 matvec\(v\) differ by"):
                 prdp.linear_solve(operators.Function(product), b, prdp.GMRES(9))
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
+def test_a_derivative_by_differences_is_linear_enough_whatever_the_size_of_b(scale):
+    u0 = torch.linspace(1, 2, 4, dtype=torch.float64)
+    b = scale * right_hand_side()
+    b[0, 0] = torch.nan  # NaN in one sample
+    a = operators.Function(lambda v: ((u0 + 1e-3 * v) ** 3 - u0**3) / 1e-3)
+    _, info = prdp.linear_solve(a, b, prdp.GMRES(9, rtol=1e-2), on_failure="return")
+    assert info.status[0] == prdp.SolveStatus.NONFINITE_INPUT
+
+
+def test_modules_of_one_class_are_looked_at_each():
+    class Scaled(torch.nn.Module):
+        def __init__(self, constant):
+            super().__init__()
+            self.constant = constant
+
+        def forward(self, v):
+            return 2 * v + self.constant
+
+    for _ in range(3):
+        prdp.linear_solve(operators.Function(Scaled(0.0)), right_hand_side(), prdp.GMRES(2))
+    with pytest.raises(ValueError, match=r"matvec\(0\) holds ±1"):
+        prdp.linear_solve(operators.Function(Scaled(1.0)), right_hand_side(), prdp.GMRES(2))
 
 
 def test_a_constant_that_appears_later_is_refused_too():

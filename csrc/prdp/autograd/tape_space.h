@@ -167,9 +167,8 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return number(Kind::kSquare, rr, r.version);
   }
   void solve_directly(const Vector&, Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
-  std::array<double, 1> skeel_estimates(const Vector&) {
-    TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method");
-  }
+  std::array<bool, 1> definite_factors() const { return {false}; }
+  Scalar skeel_estimate2(const Vector&) { TORCH_INTERNAL_ASSERT(false, "no derivative of a direct method"); }
 
   Scalar guarded_quotient(const Scalar& num, const Scalar& den, const Scalar& v2, const Scalar& w2) {
     const T value = values_.guarded_quotient(num.value, den.value, v2.value, w2.value);

@@ -54,6 +54,9 @@ class Kernel {
   virtual double norm() const = 0;
   /// Whether A is known to be positive definite, and rounding does not change that.
   virtual bool is_surely_definite() const { return false; }
+  /// Whether its factors in float64 are, too. Where the rows of A differ by more than 1e13, they lose what couples the
+  /// small ones.
+  virtual bool has_definite_factors() const { return false; }
   /// Multiplications of a product.
   virtual int64_t work() const { return unknowns(); }
   /// out = A v

@@ -11,6 +11,7 @@
 #include <cmath>
 #include <limits>
 #include <mutex>
+#include <typeindex>
 #include <unordered_map>
 
 #include "prdp/error_text.h"
@@ -87,9 +88,26 @@ at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
 
 }  // namespace
 
+namespace {
+
+/// One for each lambda in the source; functions that a pointer points to have one each.
+std::shared_ptr<FunctionCode> code_of(const Products::Product& apply) {
+  static std::mutex mutex;
+  static auto* codes = new std::unordered_map<std::type_index, std::shared_ptr<FunctionCode>>;
+  if (apply.target<at::Tensor (*)(const at::Tensor&, const std::vector<at::Tensor>&)>())
+    return std::make_shared<FunctionCode>();
+  const std::lock_guard lock(mutex);
+  auto& code = (*codes)[apply.target_type()];
+  if (!code) code = std::make_shared<FunctionCode>();
+  return code;
+}
+
+}  // namespace
+
 std::shared_ptr<const RegisteredProducts> RegisteredProducts::make(Products products) {
   TORCH_CHECK_VALUE(products.apply, "Function: apply, the product with A, must be given");
   const std::shared_ptr<RegisteredProducts> made(new RegisteredProducts(std::move(products)));
+  made->code = code_of(made->products_.apply);
   const std::lock_guard lock(registry().mutex);
   made->number_ = ++registry().last;
   registry().entries[made->number_] = made;
@@ -140,6 +158,26 @@ void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
                     "over in tensors");
 }
 
+namespace {
+
+double largest(const at::Tensor& v) { return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>(); }
+
+/// Raises ValueError where A (2 v) is not about 2 A v, where v is b, scaled to the order of one as in a solve.
+void refuse_powers(const Operator& a, const at::Tensor& b) {
+  const auto magnitude = b.abs().flatten(1).amax(1);
+  const auto usable = per_sample(magnitude.isfinite() & magnitude.gt(0), b);
+  const auto v = at::where(usable, b * per_sample(power_of_two_scale(magnitude), b), at::zeros_like(b));
+  const auto once = a.apply(v);
+  const double size = largest(once), off = largest(a.apply(2.0 * v) - 2.0 * once);
+  // A derivative by differences is not quite linear.
+  TORCH_CHECK_VALUE(off <= 0.1 * size || !std::isfinite(off), "Function: ", product_name(), " must be linear, but ",
+                    product_name(), "(2 v) and 2 ", product_name(), "(v) differ by ", off,
+                    "; in Newton's method it is the derivative, as ",
+                    in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
+}
+
+}  // namespace
+
 void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
   const auto code = RegisteredProducts::find(a.shape.at(0))->code;
   const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
@@ -150,9 +188,6 @@ void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
     auto constant = a;
     constant.tensors = detached(a.tensors);
     const auto of = make_operator(constant);
-    const auto largest = [](const at::Tensor& v) {
-      return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>();
-    };
     const auto v = b.detach();
     const double at_zero = largest(of->apply(at::zeros_like(v)));
     // Beside b, as products by differences leave rounding.
@@ -160,13 +195,7 @@ void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
     TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
                       " must be linear, but ", product_name(), "(0) holds ±", at_zero,
                       "; constants, such as values on the boundary, belong to b");
-    const auto once = of->apply(v);
-    const double size = largest(once), off = largest(of->apply(2.0 * v) - 2.0 * once);
-    // A derivative by differences is not quite linear.
-    TORCH_CHECK_VALUE(off <= 0.1 * size + rounding || !std::isfinite(off), "Function: ", product_name(),
-                      " must be linear, but ", product_name(), "(2 b) and 2 ", product_name(), "(b) differ by ", off,
-                      "; in Newton's method it is the derivative, as ",
-                      in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
+    if (solves == 1) refuse_powers(*of, v);
   }
   ++code->solves;
 }

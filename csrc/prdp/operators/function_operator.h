@@ -42,7 +42,7 @@ class RegisteredProducts {
   const Products& products() const { return products_; }
   /// Whether the next product below autograd looks for captured tensors (see refuse_captured_gradients).
   mutable std::atomic<bool> looks_for_captures{false};
-  std::shared_ptr<FunctionCode> code = std::make_shared<FunctionCode>();
+  std::shared_ptr<FunctionCode> code;
   /// The operator, for linear_solve.
   OperatorSpec spec(std::vector<at::Tensor> tensors) const { return {"function", {number_}, {}, std::move(tensors)}; }
 
@@ -66,9 +66,9 @@ void refuse_captured_gradients(const OperatorSpec& a);
 /// refuse_mapped_captures() looks for what vmap maps over alone.
 void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b);
 void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b);
-/// Raises ValueError where A 0 is not 0, or A (2 b) not about 2 A b, as a solver would solve another problem than was
-/// meant. It looks on the CPU, in the first solve with this code, and in the 2nd, 4th, 8th, …: what a function captures
-/// may change.
+/// Raises ValueError where a solver would solve another problem than was meant: in the first solve on the CPU with this
+/// code, where A (2 v) is not about 2 A v; in the 1st, 2nd, 4th, 8th, …, as what a function captures may change, where
+/// A 0 is no rounding beside b.
 void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b);
 
 /// Kind "function"; the shape holds the number of its RegisteredProducts. Derivatives with respect to the tensors come

@@ -155,6 +155,13 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
          "take a b without that part, or add a multiple of the identity to A";
 }
 
+/// Whether a diffusion has rows that differ too much for `Direct`, see Kernel::has_definite_factors().
+bool has_wide_kappa(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return false;
+  const auto diagonal = a.diagonal().expand_as(b).select(0, sample).abs();
+  return (diagonal.max() / diagonal.min()).item<double>() >= 1e13;
+}
+
 /// Why the residual fell no further, far above what was asked for.
 std::string stagnated(const SolveRole& role, const at::Tensor& b) {
   const auto& solver = role.solver;
@@ -176,12 +183,13 @@ std::string stagnated(const SolveRole& role, const at::Tensor& b) {
 }
 
 /// Why max_iter left a large residual.
-std::string stopped(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+std::string stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const auto& solver = role.solver;
   const auto made_for = traits(solver.method).made_for;
   if (made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric)
     if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
-  const bool is_symmetric = solver.preconditioner.is_multigrid() && asymmetric(a, b, sample).empty();
-  if (is_symmetric && b.scalar_type() == at::kFloat)
+  const bool holds_weakly = role.a.kind.starts_with("diffusion") && b.scalar_type() == at::kFloat;
+  if (solver.preconditioner.is_multigrid() && holds_weakly && solver.method != Method::kConjugateGradient)
     return "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or "
            "float64";
   if (solver.preconditioner.is_multigrid())
@@ -237,9 +245,9 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         has_undeclared_constant_null_space(role, a, b, sample))
       return "A maps the constant to zero, so it is singular; " + name_the_null_space();
-    if (status == SolveStatus::kBreakdown && traits(role.solver.method).is_direct && !a.may_be_singular())
-      return "the rounding of A may move u by more than a thousandth, as its entries differ too much in size; bring "
-             "them, such as the largest and the smallest κ, nearer to each other";
+    if (status == SolveStatus::kBreakdown && has_wide_kappa(role, a, b, sample))
+      return "κ differs by more than a factor of 1e13, beyond what factors in float64 hold; bring its largest and its "
+             "smallest value nearer to each other";
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {
@@ -260,7 +268,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
       case SolveStatus::kStagnated: return stagnated(role, b);
-      case SolveStatus::kMaxIter: return stopped(role.solver, a, b, sample);
+      case SolveStatus::kMaxIter: return stopped(role, a, b, sample);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }
   }();

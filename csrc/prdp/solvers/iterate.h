@@ -107,19 +107,14 @@ inline void accept_rounding(SampleState& s) {
   s.floor2 = s.residual2;
 }
 
-constexpr double kFloat64Roundoff = 1.1e-16;
-
-/// Of the samples that return zero, accepts those whose u the rounding of A moves by less than a thousandth. What is
-/// definite for sure is factorised in float64, whatever the dtype.
+/// Of the samples that return zero, accepts those whose u the rounding of A moves by less than a thousandth.
 template <class Space, class Method>
 void accept_if_insensitive(Space& space, const Method& method, typename Space::States& states) {
   constexpr double stays = 1e-3;  // far below 1, as the estimate may be too small
-  const auto definite = space.surely_definite();
-  const auto skeel = space.skeel_estimates(method.x);
-  for (size_t i = 0; i < states.size(); ++i) {
-    const double epsilon = definite[i] ? kFloat64Roundoff : space.epsilon();
-    if (states[i].returned == Returned::kZero && epsilon * skeel[i] < stays) accept_rounding(states[i]);
-  }
+  const auto u2 = space.values_of(space.solution2(method.x)), moved2 = space.values_of(space.skeel_estimate2(method.x));
+  for (size_t i = 0; i < states.size(); ++i)
+    if (states[i].returned == Returned::kZero && space.epsilon() * std::sqrt(moved2[i]) < stays * std::sqrt(u2[i]))
+      accept_rounding(states[i]);
 }
 
 /// For direct methods, where the rounding ε ‖A‖ ‖u‖ is of the order of ‖b‖, and the residual exceeds 1e-2 ‖b‖: if the
@@ -130,16 +125,14 @@ void judge_numerical_singularity(Space& space, const Method& method, typename Sp
   const auto is_doubtful = [](const SampleState& s) { return is_unsolved(s.status) && s.residual2 > 1e-4 * s.b2; };
   if (!std::none_of(states.begin(), states.end(), is_doubtful)) {  // kernels have no any_of
     const auto floors = rounding_floors(space, method);
-    const auto definite = space.surely_definite();
+    const auto definite = space.definite_factors();
     bool asks_for_estimate = false;
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
-      const double floor = floors[i] / std::sqrt(s.b2);
-      if (!is_doubtful(s) || !(floor > 0.25)) continue;
-      const bool is_factorised_well = definite[i] && floor * kFloat64Roundoff < 1e-6 * space.epsilon();
-      if (is_factorised_well) accept_rounding(s);
+      if (!is_doubtful(s) || !(floors[i] > 0.25 * std::sqrt(s.b2))) continue;
+      if (definite[i]) accept_rounding(s);
       else s.returned = Returned::kZero;
-      asks_for_estimate = asks_for_estimate || !is_factorised_well;
+      asks_for_estimate = asks_for_estimate || !definite[i];
     }
     if (asks_for_estimate) accept_if_insensitive(space, method, states);
   }

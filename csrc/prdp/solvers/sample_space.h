@@ -4,7 +4,6 @@
 #include <cmath>
 #include <functional>
 #include <limits>
-#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -177,37 +176,27 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     return dot(memory.vector(1), memory.vector(1));
   }
   /// Seldom: as many products, and then as many solves, as there are patterns.
-  std::array<double, 1> skeel_estimates(const T* x) {
+  Scalar skeel_estimate2(const T* x) {
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    std::vector<T> u(unknowns()), values(unknowns());
-    layout().store(solution(x), T(1), u.data());
-    const T largest = *std::max_element(u.begin(), u.end(), [](T v, T w) { return std::abs(v) < std::abs(w); });
-    const T scale = kernels::power_of_two_scale(std::abs(largest));
-    std::vector<double> scale2(unknowns(), 0.0);  // of |A| |u|
-    const auto square = [](const std::vector<T>& v) {
-      return std::accumulate(v.begin(), v.end(), 0.0, [](double sum, double value) { return sum + value * value; });
-    };
-    for (T& value : u) value *= scale;
+    std::vector<T> values(unknowns()), scale2(unknowns(), T(0));  // of |A| |u|
     for (int64_t p = 0; p < kSignPatterns; ++p) {
-      layout().load(u.data(), T(1), memory.vector(0));
-      apply_with_signs(memory.vector(0), [p](int64_t i) { return is_negated(i, p); }, memory);
+      apply_with_signs(solution(x), [p](int64_t i) { return is_negated(i, p); }, memory);
       layout().store(memory.vector(1), T(1), values.data());
-      for (int64_t i = 0; i < unknowns(); ++i) scale2[i] += double(values[i]) * double(values[i]);
+      for (int64_t i = 0; i < unknowns(); ++i) scale2[i] += values[i] * values[i];
     }
-    double moved2 = 0.0;
+    T largest = 0;
     for (int64_t p = 0; p < kSignPatterns; ++p) {
       for (int64_t i = 0; i < unknowns(); ++i)
-        values[i] = (is_negated(unknowns() + i, p) ? -1 : 1) * static_cast<T>(std::sqrt(scale2[i] / kSignPatterns));
+        values[i] = (is_negated(unknowns() + i, p) ? -1 : 1) * std::sqrt(scale2[i] / T(kSignPatterns));
       layout().load(values.data(), T(1), memory.vector(0));
-      if (!system_.factors().solve(memory.vector(0), memory.vector(1)))
-        return {std::numeric_limits<double>::infinity()};
-      layout().store(memory.vector(1), T(1), values.data());
-      moved2 = std::max(moved2, square(values));
+      if (!system_.factors().solve(memory.vector(0), memory.vector(1))) return std::numeric_limits<T>::infinity();
+      largest = std::max(largest, dot(memory.vector(1), memory.vector(1)));
     }
-    return {std::sqrt(moved2 / square(u))};
+    return largest;
   }
   std::array<bool, 1> surely_definite() const { return {system_.a().is_surely_definite()}; }
+  std::array<bool, 1> definite_factors() const { return {system_.a().has_definite_factors()}; }
   void solve_directly(const T* r, Vector d) {
     if (system_.factors().solve(r, d)) return;
     broken_ = true;

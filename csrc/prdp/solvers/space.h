@@ -172,9 +172,10 @@ template <class S>
 concept FactorisedSpace = VectorSpace<S> && requires(S s, typename S::Vector x, typename S::Vector y) {
   /// y = A⁻¹ x; zero with a breakdown where A is singular.
   s.solve_directly(x, y);
-  /// Estimates Skeel's ‖|A⁻¹| |A| |u|‖ / ‖u‖ of each sample; times ε it is the relative error of u that rounding of A
-  /// causes.
-  s.skeel_estimates(x)[0];
+  /// Estimates Skeel's ‖|A⁻¹| |A| |u|‖²; times ε² it is the square of the error of u that rounding of A causes.
+  { s.skeel_estimate2(x) } -> std::same_as<typename S::Scalar>;
+  /// Whether the factors of A are positive definite for sure, of each sample.
+  s.definite_factors();
 };
 
 /// All that methods need.

@@ -154,19 +154,18 @@ at::Tensor signs_like(const at::Tensor& v, int64_t first, int64_t pattern) {
 
 }  // namespace
 
-std::vector<double> TensorSpace::skeel_estimates(const Vector& x) const {
-  const auto given = solution(x).detach();
-  const auto u = scale_rhs(given, largest_magnitude(given)).b;
+TensorSpace::Scalar TensorSpace::skeel_estimate2(const Vector& x) const {
+  const auto u = solution(x).detach();
   const int64_t n = u.numel() / std::max<int64_t>(u.size(0), 1);
-  at::Tensor scale2, moved;  // of |A| |u|; the largest of all solves
-  for (int64_t p = 0; p < kSignPatterns; ++p)
-    add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).to(at::kDouble).square());
-  const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt().to(u.scalar_type());
+  at::Tensor scale2, largest;  // of |A| |u|; of all solves
+  for (int64_t p = 0; p < kSignPatterns; ++p) add_to(scale2, system_.a.apply(u * signs_like(u, 0, p)).square());
+  const auto scale = (scale2 / static_cast<double>(kSignPatterns)).sqrt();
   for (int64_t p = 0; p < kSignPatterns; ++p) {
-    const auto size = sample_norms(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
-    moved = moved.defined() ? at::maximum(moved, size) : size;  // NaN stays
+    const auto moved = laid_out(system_.a.solve_directly(scale * signs_like(u, n, p), /*transposed=*/false));
+    const auto square = dot(moved, moved);
+    largest = largest.defined() ? at::maximum(largest, square) : square;  // NaN stays
   }
-  return to_host<double>(moved / sample_norms(u), u.size(0));
+  return largest;
 }
 
 void TensorSpace::solve_directly(const Vector& r, Vector& d) {

@@ -210,7 +210,8 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     if (where != 0) copy(from, to);
   }
   void solve_directly(const T*, Vector) {}  // no method on a GPU does
-  std::array<double, 1> skeel_estimates(const T*) const { return {0.0}; }
+  Scalar skeel_estimate2(const T*) const { return 0; }
+  std::array<bool, 1> definite_factors() const { return {false}; }
 
   // ---- what iterate.h asks for
   std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
