@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import inspect
 import types
 import weakref
 from collections.abc import Callable, Sequence
@@ -95,8 +96,9 @@ _CODES: "weakref.WeakKeyDictionary[Any, dict[int, _C.FunctionCode]]" = weakref.W
 
 def _code(function: Any) -> Any:
     """What all functions with the same text have in common; of a callable object, the object."""
-    while isinstance(function, functools.partial) or hasattr(function, "__wrapped__"):
-        function = function.func if isinstance(function, functools.partial) else function.__wrapped__
+    while isinstance(function, functools.partial):
+        function = function.func
+    function = inspect.unwrap(function)
     code = getattr(getattr(function, "__func__", function), "__code__", None)
     return code if isinstance(code, types.CodeType) else function
 
@@ -105,7 +107,7 @@ def _shared_code(matvec: Product, transpose: Product | None) -> _C.FunctionCode:
     """One for all operators that are made of the same code, as those of a step that makes its operator anew."""
     try:
         of_matvec = _CODES.setdefault(_code(matvec), {})
-    except TypeError:  # neither code nor an object that can be referred to weakly
+    except (TypeError, ValueError):  # neither code nor an object that can be referred to weakly
         return _C.FunctionCode()
     return of_matvec.setdefault(id(_code(transpose)), _C.FunctionCode())
 

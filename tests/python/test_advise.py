@@ -75,7 +75,8 @@ def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype():
     step = own_step(lambda u: prdp.operators.Matrix(torch.diag(k)))
     advice = advise(step, torch.randn(2, 16), dtypes=(torch.float64,))
     assert any(note.startswith("float64 was not tried: ") for note in advice.notes)
-    assert {row.dtype for row in advice.rows} == {torch.float32} and "Use " in advice.recommendation
+    assert {row.dtype for row in advice.rows} == {torch.float32}
+    assert advice.recommendation.startswith(("Use ", "Refine "))  # as the times fall
 
 
 def test_a_step_of_ones_own_sees_its_batch_and_its_dtype_alone():

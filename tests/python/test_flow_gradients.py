@@ -147,7 +147,7 @@ def test_picard_steps_converge_to_the_fully_implicit_step():
         u_next = physics(u)
         changes.append(float((physics.operator(u_next).apply(u_next) - u).norm() / u.norm()))
     assert changes[0] > 1e-2 and changes[1] < changes[0] and changes[2] < changes[1] and changes[3] < 1e-9
-    with pytest.raises(ValueError, match="burgers: picard_steps must be >= 1, got 0"):
+    with pytest.raises(ValueError, match="Burgers: picard_steps must be >= 1, got 0"):
         prdp.Burgers((12,), 1e-2, 0.02, solver=prdp.Direct(), picard_steps=0)
 
 

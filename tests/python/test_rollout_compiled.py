@@ -38,7 +38,7 @@ def test_the_ops_refuse_no_solves_a_step():
         lambda: torch.ops.prdp.rollout(u, *equation, -1, *options),
         lambda: torch.ops.prdp.rollout_vjp(states, states, None, None, None, [1, 0], *equation, *options),
     ):
-        with pytest.raises(ValueError, match="burgers: picard_steps must be >= 1, got 0"):
+        with pytest.raises(ValueError, match="Burgers: picard_steps must be >= 1, got 0"):
             call()
 
 
