@@ -68,9 +68,6 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
             with data_parallel.joined(), warnings.catch_warnings():
                 warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
-                if sys.stdout is None:  # closed
-                    function(*args, **kwargs)
-                    return
                 with contextlib.redirect_stdout(cast(IO[str], Output(sys.stdout))):
                     function(*args, **kwargs)
                     sys.stdout.flush()

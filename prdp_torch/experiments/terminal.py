@@ -26,10 +26,11 @@ console = Console(highlight=False, markup=False, emoji=False)  # paths and title
 
 
 class Output:
-    """Standard output whose reader may leave, or whose disk may be full: the work goes on without it."""
+    """Standard output that may be closed (None), whose reader may leave, or whose disk may be full: the work goes on
+    without it."""
 
-    def __init__(self, stream: IO[str]) -> None:
-        self._stream = stream
+    def __init__(self, stream: IO[str] | None) -> None:
+        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115  # for as long as the process lives
 
     def write(self, text: str) -> int:
         with self._which_may_end():

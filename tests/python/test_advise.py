@@ -70,13 +70,13 @@ def test_a_function_without_diagonal_leaves_out_jacobi():
     assert any(re.match("Jacobi and .* were not tried: .*diagonal", note) for note in advice.notes)
 
 
-def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype():
+def test_a_step_whose_tensors_do_not_follow_is_advised_in_its_own_dtype(monkeypatch):
+    monkeypatch.setattr("prdp_torch.advice.candidates", lambda _: [prdp.Direct()])  # no times decide what is advised
     k = torch.full((16,), 2.0)
     step = own_step(lambda u: prdp.operators.Matrix(torch.diag(k)))
     advice = advise(step, torch.randn(2, 16), dtypes=(torch.float64,))
     assert any(note.startswith("float64 was not tried: ") for note in advice.notes)
-    assert {row.dtype for row in advice.rows} == {torch.float32}
-    assert advice.recommendation.startswith(("Use ", "Refine "))  # as the times fall
+    assert {row.dtype for row in advice.rows} == {torch.float32} and "Use " in advice.recommendation
 
 
 def test_a_step_of_ones_own_sees_its_batch_and_its_dtype_alone():

@@ -146,17 +146,8 @@ def test_ctrl_c_keeps_what_is_finished_and_exits_130(tmp_path, command):
 @pytest.mark.parametrize("full", [False, True])
 def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
     """As `prdp compare … | head`, and with a disk that is full."""
-    command = [
-        *PRDP,
-        "compare",
-        str(tiny(tmp_path)),
-        "--intervals",
-        "1",
-        "--seeds",
-        "1",
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    run = tmp_path / "run"
+    command = [*PRDP, "compare", tiny(tmp_path), *["--intervals", "1", "--seeds", "1", "--out"], run]
     if full:
         with open("/dev/full", "w") as output:
             done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True)
@@ -167,7 +158,7 @@ def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
         os.close(write)
     lost = "prdp: warning: standard output: No space left on device; the work goes on without it\n"
     assert (done.returncode, done.stderr) == (0, lost if full else "")
-    assert (tmp_path / "run/report.html").exists()
+    assert (run / "report.html").exists()
 
 
 def test_a_closed_standard_output_is_no_error():
