@@ -3,8 +3,9 @@
 
 #include "bindings.h"
 #include "prdp/autograd/packed_options.h"
-#include "prdp/operators/function_operator.h"
+#include "prdp/operators/function_checks.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/steppers/equation.h"
 #include "prdp/steppers/memory_check.h"
 

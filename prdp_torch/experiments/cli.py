@@ -68,9 +68,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 raise ValueError(f"{function.__name__}: runs in a single process; only train is split by torchrun")
             with data_parallel.joined(), warnings.catch_warnings():
                 warnings.showwarning = lambda message, *_: print(f"prdp: warning: {message}", file=sys.stderr)
-                with contextlib.redirect_stdout(cast(IO[str], Output(sys.stdout))):
-                    function(*args, **kwargs)
-                    sys.stdout.flush()
+                function(*args, **kwargs)
         except KeyboardInterrupt:
             kept = "--resume keeps finished trainings and goes on from the last checkpoint"
             print(f"prdp: interrupted; {kept}", file=sys.stderr)
@@ -344,7 +342,11 @@ def _schedule(text: str, max_iter: int) -> tuple[int, int]:
 
 
 def main() -> None:
-    app()
+    with contextlib.redirect_stdout(cast(IO[str], Output(sys.stdout))):
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -161,9 +161,11 @@ def test_work_goes_on_where_nobody_takes_the_output(tmp_path, full):
     assert (run / "report.html").exists()
 
 
-def test_a_closed_standard_output_is_no_error():
-    done = subprocess.run(f"{shlex.join(PRDP)} scenes >&-", shell=True, stderr=subprocess.PIPE, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
+@pytest.mark.parametrize("words", ["scenes", "--version", "train --help"])
+def test_a_closed_or_full_standard_output_is_no_error(words):
+    for output in ("&-", "/dev/full"):
+        done = subprocess.run(f"{shlex.join(PRDP)} {words} >{output}", shell=True, stderr=subprocess.PIPE, text=True)
+        assert done.returncode == 0 and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("ignored", [False, True])

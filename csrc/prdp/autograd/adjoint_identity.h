@@ -1,6 +1,6 @@
 #pragma once
 #include "prdp/autograd/solve_vjp.h"
-#include "prdp/operators/function_operator.h"
+#include "prdp/operators/registered_products.h"
 
 namespace prdp {
 

@@ -7,6 +7,7 @@
 #include "prdp/autograd/packed_options.h"
 #include "prdp/autograd/solve_jvp.h"
 #include "prdp/autograd/solve_node.h"
+#include "prdp/operators/function_checks.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/singular_operator.h"

@@ -4,7 +4,7 @@
 #include "prdp/autograd/adjoint_identity.h"
 #include "prdp/autograd/node_pointer.h"
 #include "prdp/autograd/solve_vjp.h"
-#include "prdp/operators/function_operator.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/solvers/solve.h"
 
 namespace prdp {

@@ -1,15 +1,12 @@
 #include "prdp/autograd/unrolled_samples.h"
 
 #include <algorithm>
-#include <cmath>
 #include <limits>
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
+#include "prdp/autograd/misleading_derivatives.h"
 #include "prdp/autograd/solved_to_rounding.h"
-#include "prdp/operators/apply_on_loops.h"
-#include "prdp/operators/function_operator.h"
-#include "prdp/operators/kinds.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -26,17 +23,6 @@ enum class Derivative {
   kNone,     // its solve failed, with on_failure="zero_grad"
   kRefused,  // none: its cotangent is not finite
 };
-
-/// ‖ū - Aᵀ b̄‖ / ‖ū‖ of each sample, within the range of Aᵀ, where A is singular; 0 where ū is.
-std::vector<double> adjoint_residuals(const Operator& a, const at::Tensor& cotangent, const at::Tensor& b_bar) {
-  const at::NoGradGuard no_grad;
-  const auto norm = [](const at::Tensor& v) { return to_host<double>(sample_norms(v), v.size(0)); };
-  const auto product = apply_on_loops(a, b_bar.detach().contiguous(), /*transposed=*/true);
-  const auto left = norm(a.project_solution(cotangent.detach() - product)), whole = norm(cotangent.detach());
-  std::vector<double> residuals(whole.size());
-  for (size_t i = 0; i < whole.size(); ++i) residuals[i] = whole[i] > 0.0 ? left[i] / whole[i] : 0.0;
-  return residuals;
-}
 
 /// The derivatives of a batch, sample by sample: classify, differentiate, retry, report.
 class SampleVjps {
@@ -78,10 +64,8 @@ class SampleVjps {
   // Of the forward solve.
   const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
-  const std::vector<double> residuals_ = to_host<double>(solved_.residual, batch_);
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
-  const bool may_mislead_ = !traits(options_.solver.method).is_polynomial;  // retry_implicitly()
-  const std::vector<double> allowed_ = allowed_disagreement();
+  const bool may_mislead_ = may_mislead(options_.solver);
   const std::vector<int64_t> wanted_ = wanted();  // needed_, and b̄ where retry_implicitly() looks at it
   const bool zero_grad_ = options_.on_failure == OnFailure::kZeroGrad;
   const double judged_rtol_ =
@@ -159,77 +143,34 @@ class SampleVjps {
     }
   }
 
-  /// Those that met their tolerance or stagnated, or whose last iteration left no more than √ε ‖b‖. Without an
-  /// iteration there is nothing to mislead: the derivative is zero.
-  bool is_solved(int64_t i) const {
-    const bool left_little = status(i) == SolveStatus::kMaxIter && residuals_[i] <= std::sqrt(epsilon_of(solved_.b));
-    const bool met = status(i) == SolveStatus::kConverged || status(i) == SolveStatus::kStagnated || left_little;
-    return met && counts_[i] > 0;
-  }
-
-  /// How far b̄ and Ā of a sample may be from the implicit ones, relative to these: no further than zero is. Those of a
-  /// recurrence that may have come near a breakdown, no further than the gradient of an iterate with this residual may
-  /// be from that of the solution.
-  std::vector<double> allowed_disagreement() const {
-    std::vector<double> allowed(batch_, 1.0);
-    if (!traits(options_.solver.method).nears_breakdowns) return allowed;
-    for (int64_t i = 0; i < batch_; ++i) allowed[i] = std::clamp(10.0 * std::sqrt(residuals_[i]), 1e-3, 1.0);
-    return allowed;
-  }
-
-  /// For solved samples. Iterations excite few eigenvectors, so their b̄ may be far from the solution's, and their Ā may
-  /// be amplified rounding. Then the implicit gradient takes their place.
+  /// The implicit gradient takes the place of those that mislead (misleading_derivatives.h).
   void retry_implicitly() {
     if (!may_mislead_ || !gradients_[0].defined()) return;
-    Rows solved(batch_);
+    auto rows = solved_samples(solved_);
     for (int64_t i = 0; i < batch_; ++i)
-      solved[i] = is_solved(i) && derivatives_[i] == Derivative::kOfIterations && finite_[i];
-    if (!any(solved)) return;
-    const auto residual = adjoint_residuals(*a_, finite_cotangent_, gradients_[0]);
-    Rows misleading(batch_), to_look_at(batch_);
-    for (int64_t i = 0; i < batch_; ++i) {
-      misleading[i] = solved[i] && residual[i] > allowed_[i];
-      to_look_at[i] = solved[i] && !misleading[i];
+      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && finite_[i];
+    if (!any(rows)) return;
+    const auto allowed = allowed_disagreement(solved_, options_.solver);
+    auto misleading = misleading_b_bar(*a_, finite_cotangent_, gradients_[0], rows, allowed);
+    for (int64_t i = 0; i < batch_; ++i) rows[i] = rows[i] && !misleading[i];
+    if (needs_gradient_of_a_ && any(rows)) {
+      const auto found = gradients_of(rows);
+      if (found[0].defined()) {
+        const auto more = misleading_a_bar(spec_, found, solution().detach(), needed_, rows, allowed);
+        for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || more[i];
+      }
     }
-    if (needs_gradient_of_a_ && any(to_look_at)) mark_misleading_gradients_of_a(to_look_at, misleading);
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
       if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
     differentiate(finite_);
   }
 
-  /// Whether tensor k of A has a row for each sample. Those of a function are taken to have one where they may.
-  bool is_of_samples(size_t k) const {
-    const auto& t = spec_.tensors[k];
-    const auto axes = batched_axes(spec_.kind, static_cast<int64_t>(spec_.shape.size()), spec_.tensors.size());
-    return t.dim() > 0 && t.size(0) == batch_ && (!axes || (*axes)[k] == t.dim());
-  }
-
-  /// Marks those of `rows` whose Ā differs from -∂⟨b̄, A u⟩/∂A, the solution's, by more than allowed. Samples that
-  /// share a tensor of A are looked at together: it has the sum of their gradients.
-  void mark_misleading_gradients_of_a(const Rows& rows, Rows& misleading) {
-    bool no_other_contributes = true;
+  /// Those of the iterations of these samples alone; undefined where none ran.
+  std::vector<at::Tensor> gradients_of(const Rows& rows) const {
     for (int64_t i = 0; i < batch_; ++i)
-      no_other_contributes = no_other_contributes && (rows[i] || !finite_[i] || derivatives_[i] == Derivative::kNone);
-    const auto found = no_other_contributes ? gradients_ : vjp_of_iterations(rows).gradients;
-    if (!found[0].defined()) return;  // no iteration ran
-    const auto u = only(solution().detach(), rows);
-    const at::NoGradGuard no_grad;
-    const auto allowed = at::tensor(allowed_, at::kDouble).to(u.device());
-    const auto of_solution = a_->product_rule(only(found[0].detach(), rows), u);
-    for (size_t k = 0; k < of_solution.size(); ++k) {
-      if (!needed_[k + 1] || !found[k + 1].defined() || !of_solution[k].defined()) continue;
-      const auto in_double = at::promote_types(of_solution[k].scalar_type(), at::kDouble);
-      const auto right = of_solution[k].to(in_double), off = found[k + 1].detach() + right;
-      const bool of_samples = is_of_samples(k);
-      const auto mark_by = [&](const auto& norm) {
-        const auto is_misleading = norm(off).gt(allowed * norm(right)).expand({batch_}).contiguous();
-        const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch_);
-        for (int64_t i = 0; i < batch_; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
-      };
-      if (of_samples) mark_by([&](const at::Tensor& t) { return t.reshape({batch_, -1}).norm(2, 1); });
-      if (!of_samples || is_function(spec_)) mark_by([](const at::Tensor& t) { return t.norm(); });
-    }
+      if (!rows[i] && finite_[i] && derivatives_[i] != Derivative::kNone) return vjp_of_iterations(rows).gradients;
+    return gradients_;  // no other sample contributes
   }
 
   void leave_out_failed_adjoints() {

@@ -34,6 +34,9 @@ struct GridOperator {
 template <class T>
 class Preconditioner;
 
+/// Where the rows of a matrix differ by more, its factors in float64 lose what couples the small ones.
+inline constexpr double kWidestRowsOfFactors = 1e13;
+
 /// A on one sample in padded memory: everything that the CPU loops know of an operator. It may be used by several
 /// threads at once. What it computes with is factor()·A, where the factor is a power of two: entries far from the
 /// order of one are scaled, so that products of several of them neither overflow nor underflow.
@@ -54,8 +57,7 @@ class Kernel {
   virtual double norm() const = 0;
   /// Whether A is known to be positive definite, and rounding does not change that.
   virtual bool is_surely_definite() const { return false; }
-  /// Whether its factors in float64 are, too. Where the rows of A differ by more than 1e13, they lose what couples the
-  /// small ones.
+  /// Whether its factors in float64 are, too: not where its rows differ by kWidestRowsOfFactors.
   virtual bool has_definite_factors() const { return false; }
   /// Multiplications of a product.
   virtual int64_t work() const { return unknowns(); }

@@ -33,7 +33,9 @@ class Stencil final : public Kernel<T> {
   const PackedStencil<T>& coefficients() const { return coefficients_; }
   double norm() const override { return coefficients_.norm(); }
   bool is_surely_definite() const override { return !this->null_space() && coefficients_.is_surely_definite(); }
-  bool has_definite_factors() const override { return is_surely_definite() && coefficients_.spread() < 1e13; }
+  bool has_definite_factors() const override {
+    return is_surely_definite() && coefficients_.spread() < kWidestRowsOfFactors;
+  }
 
   void apply(const T* v, T* out) const override {
     share_rows::for_each(parts(), [&](int64_t p) {

@@ -80,79 +80,102 @@ void Transfer<T>::for_each_row(const PaddedGrid& grid, const Body& body) const {
 }
 
 template <class T>
+void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right, T* coarse) const {
+  const auto& loops = kernels::loops<T>();
+  const int64_t nx = fine_.shape[2], count = between();
+  auto& rows = SplitRows<T>::local(nx);
+  // What lies between coarse points, from place 1 on.
+  T* const others = (periodic_ ? rows.second : rows.first).data();
+  T* const here = (periodic_ ? rows.first : rows.second).data();
+  if (periodic_) loops.split(fine, here, others + 1, nx);
+  else loops.split(fine, others + 1, here, nx);
+  others[0] = others[count];
+  others[count + 1] = T(0);
+  const int64_t before = periodic_ ? 0 : 1;
+  loops.restrict_row(here, others + before, right + before, others + before + 1, left + before + 1, coarse,
+                     coarse_.shape[2]);
+}
+
+template <class T>
+template <class Row, class Weight>
+void Transfer<T>::restrict_row(int64_t j, const Row& row, const Compressed& w, const Weight& weight, T* coarse) const {
+  const int64_t n = fine_.shape[axis_], here = periodic_ ? 2 * j : 2 * j + 1, before = here - 1, after = here + 1;
+  const bool wraps = before < 0 && periodic_ && n % 2 == 0;
+  const T *row_before = zeros_.data(), *weight_before = row_before;
+  const T *row_after = row_before, *weight_after = row_before;
+  if (before >= 0 || wraps) {
+    row_before = row(wraps ? n - 1 : before);
+    weight_before = weight(w.right, wraps ? between() - 1 : before / 2);
+  }
+  if (after < n) {
+    row_after = row(after);
+    weight_after = weight(w.left, after / 2);
+  }
+  loops<T>().restrict_row(row(here), row_before, weight_before, row_after, weight_after, coarse, fine_.shape[2]);
+}
+
+template <class T>
 void Transfer<T>::restrict(const PaddedGrid& from, const T* fine, const PaddedGrid& to, T* coarse,
                            bool transposed) const {
   const auto& w = of_restriction(transposed);
-  const auto& loops = kernels::loops<T>();
-  const int64_t nx = fine_.shape[2], n = fine_.shape[axis_], count = between();
   for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
     T* const out = coarse + to.at(f, z, y);
     if (axis_ == 2) {
-      auto& rows = SplitRows<T>::local(nx);
-      // What lies between coarse points, from place 1 on.
-      T* const others = (periodic_ ? rows.second : rows.first).data();
-      T* const here = (periodic_ ? rows.first : rows.second).data();
-      if (periodic_) loops.split(fine + from.at(f, z, y), here, others + 1, nx);
-      else loops.split(fine + from.at(f, z, y), others + 1, here, nx);
-      others[0] = others[count];
-      others[count + 1] = T(0);
-      const int64_t before = periodic_ ? 0 : 1, at = weights_at(z, y);
-      loops.restrict_row(here, others + before, w.right.data() + at + before, others + before + 1,
-                         w.left.data() + at + before + 1, out, coarse_.shape[2]);
-      return;
+      const int64_t at = weights_at(z, y);
+      return restrict_along_x(fine + from.at(f, z, y), w.left.data() + at, w.right.data() + at, out);
     }
-    const int64_t j = axis_ == 0 ? z : y, here = periodic_ ? 2 * j : 2 * j + 1;
-    const auto fine_row = [&](int64_t i) { return fine + (axis_ == 0 ? from.at(f, i, y) : from.at(f, z, i)); };
+    const auto row = [&](int64_t i) { return fine + (axis_ == 0 ? from.at(f, i, y) : from.at(f, z, i)); };
     const auto weight = [&](const std::vector<T>& field, int64_t k) {
       return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
     };
-    const int64_t before = here - 1, after = here + 1;
-    const bool wraps = before < 0 && periodic_ && n % 2 == 0;
-    const T* row_before = zeros_.data();
-    const T *weight_before = zeros_.data(), *row_after = zeros_.data(), *weight_after = zeros_.data();
-    if (before >= 0 || wraps) {
-      row_before = fine_row(wraps ? n - 1 : before);
-      weight_before = weight(w.right, wraps ? count - 1 : before / 2);
-    }
-    if (after < n) {
-      row_after = fine_row(after);
-      weight_after = weight(w.left, after / 2);
-    }
-    loops.restrict_row(fine_row(here), row_before, weight_before, row_after, weight_after, out, nx);
+    restrict_row(axis_ == 0 ? z : y, row, w, weight, out);
   });
+}
+
+template <class T>
+void Transfer<T>::interpolate_along_x(const T* coarse, const T* left, const T* right, T* fine) const {
+  const auto& loops = kernels::loops<T>();
+  const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[2], count = between();
+  auto& rows = SplitRows<T>::local(nx);
+  T* const others = (periodic_ ? rows.second : rows.first).data();
+  T* const here = rows.coarse.data();  // from place 1 on, with what lies beyond the ends
+  std::copy_n(coarse, coarse_count, here + 1);
+  here[0] = T(0);
+  here[coarse_count + 1] = periodic_ ? here[1] : T(0);
+  std::fill_n(others, count, T(0));
+  const int64_t first = periodic_ ? 1 : 0;
+  loops.add_interpolated(here + first, left + 1, here + first + 1, right + 1, others, count);
+  if (periodic_) loops.add_merged(here + 1, others, fine, nx);
+  else loops.add_merged(others, here + 1, fine, nx);
+}
+
+template <class T>
+template <class Row, class Weight>
+void Transfer<T>::interpolate_row(int64_t i, const Row& row, const Compressed& w, const Weight& weight, T* fine) const {
+  const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[axis_], k = i / 2;
+  const bool is_coarse = i % 2 == (periodic_ ? 0 : 1);
+  if (is_coarse) return loops<T>().axpy(T(1), row(k), fine, nx);
+  const int64_t left = periodic_ ? k : k - 1, right = periodic_ ? (k + 1) % coarse_count : k;
+  const T* const row_left = left >= 0 ? row(left) : zeros_.data();
+  const T* const row_right = right < coarse_count ? row(right) : zeros_.data();
+  loops<T>().add_interpolated(row_left, weight(w.left, k), row_right, weight(w.right, k), fine, nx);
 }
 
 template <class T>
 void Transfer<T>::add_interpolated(const PaddedGrid& from, const T* coarse, const PaddedGrid& to, T* fine,
                                    bool transposed) const {
   const auto& w = of_interpolation(transposed);
-  const auto& loops = kernels::loops<T>();
-  const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[axis_], count = between();
   for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
     T* const out = fine + to.at(f, z, y);
     if (axis_ == 2) {
-      auto& rows = SplitRows<T>::local(nx);
-      T* const others = (periodic_ ? rows.second : rows.first).data();
-      T* const here = rows.coarse.data();  // from place 1 on, with what lies beyond the ends
-      std::copy_n(coarse + from.at(f, z, y), coarse_count, here + 1);
-      here[0] = T(0);
-      here[coarse_count + 1] = periodic_ ? here[1] : T(0);
-      std::fill_n(others, count, T(0));
-      const int64_t left = periodic_ ? 1 : 0, at = weights_at(z, y) + 1;
-      loops.add_interpolated(here + left, w.left.data() + at, here + left + 1, w.right.data() + at, others, count);
-      if (periodic_) loops.add_merged(here + 1, others, out, nx);
-      else loops.add_merged(others, here + 1, out, nx);
-      return;
+      const int64_t at = weights_at(z, y);
+      return interpolate_along_x(coarse + from.at(f, z, y), w.left.data() + at, w.right.data() + at, out);
     }
-    const int64_t i = axis_ == 0 ? z : y;
-    const auto coarse_row = [&](int64_t j) { return coarse + (axis_ == 0 ? from.at(f, j, y) : from.at(f, z, j)); };
-    const bool is_coarse = i % 2 == (periodic_ ? 0 : 1);
-    if (is_coarse) return loops.axpy(T(1), coarse_row(i / 2), out, nx);
-    const int64_t k = i / 2, at = axis_ == 0 ? weights_at(k, y) : weights_at(z, k);
-    const int64_t left = periodic_ ? k : k - 1, right = periodic_ ? (k + 1) % coarse_count : k;
-    const T* const row_left = left >= 0 ? coarse_row(left) : zeros_.data();
-    const T* const row_right = right < coarse_count ? coarse_row(right) : zeros_.data();
-    loops.add_interpolated(row_left, w.left.data() + at, row_right, w.right.data() + at, out, nx);
+    const auto row = [&](int64_t j) { return coarse + (axis_ == 0 ? from.at(f, j, y) : from.at(f, z, j)); };
+    const auto weight = [&](const std::vector<T>& field, int64_t k) {
+      return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
+    };
+    interpolate_row(axis_ == 0 ? z : y, row, w, weight, out);
   });
 }
 

@@ -55,6 +55,17 @@ class Transfer {
 
   template <class Body>
   void for_each_row(const PaddedGrid& grid, const Body& body) const;
+  /// One row of the above. Along x a row is split into its coarse and its other points, and merged again; along another
+  /// axis whole rows are combined.
+  void restrict_along_x(const T* fine, const T* left, const T* right, T* coarse) const;
+  void interpolate_along_x(const T* coarse, const T* left, const T* right, T* fine) const;
+  /// Row j of the coarse grid along the axis, from row(i) of the fine one; weight(field, k) is that of the k-th row
+  /// that is not coarse.
+  template <class Row, class Weight>
+  void restrict_row(int64_t j, const Row& row, const Compressed& w, const Weight& weight, T* coarse) const;
+  /// Adds to row i of the fine grid, from row(j) of the coarse one.
+  template <class Row, class Weight>
+  void interpolate_row(int64_t i, const Row& row, const Compressed& w, const Weight& weight, T* fine) const;
 
   StencilGrid fine_, coarse_;
   int axis_;

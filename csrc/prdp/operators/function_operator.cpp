@@ -2,21 +2,15 @@
 
 #include <ATen/ExpandUtils.h>
 #include <ATen/TensorSubclassLikeUtils.h>
-#include <ATen/functorch/BatchedTensorImpl.h>
 #include <ATen/functorch/DynamicLayer.h>
 #include <torch/csrc/autograd/autograd.h>
 
 #include <algorithm>
-#include <bit>
-#include <cmath>
 #include <limits>
-#include <mutex>
-#include <typeindex>
-#include <unordered_map>
 
 #include "prdp/error_text.h"
 #include "prdp/operators/dense.h"
-#include "prdp/operators/kinds.h"
+#include "prdp/operators/function_checks.h"
 #include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/operators/with_autograd.h"
@@ -24,17 +18,6 @@
 namespace prdp {
 
 namespace {
-
-struct Registry {
-  std::mutex mutex;
-  std::unordered_map<int64_t, std::weak_ptr<const RegisteredProducts>> entries;
-  int64_t last = 0;
-};
-
-Registry& registry() {
-  static auto* all = new Registry;  // outlives every backward thread
-  return *all;
-}
 
 at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* name) {
   TORCH_CHECK_TYPE(result.defined(), "Function: ", name, " must return a tensor, got none");
@@ -49,156 +32,19 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
 /// How often a tensor was written to; unknown in inference mode.
 int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<int64_t>(t._version()); }
 
-std::vector<at::Tensor> detached(const std::vector<at::Tensor>& tensors) {
-  std::vector<at::Tensor> plain;
-  for (const auto& t : tensors) plain.push_back(t.detach());
-  return plain;
-}
-
 /// Whether a tensor may have a gradient, and entries that are not finite. Complex ones are symbols of spectral
 /// operators.
 bool holds_numbers(const at::Tensor& t) {
   return at::isFloatingType(t.scalar_type()) || at::isComplexType(t.scalar_type());
 }
 
-const char* product_name() { return in_language("matvec", "apply"); }
 const char* transpose_name() { return in_language("transpose", "apply_transpose"); }
-
-/// Raises ValueError if a product of constants has a derivative, in reverse mode only if that is asked for.
-void check_nothing_is_captured(const at::Tensor& result, bool reverse = true) {
-  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result), "Function: ", product_name(),
-                    " uses a tensor that requires grad",
-                    has_tangent(result) || in_torch_func() ? ", or that forward mode or torch.func follows," : "",
-                    " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
-                    "detach it");
-}
-
-/// A tensor that vmap maps over, for one of the entries; undefined where there is none.
-at::Tensor for_one_entry(at::Tensor t) {
-  while (const auto* mapped = at::functorch::maybeGetBatchedImpl(t)) {
-    if (mapped->value().size(mapped->bdim()) == 0) return {};
-    t = mapped->value().select(mapped->bdim(), 0);
-  }
-  return t;
-}
 
 at::Tensor solve(const at::Tensor& matrix, const at::Tensor& b) {
   return solve_dense(matrix, b.flatten(1).unsqueeze(-1)).reshape_as(b);
 }
 
 }  // namespace
-
-namespace {
-
-/// One for each lambda in the source; functions that a pointer points to have one each.
-std::shared_ptr<FunctionCode> code_of(const Products::Product& apply) {
-  static std::mutex mutex;
-  static auto* codes = new std::unordered_map<std::type_index, std::shared_ptr<FunctionCode>>;
-  if (apply.target<at::Tensor (*)(const at::Tensor&, const std::vector<at::Tensor>&)>())
-    return std::make_shared<FunctionCode>();
-  const std::lock_guard lock(mutex);
-  auto& code = (*codes)[apply.target_type()];
-  if (!code) code = std::make_shared<FunctionCode>();
-  return code;
-}
-
-}  // namespace
-
-std::shared_ptr<const RegisteredProducts> RegisteredProducts::make(Products products) {
-  TORCH_CHECK_VALUE(products.apply, "Function: apply, the product with A, must be given");
-  const std::shared_ptr<RegisteredProducts> made(new RegisteredProducts(std::move(products)));
-  made->code = code_of(made->products_.apply);
-  const std::lock_guard lock(registry().mutex);
-  made->number_ = ++registry().last;
-  registry().entries[made->number_] = made;
-  return made;
-}
-
-std::shared_ptr<const RegisteredProducts> RegisteredProducts::find(int64_t number) {
-  std::shared_ptr<const RegisteredProducts> found;
-  {
-    const std::lock_guard lock(registry().mutex);
-    const auto entry = registry().entries.find(number);
-    if (entry != registry().entries.end()) found = entry->second.lock();
-  }
-  TORCH_CHECK_VALUE(found, "Function: the operator no longer exists");
-  return found;
-}
-
-RegisteredProducts::~RegisteredProducts() {
-  const std::lock_guard lock(registry().mutex);
-  registry().entries.erase(number_);
-}
-
-std::shared_ptr<const RegisteredProducts> products_of(const OperatorSpec& a) {
-  return is_function(a) ? RegisteredProducts::find(a.shape.at(0)) : nullptr;
-}
-
-void refuse_captured_gradients(const OperatorSpec& a) {
-  RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
-}
-
-void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
-  if (a.transposed) return;  // of an adjoint solve, whose A was looked at
-  auto constant = a;
-  for (auto& t : constant.tensors) t = primal(t).detach();
-  const auto v = primal(b).detach();
-  const bool reverse = at::GradMode::is_enabled();
-  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
-}
-
-void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
-  auto of_one = a;
-  for (auto& t : of_one.tensors) t = for_one_entry(primal(t).detach());
-  const auto v = for_one_entry(primal(b).detach());
-  const auto is_there = [](const at::Tensor& t) { return t.defined(); };
-  if (a.transposed || !v.defined() || !std::all_of(of_one.tensors.begin(), of_one.tensors.end(), is_there)) return;
-  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(make_operator(of_one)->apply(v)), "Function: ", product_name(),
-                    " uses a tensor that vmap maps over, but that is not among its tensors; hand it "
-                    "over in tensors");
-}
-
-namespace {
-
-double largest(const at::Tensor& v) { return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>(); }
-
-/// Raises ValueError where A (2 v) is not about 2 A v, where v is b, scaled to the order of one as in a solve.
-void refuse_powers(const Operator& a, const at::Tensor& b) {
-  const auto magnitude = b.abs().flatten(1).amax(1);
-  const auto usable = per_sample(magnitude.isfinite() & magnitude.gt(0), b);
-  const auto v = at::where(usable, b * per_sample(power_of_two_scale(magnitude), b), at::zeros_like(b));
-  const auto once = a.apply(v);
-  const double size = largest(once), off = largest(a.apply(2.0 * v) - 2.0 * once);
-  // A derivative by differences is not quite linear.
-  TORCH_CHECK_VALUE(off <= 0.1 * size || !std::isfinite(off), "Function: ", product_name(), " must be linear, but ",
-                    product_name(), "(2 v) and 2 ", product_name(), "(v) differ by ", off,
-                    "; in Newton's method it is the derivative, as ",
-                    in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
-}
-
-}  // namespace
-
-void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
-  const auto code = RegisteredProducts::find(a.shape.at(0))->code;
-  const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
-  if (!can_look) return;
-  const auto solves = static_cast<uint64_t>(code->solves) + 1;
-  if (std::has_single_bit(solves)) {
-    const at::NoGradGuard no_grad;
-    auto constant = a;
-    constant.tensors = detached(a.tensors);
-    const auto of = make_operator(constant);
-    const auto v = b.detach();
-    const double at_zero = largest(of->apply(at::zeros_like(v)));
-    // Beside b, as products by differences leave rounding.
-    const double rounding = 32.0 * std::sqrt(epsilon_of(b)) * largest(v);
-    TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
-                      " must be linear, but ", product_name(), "(0) holds ±", at_zero,
-                      "; constants, such as values on the boundary, belong to b");
-    if (solves == 1) refuse_powers(*of, v);
-  }
-  ++code->solves;
-}
 
 FunctionOperator::FunctionOperator(const OperatorSpec& spec) : tensors_(spec.tensors) {
   TORCH_CHECK_VALUE(spec.shape.size() == 1 && spec.parameters.empty(),

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "prdp/operators/tensors.h"
 
@@ -22,10 +23,8 @@ at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
 Separability::Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic)
     : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
   std::vector<at::Tensor> lines, told;
-  for (int64_t axis = 0; axis < dim(); ++axis) {
-    lines.push_back(middle_line(coefficients, axis));
-    told.push_back(lines.back().flatten(1));
-  }
+  for (int64_t axis = 0; axis < dim(); ++axis) lines.push_back(middle_line(coefficients, axis));
+  for (const auto& line : lines) told.push_back(line.flatten(1));
   at::Tensor outer;
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const auto ends = decoupled_ends(coefficients, axis);
@@ -44,6 +43,12 @@ Separability::Separability(const at::Tensor& coefficients, const std::vector<boo
   for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) told.push_back(largest_inside(t));
   told.push_back(largest(size));
   host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
+  int64_t column = 0;
+  const auto next = [&](int64_t columns) { return host_.narrow(1, std::exchange(column, column + columns), columns); };
+  for (const auto& line : lines)
+    lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
+  for (int64_t axis = 0; axis < dim(); ++axis) ends_.push_back(next(2));
+  sizes_ = next(5);
 }
 
 at::Tensor Separability::middle_line(const at::Tensor& coefficients, int64_t axis) const {
@@ -79,7 +84,7 @@ at::Tensor Separability::distance_from_sum(const at::Tensor& coefficients, const
 }
 
 Separability::Sizes Separability::sizes(int64_t s) const {
-  const double* of = of_sample(s + 1) - kSizes;
+  const auto of = sizes_.accessor<double, 2>()[s];
   return {of[0], of[1], of[2], of[3], of[4]};
 }
 
@@ -100,15 +105,17 @@ std::optional<kernels::SumOverAxes> Separability::sum(int64_t s) const {
 InnerBox Separability::inner_box(int64_t s) const {
   InnerBox box{std::vector<int64_t>(dim()), shape_};
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    box.first[axis] = ends(s)[2 * axis] != 0.0;
-    box.shape[axis] -= box.first[axis] + (ends(s)[2 * axis + 1] != 0.0);
+    const auto ends = ends_[axis].accessor<double, 2>()[s];
+    box.first[axis] = ends[0] != 0.0;
+    box.shape[axis] -= box.first[axis] + (ends[1] != 0.0);
   }
   return box;
 }
 
 kernels::FactorKey Separability::key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
   kernels::FactorKeyMaker key;
-  key.add(of_sample(s), host_.size(1) - kSizes).add(shape_.data(), dim()).add(null_vectors);
+  const auto row = host_.select(0, s);  // without the sizes: where there is a sum, the others tell all of it
+  key.add(row.const_data_ptr<double>(), row.size(0) - sizes_.size(1)).add(shape_.data(), dim()).add(null_vectors);
   for (const bool closed : periodic_) key.add(int64_t{closed});
   key.add(static_cast<int64_t>(c10::typeMetaToScalarType(options.dtype())));
   const auto device = options.device();
@@ -117,22 +124,20 @@ kernels::FactorKey Separability::key(int64_t s, int64_t null_vectors, const at::
 
 kernels::SumOverAxes Separability::sum_of_lines(int64_t s, const InnerBox& box) const {
   kernels::SumOverAxes sum;
-  const double* line = of_sample(s);
-  for (int64_t axis = dim() - 3; axis < dim(); ++axis) {
-    const int64_t n = axis < 0 ? 1 : box.shape[axis];
+  for (auto& a : sum) a.setZero(1, 1);
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    const auto line = lines_[axis].accessor<double, 3>()[s];
+    const auto diagonal = line[0], before = line[1 + 2 * axis], behind = line[2 + 2 * axis];
+    // The diagonal at the middle point counts once, with the last axis.
+    const double of_others = axis + 1 == dim() ? 0.0 : diagonal[middle(axis)];
+    const int64_t n = box.shape[axis], first = box.first[axis];
     auto& a = sum[3 - dim() + axis];
     a.setZero(n, n);
-    if (axis < 0) continue;
-    const int64_t whole = shape_[axis];
-    const double* diagonal = line + box.first[axis];
-    const double *before = diagonal + (1 + 2 * axis) * whole, *behind = before + whole;
-    const double of_others = axis + 1 == dim() ? 0.0 : line[middle(axis)];
     for (int64_t i = 0; i < n; ++i) {
-      a(i, i) = diagonal[i] - of_others;
-      if (const auto j = kernels::neighbour(i, -1, n, periodic_[axis]); j >= 0) a(i, j) = before[i];
-      if (const auto j = kernels::neighbour(i, 1, n, periodic_[axis]); j >= 0) a(i, j) = behind[i];
+      a(i, i) = diagonal[first + i] - of_others;
+      if (const auto j = kernels::neighbour(i, -1, n, periodic_[axis]); j >= 0) a(i, j) = before[first + i];
+      if (const auto j = kernels::neighbour(i, 1, n, periodic_[axis]); j >= 0) a(i, j) = behind[first + i];
     }
-    line += (1 + 2 * dim()) * whole;
   }
   return sum;
 }

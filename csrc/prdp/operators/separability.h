@@ -40,15 +40,16 @@ class Separability {
     double distance, norm, diagonal, inverse_diagonal;  // the largest ones of the inner points
     double largest;                                     // of all coefficients
   };
-  static constexpr int64_t kSizes = 5;
   Sizes sizes(int64_t s) const;
-  const double* of_sample(int64_t s) const { return host_.const_data_ptr<double>() + s * host_.size(1); }
-  const double* ends(int64_t s) const { return of_sample(s + 1) - kSizes - 2 * dim(); }
 
   std::vector<int64_t> shape_;
   std::vector<bool> periodic_;
   double epsilon_;
+  // On the host, in float64: (samples, columns), and what its columns are.
   at::Tensor host_;
+  std::vector<at::Tensor> lines_;  // of each axis (samples, 1 + 2 dim, n)
+  std::vector<at::Tensor> ends_;   // of each axis (samples, 2), not 0 where they are decoupled
+  at::Tensor sizes_;               // (samples, 5), as Sizes has them
 };
 
 }  // namespace prdp

@@ -53,9 +53,35 @@ inline at::Tensor power_of_two_scale(const at::Tensor& magnitude) {
   return at::ldexp(at::ones_like(magnitude), exponent.neg());
 }
 
+/// Vectors with samples scaled by powers of two to the order of one, by their `magnitude`, and zero where they do not
+/// take part; all do where `takes_part` is undefined. Differentiable.
+struct ScaledSamples {
+  at::Tensor v, scale;
+};
+inline ScaledSamples scale_samples(const at::Tensor& v, const at::Tensor& magnitude,
+                                   const at::Tensor& takes_part = {}) {
+  if (!takes_part.defined()) {
+    const auto scale = per_sample(power_of_two_scale(magnitude), v);
+    return {v * scale, scale};
+  }
+  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
+  const auto scale = per_sample(power_of_two_scale(safe), v);
+  return {at::where(per_sample(takes_part, v), v, at::zeros_like(v)) * scale, scale};
+}
+/// The same, of those that have a finite magnitude and are not zero.
+inline ScaledSamples scale_finite_samples(const at::Tensor& v, const at::Tensor& magnitude) {
+  return scale_samples(v, magnitude, magnitude.isfinite().logical_and(magnitude.gt(0)));
+}
+
 /// sum += term; an undefined tensor is a zero of any shape.
 inline void add_to(at::Tensor& sum, const at::Tensor& term) {
   if (term.defined()) sum = sum.defined() ? sum + term : term;
+}
+
+inline std::vector<at::Tensor> detached(at::TensorList tensors) {
+  std::vector<at::Tensor> plain;
+  for (const auto& t : tensors) plain.push_back(t.detach());
+  return plain;
 }
 
 inline bool any_requires_grad(at::TensorList tensors) {

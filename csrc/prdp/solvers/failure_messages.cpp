@@ -8,6 +8,7 @@
 #include <sstream>
 
 #include "prdp/error_text.h"
+#include "prdp/kernels/kernel.h"
 #include "prdp/operators/kinds.h"
 #include "prdp/operators/probes.h"
 #include "prdp/operators/singular_operator.h"
@@ -159,7 +160,7 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
 bool has_wide_kappa(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return false;
   const auto diagonal = a.diagonal().expand_as(b).select(0, sample).abs();
-  return (diagonal.max() / diagonal.min()).item<double>() >= 1e13;
+  return (diagonal.max() / diagonal.min()).item<double>() >= kernels::kWidestRowsOfFactors;
 }
 
 /// Why the residual fell no further, far above what was asked for.

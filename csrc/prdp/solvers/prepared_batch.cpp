@@ -48,17 +48,6 @@ OutsideRange outside_range(const at::Tensor& b, const at::Tensor& projected, dou
 
 }  // namespace
 
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part) {
-  if (!takes_part.defined()) {
-    const auto scale = per_sample(power_of_two_scale(magnitude), b);
-    return {b * scale, scale};
-  }
-  const auto safe = at::where(takes_part, magnitude, at::ones_like(magnitude));
-  const auto scale = per_sample(power_of_two_scale(safe), b);
-  const auto rows = per_sample(takes_part, b);
-  return {at::where(rows, b, at::zeros_like(b)) * scale, scale};
-}
-
 at::Tensor largest_magnitude(const at::Tensor& b) {
   const auto plain = b.detach();
   const bool has_memory = !at::isTensorSubclassLike(plain);
@@ -77,7 +66,7 @@ PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveR
   const auto magnitude = largest_magnitude(b);
   auto status = settle_beforehand(a, solver, b, magnitude, starts ? largest_magnitude(request.x0) : at::Tensor());
   auto takes_part = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter));
-  const auto [whole, scale] = scale_rhs(b, magnitude, takes_part);
+  const auto [whole, scale] = scale_samples(b, magnitude, takes_part);
   const auto rhs = a.project(whole);
   const auto rounding = subnormal_rounding(scale, b);
   auto inconsistent = at::zeros_like(takes_part);

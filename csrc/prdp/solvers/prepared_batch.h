@@ -16,13 +16,6 @@ struct PreparedBatch {
 
 PreparedBatch prepare_batch(const Operator& a, const at::Tensor& b, const SolveRequest& request);
 
-/// b with its rows scaled by powers of two to the order of one, by `magnitude`, and zero in those that do not take
-/// part; all do where `takes_part` is undefined. Differentiable.
-struct ScaledRhs {
-  at::Tensor b, scale;
-};
-ScaledRhs scale_rhs(const at::Tensor& b, const at::Tensor& magnitude, const at::Tensor& takes_part = {});
-
 /// max |b| of each sample, (batch,).
 at::Tensor largest_magnitude(const at::Tensor& b);
 /// subnormal_rounding() of vectors like b that were multiplied by `scale`, (batch,).

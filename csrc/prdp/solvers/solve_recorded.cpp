@@ -54,7 +54,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   const auto host_caps = to_host<int64_t>(caps, caps.numel());
   const int64_t most = *std::max_element(host_caps.begin(), host_caps.end());
   std::vector<SampleState> states(b.size(0));
-  const auto [rhs, scale] = scale_rhs(b, largest_magnitude(b));
+  const auto [rhs, scale] = scale_samples(b, largest_magnitude(b));
   const auto whole = a.project(rhs);
   const auto inverse = make_inverse(a, solver.preconditioner, b);
   TensorSpace::System system{a, solver.preconditioner, inverse};
@@ -81,7 +81,7 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
 StepwiseSolve::StepwiseSolve(const Operator& a, const Solver& solver, const at::Tensor& b, const at::Tensor& x0,
                              const at::Tensor& caps)
     : solver_(solver), inverse_(make_inverse(a, solver.preconditioner, b)) {
-  const auto [scaled, scale] = scale_rhs(b, largest_magnitude(b));
+  const auto [scaled, scale] = scale_samples(b, largest_magnitude(b));
   scale_ = scale;
   rhs_ = a.project(scaled);
   b2_ = to_host<double>(dot_in_order(rhs_, rhs_), rhs_.size(0));

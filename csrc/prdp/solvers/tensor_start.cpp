@@ -13,12 +13,8 @@ namespace prdp {
 bool takes_start(Method method, const at::Tensor& x0) { return x0.defined() && !traits(method).is_direct; }
 
 TensorStart make_start(const Operator& a, const at::Tensor& b, const at::Tensor& x0) {
-  const auto of_order_one = [](const at::Tensor& v) {
-    const auto magnitude = largest_magnitude(v);
-    const auto usable = magnitude.isfinite().logical_and(magnitude.gt(0));
-    return scale_rhs(v, magnitude, usable);
-  };
-  const auto y = of_order_one(x0.detach()).b;
+  const auto of_order_one = [](const at::Tensor& v) { return scale_finite_samples(v, largest_magnitude(v)); };
+  const auto y = of_order_one(x0.detach()).v;
   auto takes_product = per_sample(y.flatten(1).ne(0).any(1), b);
   auto z = a.project_solution(y);
   if (a.needs_projection()) {

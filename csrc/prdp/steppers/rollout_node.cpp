@@ -4,8 +4,8 @@
 #include <torch/custom_class.h>
 
 #include "prdp/operators/autocast.h"
-#include "prdp/operators/function_operator.h"
 #include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/steppers/equation_kinds.h"

@@ -120,51 +120,70 @@ at::Tensor diffusion_coefficients(const FlowBox& box, int64_t along, const at::T
   return coefficients(diagonal, of_neighbours);
 }
 
+/// What the faces at the low ends of cells are, (d, *shape): 1 where the name holds, else 0.
+struct FaceMasks {
+  at::Tensor free, inlet;
+  at::Tensor inside;  // an obstacle
+};
+FaceMasks make_face_masks(const FlowBox& box, const at::Tensor& fluid) {
+  std::vector<at::Tensor> free(box.dim()), inlet(box.dim()), inside(box.dim());
+  for (int64_t axis = 0; axis < box.dim(); ++axis) {
+    const int64_t c = box.channel_of(axis);
+    free[c] = fluid * neighbour(box, fluid, axis, -1, 0.0);
+    inside[c] = (1 - fluid) * (1 - neighbour(box, fluid, axis, -1, 1.0));
+    inlet[c] = at::zeros_like(fluid);
+    if (axis == box.open_axis()) inlet[c].narrow(axis, 0, 1).copy_(fluid.narrow(axis, 0, 1));
+  }
+  return {at::stack(free), at::stack(inlet), at::stack(inside)};
+}
+
+/// 1/dx² for each neighbour of a free face that lies inside an obstacle, (d, *shape).
+at::Tensor friction_coefficients(const FlowBox& box, const FaceMasks& faces) {
+  auto friction = at::zeros_like(faces.free);
+  for (int64_t along = 0; along < box.dim(); ++along)
+    for (int64_t axis = 0; axis < box.dim(); ++axis)
+      for (const int64_t side : {-1, 1}) {
+        if (axis == along) continue;
+        const int64_t c = box.channel_of(along);
+        friction[c] += faces.free[c] * neighbour(box, faces.inside[c], axis, side, 0.0) / (box.dx(axis) * box.dx(axis));
+      }
+  return friction;
+}
+
+/// By what the velocity beside a high wall of this axis is multiplied beyond it, (d, 1, …): its own component is zero
+/// on the wall.
+at::Tensor signs_beyond_wall(const FlowBox& box, int64_t axis) {
+  auto signs = -at::ones(box.dim(), at::kDouble);
+  signs[box.channel_of(axis)] = 0.0;
+  std::vector<int64_t> shape(box.dim() + 1, 1);
+  shape[0] = box.dim();
+  return signs.reshape(shape);
+}
+
 bool all_ones(const at::Tensor& mask) { return mask.eq(1).all().item<bool>(); }
 
 }  // namespace
 
 FlowFields make_flow_fields(const FlowBox& box) {
   const at::NoGradGuard no_grad;
-  const int64_t d = box.dim(), open = box.open_axis();
-  const auto fluid = box.obstacle().defined() ? box.obstacle().logical_not() : at::ones(box.shape(), at::kBool);
+  const int64_t open = box.open_axis();
+  const bool has_obstacle = box.obstacle().defined();
+  const auto fluid = has_obstacle ? box.obstacle().logical_not() : at::ones(box.shape(), at::kBool);
   TORCH_CHECK_VALUE(fluid.any().item<bool>(), "Flow: the obstacle fills the grid; at least one cell must be fluid");
-  const auto is_fluid = fluid.to(at::kDouble);
+  const auto faces = make_face_masks(box, fluid.to(at::kDouble));
   FlowFields fields;
-
-  std::vector<at::Tensor> free(d), inlet(d), inside(d), friction(d);
-  for (int64_t axis = 0; axis < d; ++axis) {
-    const int64_t c = box.channel_of(axis);
-    const auto below = neighbour(box, is_fluid, axis, -1, 0.0);
-    free[c] = is_fluid * below;
-    inside[c] = (1 - is_fluid) * (1 - neighbour(box, is_fluid, axis, -1, 1.0));
-    inlet[c] = at::zeros_like(is_fluid);
-    if (axis == open) inlet[c].narrow(axis, 0, 1).copy_(is_fluid.narrow(axis, 0, 1));
-    friction[c] = at::zeros_like(is_fluid);
-    std::vector<int64_t> ones(d, 1);
-    fields.high_sign.push_back(-at::ones(d, at::kDouble));
-    fields.high_sign.back()[c] = 0.0;  // its own component is zero on the wall
-    ones.insert(ones.begin(), d);
-    fields.high_sign.back() = fields.high_sign.back().reshape(ones);
-  }
-  const bool regular = !box.obstacle().defined();
-  for (int64_t c = 0; c < d; ++c) {
-    const int64_t along = d - 1 - c;
-    for (int64_t axis = 0; axis < d && !regular; ++axis)
-      for (const int64_t side : {-1, 1})
-        if (axis != along)
-          friction[c] += free[c] * neighbour(box, inside[c], axis, side, 0.0) / (box.dx(axis) * box.dx(axis));
-    fields.diffusion.push_back(diffusion_coefficients(box, along, free[c], inside[c]));
-  }
+  for (int64_t axis = 0; axis < box.dim(); ++axis) fields.high_sign.push_back(signs_beyond_wall(box, axis));
+  for (int64_t c = 0; c < box.dim(); ++c)
+    fields.diffusion.push_back(diffusion_coefficients(box, box.dim() - 1 - c, faces.free[c], faces.inside[c]));
   auto known = fluid.logical_not();
   if (open >= 0) known.narrow(open, box.shape()[open] - 1, 1).fill_(true);
-  fields.pressure = pressure_coefficients(box, at::stack(free), known);
+  fields.pressure = pressure_coefficients(box, faces.free, known);
   fields.closed_parts = find_closed_parts(box, fluid);
 
   fields.cells = known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
-  fields.free = at::stack(free).unsqueeze(0);
-  if (open >= 0) fields.inlet = at::stack(inlet).unsqueeze(0);
-  if (!regular) fields.friction = at::stack(friction).unsqueeze(0);
+  fields.free = faces.free.unsqueeze(0);
+  if (open >= 0) fields.inlet = faces.inlet.unsqueeze(0);
+  if (has_obstacle) fields.friction = friction_coefficients(box, faces).unsqueeze(0);
   if (all_ones(fields.free)) fields.diffusion.resize(1);  // periodic, no obstacle: all components are alike
   for (auto* mask : {&fields.cells, &fields.free})
     if (all_ones(*mask)) *mask = at::Tensor();

@@ -1,0 +1,87 @@
+#include "prdp/autograd/misleading_derivatives.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/operators/apply_on_loops.h"
+#include "prdp/operators/kinds.h"
+#include "prdp/operators/registered_products.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
+
+namespace prdp {
+
+namespace {
+
+/// Whether tensor k of A has a row for each sample. Those of a function are taken to have one where they may.
+bool is_of_samples(const OperatorSpec& spec, size_t k, int64_t batch) {
+  const auto& t = spec.tensors[k];
+  const auto axes = batched_axes(spec.kind, static_cast<int64_t>(spec.shape.size()), spec.tensors.size());
+  return t.dim() > 0 && t.size(0) == batch && (!axes || (*axes)[k] == t.dim());
+}
+
+}  // namespace
+
+bool may_mislead(const Solver& solver) { return !traits(solver.method).is_polynomial; }
+
+Rows solved_samples(const Solved& solved) {
+  const int64_t batch = solved.b.size(0);
+  const auto counts = to_host<int64_t>(solved.iterations, batch), statuses = to_host<int64_t>(solved.status, batch);
+  const auto residuals = to_host<double>(solved.residual, batch);
+  Rows rows(batch);
+  for (int64_t i = 0; i < batch; ++i) {
+    const auto status = static_cast<SolveStatus>(statuses[i]);
+    const bool left_little = status == SolveStatus::kMaxIter && residuals[i] <= std::sqrt(epsilon_of(solved.b));
+    const bool met = status == SolveStatus::kConverged || status == SolveStatus::kStagnated || left_little;
+    rows[i] = met && counts[i] > 0;
+  }
+  return rows;
+}
+
+std::vector<double> allowed_disagreement(const Solved& solved, const Solver& solver) {
+  const int64_t batch = solved.b.size(0);
+  std::vector<double> allowed(batch, 1.0);  // no further than zero is
+  if (!traits(solver.method).nears_breakdowns) return allowed;
+  // A recurrence that may have come near a breakdown: no further than the gradient of an iterate with this residual
+  // may be from that of the solution.
+  const auto residuals = to_host<double>(solved.residual, batch);
+  for (int64_t i = 0; i < batch; ++i) allowed[i] = std::clamp(10.0 * std::sqrt(residuals[i]), 1e-3, 1.0);
+  return allowed;
+}
+
+Rows misleading_b_bar(const Operator& a, const at::Tensor& cotangent, const at::Tensor& b_bar, const Rows& rows,
+                      const std::vector<double>& allowed) {
+  const at::NoGradGuard no_grad;
+  const auto norm = [](const at::Tensor& v) { return to_host<double>(sample_norms(v), v.size(0)); };
+  const auto product = apply_on_loops(a, b_bar.detach().contiguous(), /*transposed=*/true);
+  const auto left = norm(a.project_solution(cotangent.detach() - product)), whole = norm(cotangent.detach());
+  Rows misleading(rows.size());
+  for (size_t i = 0; i < rows.size(); ++i)
+    misleading[i] = rows[i] && (whole[i] > 0.0 ? left[i] / whole[i] : 0.0) > allowed[i];
+  return misleading;
+}
+
+Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& gradients, const at::Tensor& u,
+                      at::IntArrayRef needed, const Rows& rows, const std::vector<double>& allowed) {
+  const at::NoGradGuard no_grad;
+  const auto batch = static_cast<int64_t>(rows.size());
+  const auto allowed_of = at::tensor(allowed, at::kDouble).to(u.device());
+  const auto of_solution = make_operator(spec)->product_rule(only(gradients[0].detach(), rows), only(u, rows));
+  Rows misleading(batch);
+  for (size_t k = 0; k < of_solution.size(); ++k) {
+    if (!needed[k + 1] || !gradients[k + 1].defined() || !of_solution[k].defined()) continue;
+    const auto in_double = at::promote_types(of_solution[k].scalar_type(), at::kDouble);
+    const auto right = of_solution[k].to(in_double), off = gradients[k + 1].detach() + right;
+    const bool of_samples = is_of_samples(spec, k, batch);
+    const auto mark_by = [&](const auto& norm) {
+      const auto is_misleading = norm(off).gt(allowed_of * norm(right)).expand({batch}).contiguous();
+      const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch);
+      for (int64_t i = 0; i < batch; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
+    };
+    if (of_samples) mark_by([&](const at::Tensor& t) { return t.reshape({batch, -1}).norm(2, 1); });
+    if (!of_samples || is_function(spec)) mark_by([](const at::Tensor& t) { return t.norm(); });
+  }
+  return misleading;
+}
+
+}  // namespace prdp

@@ -1,0 +1,101 @@
+#include "prdp/operators/function_checks.h"
+
+#include <ATen/functorch/BatchedTensorImpl.h>
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+
+#include "prdp/error_text.h"
+#include "prdp/operators/kinds.h"
+#include "prdp/operators/plain_tensors.h"
+#include "prdp/operators/registered_products.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/operators/with_autograd.h"
+
+namespace prdp {
+
+namespace {
+
+/// A tensor that vmap maps over, for one of the entries; undefined where there is none.
+at::Tensor for_one_entry(at::Tensor t) {
+  while (const auto* mapped = at::functorch::maybeGetBatchedImpl(t)) {
+    if (mapped->value().size(mapped->bdim()) == 0) return {};
+    t = mapped->value().select(mapped->bdim(), 0);
+  }
+  return t;
+}
+
+double largest(const at::Tensor& v) { return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>(); }
+
+/// Raises ValueError where A (2 v) is not about 2 A v, where v is b, scaled to the order of one as in a solve.
+void refuse_powers(const Operator& a, const at::Tensor& b) {
+  const auto v = scale_finite_samples(b, b.abs().flatten(1).amax(1)).v;
+  const auto once = a.apply(v);
+  const double size = largest(once), off = largest(a.apply(2.0 * v) - 2.0 * once);
+  // A derivative by differences is not quite linear.
+  TORCH_CHECK_VALUE(off <= 0.1 * size || !std::isfinite(off), "Function: ", product_name(), " must be linear, but ",
+                    product_name(), "(2 v) and 2 ", product_name(), "(v) differ by ", off,
+                    "; in Newton's method it is the derivative, as ",
+                    in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
+}
+
+}  // namespace
+
+const char* product_name() { return in_language("matvec", "apply"); }
+
+void check_nothing_is_captured(const at::Tensor& result, bool reverse) {
+  TORCH_CHECK_VALUE(!(reverse && result.requires_grad()) && !has_tangent(result), "Function: ", product_name(),
+                    " uses a tensor that requires grad",
+                    has_tangent(result) || in_torch_func() ? ", or that forward mode or torch.func follows," : "",
+                    " but is not among its tensors, so that no gradient would reach it; hand it over in tensors, or "
+                    "detach it");
+}
+
+void refuse_captured_gradients(const OperatorSpec& a) {
+  RegisteredProducts::find(a.shape.at(0))->looks_for_captures = true;
+}
+
+void refuse_captured_transforms(const OperatorSpec& a, const at::Tensor& b) {
+  if (a.transposed) return;  // of an adjoint solve, whose A was looked at
+  auto constant = a;
+  for (auto& t : constant.tensors) t = primal(t).detach();
+  const auto v = primal(b).detach();
+  const bool reverse = at::GradMode::is_enabled();
+  check_nothing_is_captured(with_autograd([&] { return make_operator(constant)->apply(v); }), reverse);
+}
+
+void refuse_mapped_captures(const OperatorSpec& a, const at::Tensor& b) {
+  auto of_one = a;
+  for (auto& t : of_one.tensors) t = for_one_entry(primal(t).detach());
+  const auto v = for_one_entry(primal(b).detach());
+  const auto is_there = [](const at::Tensor& t) { return t.defined(); };
+  if (a.transposed || !v.defined() || !std::all_of(of_one.tensors.begin(), of_one.tensors.end(), is_there)) return;
+  TORCH_CHECK_VALUE(!at::functorch::maybeGetBatchedImpl(make_operator(of_one)->apply(v)), "Function: ", product_name(),
+                    " uses a tensor that vmap maps over, but that is not among its tensors; hand it "
+                    "over in tensors");
+}
+
+void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
+  const auto code = RegisteredProducts::find(a.shape.at(0))->code;
+  const bool can_look = b.is_cpu() && b.numel() > 0 && is_plain(b) && all_plain(a.tensors) && !in_torch_func();
+  if (!can_look) return;
+  const auto solves = static_cast<uint64_t>(code->solves) + 1;
+  if (std::has_single_bit(solves)) {
+    const at::NoGradGuard no_grad;
+    auto constant = a;
+    constant.tensors = detached(a.tensors);
+    const auto of = make_operator(constant);
+    const auto v = b.detach();
+    const double at_zero = largest(of->apply(at::zeros_like(v)));
+    // Beside b, as products by differences leave rounding.
+    const double rounding = 32.0 * std::sqrt(epsilon_of(b)) * largest(v);
+    TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
+                      " must be linear, but ", product_name(), "(0) holds ±", at_zero,
+                      "; constants, such as values on the boundary, belong to b");
+    if (solves == 1) refuse_powers(*of, v);
+  }
+  ++code->solves;
+}
+
+}  // namespace prdp
