@@ -71,4 +71,6 @@ def dense(who: str, name: str, value: object) -> Tensor:
         raise TypeError(f"{who}: {name} must be a torch tensor, got {type(value).__name__}")
     if value.layout != torch.strided:
         raise TypeError(f"{who}: {name} must be a dense tensor, got one of layout {value.layout}")
+    if value.is_nested:
+        raise TypeError(f"{who}: {name} must be a dense tensor, got a nested one")
     return value

@@ -140,11 +140,10 @@ def _remade(
     return controller
 
 
-def _number(who: str, name: str, value: Number) -> float:
-    """A metric as a float; a tensor of one element is one."""
-    if isinstance(value, Tensor) and value.numel() == 1:
-        return value.item()
-    return _check.real(who, name, value)
+def _number(who: str, name: str, value: Any) -> float:
+    """A metric as a float; a tensor of one element is one, and an array without axes."""
+    is_one = isinstance(value, Tensor) and value.numel() == 1
+    return _check.real(who, name, value.item() if is_one or getattr(value, "shape", None) == () else value)
 
 
 def _checked(who: str, settings: Mapping[str, object], defaults: dict[str, Any]) -> dict[str, Any]:

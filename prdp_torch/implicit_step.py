@@ -1,6 +1,7 @@
 """`ImplicitStep`: a step of an equation of your own."""
 
 import copy
+import inspect
 from collections.abc import Callable
 from operator import is_
 from typing import Any, Self, Unpack
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _check, operators, torch_private
-from prdp_torch.closures import warn_of_shared
+from prdp_torch.closures import closed_over, warn_of_shared
 from prdp_torch.operators.matrix import as_operator
 from prdp_torch.solvers import Solver
 from prdp_torch.stepper import Stepper
@@ -22,15 +23,16 @@ class ImplicitStep(Stepper):
     Args:
         operator: a function that takes u and returns an operator of `prdp_torch.operators` of any kind, or one
             operator for all u. The state u has the shape of the operator's vectors, (batch, ...).
-        rhs: a function that takes u and returns b, with the shape and dtype of u. None takes u itself.
+        rhs: a function that takes u, or u and A(u), and returns b, with the shape and dtype of u. None takes u itself.
         solver, backward and the other options: as in `Stepper`.
 
     Gradients reach u and every tensor that A(u) and b(u) are made of. If `operator` or `rhs` is an `nn.Module`, it
     becomes a submodule, so its Parameters are trained, moved and saved with the stepper. The same holds for the
     tensors of a constant operator, under the names of its arguments, such as `operator_at.kappa`; those of a
     `Function` are tensors_0, tensors_1 and so on. It does not hold for variables that a plain function captures:
-    `copy.deepcopy` does not copy them, and warns where it copies a module that they belong to. In a module of your own,
-    give methods, `ImplicitStep(self.operator, self.rhs)`, which copies make their own.
+    `copy.deepcopy` does not copy them, and warns where it copies a module that they belong to. A b that is made of A
+    takes it as an argument: `rhs=lambda u, A: u / dt + A.boundary_rhs(values=2.0)`. In a module of your own, give
+    methods, `ImplicitStep(self.operator, self.rhs)`, which copies make their own.
 
     Raises:
         TypeError, ValueError: A(u), b(u) and u do not fit each other. This is checked before any work.
@@ -46,7 +48,7 @@ class ImplicitStep(Stepper):
     def __init__(
         self,
         operator: Callable[[Tensor], operators.Operator | Tensor] | operators.Operator | Tensor,
-        rhs: Callable[[Tensor], Tensor] | None = None,
+        rhs: Callable[..., Tensor] | None = None,
         solver: Solver = None,  # type: ignore[assignment]  # None is refused
         backward: Backward = "implicit",
         **options: Unpack[StepOptions],
@@ -69,11 +71,12 @@ class ImplicitStep(Stepper):
             raise TypeError(f"{who}: rhs must be a function of u or None, got {_check.shown(rhs)}")
         self.operator_at = operator
         self.rhs_at = rhs
+        self._rhs_takes_operator = _takes_two(rhs)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        warn_of_shared(type(self).__name__, (self.operator_at, self.rhs_at), memo)
         other = memo[id(self)] = type(self).__new__(type(self))
         vars(other).update(copy.deepcopy(vars(self), memo))
+        warn_of_shared(type(self).__name__, (self.operator_at, self.rhs_at), memo)
         return other
 
     def operator(self, u: Tensor) -> operators.Operator | Tensor:
@@ -82,7 +85,27 @@ class ImplicitStep(Stepper):
 
     def rhs(self, u: Tensor) -> Tensor:
         """b(u), the right-hand side of the step from u."""
+        if self._rhs_takes_operator:
+            return self._rhs_with(u, as_operator(type(self).__name__, "operator(u)", self.operator(u)))
         return u if self.rhs_at is None else self.rhs_at(u)
+
+    def _rhs_with(self, u: Tensor, a: operators.Operator) -> Tensor:
+        if self._rhs_takes_operator and type(self).rhs is ImplicitStep.rhs:
+            b: Tensor = self.rhs_at(u, a)
+            return b
+        if isinstance(self.operator_at, ConstantOperator):
+            self.operator_at.check_is_not_captured(self.rhs_at, a)
+        return self.rhs(u)
+
+
+def _takes_two(rhs: object) -> bool:
+    """Whether a function has two arguments without a default."""
+    try:
+        parameters = inspect.signature(rhs.forward if isinstance(rhs, torch.nn.Module) else rhs).parameters.values()
+    except (TypeError, ValueError):  # None, or a function of C
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
 
 
 class ConstantOperator(torch_private.HearsOfMoves):
@@ -106,6 +129,18 @@ class ConstantOperator(torch_private.HearsOfMoves):
         if all(map(is_, tensors, self._operator.tensors)):
             return self._operator
         return self._operator.of(tensors)  # others for this call, such as those of torch.func.functional_call
+
+    def check_is_not_captured(self, rhs: object, a: operators.Operator) -> None:
+        """Raise ValueError if `a` has other tensors than the operator, and `rhs` has captured those of the operator."""
+        if a is self._operator or torch.compiler.is_compiling():
+            return
+        own = {id(tensor) for tensor in self._operator.tensors}
+        for name, held in closed_over(rhs):
+            if id(held) in own:
+                raise ValueError(
+                    f"ImplicitStep: rhs captures {name!r}, whose tensors are not those of this call, as in "
+                    "torch.func.functional_call; let it take A beside u: rhs=lambda u, A: ..."
+                )
 
     def _moved(self, move: Callable[[Tensor], Tensor]) -> None:
         """Keep the tensors that the module has now."""

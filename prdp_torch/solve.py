@@ -201,7 +201,8 @@ def linear_solve(
     if isinstance(A, torch.Tensor):
         A = operators.Matrix(A)
     if not isinstance(A, operators.Operator):
-        raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}")
+        hint = "; a product A v in a function is operators.Function(matvec)" if callable(A) else ""
+        raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}{hint}")
     compiling = torch.compiler.is_compiling()
     log: AdjointLog | None = None
     found: Solution | None = None

@@ -48,6 +48,8 @@ class Solver:
 
     def __post_init__(self) -> None:
         who = type(self).__name__
+        if type(self) is Solver:
+            raise TypeError("Solver: is the base of all solvers; take one of them, such as CG or GMRES")
         check_preconditioner(who, self.preconditioner)
         if not torch.compiler.is_compiling():
             self.max_iter = _check.whole(who, "max_iter", self.max_iter)
@@ -70,9 +72,10 @@ def check_preconditioner(who: str, preconditioner: object) -> None:
         names = ", ".join(map(repr, (None, *PRECONDITIONERS)))
         raise ValueError(f"{who}: unknown preconditioner {preconditioner!r}; allowed: {names}, or an operator")
     if not isinstance(preconditioner, str | Operator | Multigrid | None):
+        hint = "; a function that returns M⁻¹ r is operators.Function(apply)" if callable(preconditioner) else ""
         raise TypeError(
             f"{who}: preconditioner must be a name or an operator of prdp_torch.operators, "
-            f"got {_check.shown(preconditioner):.80}"
+            f"got {_check.shown(preconditioner):.80}{hint}"
         )
 
 

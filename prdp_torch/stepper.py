@@ -87,6 +87,10 @@ class Stepper(HasSettings):
         """b(u), the right-hand side of the step from u."""
         return u
 
+    def _rhs_with(self, u: Tensor, a: operators.Operator) -> Tensor:
+        """b(u), where a = A(u)."""
+        return self.rhs(u)
+
     @forgets_if_it_raises
     def forward(self, u: Tensor) -> Tensor:
         """Return the next state, of the shape and dtype of u, (batch, channel, *shape). Call the module instead.
@@ -191,7 +195,7 @@ class Stepper(HasSettings):
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
         who, compiling = type(self).__name__, torch.compiler.is_compiling()
         a = as_operator(who, "operator(u)", self.operator(u))
-        b = self.rhs(u)
+        b = self._rhs_with(u, a)
         if not compiling:
             _check.dense(who, "rhs(u)", b)
         b = full_precision(b)

@@ -33,7 +33,9 @@ class Matrix(Operator):
             self.kind = "dense"
             given = {"matrix": matrix}
         else:
-            raise ValueError(f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}")
+            raise ValueError(
+                f"linear_solve: A must be a dense or sparse CSR tensor, got {matrix.layout}; take A.to_sparse_csr()"
+            )
         if matrix.dim() not in (2, 3) or matrix.shape[-1] != matrix.shape[-2]:
             raise ValueError(f"linear_solve: A must have shape (n, n) or (batch, n, n), got {tuple(matrix.shape)}")
         if self.kind == "csr" and given["crow"].shape[-1] != matrix.shape[-1] + 1:
@@ -46,11 +48,20 @@ class Matrix(Operator):
 
     def apply(self, v: Tensor) -> Tensor:
         """Return A v, with gradients. v: (batch, n), or (n,)."""
+        _check.dense("Matrix.apply", "v", v)
         return super().apply(v) if v.dim() > 1 else super().apply(v.unsqueeze(0)).squeeze(0)
 
     def apply_transpose(self, v: Tensor) -> Tensor:
         """Return Aᵀ v, with gradients. v: (batch, n), or (n,)."""
+        _check.dense("Matrix.apply_transpose", "v", v)
         return super().apply_transpose(v) if v.dim() > 1 else super().apply_transpose(v.unsqueeze(0)).squeeze(0)
+
+    def dense(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Return A as a matrix (n, n), or (batch, n, n) if it differs between samples."""
+        if dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"Matrix.dense: dtype must be torch.float32 or torch.float64, got {dtype}")
+        converted = self.of([t.to(dtype) if t.is_floating_point() else t for t in self.tensors])
+        return Operator.dense(converted, dtype)
 
     def __repr__(self) -> str:
         values = self.tensors[2] if self.kind.endswith("csr") else self.tensors[0]
@@ -93,12 +104,14 @@ class Matrix(Operator):
         if not isinstance(size, (tuple, list)):
             size = (_check.whole("Matrix.csr", "size", size),) * 2
         size = tuple(_check.whole("Matrix.csr", "every extent of size", n) for n in size)
-        n, batch = size[-1], values.shape[:-1]
-        if values.dim() not in (1, 2) or len(size) not in (2, 3) or size[-2] != n or size[:-2] not in ((), batch):
+        batch = values.shape[:-1]
+        is_square = len(size) in (2, 3) and size[-2] == size[-1] > 0
+        if values.dim() not in (1, 2) or not is_square or size[:-2] not in ((), batch):
             raise ValueError(
                 "Matrix.csr: size must be (n, n), or (batch, n, n) with values of shape (batch, nnz), "
                 f"got {size} with values of shape {tuple(values.shape)}"
             )
+        n = size[-1]
         for name, tensor, length in (("crow", crow, n + 1), ("col", col, values.shape[-1])):
             if tensor.shape not in ((length,), (*batch, length)):
                 raise ValueError(f"Matrix.csr: {name} must have shape ({length},), got {tuple(tensor.shape)}")
@@ -129,4 +142,5 @@ def as_operator(who: str, name: str, value: object) -> Operator:
         return value
     if isinstance(value, torch.Tensor):
         return Matrix(value)
-    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}")
+    hint = "; a product A v in a function is operators.Function(matvec)" if callable(value) else ""
+    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}{hint}")

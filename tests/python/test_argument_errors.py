@@ -3,6 +3,7 @@
 import math
 import re
 
+import numpy as np
 import pytest
 import torch
 from helpers import field
@@ -161,3 +162,44 @@ def test_other_attributes_are_free():
     step = heat()
     step.label, step.name = "fine", "heat"
     assert Own().max_iters == 3 and step.label == "fine"
+
+
+CSR = (torch.arange(4), torch.arange(3), torch.ones(3))
+
+
+@pytest.mark.parametrize("call, error, said", [
+    (lambda: prdp.Solver(10), TypeError, "Solver: is the base of all solvers; take one of them, such as CG or GMRES"),
+    (lambda: operators.Matrix.csr(*CSR, ()), ValueError, "Matrix.csr: size must be (n, n)"),
+    (lambda: operators.Matrix.csr(*CSR, -1), ValueError, "Matrix.csr: size must be (n, n)"),
+    (lambda: operators.Matrix(torch.eye(3)).apply([1.0]), TypeError, "Matrix.apply: v must be a torch tensor, got list"),
+    (lambda: operators.Matrix(torch.eye(3)).dense(torch.int64), TypeError,
+     "Matrix.dense: dtype must be torch.float32 or torch.float64, got torch.int64"),
+    (lambda: operators.Matrix(torch.eye(3).to_sparse()), ValueError, "torch.sparse_coo; take A.to_sparse_csr()"),
+    (lambda: prdp.CG(5, preconditioner=lambda r: r), TypeError, "that returns M⁻¹ r is operators.Function(apply)"),
+    (lambda: prdp.linear_solve(lambda v: v, torch.ones(1, 3), prdp.CG(5)), TypeError, "operators.Function(matvec)"),
+    (lambda: prdp.ImplicitStep(lambda u: len, None, prdp.CG(5))(torch.ones(1, 3)), TypeError,
+     "operators.Function(matvec)"),
+    (lambda: prdp.ToleranceController().step(torch.tensor(1j)), TypeError, "error must be a real number, got 1j"),
+    (lambda: prdp.PRDPController().step(-0.9), ValueError, "got -0.9; smaller is better, as in 1 - accuracy"),
+])  # fmt: skip
+def test_what_strangers_tried(call, error, said):
+    with pytest.raises(error, match=re.escape(said)):
+        call()
+
+
+def test_an_array_of_one_number_is_a_metric():
+    controller = prdp.ToleranceController()
+    for error in (np.array(0.5), np.float32(0.4), torch.tensor([0.3]), torch.tensor(0.2)):
+        controller.step(error)
+    assert [record.error for record in controller.history] == pytest.approx([0.5, 0.4, 0.3, 0.2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("wanted", [torch.float32, torch.float64])
+def test_a_matrix_is_dense_in_any_dtype(dtype, wanted):
+    a = torch.rand(2, 3, 3, dtype=dtype)
+    crow, col = torch.arange(0, 10, 3), torch.arange(3).repeat(3)
+    forms = [operators.Matrix(a), operators.Matrix.csr(crow, col, a.flatten(1), 3), operators.Matrix(a[0])]
+    for form, expected in zip(forms, (a, a, a[0]), strict=True):
+        assert torch.equal(form.dense(wanted), expected.to(wanted))
+    assert torch.equal(operators.Matrix(a[0].to_sparse_csr()).dense(wanted), a[0].to(wanted))

@@ -128,6 +128,10 @@ def test_failures_are_named_by_their_number_among_the_data():
 CONTROLLERS = [lambda: prdp.PRDPController(initial=3), lambda: prdp.ToleranceController()]
 
 
+def metric_of(controller):
+    return "error" if isinstance(controller, prdp.ToleranceController) else "metric"
+
+
 @pytest.mark.parametrize("make", CONTROLLERS)
 @pytest.mark.parametrize("metric", [math.nan, math.inf, -1.0])
 def test_a_metric_that_is_no_number_is_refused_changes_nothing_and_is_said(make, metric):
@@ -137,8 +141,8 @@ def test_a_metric_that_is_no_number_is_refused_changes_nothing_and_is_said(make,
     with pytest.raises(ValueError, match=f"must be finite and >= 0, got {metric:g}"):
         controller.step(metric)
     assert controller.state_dict() == before
-    name = type(controller).__name__
-    assert controller.warning.startswith(f"{name}: the last metric was {metric:.1e}, and nothing was changed; K = ")
+    name, what = type(controller).__name__, metric_of(controller)
+    assert controller.warning.startswith(f"{name}: the last {what} was {metric:.1e}, and nothing was changed. Go back")
     controller.step(0.4)
     assert controller.warning is None
 
@@ -150,7 +154,7 @@ def test_a_metric_that_grows_is_said(make):
         controller.step(metric)
         assert controller.warning is None
     controller.step(0.7)
-    said = "the metric grows: 7.0e-01 after 1.0e-01 in interval 2; lower the learning rate"
+    said = f"the {metric_of(controller)} grows: 7.0e-01 after 1.0e-01 in interval 2; lower the learning rate"
     assert controller.warning.startswith(f"{type(controller).__name__}: {said}")
     controller.step(0.15)
     assert controller.warning is None

@@ -77,3 +77,36 @@ def test_a_few_unknowns_that_are_singular_are_found_wherever_they_stand(nodes, d
         b = noise(1, 12 + nodes, seed=at).to(dtype)
         u, info = prdp.linear_solve(a.to(dtype), b, prdp.Direct(), on_failure="return")
         assert not info.solved.any() and u.abs().max() < 1e3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("n", [10, 50, 120])
+def test_a_function_is_as_singular_as_its_matrix(n, dtype):
+    """With a null vector that nobody named, and the constant pressure of a saddle point."""
+    refused = 0
+    for seed in range(6):
+        q = torch.nn.functional.normalize(noise(n, seed=seed), dim=0)
+        x, p = noise(n, n, seed=seed + 50), torch.eye(n, dtype=F64) - torch.outer(q, q)
+        projected = p @ (x @ x.T / n + torch.eye(n, dtype=F64)) @ p
+        saddle = constrained(1.0, n - n // 3, n // 3)
+        saddle[n - n // 3 :] -= saddle[n - n // 3 :].mean(0)
+        saddle[:, n - n // 3 :] -= saddle[:, n - n // 3 :].mean(1, keepdim=True)
+        for a in (((projected + projected.T) / 2).to(dtype), saddle.to(dtype)):
+            b = noise(1, n, seed=seed + 100).to(dtype)
+            for product in (a, prdp.operators.Function(lambda v, a=a: v @ a, symmetric=True)):
+                u, info = prdp.linear_solve(product, b, prdp.Direct(), on_failure="return")
+                refused += int(info.failed)
+                assert not info.failed or not u.any()
+    assert refused == 24
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_a_function_with_rows_of_other_sizes_is_solved(dtype):
+    a, b = noise(7, 7) + 3 * torch.eye(7, dtype=F64), noise(2, 7, seed=1)
+    rows = torch.logspace(-9, 9, 7, dtype=F64)[:, None]
+    u, info = prdp.linear_solve(
+        prdp.operators.Function(lambda v: v @ (rows * a).to(dtype).T), b.to(dtype) * rows.T.to(dtype), prdp.Direct(),
+        on_failure="return",
+    )  # fmt: skip
+    expected = torch.linalg.solve(a, b.T).T
+    assert ((u - expected).norm(dim=1) < 300 * torch.finfo(dtype).eps * expected.norm(dim=1)).all(), info

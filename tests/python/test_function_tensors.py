@@ -168,3 +168,22 @@ def test_what_vmap_maps_over_and_a_product_captures_is_refused(mapped):
         found = torch.func.vmap(solution, axes)(*given)
         factor = scales[:, None, None] if mapped == "a tensor" else 1.0
         assert torch.allclose(found, (b if of_b else B[None].expand(3, -1, -1)) / (factor * k[0]))
+
+
+@pytest.mark.parametrize("by_numpy", [False, True])
+def test_a_product_that_torch_does_not_record_has_no_silent_gradient_of_none(by_numpy):
+    k = torch.linspace(1, 2, 5, dtype=torch.float64).requires_grad_()
+    b = torch.ones(2, 5, dtype=torch.float64)
+
+    def product(v, k):
+        if by_numpy:
+            return torch.from_numpy(k.detach().numpy() * v.detach().numpy())
+        with torch.no_grad():
+            return k * v
+
+    u, _ = prdp.linear_solve(operators.Function(product, product, tensors=(k,)), b, prdp.CG(9))
+    with pytest.raises(ValueError, match="torch does not record matvec, so that its tensors would get no gradient"):
+        u.sum().backward()
+    unused = operators.Function(lambda v, k: 2 * v, symmetric=True, tensors=(k,))
+    prdp.linear_solve(unused, b, prdp.CG(9))[0].sum().backward()  # is recorded, and k is not in it
+    assert k.grad is None or not k.grad.any()

@@ -292,3 +292,55 @@ def test_mistakes_are_named_before_any_work(call, error, message):
 
 def run(operator, rhs=None, u=None):
     return prdp.ImplicitStep(operator, rhs, prdp.CG(3))(field((N,)) if u is None else u)
+
+
+def step_with_boundary_values(rhs):
+    """And A, of which b is made as well."""
+    A = prdp.operators.Diffusion(torch.nn.Parameter(torch.rand(1, 8, dtype=torch.float64) + 0.5), shift=10.0)
+    return A, prdp.ImplicitStep(A, rhs(A), prdp.Direct())
+
+
+def exact_with_boundary_values(kappa, u):
+    A = prdp.operators.Diffusion(kappa, shift=10.0)
+    b = 10.0 * u + A.boundary_rhs(values=2.0)
+    return torch.linalg.solve(A.dense(), b.flatten(1).T).T.view_as(u)
+
+
+def test_a_right_hand_side_may_take_the_operator():
+    """Then b follows A into copies, `functional_call` and ensembles."""
+    u = torch.randn(2, 1, 8, dtype=torch.float64)
+    _, step = step_with_boundary_values(lambda A: lambda u, A: 10.0 * u + A.boundary_rhs(values=2.0))
+    kappa = step.operator_at.kappa.detach().clone()
+    torch.testing.assert_close(step(u), exact_with_boundary_values(kappa, u))
+    assert torch.equal(step.rhs(u), 10.0 * u + step.operator(u).boundary_rhs(values=2.0))
+    other = copy.deepcopy(step)
+    with torch.no_grad():
+        other.operator_at.kappa.mul_(3.0)
+    torch.testing.assert_close(other(u), exact_with_boundary_values(3.0 * kappa, u))
+    of = {"operator_at.kappa": 2.0 * kappa}
+    torch.testing.assert_close(torch.func.functional_call(step, of, u), exact_with_boundary_values(2.0 * kappa, u))
+    torch.testing.assert_close(step.rollout(u, 2)[:, 1], exact_with_boundary_values(kappa, u))
+    assert torch.autograd.gradcheck(
+        lambda k: torch.func.functional_call(step, {"operator_at.kappa": k}, u), kappa.requires_grad_()
+    )
+
+
+@pytest.mark.parametrize(
+    "rhs",
+    [
+        lambda A: lambda u: 10.0 * u + A.boundary_rhs(values=2.0),
+        lambda A: lambda u, A=A: 10.0 * u + A.boundary_rhs(values=2.0),
+        lambda A: lambda u, kappa=A.kappa: u * kappa,
+    ],
+)
+def test_a_right_hand_side_that_captures_the_operator_says_so_where_it_would_be_wrong(rhs):
+    u = torch.randn(2, 1, 8, dtype=torch.float64)
+    A, step = step_with_boundary_values(rhs)
+    step(u)  # is right
+    with pytest.warns(UserWarning, match="still uses '(A|kappa)' of the original"):
+        copy.deepcopy(step)
+    with pytest.raises(ValueError, match=r"rhs captures '(A|kappa)', .* let it take A beside u"):
+        torch.func.functional_call(step, {"operator_at.kappa": 2.0 * A.kappa.detach()}, u)
+    step.load_state_dict({"operator_at.kappa": 2.0 * A.kappa.detach()}, assign=True)
+    with pytest.raises(ValueError, match="rhs captures"):
+        step(u)

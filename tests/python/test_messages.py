@@ -128,3 +128,20 @@ def test_the_message_of_a_stepper_is_the_same():
     with pytest.warns(UserWarning, match="step 1 of 1: linear_solve: .* Jacobi on NavierStokes: the pressure rows"):
         flow.on_failure = "warn"
         flow.rollout(flow_state(), 1)
+
+
+def test_a_reason_that_is_the_same_is_said_once():
+    b = torch.full((64, 2), torch.nan, dtype=torch.float64)
+    with pytest.raises(torch.linalg.LinAlgError) as error:
+        prdp.linear_solve(SINGULAR + torch.eye(2).double(), b, prdp.CG(9))
+    assert str(error.value).startswith(
+        "linear_solve: 64 of 64 samples failed: sample 0 NONFINITE_INPUT at index (0), CG on Matrix: the right-hand "
+        "side is NaN or Inf there; look at the state that it is made of; sample 1 NONFINITE_INPUT at index (0); "
+        "sample 2 NONFINITE_INPUT at index (0); sample 3 NONFINITE_INPUT at index (0); and 60 more. With"
+    )
+
+
+def test_symmetric_is_not_believed_where_it_is_false():
+    a = operators.Function(lambda v: v @ TURN.T, symmetric=True)
+    with pytest.raises(torch.linalg.LinAlgError, match=NOT_SYMMETRIC):
+        prdp.linear_solve(a, E1[None], prdp.CG(9))

@@ -133,3 +133,21 @@ def test_failures_of_an_own_preconditioner_are_not_blamed_on_a():
 def test_what_is_singular_to_float32_is_sent_to_float64():
     with pytest.raises(torch.linalg.LinAlgError, match="singular to float32; take float64, or GMRES"):
         prdp.linear_solve(torch.diag(torch.tensor([1.0, 0.0, 2.0])), torch.ones(3), prdp.Direct())
+
+
+@pytest.mark.parametrize("solver", [prdp.CG, prdp.MINRES, prdp.GMRES, prdp.BiCGStab])
+@pytest.mark.parametrize("write", [lambda r: r.mul_(0.5), lambda r: r.copy_(2 * r)])
+def test_a_preconditioner_that_writes_into_the_residual_is_refused(solver, write):
+    """It would change what the method goes on with, and the report with it."""
+    m = operators.Function(write, symmetric=True)
+    with pytest.raises(ValueError, match="preconditioner: Function: matvec changes its arguments in place"):
+        prdp.linear_solve(MATRICES[0], rhs((6,)), solver(9, preconditioner=m))
+    with torch.inference_mode(), pytest.raises(ValueError, match="changes its arguments in place"):
+        prdp.linear_solve(MATRICES[0].clone(), rhs((6,)).clone(), solver(9, preconditioner=m))
+
+
+def test_minres_tells_nan_of_its_preconditioner_from_one_that_is_not_definite():
+    for bad, said in ((torch.nan, "hands out NaN or Inf"), (-1.0, "is not positive definite")):
+        m = operators.Function(lambda r, bad=bad: bad * r, symmetric=True)
+        with pytest.raises(torch.linalg.LinAlgError, match=f"its preconditioner {said}"):
+            prdp.linear_solve(MATRICES[0], rhs((6,)), prdp.MINRES(9, preconditioner=m))

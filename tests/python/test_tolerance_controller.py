@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import prdp_torch as prdp
 
 
-@pytest.mark.filterwarnings("ignore:ToleranceController. the error has not fallen", "ignore:.*the metric grows")
+@pytest.mark.filterwarnings("ignore:ToleranceController. the error has not fallen", "ignore:.*the error grows")
 @given(st.lists(st.floats(0, 10), max_size=30))
 def test_the_tolerance_is_the_ratio_of_the_smallest_error_within_its_bounds(errors):
     heat = heat_step()

@@ -34,10 +34,11 @@ std::optional<std::string> Controller::warning() const {
   return text.empty() ? std::nullopt : std::optional(text);
 }
 
-void Controller::check_metric(double metric, const char* what) {
+void Controller::check_metric(double metric) {
   const bool good = is_size(metric);
   refused_ = good ? std::nullopt : std::optional(metric);
-  TORCH_CHECK_VALUE(good, name(), ": ", what, " must be finite and >= 0, got ", metric);
+  TORCH_CHECK_VALUE(good, name(), ": ", metric_name(), " must be finite and >= 0, got ", metric,
+                    metric < 0.0 ? "; smaller is better, as in 1 - accuracy" : "");
 }
 
 void Controller::check_solves(const Solves& solves) {
@@ -65,8 +66,8 @@ std::string Controller::about_metric() const {
   std::ostringstream text;
   text << std::scientific << std::setprecision(1) << name() << ": ";
   if (refused_) {
-    text << "the last metric was " << *refused_ << ", and nothing was changed; K = " << max_iter()
-         << " still. Go back to the weights before it, with a smaller learning rate";
+    text << "the last " << metric_name() << " was " << *refused_ << ", and nothing was changed. Go back to the weights "
+         << "before it, with a smaller learning rate";
     return text.str();
   }
   if (history.size() <= kGrown) return {};
@@ -76,7 +77,7 @@ std::string Controller::about_metric() const {
   const bool grows =
       std::all_of(history.end() - kGrown, history.end(), [&](const Record& r) { return r.metric > bound; });
   if (!grows) return {};
-  text << "the metric grows: " << history.back().metric << " after " << least->metric << " in interval "
+  text << "the " << metric_name() << " grows: " << history.back().metric << " after " << least->metric << " in interval "
        << least - history.begin() << "; lower the learning rate, or go back to the weights of then";
   return text.str();
 }

@@ -79,14 +79,16 @@ class Controller {
 
  protected:
   explicit Controller(int64_t max_iter) : state_{max_iter} {}
-  /// Raises ValueError unless the metric, called `what` in the message, is finite and >= 0. warning() then reports it.
-  void check_metric(double metric, const char* what);
+  /// Raises ValueError unless the metric is finite and >= 0. warning() then reports it.
+  void check_metric(double metric);
   /// Raises ValueError unless the error and the residual, where they are known, are finite and >= 0. warning() then
   /// reports solves that did nothing.
   void check_solves(const Solves& solves);
   /// Raises ValueError for a state that no controller can have reached; a metric that `is_ignored` may be anything.
   void check_state(const State& state, bool is_ignored = false) const;
   virtual const char* name() const = 0;
+  /// What messages call the metric.
+  virtual const char* metric_name() const { return "metric"; }
   /// What the user should do about the warning, as the end of a sentence.
   virtual const char* remedy() const = 0;
   /// Whether the metric no longer falls.

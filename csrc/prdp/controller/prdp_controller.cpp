@@ -49,7 +49,7 @@ bool PRDPController::should_refine() const {
 
 bool PRDPController::step(double metric, const Solves& solves) {
   check_solves(solves);
-  check_metric(metric, "metric");
+  check_metric(metric);
   const double alpha = 2.0 / (static_cast<double>(settings_.window) + 1.0);
   const auto& history = state_.history;
   const double smoothed =

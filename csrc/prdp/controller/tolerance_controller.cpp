@@ -37,7 +37,7 @@ Budget ToleranceController::budget() const {
 
 bool ToleranceController::step(double error, const Solves& solves) {
   check_solves(solves);
-  check_metric(error, "error");
+  check_metric(error);
   const double before = rtol();
   state_.checkpoint = std::min(state_.checkpoint, error);
   const bool tightened = rtol() < before;

@@ -38,6 +38,7 @@ class ToleranceController final : public Controller {
 
  private:
   const char* name() const override { return "ToleranceController"; }
+  const char* metric_name() const override { return "error"; }
   const char* remedy() const override {
     return "raise maximum, or take a solver that needs fewer iterations, as with preconditioner=\"multigrid\", or "
            "float64 if it stalls";

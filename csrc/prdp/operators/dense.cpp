@@ -1,32 +1,58 @@
 #include "prdp/operators/dense.h"
 
 #include <algorithm>
+#include <limits>
 
+#include "prdp/operators/plain_tensors.h"
 #include "prdp/operators/tensors.h"
 
 namespace prdp {
 
 namespace {
 
-/// With rows and columns brought to one size by powers of two, which change no digit but the choice of pivots: on the
-/// CPU the factorisations of the loops do that.
-at::Tensor solve_equilibrated(const at::Tensor& matrix, const at::Tensor& b) {
+at::Tensor solve_plainly(const at::Tensor& matrix, const at::Tensor& b) {
+  return std::get<0>(at::linalg_solve_ex(matrix, b));
+}
+
+/// With rows and columns brought to one size by powers of two, which change no digit but the choice of pivots.
+template <class Solve>
+at::Tensor solve_equilibrated(const at::Tensor& matrix, const at::Tensor& b, const Solve& solve) {
   const auto scale_of = [](const at::Tensor& a, int64_t along) {
     return power_of_two_scale(a.detach().abs().amax(along, /*keepdim=*/true));
   };
   const auto rows = scale_of(matrix, -1), columns = scale_of(rows * matrix, -2);
-  return columns.mT() * std::get<0>(at::linalg_solve_ex(rows * matrix * columns, rows * b));
+  return columns.mT() * solve(rows * matrix * columns, rows * b);
+}
+
+/// NaN where a pivot is rounding beside its own column, as the factorisations of the loops have it (kernels/
+/// matrix_factors.cpp): A is singular, and its solution would be rounding.
+at::Tensor solve_regular(const at::Tensor& matrix, const at::Tensor& b) {
+  const auto [lu, pivots, info] = at::linalg_lu_factor_ex(matrix);
+  const double rounding = epsilon_of(matrix) * static_cast<double>(matrix.size(-1));
+  const auto size = matrix.detach().abs().sum(-2);
+  const auto is_regular = lu.detach().diagonal(0, -2, -1).abs().gt(rounding * size).all();
+  return at::where(is_regular, at::linalg_lu_solve(lu, pivots, b), std::numeric_limits<double>::quiet_NaN());
+}
+
+/// One matrix (n, n), in float64 whatever its dtype, and scaled where it seems singular as it is.
+at::Tensor solve_on_cpu(const at::Tensor& matrix, const at::Tensor& b) {
+  if (!is_plain(matrix) || !is_plain(b)) return solve_plainly(matrix, b);
+  const auto a = matrix.to(at::kDouble), rhs = b.to(at::kDouble);
+  auto x = solve_regular(a, rhs);
+  if (x.isnan().any().item<bool>()) x = solve_equilibrated(a, rhs, solve_regular);
+  return x.to(b.scalar_type());
 }
 
 }  // namespace
 
 at::Tensor solve_dense(const at::Tensor& matrix, const at::Tensor& b) {
-  if (!matrix.is_cpu()) return solve_equilibrated(matrix, b);
-  if (matrix.dim() < 3 || matrix.size(0) == 1) return std::get<0>(at::linalg_solve_ex(matrix, b));
+  if (!matrix.is_cpu()) return solve_equilibrated(matrix, b, solve_plainly);
+  if (matrix.dim() < 3) return solve_on_cpu(matrix, b);
+  if (matrix.size(0) == 1) return solve_on_cpu(matrix[0], b);
   // One at a time: after torch.set_num_threads, torch factors the matrices of a batch in threads that
   // spoil each other's pivots (pytorch issue 142815).
   std::vector<at::Tensor> solutions;
-  for (int64_t i = 0; i < matrix.size(0); ++i) solutions.push_back(std::get<0>(at::linalg_solve_ex(matrix[i], b[i])));
+  for (int64_t i = 0; i < matrix.size(0); ++i) solutions.push_back(solve_on_cpu(matrix[i], b[i]));
   return solutions.empty() ? at::empty_like(b) : at::stack(solutions);
 }
 

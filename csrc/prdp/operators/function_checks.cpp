@@ -28,14 +28,14 @@ at::Tensor for_one_entry(at::Tensor t) {
 
 double largest(const at::Tensor& v) { return v.nan_to_num(0.0, 0.0, 0.0).abs().max().to(at::kDouble).item<double>(); }
 
-/// Raises ValueError where A (2 v) is not about 2 A v, where v is b, scaled to the order of one as in a solve.
-void refuse_powers(const Operator& a, const at::Tensor& b) {
+/// Raises ValueError where A (-2 v) is not about -2 A v, where v is b, scaled to the order of one as in a solve.
+void check_multiples(const Operator& a, const at::Tensor& b) {
   const auto v = scale_finite_samples(b, b.abs().flatten(1).amax(1)).v;
   const auto once = a.apply(v);
-  const double size = largest(once), off = largest(a.apply(2.0 * v) - 2.0 * once);
+  const double size = largest(once), off = largest(a.apply(-2.0 * v) + 2.0 * once);
   // A derivative by differences is not quite linear.
   TORCH_CHECK_VALUE(off <= 0.1 * size || !std::isfinite(off), "Function: ", product_name(), " must be linear, but ",
-                    product_name(), "(2 v) and 2 ", product_name(), "(v) differ by ", off,
+                    product_name(), "(-2 v) and -2 ", product_name(), "(v) differ by ", off,
                     "; in Newton's method it is the derivative, as ",
                     in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
 }
@@ -93,7 +93,7 @@ void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
     TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
                       " must be linear, but ", product_name(), "(0) holds ±", at_zero,
                       "; constants, such as values on the boundary, belong to b");
-    if (solves == 1) refuse_powers(*of, v);
+    if (solves == 1) check_multiples(*of, v);
   }
   ++code->solves;
 }

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <utility>
 
 #include "prdp/error_text.h"
 #include "prdp/operators/dense.h"
@@ -28,6 +29,17 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
                     " in ", result.scalar_type());
   return result;
 }
+
+/// Counts writes into tensors also below autograd, where a solve runs.
+class WritesCounted {
+ public:
+  WritesCounted()
+      : guard_(c10::impl::tls_local_dispatch_key_set().included_,
+               c10::impl::tls_local_dispatch_key_set().excluded_.remove(c10::DispatchKey::ADInplaceOrView)) {}
+
+ private:
+  c10::impl::ForceDispatchKeyGuard guard_;
+};
 
 /// How often a tensor was written to; unknown in inference mode.
 int64_t writes(const at::Tensor& t) { return t.is_inference() ? 0 : static_cast<int64_t>(t._version()); }
@@ -88,8 +100,16 @@ at::Tensor FunctionOperator::product(const Products::Product& function, const at
     return sum;
   };
   const auto before = of_all();
-  const auto result = checked(function(v, tensors), v, name);
-  TORCH_CHECK_VALUE(of_all() == before, "Function: ", name,
+  const bool is_first = v.is_inference() && v.is_cpu() && is_plain(v) && !std::exchange(looked_in_inference_, true);
+  const auto copy = is_first ? v.clone() : at::Tensor();
+  const auto call = [&] {
+    if (in_torch_func()) return function(v, tensors);
+    const WritesCounted counted;
+    return function(v, tensors);
+  };
+  const auto result = checked(call(), v, name);
+  const bool is_unchanged = of_all() == before && (!is_first || at::allclose(v, copy, 0.0, 0.0, /*equal_nan=*/true));
+  TORCH_CHECK_VALUE(is_unchanged, "Function: ", name,
                     " changes its arguments in place; it must return a new tensor and leave them as they are");
   return result;
 }
@@ -145,7 +165,9 @@ std::vector<int64_t> FunctionOperator::vector_shape() const {
 at::Tensor FunctionOperator::solve_directly(const at::Tensor& b, bool transposed) const {
   const auto product = [&](const at::Tensor& v) { return transposed ? apply_transpose(v) : apply(v); };
   check_dense_fits(b, b.numel() / std::max<int64_t>(b.size(0), 1), b.size(0));
-  return solve(matrix_by_columns(product, b), b);
+  const auto matrix = matrix_by_columns(product, b);
+  norm_of_matrix_ = matrix.detach().abs().sum(transposed ? -2 : -1).amax(-1).to(at::kDouble);
+  return solve(matrix, b);
 }
 
 std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
@@ -164,7 +186,10 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
     std::vector<at::Tensor> gradients(tensors_.size());
     if (wanted.empty()) return gradients;
     const auto made = product(registered_->products().apply, create_graph ? u : u.detach(), arguments, product_name());
-    if (!made.requires_grad()) return gradients;
+    if (!made.requires_grad()) {
+      check_is_recorded(u);
+      return gradients;
+    }
     const auto found = torch::autograd::grad({made}, wanted, {create_graph ? lambda : lambda.detach()}, create_graph,
                                              create_graph, /*allow_unused=*/true);
     for (size_t i = 0, next = 0; i < tensors_.size(); ++i)
@@ -173,7 +198,16 @@ std::vector<at::Tensor> FunctionOperator::product_rule(const at::Tensor& lambda,
   });
 }
 
+void FunctionOperator::check_is_recorded(const at::Tensor& u) const {
+  const auto v = u.detach().requires_grad_();
+  TORCH_CHECK_VALUE(product(registered_->products().apply, v, detached(tensors_), product_name()).requires_grad(),
+                    "Function: torch does not record ", product_name(),
+                    ", so that its tensors would get no gradient; make it of torch operations, without ",
+                    in_language("numpy and torch.no_grad()", "NoGradGuard"), ", or detach its tensors");
+}
+
 at::Tensor FunctionOperator::norm() const {
+  if (norm_of_matrix_.defined()) return norm_of_matrix_;
   auto norm = at::scalar_tensor(0.0, at::kDouble);
   for (const auto& t : tensors_)
     if (holds_numbers(t))

@@ -19,7 +19,7 @@ class FunctionOperator final : public Operator {
   at::Tensor diagonal() const override;
   at::Tensor solve_directly(const at::Tensor& b, bool transposed) const override;
   std::vector<at::Tensor> product_rule(const at::Tensor& lambda, const at::Tensor& u) const override;
-  /// Not known: 0, or NaN if a tensor is not finite.
+  /// Not known before an exact solve: 0, or NaN if a tensor is not finite.
   at::Tensor norm() const override;
   /// The samples whose product with a vector of ones is not finite, if a tensor is not; all if no product is.
   at::Tensor nonfinite_samples(const at::Tensor& b) const override;
@@ -36,6 +36,8 @@ class FunctionOperator final : public Operator {
                      const char* name) const;
   at::Tensor product_without_captures(const at::Tensor& v) const;
   at::Tensor derivative_transposed(const at::Tensor& v) const;
+  /// Raises ValueError where autograd does not follow `apply`, so that no tensor could have a gradient.
+  void check_is_recorded(const at::Tensor& u) const;
 
   std::shared_ptr<const RegisteredProducts> registered_;
   std::vector<at::Tensor> tensors_;
@@ -44,6 +46,8 @@ class FunctionOperator final : public Operator {
     at::Tensor point, product;
   };
   mutable std::optional<Recorded> recorded_;
+  mutable bool looked_in_inference_ = false;  // for writes, which no tensor counts there
+  mutable at::Tensor norm_of_matrix_;         // (batch,), once it has been made
   mutable std::vector<int64_t> vectors_;  // shape of the right-hand side; empty: not known
 };
 

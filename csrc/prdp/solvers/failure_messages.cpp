@@ -2,6 +2,7 @@
 
 #include <ATen/core/grad_mode.h>
 
+#include <algorithm>
 #include <cmath>
 #include <iomanip>
 #include <limits>
@@ -43,13 +44,22 @@ double value_of_sample(const at::Tensor& t, int64_t sample) {
   return (t.dim() == 0 || t.size(0) == 1 ? t.reshape({-1})[0] : t.reshape({-1})[sample]).to(at::kDouble).item<double>();
 }
 
-/// ‖A v - Aᵀ v‖ / ‖A v‖ of a vector v without structure, for this sample; NaN for a function without a transpose.
+/// How far A is from symmetric, for vectors without structure of this sample: ‖A v - Aᵀ v‖ / ‖A v‖, and, as the
+/// transpose of a function may be claimed to be A itself, |⟨A v, w⟩ - ⟨v, A w⟩| / (‖A v‖ ‖w‖). NaN for a function
+/// without a transpose.
 double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
-  const auto v = unstructured_like(b);
-  const auto product = a.apply(v).select(0, sample), other = a.apply_transpose(v).select(0, sample);
-  return norm_of(product - other) / norm_of(product);
+  const auto v = unstructured_like(b), w = v.flatten(1).roll(1, 1).view_as(v);
+  const auto of = [&](const at::Tensor& t) { return t.select(0, sample).flatten().to(at::kDouble); };
+  const auto product = of(a.apply(v)), other = of(a.apply_transpose(v));
+  const double claimed = (product.dot(of(w)) - of(v).dot(of(a.apply(w)))).item<double>();
+  return std::max(norm_of(product - other) / norm_of(product), std::abs(claimed) / (norm_of(product) * norm_of(of(w))));
 } catch (const std::exception&) {  // it has nothing to add to a message
   return std::numeric_limits<double>::quiet_NaN();
+}
+
+/// Whether the product with a vector of ones is finite, for this sample.
+bool is_finite(const Operator& a, const at::Tensor& b, int64_t sample) {
+  return a.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>();
 }
 
 /// Whether the null space of A is known: somebody named it, or it is that of a pressure.
@@ -102,8 +112,16 @@ std::string not_definite(const Operator& a, const at::Tensor& b, int64_t sample)
   return "A is symmetric but not definite; take MINRES, or name all its null vectors (nullspace) if it is singular";
 }
 
+/// Where a preconditioner of the user's own hands out NaN or Inf: that, in words. Else empty.
+std::string nonfinite_preconditioner(const Solver& solver, const at::Tensor& b, int64_t sample) {
+  if (!solver.preconditioner.is_operator() || is_finite(*make_operator(solver.preconditioner.spec()), b, sample))
+    return {};
+  return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
+}
+
 /// Why MINRES finds no direction.
 std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (auto found = nonfinite_preconditioner(solver, b, sample); !found.empty()) return found;
   if (solver.preconditioner)
     return "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is singular";
   if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
@@ -119,11 +137,7 @@ std::string diverged(const Solver& solver, const Operator& a, const at::Tensor& 
 }
 
 std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
-  const auto is_finite = [&](const Operator& m) {
-    return m.apply(at::ones_like(b)).select(0, sample).isfinite().all().item<bool>();
-  };
-  if (solver.preconditioner.is_operator() && !is_finite(*make_operator(solver.preconditioner.spec())))
-    return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
+  if (auto found = nonfinite_preconditioner(solver, b, sample); !found.empty()) return found;
   if (solver.preconditioner && traits(solver.method).made_for == MadeFor::kSymmetric)
     return std::string("a number left the range of its dtype: its preconditioner may not be positive definite") +
            (solver.preconditioner.is_multigrid() ? ", as multigrid is not where A is not" : "") +
@@ -131,7 +145,7 @@ std::string overflow(const Solver& solver, const Operator& a, const at::Tensor& 
   const bool single = b.scalar_type() == at::kFloat;
   const double norm = value_of_sample(a.norm(), sample), norm_b = norm_of(b.select(0, sample));
   const bool known = norm > 0.0;  // not of a function
-  if (!known && !is_finite(a))
+  if (!known && !is_finite(a, b, sample))
     return "A v is NaN or Inf for a vector v of ones; look at the state, the weights or the file that A is made of";
   return "a number left the range of " + std::string(single ? "float32" : "float64") + " (" +
          (known ? "‖A‖ is " + number(norm) + ", " : "") + "‖b‖ is " +

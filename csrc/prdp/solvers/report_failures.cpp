@@ -215,6 +215,7 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   constexpr size_t named = 4;
   std::ostringstream text;
   text << name_of(role) << ": " << failed.size() << " of " << batch << " samples failed";
+  std::string said;
   for (size_t k = 0; k < std::min(named, failed.size()); ++k) {
     const int64_t i = failed[k];
     const auto what = static_cast<SolveStatus>(status[i]);
@@ -222,7 +223,9 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
     if (!is_refused(what))
       text << " (the iterate handed out has relative residual " << info.residual[i].item<double>() << " after "
            << info.iterations[i].item<int64_t>() << " iterations)";
-    text << ", " << diagnosis(role, a, b, what, i);
+    const auto why = diagnosis(role, a, b, what, i);
+    if (why != said) text << ", " << why;
+    said = why;
   }
   if (failed.size() > named) text << "; and " << failed.size() - named << " more";
   raise_or_warn(text.str(), on_failure);
