@@ -1,5 +1,5 @@
 """`python -m prdp_torch`: the command `prdp`, for launchers such as torchrun that start a module."""
 
-from prdp_torch.experiments.cli import main
+from prdp_command import main
 
 main()

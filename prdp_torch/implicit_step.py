@@ -90,19 +90,20 @@ class ImplicitStep(Stepper):
         return u if self.rhs_at is None else self.rhs_at(u)
 
     def _rhs_with(self, u: Tensor, a: operators.Operator) -> Tensor:
-        if self._rhs_takes_operator and type(self).rhs is ImplicitStep.rhs:
-            b: Tensor = self.rhs_at(u, a)
-            return b
+        if self.rhs_at is not None and self._rhs_takes_operator and type(self).rhs is ImplicitStep.rhs:
+            return self.rhs_at(u, a)
         if isinstance(self.operator_at, ConstantOperator):
             self.operator_at.check_is_not_captured(self.rhs_at, a)
         return self.rhs(u)
 
 
-def _takes_two(rhs: object) -> bool:
+def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
     """Whether a function has two arguments without a default."""
+    if rhs is None:
+        return False
     try:
         parameters = inspect.signature(rhs.forward if isinstance(rhs, torch.nn.Module) else rhs).parameters.values()
-    except (TypeError, ValueError):  # None, or a function of C
+    except (TypeError, ValueError):  # of a function of C
         return False
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2

@@ -212,8 +212,8 @@ def _replaced(path: Path, scene: _C.Scene, resume: bool) -> list[str]:
     """The finished record at a path, if this training writes its own over it, and how the two differ."""
     try:
         record = records.read_training(path)
-    except ValueError:  # damaged; who reads it says so
-        return []
+    except ValueError:  # with --resume, who reads it says so
+        return [] if resume else [f"'{path}', which is damaged"]
     if record is None:
         return []
     there, here = record["settings"], records.settings(scene)

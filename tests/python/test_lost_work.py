@@ -89,4 +89,4 @@ def test_finished_records_that_are_replaced_are_told_before(tmp_path):
     words = f"prdp: replaces when it ends: '{record}' (backward was 'implicit', and is 'unrolled')\n"
     assert prdp(*train, "--backward", "unrolled", "--resume", "--seeds", 2) == (0, words)
     record.write_text("damaged")
-    assert prdp(*train) == (0, "")
+    assert prdp(*train) == (0, f"prdp: replaces when it ends: '{record}', which is damaged\n")

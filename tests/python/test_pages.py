@@ -16,7 +16,7 @@ NAVIGATION = {f"docs/{name}" for name in re.findall(r": (\w+\.md)$", (ROOT / "mk
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 GENERATED = re.compile(r"^<!-- docs/\w+\.py writes [^\n]+ -->\n.*?^<!-- end -->$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"^( *)```.*?^\1```$|`[^`\n]*`", re.MULTILINE | re.DOTALL)
-OF_RECORDS = "README index which_solver results own_scenes questions reproduction performance why_a_tolerance"
+OF_RECORDS = "README index which_solver results three_scenes questions reproduction performance why_a_tolerance"
 RECORDED = [page for page in PAGES if Path(page).stem in OF_RECORDS.split() and "appendix" not in page]
 # What no record of this project holds.
 ELSEWHERE = r"\bpaper\b|\bpaper's\b|measured once|published\s+code"

@@ -90,7 +90,7 @@ def test_no_line_of_a_table_claims_what_it_warns_of(page):
 
 def test_the_figures_in_the_prose_are_those_of_the_records():
     pages = {path.name for path in figures.PAGES}
-    assert {"results.md", "questions.md", "own_scenes.md"} <= pages
+    assert {"results.md", "questions.md", "three_scenes.md"} <= pages
     for path in figures.PAGES:
         text = path.read_text()
         assert text == figures.with_figures(text), f"{path.name}: run: python -m docs.figures"
