@@ -71,7 +71,7 @@ class ImplicitStep(Stepper):
             raise TypeError(f"{who}: rhs must be a function of u or None, got {_check.shown(rhs)}")
         self.operator_at = operator
         self.rhs_at = rhs
-        self._rhs_takes_operator = _takes_two(rhs)
+        self._takes_two = rhs, _takes_two(rhs)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         other = memo[id(self)] = type(self).__new__(type(self))
@@ -85,28 +85,47 @@ class ImplicitStep(Stepper):
 
     def rhs(self, u: Tensor) -> Tensor:
         """b(u), the right-hand side of the step from u."""
-        if self._rhs_takes_operator:
-            return self._rhs_with(u, as_operator(type(self).__name__, "operator(u)", self.operator(u)))
-        return u if self.rhs_at is None else self.rhs_at(u)
+        if self.rhs_at is None:
+            return u
+        if self._rhs_takes_operator():
+            return self.rhs_at(u, as_operator(type(self).__name__, "operator(u)", self.operator(u)))
+        return self.rhs_at(u)
 
     def _rhs_with(self, u: Tensor, a: operators.Operator) -> Tensor:
-        if self.rhs_at is not None and self._rhs_takes_operator and type(self).rhs is ImplicitStep.rhs:
+        is_own = type(self).rhs is ImplicitStep.rhs and "rhs" not in vars(self)
+        if is_own and self.rhs_at is not None and self._rhs_takes_operator():
             return self.rhs_at(u, a)
         if isinstance(self.operator_at, ConstantOperator):
             self.operator_at.check_is_not_captured(self.rhs_at, a)
         return self.rhs(u)
 
+    def _rhs_takes_operator(self) -> bool:
+        """Whether `rhs_at` takes A beside u; asked anew where it was set later."""
+        asked, answer = vars(self).get("_takes_two", (None, False))
+        if asked is not self.rhs_at:
+            answer = _takes_two(self.rhs_at)
+            self._takes_two = self.rhs_at, answer
+        return bool(answer)
+
 
 def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
-    """Whether a function has two arguments without a default."""
+    """Whether a function has two arguments without a default. What takes any number, as compiled functions do, is asked
+    for the function that it wraps."""
     if rhs is None:
         return False
-    try:
-        parameters = inspect.signature(rhs.forward if isinstance(rhs, torch.nn.Module) else rhs).parameters.values()
-    except (TypeError, ValueError):  # of a function of C
-        return False
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
+    asked = [(rhs, False), (rhs, True)]
+    if isinstance(rhs, torch.nn.Module):
+        has_own_call = type(rhs).__call__ is not torch.nn.Module.__call__
+        asked = [*([(rhs, False)] if has_own_call else []), (rhs.forward, False), (rhs.forward, True)]
+    for function, follow in asked:
+        try:
+            parameters = inspect.signature(function, follow_wrapped=follow).parameters.values()
+        except (TypeError, ValueError):  # of a function of C
+            return False
+        if all(p.kind is not p.VAR_POSITIONAL for p in parameters):
+            positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+            return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
+    return False
 
 
 class ConstantOperator(torch_private.HearsOfMoves):

@@ -184,6 +184,9 @@ def test_a_product_that_torch_does_not_record_has_no_silent_gradient_of_none(by_
     u, _ = prdp.linear_solve(operators.Function(product, product, tensors=(k,)), b, prdp.CG(9))
     with pytest.raises(ValueError, match="torch does not record matvec, so that its tensors would get no gradient"):
         u.sum().backward()
+    c = b.clone().requires_grad_()
+    u, _ = prdp.linear_solve(operators.Function(product, product, tensors=(k,)), c, prdp.CG(9))
+    torch.testing.assert_close(torch.autograd.grad(u.sum(), c)[0], (1 / k.detach()).expand(2, 5))  # is not asked for k
     unused = operators.Function(lambda v, k: 2 * v, symmetric=True, tensors=(k,))
     prdp.linear_solve(unused, b, prdp.CG(9))[0].sum().backward()  # is recorded, and k is not in it
     assert k.grad is None or not k.grad.any()

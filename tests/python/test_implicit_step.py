@@ -1,6 +1,7 @@
 """Steps of one's own equations: `ImplicitStep`, and subclasses of `Stepper`."""
 
 import copy
+import functools
 import pickle
 
 import pytest
@@ -344,3 +345,62 @@ def test_a_right_hand_side_that_captures_the_operator_says_so_where_it_would_be_
     step.load_state_dict({"operator_at.kappa": 2.0 * A.kappa.detach()}, assign=True)
     with pytest.raises(ValueError, match="rhs captures"):
         step(u)
+
+
+class OwnCall(torch.nn.Module):
+    def __call__(self, u):
+        return super().__call__(u, 2.0)
+
+    def forward(self, u, factor):
+        return factor * u
+
+
+class WithOperator(torch.nn.Module):
+    def forward(self, u, A):
+        return A.apply(u)
+
+
+def wrapped(u):
+    return 2.0 * u
+
+
+wrapped.__wrapped__ = lambda u, factor: factor * u
+
+
+@pytest.mark.parametrize("rhs", [
+    lambda u, factor=2.0: factor * u, lambda u, *rest: 2.0 * u, lambda u, *, factor=2.0: factor * u, OwnCall(), wrapped,
+    functools.partial(torch.mul, other=2.0), torch.compile(lambda u: 2.0 * u, backend="eager"),
+])  # fmt: skip
+def test_functions_of_u_alone_get_no_operator(rhs):
+    u = field((N,))
+    a = operators.Heat((N,), 0.1, 0.1)
+    torch.testing.assert_close(
+        prdp.ImplicitStep(a, rhs, prdp.Direct())(u), prdp.linear_solve(a, 2 * u, prdp.Direct())[0]
+    )
+
+
+@pytest.mark.parametrize("rhs", [
+    lambda u, A: A.apply(u), WithOperator(), torch.compile(lambda u, A: A.apply(u), backend="eager"),
+])  # fmt: skip
+def test_functions_of_two_arguments_get_it(rhs):
+    u = field((N,))
+    step = prdp.ImplicitStep(operators.Heat((N,), 0.1, 0.1), rhs, prdp.Direct())
+    torch.testing.assert_close(step(u), u)
+
+
+def test_a_right_hand_side_that_is_set_later_is_asked_anew():
+    u = field((N,))
+    step = prdp.ImplicitStep(operators.Heat((N,), 0.1, 0.1), lambda u, A: A.apply(u), prdp.Direct())
+    step.rhs_at = lambda u: u
+    torch.testing.assert_close(step(step.operator(u).apply(u)), u)
+
+
+def test_a_subclass_adds_to_a_right_hand_side_that_takes_the_operator():
+    class Heated(prdp.ImplicitStep):
+        def rhs(self, u):
+            return super().rhs(u) + 1.0
+
+    u = field((N,))
+    a = operators.Heat((N,), 0.1, 0.1)
+    step = Heated(a, lambda u, A: A.apply(u), prdp.Direct())
+    torch.testing.assert_close(step(u), prdp.linear_solve(a, a.apply(u) + 1.0, prdp.Direct())[0])

@@ -3,6 +3,8 @@
 #include <ATen/TensorSubclassLikeUtils.h>
 #include <ATen/core/grad_mode.h>
 
+#include <algorithm>
+
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
 #include "prdp/autograd/unrolled_vjp.h"
@@ -78,7 +80,8 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
 
   SolveVjp found{std::vector<at::Tensor>(needed.size()), std::move(info)};
   if (needed[0]) found.gradients[0] = lambda;
-  if (!u.defined()) return found;
+  const bool needs_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
+  if (!u.defined() || !needs_a) return found;
   const auto op = make_operator(a);
   const auto of_tensors = [&](const at::Tensor& of_lambda) {
     auto products = op->product_rule(of_lambda, u);
