@@ -1,6 +1,7 @@
 """What the functions of a step or an operator close over, which copies of them do not copy."""
 
 import contextlib
+import dis
 import types
 import warnings
 from collections.abc import Iterator
@@ -52,7 +53,7 @@ def _names_around(function: types.FunctionType) -> Iterator[tuple[str, object]]:
             yield name, cell.cell_contents
     defaults = function.__defaults__ or ()
     yield from zip(code.co_varnames[code.co_argcount - len(defaults) : code.co_argcount], defaults, strict=True)
-    for name in code.co_names:
+    for name in {i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")}:
         held = function.__globals__.get(name)
         if not isinstance(held, types.FunctionType) or held.__globals__ is function.__globals__:
             yield name, held

@@ -4,7 +4,7 @@ import copy
 import inspect
 from collections.abc import Callable
 from operator import is_
-from typing import Any, Self, Unpack
+from typing import Any, NamedTuple, Self, Unpack
 
 import torch
 from torch import Tensor
@@ -71,7 +71,7 @@ class ImplicitStep(Stepper):
             raise TypeError(f"{who}: rhs must be a function of u or None, got {_check.shown(rhs)}")
         self.operator_at = operator
         self.rhs_at = rhs
-        self._takes_two = rhs, _takes_two(rhs)
+        self._asked = _Asked(rhs, _takes_two(rhs))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         other = memo[id(self)] = type(self).__new__(type(self))
@@ -87,25 +87,35 @@ class ImplicitStep(Stepper):
         """b(u), the right-hand side of the step from u."""
         if self.rhs_at is None:
             return u
-        if self._rhs_takes_operator():
+        if self._takes_operator(self.rhs_at):
             return self.rhs_at(u, as_operator(type(self).__name__, "operator(u)", self.operator(u)))
         return self.rhs_at(u)
 
     def _rhs_with(self, u: Tensor, a: operators.Operator) -> Tensor:
-        is_own = type(self).rhs is ImplicitStep.rhs and "rhs" not in vars(self)
-        if is_own and self.rhs_at is not None and self._rhs_takes_operator():
-            return self.rhs_at(u, a)
-        if isinstance(self.operator_at, ConstantOperator):
-            self.operator_at.check_is_not_captured(self.rhs_at, a)
-        return self.rhs(u)
+        if type(self).rhs is not ImplicitStep.rhs or "rhs" in vars(self):
+            return self.rhs(u)
+        rhs = self.rhs_at
+        if rhs is None:
+            return u
+        if self._takes_operator(rhs):
+            return rhs(u, a)
+        if a.stands_for is not None:
+            _refuse_captured(rhs, a.stands_for, a)
+        return rhs(u)
 
-    def _rhs_takes_operator(self) -> bool:
+    def _takes_operator(self, rhs: Callable[..., Tensor]) -> bool:
         """Whether `rhs_at` takes A beside u; asked anew where it was set later."""
-        asked, answer = vars(self).get("_takes_two", (None, False))
-        if asked is not self.rhs_at:
-            answer = _takes_two(self.rhs_at)
-            self._takes_two = self.rhs_at, answer
-        return bool(answer)
+        asked: _Asked | None = vars(self).get("_asked")
+        if asked is None or asked.rhs is not rhs:
+            asked = self._asked = _Asked(rhs, _takes_two(rhs))
+        return asked.takes_two
+
+
+class _Asked(NamedTuple):
+    """A right-hand side, and whether it is a function of two arguments."""
+
+    rhs: Callable[..., Tensor] | None
+    takes_two: bool
 
 
 def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
@@ -113,11 +123,11 @@ def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
     for the function that it wraps."""
     if rhs is None:
         return False
-    asked = [(rhs, False), (rhs, True)]
+    may_tell = [(rhs, False), (rhs, True)]  # the first that has a fixed number of arguments does
     if isinstance(rhs, torch.nn.Module):
         has_own_call = type(rhs).__call__ is not torch.nn.Module.__call__
-        asked = [*([(rhs, False)] if has_own_call else []), (rhs.forward, False), (rhs.forward, True)]
-    for function, follow in asked:
+        may_tell = [*([(rhs, False)] if has_own_call else []), (rhs.forward, False), (rhs.forward, True)]
+    for function, follow in may_tell:
         try:
             parameters = inspect.signature(function, follow_wrapped=follow).parameters.values()
         except (TypeError, ValueError):  # of a function of C
@@ -148,19 +158,10 @@ class ConstantOperator(torch_private.HearsOfMoves):
         tensors = self._tensors()
         if all(map(is_, tensors, self._operator.tensors)):
             return self._operator
-        return self._operator.of(tensors)  # others for this call, such as those of torch.func.functional_call
-
-    def check_is_not_captured(self, rhs: object, a: operators.Operator) -> None:
-        """Raise ValueError if `a` has other tensors than the operator, and `rhs` has captured those of the operator."""
-        if a is self._operator or torch.compiler.is_compiling():
-            return
-        own = {id(tensor) for tensor in self._operator.tensors}
-        for name, held in closed_over(rhs):
-            if id(held) in own:
-                raise ValueError(
-                    f"ImplicitStep: rhs captures {name!r}, whose tensors are not those of this call, as in "
-                    "torch.func.functional_call; let it take A beside u: rhs=lambda u, A: ..."
-                )
+        other = self._operator.of(tensors)  # for this call, such as those of torch.func.functional_call
+        if not torch.compiler.is_compiling():
+            other.stands_for = self._operator
+        return other
 
     def _moved(self, move: Callable[[Tensor], Tensor]) -> None:
         """Keep the tensors that the module has now."""
@@ -169,3 +170,22 @@ class ConstantOperator(torch_private.HearsOfMoves):
     def _tensors(self) -> list[Tensor]:
         made_of = zip(self._operator.names, self._operator.tensors, strict=True)
         return [tensor if name is None else getattr(self, name) for name, tensor in made_of]
+
+
+def _refuse_captured(rhs: object, own: operators.Operator, given: operators.Operator) -> None:
+    """Raise ValueError if `rhs` has captured a tensor of its step's operator that another stands for in this call."""
+    pairs = zip(own.tensors, given.tensors, strict=True)
+    replaced = {id(tensor) for tensor, other in pairs if not _is_same(tensor, other)}
+    for name, held in closed_over(rhs):
+        if id(held) in replaced:
+            raise ValueError(
+                f"ImplicitStep: rhs captures {name!r}, whose tensors are not those of this call, as in "
+                "torch.func.functional_call; let it take A beside u: rhs=lambda u, A: ..."
+            )
+
+
+def _is_same(own: Tensor, given: Tensor) -> bool:
+    """Whether a tensor that is given for another is that one, or its values without a gradient."""
+    if own is given:
+        return True
+    return not (torch_private.transforms_are_active() or given.requires_grad) and given.is_set_to(own)

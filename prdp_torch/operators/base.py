@@ -28,6 +28,7 @@ class Operator:
     parameters: list[float]
     tensors: list[Tensor]
     names: list[str | None]
+    stands_for: "Operator | None" = None  # the constant operator of a step, in a call with other tensors
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 import copy
 import functools
 import pickle
+import warnings
 
 import pytest
 import torch
@@ -404,3 +405,28 @@ def test_a_subclass_adds_to_a_right_hand_side_that_takes_the_operator():
     a = operators.Heat((N,), 0.1, 0.1)
     step = Heated(a, lambda u, A: A.apply(u), prdp.Direct())
     torch.testing.assert_close(step(u), prdp.linear_solve(a, a.apply(u) + 1.0, prdp.Direct())[0])
+
+
+def test_what_is_no_tensor_of_the_operator_may_be_captured():
+    """Another tensor of it, one that is not replaced, the same values, and an attribute with the name of a global."""
+    u = torch.randn(2, 1, 8, dtype=torch.float64)
+    kappa, shift = torch.rand(1, 8, dtype=torch.float64) + 1, torch.tensor(0.5, dtype=torch.float64)
+    A = operators.Diffusion(kappa, shift=shift)
+    step = prdp.ImplicitStep(A, lambda u: shift * u, prdp.Direct())
+    found = torch.func.functional_call(step, {"operator_at.kappa": 2 * kappa}, u)
+    expected = prdp.linear_solve(operators.Diffusion(2 * kappa, shift=shift), shift * u, prdp.Direct())[0]
+    assert torch.equal(found, expected)
+    parameter = torch.nn.Parameter(kappa)
+    step = prdp.ImplicitStep(operators.Diffusion(parameter, shift=1.0), lambda u: u * parameter.detach(), prdp.Direct())
+    assert torch.equal(torch.func.functional_call(step, {"operator_at.kappa": parameter.detach()}, u), step(u))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        holder = torch.nn.ModuleList([GLOBAL, prdp.ImplicitStep(A, lambda u: Named.GLOBAL * u, prdp.Direct())])
+        copy.deepcopy(holder)
+
+
+class Named:
+    GLOBAL = 3.0
+
+
+GLOBAL = torch.nn.Linear(2, 2)
