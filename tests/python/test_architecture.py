@@ -25,7 +25,7 @@ def test_the_library_knows_nothing_of_the_experiments():
     sources = [*(ROOT / "csrc/prdp").rglob("*.*"), *(ROOT / "csrc/bindings").glob("*.*")]
     assert [path.name for path in sources if "prdp_experiments" in path.read_text()] == []
     naming = {path.name for path in (ROOT / "prdp_torch").glob("*.py") if "experiments" in path.read_text()}
-    assert naming == {"__init__.py", "__main__.py"}  # when they are asked for; the command
+    assert naming == {"__init__.py"}  # when they are asked for
 
 
 def test_the_folders_have_as_many_lines_as_the_page_says():

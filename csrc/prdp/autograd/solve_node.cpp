@@ -21,8 +21,8 @@ SolveNode::SolveNode(const at::Tensor& b, OperatorSpec a, SolveOptions options)
 }
 
 void SolveNode::save(const at::Tensor& b, const Solved& solved) {
-  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve
-  // said are unrolled mode's. Where a failed sample may have passed, its status says so.
+  // Implicit mode keeps u alone, and that only if A has a derivative; b and what the solve said are unrolled mode's,
+  // and of a Function they serve to check its transpose. Where a failed sample may have passed, its status says so.
   const bool unrolled = options_.backward == Backward::kUnrolled;
   if (unrolled) {
     b_ = SavedVariable(b, /*is_output=*/false);

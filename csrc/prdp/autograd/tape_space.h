@@ -9,7 +9,8 @@
 namespace prdp {
 
 /// A sample as a space whose operations can be taken back. A method runs in it as in any other. While it records, every
-/// operation writes to new memory and notes on the tape what it did; so no method needs a derivative of its own.
+/// operation whose old values a derivative needs writes to new memory and notes on the tape what it did; so no method
+/// needs a derivative of its own.
 template <class T>
 class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
  public:

@@ -37,7 +37,7 @@ class SampleVjps {
         of_iterations_(of_iterations),
         any_solve_(any_solve) {}
 
-  SolveVjp find() {
+  SolveVjp take() {
     if (needs_gradient_of_a_ && options_.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
     classify();
     differentiate(finite_);
@@ -59,6 +59,7 @@ class SampleVjps {
   OfIterations of_iterations_;
   decltype(linear_solve)& any_solve_;
 
+  // Made of the above and of each other, in this order.
   const int64_t batch_ = solved_.b.size(0);
   const std::unique_ptr<Operator> a_ = make_operator(spec_);
   // Of the forward solve.
@@ -216,7 +217,7 @@ class SampleVjps {
 SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
                         const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
                         decltype(linear_solve)& any_solve) {
-  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).find();
+  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).take();
 }
 
 }  // namespace prdp

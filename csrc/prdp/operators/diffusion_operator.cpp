@@ -213,17 +213,18 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
                 static_cast<int>(Side::kRobin) == 3);
   std::string sides;
   gpu::OperatorView view;
-  view.tensors.resize(8);
-  view.numbers.resize(10);
+  using namespace gpu::diffusion_slots;
+  view.tensors.resize(gpu::kMostTensors);
+  view.numbers.resize(gpu::kMostNumbers);
   // A single number of the host is an argument; one of the device becomes a field.
   const auto take = [&](const at::Tensor& t, at::IntArrayRef field, size_t tensor, size_t number) {
     if (t.dim() == 0 && t.is_cpu()) view.numbers[number] = number_of(t);
     else view.tensors[tensor] = (t.dim() == 0 ? t.expand(field) : t).contiguous();
   };
-  view.tensors[0] = kappa_.contiguous();
+  view.tensors[kKappa] = kappa_.contiguous();
   auto field = kappa_.sizes().vec();
   field[0] = 1;
-  take(shift_, field, 1, 0);
+  take(shift_, field, kShift, kShiftNumber);
   for (size_t axis = 0; axis < 3; ++axis) {
     const int64_t d = static_cast<int64_t>(axis) - 3 + dim();
     for (size_t end = 0; end < 2; ++end) {
@@ -231,9 +232,9 @@ std::optional<gpu::OperatorView> DiffusionOperator::gpu_view(const at::Tensor& b
       sides += ", " + std::to_string(static_cast<int>(side));
       auto on_side = field;
       if (d >= 0) on_side[2 + d] = 1;
-      if (side == Side::kRobin) take(robin(d, end), on_side, 2 + 2 * axis + end, 4 + 2 * axis + end);
+      if (side == Side::kRobin) take(robin(d, end), on_side, kRobin + 2 * axis + end, kRobinNumber + 2 * axis + end);
     }
-    view.numbers[1 + axis] = d < 0 ? 0.0 : inverse_width(d);
+    view.numbers[kInverseWidth + axis] = d < 0 ? 0.0 : inverse_width(d);
   }
   view.type = "Diffusion<" + gpu::type_of(b.scalar_type()) + ", " + gpu::grid_of(shape_) + ", " +
               std::to_string(b.size(1)) + ", " + std::to_string(mean_ == FaceMean::kHarmonic) + sides + ">";

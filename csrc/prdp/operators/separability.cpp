@@ -22,13 +22,13 @@ at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
 
 Separability::Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic)
     : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
-  std::vector<at::Tensor> lines, told;
+  std::vector<at::Tensor> lines, columns;
   for (int64_t axis = 0; axis < dim(); ++axis) lines.push_back(middle_line(coefficients, axis));
-  for (const auto& line : lines) told.push_back(line.flatten(1));
+  for (const auto& line : lines) columns.push_back(line.flatten(1));
   at::Tensor outer;
   for (int64_t axis = 0; axis < dim(); ++axis) {
     const auto ends = decoupled_ends(coefficients, axis);
-    told.push_back(ends.to(coefficients.scalar_type()));
+    columns.push_back(ends.to(coefficients.scalar_type()));
     if (periodic_[axis]) continue;
     const auto between = ends.new_zeros({ends.size(0), shape_[axis] - 2});
     const auto of_axis = along(at::cat({ends.narrow(1, 0, 1), between, ends.narrow(1, 1, 1)}, 1), axis, dim());
@@ -40,11 +40,12 @@ Separability::Separability(const at::Tensor& coefficients, const std::vector<boo
   };
   const auto size = coefficients.abs(), diagonal = size.select(1, 0);
   const auto distance = distance_from_sum(coefficients, lines);
-  for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) told.push_back(largest_inside(t));
-  told.push_back(largest(size));
-  host_ = at::cat(told, 1).to(at::kCPU, at::kDouble).contiguous();
-  int64_t column = 0;
-  const auto next = [&](int64_t columns) { return host_.narrow(1, std::exchange(column, column + columns), columns); };
+  // As Sizes has them.
+  for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) columns.push_back(largest_inside(t));
+  columns.push_back(largest(size));
+  host_ = at::cat(columns, 1).to(at::kCPU, at::kDouble).contiguous();
+  int64_t column = 0;  // the columns back in the order in which they were joined
+  const auto next = [&](int64_t count) { return host_.narrow(1, std::exchange(column, column + count), count); };
   for (const auto& line : lines)
     lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
   for (int64_t axis = 0; axis < dim(); ++axis) ends_.push_back(next(2));

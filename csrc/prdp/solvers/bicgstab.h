@@ -37,7 +37,7 @@ class BiCGStabMethod {
     space_.copy(space_.b(), r_);
     space_.copy(space_.b(), hat_);
     rr_ = hh_ = ss_ = st_ = tt_ = space_.b2();
-    inverse_ = zero_ = rr_ * 0;
+    inverse_hv_ = zero_ = rr_ * 0;
   }
   void step() {
     Scalar rho = space_.dot(hat_, r_);
@@ -45,19 +45,20 @@ class BiCGStabMethod {
     space_.restore(lost, r_, hat_);
     space_.restore(lost, rr_, hh_);
     space_.restore(lost, rr_, rho);
-    space_.restore(lost, zero_, inverse_);
+    space_.restore(lost, zero_, inverse_hv_);
 
     const Scalar over_omega = space_.guarded_quotient(tt_, st_, ss_, tt_);
     space_.xpby(v_, -over_omega, p_);
-    space_.xpby(r_, -(rho * inverse_), p_);
+    space_.xpby(r_, -(rho * inverse_hv_), p_);
     auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
-    const Scalar starts_anew = space_.breaks_down(hv, hh_, vv, inverse_);
+    const Scalar starts_anew = space_.breaks_down(hv, hh_, vv, inverse_hv_);
     space_.restore(starts_anew, zero_, rho);
     space_.restore(starts_anew, zero_, hh_);
     space_.restore(starts_anew, vv, hv);  // a number to divide by, which ρ = 0 takes out again
-    inverse_ = space_.ratio(space_.guarded_quotient(rr_, hv, hh_, vv), rr_);
-    const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_); };
-    ss_ = space_.update_iterate_and_residual(moves(rho * inverse_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
+    // r·r, which is never zero while there is something to do, is the size that a quotient is judged by; ρ may be zero.
+    inverse_hv_ = space_.ratio(space_.guarded_quotient(rr_, hv, hh_, vv), rr_);
+    const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_hv_); };
+    ss_ = space_.update_iterate_and_residual(moves(rho * inverse_hv_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
     const auto [st, tt] = apply_to(r_, t_);
     st_ = st;
     tt_ = tt;
@@ -65,7 +66,7 @@ class BiCGStabMethod {
                                              r_);
     space_.restore(starts_anew, r_, hat_);
     space_.restore(starts_anew, rr_, hh_);
-    space_.restore(starts_anew, zero_, inverse_);
+    space_.restore(starts_anew, zero_, inverse_hv_);
   }
   auto residual2() const { return rr_; }
   /// From the true residual it starts anew.
@@ -73,12 +74,12 @@ class BiCGStabMethod {
     rr_ = space_.residual(x, r_);
     space_.copy(r_, hat_);
     for (auto* square : {&hh_, &ss_, &st_, &tt_}) space_.assign(rr_, *square);
-    space_.assign(rr_ * 0, inverse_);
+    space_.assign(rr_ * 0, inverse_hv_);
     return rr_;
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto iteration_state() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_); }
+  auto iteration_state() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_hv_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;
@@ -98,8 +99,8 @@ class BiCGStabMethod {
   }
 
   Space& space_;
-  typename Space::Vector r_, hat_, p_, v_, t_, z_;   // r, and s between; r̂; A p; A s; M⁻¹ p, or of s
-  Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
+  typename Space::Vector r_, hat_, p_, v_, t_, z_;  // r, and s between; r̂; A p; A s; M⁻¹ p, or of s
+  Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_hv_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
   Scalar zero_{};
 };
 

@@ -31,7 +31,7 @@ class HessenbergProblem {
   /// Begins a cycle with v₀ = r/‖r‖.
   void begin(const Scalar& length) {
     columns_[0].g = length;
-    solved2_ = length * length * 1e-6;
+    solved2_ = length * length * kSolved2;
     columns_[0].inverse_length = numbers_.inverse(length, length);
     exhausted_ = numbers_.is_zero(length);
   }
@@ -40,6 +40,7 @@ class HessenbergProblem {
   /// Takes column j, once it is filled; `length` is ‖A v_j‖.
   PRDP_NOINLINE void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
+    // At sixteen units the space counts as exhausted, and goes on; at one, it ends.
     exhausted_ = exhausted_ + numbers_.is_zero(numbers_.inverse(h(j + 1, j), scale_));
     h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(numbers_.inverse(h(j + 1, j), scale_ * kOneUnit));
     const Scalar next = h(j + 1, j);
@@ -53,7 +54,7 @@ class HessenbergProblem {
       Column& c = columns_[j];
       c.y = c.g;
       PRDP_NO_UNROLL for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
-      c.y = c.y * c.inverse;
+      c.y = c.y * c.inverse_diagonal;
       short_enough = short_enough * numbers_.is_not_zero(numbers_.inverse(size, scale_ * c.y));
     }
     if (!numbers_.surely_all(short_enough)) damp(columns, short_enough);
@@ -62,11 +63,11 @@ class HessenbergProblem {
   void solve_normal(Scalar* z, int64_t columns) {
     PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
       PRDP_NO_UNROLL for (int64_t i = 0; i < j; ++i) z[j] = z[j] - h(i, j) * z[i];
-      z[j] = z[j] * columns_[j].inverse;
+      z[j] = z[j] * columns_[j].inverse_diagonal;
     }
     PRDP_NO_UNROLL for (int64_t j = columns - 1; j >= 0; --j) {
       PRDP_NO_UNROLL for (int64_t k = j + 1; k < columns; ++k) z[j] = z[j] - h(j, k) * z[k];
-      z[j] = z[j] * columns_[j].inverse;
+      z[j] = z[j] * columns_[j].inverse_diagonal;
     }
   }
 
@@ -87,10 +88,11 @@ class HessenbergProblem {
     Scalar cos{};
     Scalar inverse_length{};
     Scalar sin{};
-    Scalar inverse{};  // 1/R_jj, or zero
+    Scalar inverse_diagonal{};  // 1/R_jj, or zero
     Scalar g{}, y{};
   };
   static constexpr double kOneUnit = 1.0 / 16;  // numbers vanish at sixteen units of rounding
+  static constexpr double kSolved2 = 1e-6;      // a cycle that takes a thousandth off its residual solves
 
   Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
 
@@ -111,9 +113,9 @@ class HessenbergProblem {
     }
     Column& c = columns_[j];
     const Scalar diagonal = sqrt(h(j, j) * h(j, j) + h(j + 1, j) * h(j + 1, j));
-    c.inverse = numbers_.inverse(diagonal, rounding(c.g));  // 0 where A is singular on the space
-    c.cos = h(j, j) * c.inverse;
-    c.sin = h(j + 1, j) * c.inverse;
+    c.inverse_diagonal = numbers_.inverse(diagonal, rounding(c.g));  // 0 where A is singular on the space
+    c.cos = h(j, j) * c.inverse_diagonal;
+    c.sin = h(j + 1, j) * c.inverse_diagonal;
     h(j, j) = diagonal;
     columns_[j + 1].g = -(c.sin * c.g);
     c.g = c.cos * c.g;
@@ -121,11 +123,14 @@ class HessenbergProblem {
   /// y = argmin ‖g - R y‖² + τ² ‖y‖² where it is not short enough, τ being a few rounding errors of A: the next cycles
   /// recover what that holds back of a regular A, and along the null space of a singular one y stays short.
   void damp(int64_t columns, const Scalar& short_enough) {
-    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) rhs_[j] = columns_[j].g, damped_[j] = columns_[j].y;
+    PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
+      rhs_[j] = columns_[j].g;
+      damped_[j] = columns_[j].y;
+    }
     numbers_.damp(h_.data(), m_ + 1, rhs_.data(), columns, scale_ * 4, short_enough, damped_.data());
     PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
       columns_[j].y = damped_[j];
-      columns_[j].inverse = columns_[j].inverse * short_enough;
+      columns_[j].inverse_diagonal = columns_[j].inverse_diagonal * short_enough;
     }
   }
 

@@ -37,7 +37,7 @@ struct MethodTraits {
   Counts counts = Counts::kIterations;
   int64_t products = 1;       // with A per iteration, or per vector of a cycle
   int64_t vectors;            // that it keeps at most beside b and scratch; a cycle keeps `restart` more
-  bool takes_preconditioner = false;  // and then keeps two vectors more
+  bool takes_preconditioner = false;  // and then keeps at most two vectors more
   double nanoseconds;         // of a core per unknown and iteration, or vector of a cycle
   bool divides_by_diagonal = false;  // refuses an operator with a zero on it
   bool is_direct = false;  // takes the operator's exact method, and no start

@@ -15,15 +15,18 @@ namespace {
 /// Of GMRES: a thread keeps its triangle, so longer bases would fill the device with copies of it.
 constexpr int64_t kLongestBasis = 50;
 
-/// Bytes of the small arrays of a method, each of whole eight bytes.
+/// Bytes of the small arrays that a method's members take by array<X>(), each of whole eight bytes. A kernel traps
+/// where it takes more.
 int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
-  constexpr int64_t pointer = 8, weights_at_once = 64, numbers_of_column = 6, arrays = 8;
-  if (method == Method::kChebyshev) return weights_at_once * number;
-  if (method == Method::kMinres) return 3 * pointer + 3 * 8;
+  constexpr int64_t pointer = 8;
+  if (method == Method::kChebyshev) return 64 * number;        // the weights of as many sweeps
+  if (method == Method::kMinres) return 3 * pointer + 3 * 8;  // three vectors of its basis, and their weights
   if (traits(method).counts != Counts::kCycles) return 0;
   const int64_t columns = restart + 1;
-  const int64_t numbers = restart * columns + numbers_of_column * columns + 2 * columns + 2 * restart;
-  return columns * pointer + numbers * number + arrays * 8;
+  const int64_t of_triangle = restart * columns, of_columns = 6 * columns;  // h_, columns_ of HessenbergProblem
+  const int64_t of_rhs = 2 * restart, of_weights = 2 * columns;  // rhs_, damped_; again_, weights_ of GMRES
+  constexpr int64_t arrays = 8;  // those, u_ and products_
+  return columns * pointer + (of_triangle + of_columns + of_rhs + of_weights) * number + arrays * 8;
 }
 
 }  // namespace
@@ -40,13 +43,13 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   if (unknowns > std::numeric_limits<int32_t>::max() / 2)
     throw Unavailable("a sample of " + std::to_string(unknowns) + " unknowns is too large for a kernel");
   const auto& row = traits(solver.method);
-  const bool has_arrays = row.counts == Counts::kCycles, has_cycles = solver.preconditioner.is_multigrid();
-  const int64_t number = b.element_size(), restart = has_arrays ? std::min(solver.restart, unknowns) : 0;
-  const int64_t of_cycles = !has_cycles ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
+  const bool is_restarted = row.counts == Counts::kCycles, by_multigrid = solver.preconditioner.is_multigrid();
+  const int64_t number = b.element_size(), restart = is_restarted ? std::min(solver.restart, unknowns) : 0;
+  const int64_t of_cycles = !by_multigrid ? 0 : is_saddle_point ? 2 * kVectorsOfCycle : kVectorsOfCycle;
   const int64_t vectors = kOwnVectors + vectors_of(solver.method, restart) + of_cycles;
   const auto [blocks, threads] = team_size(unknowns, limits);
   // Coarse grids come first into the memory of the block, then the vectors of the finest one.
-  const CycleMemory cycle = has_cycles ? memory_of_cycle(b) : CycleMemory{};
+  const CycleMemory cycle = by_multigrid ? memory_of_cycle(b) : CycleMemory{};
   const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;
   const int64_t cycle_in_block = cycle.usual <= of_block ? cycle.usual : 0;
   const int64_t in_block = std::min(vectors, (of_block - cycle_in_block) / unknowns);
@@ -58,7 +61,7 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
        << ", " << vectors << ", " << in_block << ", " << solver.preconditioner.is_diagonal() << ", "
        << divides_by_diagonal(solver) << ", " << bytes_of_arrays(solver.method, restart, number) << ", " << restart
        << ", ";
-  if (has_cycles)
+  if (by_multigrid)
     text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
   else text << "NoCycleSetting";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"

@@ -21,6 +21,12 @@ struct OperatorArguments {
   double numbers[kMostNumbers];
 };
 
+/// Where the tensors and numbers of a Diffusion are. Sides count z, y and x, the low one first.
+namespace diffusion_slots {
+inline constexpr int kKappa = 0, kShift = 1, kRobin = 2;                        // tensors; kRobin + side
+inline constexpr int kShiftNumber = 0, kInverseWidth = 1, kRobinNumber = 4;  // numbers; + axis, + side
+}  // namespace diffusion_slots
+
 /// A grid of a hierarchy, with the places of what belongs to it in the numbers of the sample.
 struct CoarseGrid {
   int shape[3];          // z, y, x

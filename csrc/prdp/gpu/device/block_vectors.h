@@ -61,7 +61,7 @@ class BlockVectors {
   Slice<X> array(int64_t n) const {
     auto* first = reinterpret_cast<X*>(numbers_ + used_numbers_);
     used_numbers_ += (n * static_cast<int64_t>(sizeof(X)) + 7) / 8 * 8;
-    require(used_numbers_ <= S::kNumbers);
+    require(used_numbers_ <= S::kBytesOfArrays);
     return {first, n};
   }
   PRDP_NOINLINE void fill_zero(Vector v) {
@@ -165,7 +165,7 @@ class BlockVectors {
   }
 
   int used_ = kOwnVectors;
-  alignas(8) mutable char numbers_[S::kNumbers > 0 ? S::kNumbers : 1];
+  alignas(8) mutable char numbers_[S::kBytesOfArrays > 0 ? S::kBytesOfArrays : 1];
   mutable int64_t used_numbers_ = 0;
 };
 

@@ -19,13 +19,14 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
       const T* const first = static_cast<const T*>(a.tensors[k]);
       return first ? first + sample * a.sample_strides[k] : nullptr;
     };
-    kappa_ = field(0);
-    shift_ = field(1);
-    shift_number_ = static_cast<T>(a.numbers[0]);
-    for (int axis = 0; axis < 3; ++axis) inverse_width_[axis] = static_cast<T>(a.numbers[1 + axis]);
+    using namespace diffusion_slots;
+    kappa_ = field(kKappa);
+    shift_ = field(kShift);
+    shift_number_ = static_cast<T>(a.numbers[kShiftNumber]);
+    for (int axis = 0; axis < 3; ++axis) inverse_width_[axis] = static_cast<T>(a.numbers[kInverseWidth + axis]);
     for (int side = 0; side < 6; ++side) {
-      robin_[side] = field(2 + side);
-      robin_number_[side] = static_cast<T>(a.numbers[4 + side]);
+      robin_[side] = field(kRobin + side);
+      robin_number_[side] = static_cast<T>(a.numbers[kRobinNumber + side]);
     }
   }
 

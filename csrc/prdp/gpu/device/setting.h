@@ -6,7 +6,7 @@ namespace prdp::gpu {
 
 /// Constants of a kernel.
 template <class Number, class Operator, int blocks, int threads, int vectors, int vectors_in_block, bool by_diagonal,
-          bool divides_by_diagonal, int numbers, int restart, class WithCycles>
+          bool divides_by_diagonal, int bytes_of_arrays, int restart, class WithCycles>
 struct Setting {
   using T = Number;                                 // float or double
   using A = Operator;                               // of views.h
@@ -16,7 +16,7 @@ struct Setting {
   static constexpr int kInBlock = vectors_in_block; // the first so many of them lie in the block's own memory
   static constexpr bool kByDiagonal = by_diagonal;  // the preconditioner is the diagonal
   static constexpr bool kDividesByDiagonal = divides_by_diagonal;  // by it, or by the method
-  static constexpr int kNumbers = numbers;          // bytes of small arrays that the method keeps
+  static constexpr int kBytesOfArrays = bytes_of_arrays;  // that the method keeps
   static constexpr int kRestart = restart;          // of GMRES
   using Cycles = WithCycles;                        // the preconditioner is a V-cycle (cycle.h)
   static_assert(blocks == 1 || vectors_in_block == 0);

@@ -53,8 +53,8 @@ Parts find_parts(const FlowBox& box, const at::Tensor& fluid) {
 /// The parts without an open end, as FlowFields has them.
 at::Tensor find_closed_parts(const FlowBox& box, const at::Tensor& fluid) {
   const int64_t open = box.open_axis();
-  const auto parts = find_parts(box, fluid);
   if (open < 0 && !box.obstacle().defined()) return at::empty({0}, at::kDouble);
+  const auto parts = find_parts(box, fluid);
   std::vector<bool> inlet(parts.count), outlet(parts.count);
   const auto cells = static_cast<int64_t>(parts.of_cell.size());
   for (int64_t cell = 0; cell < cells && open >= 0; ++cell) {
@@ -82,8 +82,13 @@ at::Tensor coefficients(const at::Tensor& diagonal, const std::vector<at::Tensor
   return at::stack(all).unsqueeze(0);
 }
 
-/// -div grad of the pressure times dx² of the last axis: 1 on free faces, 0 on others; identity where it is known.
-at::Tensor pressure_coefficients(const FlowBox& box, const at::Tensor& free, at::Tensor& known) {
+/// -div grad of the pressure times dx² of the last axis: 1 on free faces, 0 on others. Where the pressure is known, its
+/// row has a diagonal alone, of the size of the others.
+struct PressureCoefficients {
+  at::Tensor coefficients;
+  at::Tensor known;  // (*shape): where it is, also in cells without a free face
+};
+PressureCoefficients pressure_coefficients(const FlowBox& box, const at::Tensor& free, at::Tensor known) {
   auto diagonal = at::zeros(box.shape(), at::kDouble);
   std::vector<at::Tensor> open;
   for (int64_t axis = 0; axis < box.dim(); ++axis) {
@@ -98,7 +103,7 @@ at::Tensor pressure_coefficients(const FlowBox& box, const at::Tensor& free, at:
   std::vector<at::Tensor> of_neighbours;
   for (int64_t k = 0; k < 2 * box.dim(); ++k)
     of_neighbours.push_back(-open[k] * unknown * neighbour(box, unknown, k / 2, k % 2 ? 1 : -1, 0.0));
-  return coefficients(at::where(known, at::full({}, 4.0, at::kDouble), diagonal), of_neighbours);
+  return {coefficients(at::where(known, at::full({}, 4.0, at::kDouble), diagonal), of_neighbours), known};
 }
 
 /// -Δ of the component along `along`, for values that are zero on all faces which are not free. `inside`: faces inside
@@ -175,12 +180,13 @@ FlowFields make_flow_fields(const FlowBox& box) {
   for (int64_t axis = 0; axis < box.dim(); ++axis) fields.high_sign.push_back(signs_beyond_wall(box, axis));
   for (int64_t c = 0; c < box.dim(); ++c)
     fields.diffusion.push_back(diffusion_coefficients(box, box.dim() - 1 - c, faces.free[c], faces.inside[c]));
-  auto known = fluid.logical_not();
-  if (open >= 0) known.narrow(open, box.shape()[open] - 1, 1).fill_(true);
-  fields.pressure = pressure_coefficients(box, faces.free, known);
+  auto given = fluid.logical_not();
+  if (open >= 0) given.narrow(open, box.shape()[open] - 1, 1).fill_(true);
+  const auto pressure = pressure_coefficients(box, faces.free, given);
+  fields.pressure = pressure.coefficients;
   fields.closed_parts = find_closed_parts(box, fluid);
 
-  fields.cells = known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
+  fields.cells = pressure.known.logical_not().to(at::kDouble).unsqueeze(0).unsqueeze(0);
   fields.free = faces.free.unsqueeze(0);
   if (open >= 0) fields.inlet = faces.inlet.unsqueeze(0);
   if (has_obstacle) fields.friction = friction_coefficients(box, faces).unsqueeze(0);

@@ -41,7 +41,7 @@ at::Tensor without_means(const FlowBox& box, const at::Tensor& t) {
 }
 
 /// Divergences that the dtype has no normal numbers for are rounding, and nothing to do: they are zero to the solve,
-/// which knows no null space and could not tell their mean from what rounding leaves of it.
+/// which could not tell their mean from what rounding leaves of it.
 at::Tensor flush_subnormals(const at::Tensor& b) {
   const double normal =
       b.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
