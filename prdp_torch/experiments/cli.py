@@ -347,7 +347,3 @@ def main() -> None:
             app()
         finally:
             sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()
