@@ -30,15 +30,18 @@ at::Tensor checked(const at::Tensor& result, const at::Tensor& v, const char* na
   return result;
 }
 
-/// Counts writes into tensors also below autograd, where a solve runs.
+/// Counts writes into tensors also below autograd, where a solve runs. What a product changes beside that, such as a
+/// mode that it enters, stays.
 class WritesCounted {
  public:
-  WritesCounted()
-      : guard_(c10::impl::tls_local_dispatch_key_set().included_,
-               c10::impl::tls_local_dispatch_key_set().excluded_.remove(c10::DispatchKey::ADInplaceOrView)) {}
+  WritesCounted() { c10::impl::tls_set_dispatch_key_excluded(kCounter, false); }
+  ~WritesCounted() { c10::impl::tls_set_dispatch_key_excluded(kCounter, was_excluded_); }
+  WritesCounted(const WritesCounted&) = delete;
+  WritesCounted& operator=(const WritesCounted&) = delete;
 
  private:
-  c10::impl::ForceDispatchKeyGuard guard_;
+  static constexpr auto kCounter = c10::DispatchKey::ADInplaceOrView;
+  const bool was_excluded_ = c10::impl::tls_is_dispatch_key_excluded(kCounter);
 };
 
 /// How often a tensor was written to; unknown in inference mode.
