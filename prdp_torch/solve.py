@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prdp_torch import _C, _check, operators
+from prdp_torch.operators.matrix import hint_for
 from prdp_torch.solvers import Solver, check_options, packed_options
 from prdp_torch.types import Backward, CheckpointEvery, OnFailure, Solution
 
@@ -201,8 +202,7 @@ def linear_solve(
     if isinstance(A, torch.Tensor):
         A = operators.Matrix(A)
     if not isinstance(A, operators.Operator):
-        hint = "; a product A v in a function is operators.Function(matvec)" if callable(A) else ""
-        raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}{hint}")
+        raise TypeError(f"linear_solve: A must be an operator or a tensor, got {type(A).__name__}{hint_for(A)}")
     compiling = torch.compiler.is_compiling()
     log: AdjointLog | None = None
     found: Solution | None = None

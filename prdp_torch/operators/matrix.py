@@ -142,5 +142,9 @@ def as_operator(who: str, name: str, value: object) -> Operator:
         return value
     if isinstance(value, torch.Tensor):
         return Matrix(value)
-    hint = "; a product A v in a function is operators.Function(matvec)" if callable(value) else ""
-    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}{hint}")
+    raise TypeError(f"{who}: {name} must be an operator of prdp_torch.operators, got {value!r:.80}{hint_for(value)}")
+
+
+def hint_for(value: object) -> str:
+    """How a function becomes an operator, where one was given for it; else empty."""
+    return "; a product A v in a function is operators.Function(matvec)" if callable(value) else ""

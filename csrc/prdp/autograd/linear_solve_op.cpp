@@ -21,13 +21,14 @@ namespace {
 constexpr const char* kSchema = "linear_solve(Tensor b, " PRDP_SOLVE_SCHEMA ") -> (Tensor u, " PRDP_REPORT_SCHEMA ")";
 using Signature = WithSolve<SolveOutputs(const at::Tensor&)>;
 
-// The way of a solve, each function calling the next:
-//   linear_solve                        a lone vector (n,) as a batch of one
-//   solve_or_dispatch                   plain tensors go on here; others by call_op through the dispatcher, to
-//   `autograd` solve_and_differentiate_null_space  the part of u̇ that comes of a null space which depends on parameters
-//   solve_with_node                     records a node for reverse mode, and makes the tangent of forward mode
-//   call_op_below_autograd              plain tensors go on here; others by call_op to `solve`
-//   linear_solve_unrecorded             checks, solves and reports; what adjoint solves call, too
+// The way of a solve, each function calling the next. Plain tensors take it all; for others `call_op` goes through the
+// dispatcher, from the second step to `autograd` below, and from the fifth to `solve`.
+//   1. linear_solve: a lone vector (n,) as a batch of one
+//   2. solve_or_dispatch
+//   3. solve_and_differentiate_null_space: the part of u̇ that comes of a null space which depends on parameters
+//   4. solve_with_node: records a node for reverse mode, and makes the tangent of forward mode
+//   5. call_op_below_autograd
+//   6. linear_solve_unrecorded: checks, solves and reports; what adjoint solves call, too
 
 SolveOutputs call_op(const at::Tensor& b, const OperatorSpec& a, const SolveOptions& o, const at::Tensor& x0) {
   static const auto op = c10::Dispatcher::singleton().findSchemaOrThrow("prdp::linear_solve", "").typed<Signature>();

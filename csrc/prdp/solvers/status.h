@@ -11,14 +11,13 @@ enum class SolveStatus : int64_t {
   kConvergedBreakdown = 2,   // the Krylov space contains the solution
   kMaxIter = -1,             // max_iter iterations were done; u is finite. PRDP stops here by design
   kStagnated = -2,           // no further progress, for example because the dtype cannot reach rtol
-  kDiverged = -3,  // the residual exceeded 1e13 ‖b‖, or ‖b‖ with CG and steepest descent where A is not definite; or
-                   // the step of a flow is too long
-  kOverflow = -4,  // finite input gave a number outside the range of the dtype
-  kBreakdown = -5,  // the method cannot continue: r·Ar = 0, or a singular matrix
-  kZeroDiagonal = -6,  // the method divides by the diagonal, which has a zero
-  kInconsistent = -7,  // A is singular, and b is not in its range
-  kNonfiniteInput = -8,  // NaN or Inf in b or in the start
-  kNonfiniteOperator = -9,  // NaN or Inf in A
+  kDiverged = -3,            // residual above 1e13 ‖b‖, or ‖b‖ by CG, steepest descent; of a flow: dt too long
+  kOverflow = -4,            // finite input gave a number outside the range of the dtype
+  kBreakdown = -5,           // the method cannot continue: r·Ar = 0, or a singular matrix
+  kZeroDiagonal = -6,        // the method divides by the diagonal, which has a zero
+  kInconsistent = -7,        // A is singular, and b is not in its range
+  kNonfiniteInput = -8,      // NaN or Inf in b or in the start
+  kNonfiniteOperator = -9,   // NaN or Inf in A
 };
 
 struct StatusText {
