@@ -3,24 +3,13 @@
 #include <algorithm>
 #include <cmath>
 
+#include "prdp/autograd/healthy_tensors.h"
 #include "prdp/operators/apply_on_loops.h"
-#include "prdp/operators/kinds.h"
 #include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 
 namespace prdp {
-
-namespace {
-
-/// Whether tensor k of A has a row for each sample. Those of a function are taken to have one where they may.
-bool is_of_samples(const OperatorSpec& spec, size_t k, int64_t batch) {
-  const auto& t = spec.tensors[k];
-  const auto axes = batched_axes(spec.kind, static_cast<int64_t>(spec.shape.size()), spec.tensors.size());
-  return t.dim() > 0 && t.size(0) == batch && (!axes || (*axes)[k] == t.dim());
-}
-
-}  // namespace
 
 bool may_mislead(const Solver& solver) { return !traits(solver.method).is_polynomial; }
 
@@ -66,7 +55,8 @@ Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& g
   const at::NoGradGuard no_grad;
   const auto batch = static_cast<int64_t>(rows.size());
   const auto allowed_of = at::tensor(allowed, at::kDouble).to(u.device());
-  const auto of_solution = make_operator(spec)->product_rule(only(gradients[0].detach(), rows), only(u, rows));
+  const auto healthy = with_healthy_tensors(spec, u, rows);
+  const auto of_solution = make_operator(healthy)->product_rule(only(gradients[0].detach(), rows), only(u, rows));
   Rows misleading(batch);
   for (size_t k = 0; k < of_solution.size(); ++k) {
     if (!needed[k + 1] || !gradients[k + 1].defined() || !of_solution[k].defined()) continue;

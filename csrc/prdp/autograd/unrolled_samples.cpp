@@ -5,8 +5,10 @@
 
 #include "prdp/autograd/adjoint_log.h"
 #include "prdp/autograd/finite_rows.h"
+#include "prdp/autograd/healthy_tensors.h"
 #include "prdp/autograd/misleading_derivatives.h"
 #include "prdp/autograd/solved_to_rounding.h"
+#include "prdp/operators/registered_products.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
 #include "prdp/solvers/solve.h"
@@ -20,7 +22,7 @@ namespace {
 enum class Derivative {
   kOfIterations,
   kOfSolution,
-  kNone,     // its solve failed, with on_failure="zero_grad"
+  kNone,     // its solve failed, and has none or is to have none
   kRefused,  // none: its cotangent is not finite
 };
 
@@ -65,6 +67,7 @@ class SampleVjps {
   // Of the forward solve.
   const std::vector<int64_t> counts_ = to_host<int64_t>(solved_.iterations, batch_);
   const std::vector<int64_t> statuses_ = to_host<int64_t>(solved_.status, batch_);
+  const Rows has_finite_inverse_ = finite_inverses();
   const bool needs_gradient_of_a_ = std::find(needed_.begin() + 1, needed_.end(), 1) != needed_.end();
   const bool may_mislead_ = may_mislead(options_.solver);
   const std::vector<int64_t> wanted_ = wanted();  // needed_, and b̄ where retry_implicitly() looks at it
@@ -78,6 +81,16 @@ class SampleVjps {
   std::vector<at::Tensor> gradients_{};
   at::Tensor u_{};
 
+  Rows finite_inverses() const {
+    const auto& m = options_.solver.preconditioner;
+    return m.is_operator() ? has_finite_tensors(m.spec(), batch_) : Rows(batch_, true);
+  }
+  /// Whether a sample hands out an iterate that has a derivative. One that overflowed has none, nor has one that failed
+  /// with a preconditioner of NaN.
+  bool has_derivative(int64_t i) const {
+    if (zero_grad_ && is_failure(status(i))) return false;
+    return status(i) != SolveStatus::kOverflow && (has_finite_inverse_[i] || !is_failure(status(i)));
+  }
   std::vector<int64_t> wanted() const {
     auto all = needed_.vec();
     if (needs_gradient_of_a_ && may_mislead_) all[0] = 1;
@@ -88,10 +101,10 @@ class SampleVjps {
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
     for (int64_t i = 0; i < batch_; ++i)
-      derivatives_.push_back(!finite_[i]                           ? Derivative::kRefused
-                             : exact[i]                            ? Derivative::kOfSolution
-                             : zero_grad_ && is_failure(status(i)) ? Derivative::kNone
-                                                                   : Derivative::kOfIterations);
+      derivatives_.push_back(!finite_[i]          ? Derivative::kRefused
+                             : exact[i]           ? Derivative::kOfSolution
+                             : !has_derivative(i) ? Derivative::kNone
+                                                  : Derivative::kOfIterations);
   }
 
   /// Sums the gradients of these samples, and notes their outcomes; those whose gradient is not finite leave `rows`.
@@ -111,15 +124,25 @@ class SampleVjps {
 
   UnrolledVjp vjp_of_iterations(const Rows& rows) const {
     auto caps = at::zeros({batch_}, at::kLong);
-    // finite_sum() may ask for the share of no sample: all iterations, with a cotangent of zero.
-    const bool for_no_sample = !any(rows);
-    for (int64_t i = 0; i < batch_; ++i)
-      if ((rows[i] || for_no_sample) && derivatives_[i] == Derivative::kOfIterations)
-        caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
-    if (!caps.any().item<bool>()) return {std::vector<at::Tensor>(wanted_.size()), at::zeros({batch_}, at::kLong)};
-    return of_iterations_(
-        only(finite_cotangent_, rows), solved_.b,
-        {spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()), options_.checkpoint_every}, wanted_);
+    auto runs = rows;
+    for (int64_t i = 0; i < batch_; ++i) {
+      runs[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && counts_[i] > 0;
+      if (runs[i]) caps.mutable_data_ptr<int64_t>()[i] = counts_[i];
+    }
+    if (!any(runs)) return {std::vector<at::Tensor>(wanted_.size()), at::zeros({batch_}, at::kLong)};
+    UnrolledSolve solve{spec_, solved_.x0, options_.solver, caps.to(solved_.iterations.device()),
+                        options_.checkpoint_every};
+    auto b = solved_.b;
+    auto& m = solve.solver.preconditioner;
+    if (!all(runs) && (is_function(spec_) || m.is_operator())) {  // these cannot leave out samples that do not run
+      auto replaced = runs;
+      replaced.flip();
+      solve.a = with_healthy_tensors(spec_, b, runs);
+      if (m.is_operator()) m = with_healthy_tensors(m.spec(), b, runs);
+      solve.x0 = with_healthy_rows(solved_.x0, replaced);
+      b = with_healthy_rows(b, replaced);
+    }
+    return of_iterations_(only(finite_cotangent_, rows), b, solve, wanted_);
   }
 
   void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum) {

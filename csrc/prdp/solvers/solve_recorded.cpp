@@ -44,7 +44,8 @@ RecordedSolve solve_recorded(const Operator& a, const at::Tensor& b, const at::T
   if (index.numel() < b.size(0)) {
     const auto zeros = at::zeros_like(b), none = at::zeros_like(caps);
     if (index.numel() == 0) return {zeros, none};
-    if (const auto part = a.select(index)) {
+    // A preconditioner of the user's own cannot be had without them.
+    if (const auto part = solver.preconditioner.is_operator() ? nullptr : a.select(index)) {
       const auto there = index.to(caps.device());
       const auto x0_there = x0.defined() ? x0.index_select(0, index) : x0;
       const auto some = solve_recorded(*part, b.index_select(0, index), x0_there, solver, caps.index_select(0, there));
