@@ -76,7 +76,7 @@ class PlainSpace : public SampleNumbers<double>, public SpaceDefaults<PlainSpace
   std::array<double, 1> operator_norm() const { return {a_.abs().sum(1).max().item<double>()}; }
   std::array<bool, 1> surely_definite() const { return {false}; }
   Scalar solution2(const double* x) const { return dot(x, x); }
-  Scalar componentwise_scale2(const double* x) const { return dot(x, x); }
+  Scalar componentwise_scale2(const double* x, int64_t) const { return dot(x, x); }
   template <class Wanted>
   void freeze_unless(const States&, const Wanted&) {}
   template <class Function>

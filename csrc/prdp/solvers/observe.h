@@ -76,13 +76,23 @@ PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, ty
   }
   if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
   constexpr double roundings = 64.0;  // of a product
-  const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x));
-  for (size_t i = 0; i < states.size(); ++i) {
-    auto& s = states[i];
-    const double rounding_of_product = roundings * space.epsilon() * std::sqrt(componentwise_scale2[i]);
-    if (!(floors[i] > 0.0) || !(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) continue;
-    s.stop(SolveStatus::kStagnated);
-    s.floor2 = floors[i] * floors[i];
+  constexpr int64_t patterns = 8;     // one estimate misses the strongest coupling of two unknowns every second time
+  bool is_in_doubt = true;
+  for (int64_t p = 0; is_in_doubt && p < patterns; ++p) {
+    const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, p));
+    is_in_doubt = false;
+    for (size_t i = 0; i < states.size(); ++i) {
+      auto& s = states[i];
+      if (!(floors[i] > 0.0)) continue;
+      const double rounding_of_product = roundings * space.epsilon() * std::sqrt(componentwise_scale2[i]);
+      if (!(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) {
+        is_in_doubt = true;
+        continue;
+      }
+      s.stop(SolveStatus::kStagnated);
+      s.floor2 = floors[i] * floors[i];
+      floors[i] = 0.0;
+    }
   }
 }
 

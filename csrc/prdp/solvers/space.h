@@ -185,7 +185,7 @@ concept IterationSpace = SweepingSpace<S> && KrylovSpace<S> && FactorisedSpace<S
 /// What the loop around the methods needs beside (iterate.h).
 template <class S>
 concept LoopSpace =
-    Primitives<S> && requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a,
+    Primitives<S> && requires(S s, typename S::Vector x, typename S::Vector kept, typename S::Scalar a, int64_t n,
                               typename S::States states, bool (*wanted)(const typename S::States::value_type&)) {
       /// One number per sample, on the host: a; whether it broke down; ‖A‖; whether A is known to be positive definite,
       /// and rounding does not change that.
@@ -195,8 +195,8 @@ concept LoopSpace =
       s.surely_definite();
       /// ‖u‖², where u is x and the start.
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-      /// Estimates ‖|A| |u|‖² as ‖A S u‖², where S is a fixed diagonal of ±1 without a pattern.
-      { s.componentwise_scale2(x) } -> std::same_as<typename S::Scalar>;
+      /// Estimates ‖|A| |u|‖² from below as ‖A S u‖², where S is a diagonal of ±1: a pattern of is_negated().
+      { s.componentwise_scale2(x, n) } -> std::same_as<typename S::Scalar>;
       /// A vector that the next operation may overwrite.
       { s.scratch() } -> std::convertible_to<typename S::Vector>;
       /// From here on, the samples that are not wanted are frozen.

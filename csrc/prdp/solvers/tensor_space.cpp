@@ -133,13 +133,6 @@ TensorSpace::Vector TensorSpace::solution(const Vector& x) const {
   return started() ? start_ + from_zero : from_zero;
 }
 
-TensorSpace::Scalar TensorSpace::componentwise_scale2(const Vector& x) const {
-  const auto u = solution(x).detach();
-  const auto negated = unstructured_like(u).lt(0);  // as is_negated() of sample_numbers.h
-  const auto terms = laid_out(system_.a.apply(at::where(negated, -u, u)));
-  return dot(terms, terms);
-}
-
 namespace {
 
 /// The signs of a pattern, the same for every sample.
@@ -153,6 +146,12 @@ at::Tensor signs_like(const at::Tensor& v, int64_t first, int64_t pattern) {
 }
 
 }  // namespace
+
+TensorSpace::Scalar TensorSpace::componentwise_scale2(const Vector& x, int64_t pattern) const {
+  const auto u = solution(x).detach();
+  const auto terms = laid_out(system_.a.apply(u * signs_like(u, 0, pattern)));
+  return dot(terms, terms);
+}
 
 TensorSpace::Scalar TensorSpace::skeel_estimate2(const Vector& x) const {
   const auto u = solution(x).detach();
