@@ -12,7 +12,7 @@ from prdp_torch.calls import forgets_if_it_raises, not_in_graphs
 from prdp_torch.flow_walls import Side, WallVelocity
 from prdp_torch.held_tensors import HoldsTensors
 from prdp_torch.kept_objects import Kept
-from prdp_torch.operators.base import full_precision, real_tensor
+from prdp_torch.operators.base import full_precision, kept_numbers, real_tensor
 from prdp_torch.solvers import CG, Solver
 from prdp_torch.stepper import Stepper
 from prdp_torch.types import Backward, Length, Number, Shape, Solution, Start, StepOptions
@@ -297,4 +297,4 @@ def _make_box(shape: tuple[int, ...], boundary: tuple[str, ...], length: tuple[f
 def _of_numbers(name: str, value: object) -> Tensor:
     if not isinstance(value, (tuple, list)):
         raise TypeError(f"Flow: {name} must be a tensor or a tuple of numbers, got {value!r}")
-    return torch.tensor([_check.real("Flow", f"every entry of {name}", v) for v in value], dtype=torch.float64)
+    return kept_numbers([_check.real("Flow", f"every entry of {name}", v) for v in value])

@@ -131,7 +131,16 @@ def real_tensor(who: str, name: str, value: Number) -> Tensor:
     """A number as the 0-dimensional tensor that the library takes; a tensor as it is."""
     if isinstance(value, Tensor):
         return value
-    return torch.tensor(_check.real(who, name, value), dtype=torch.float64, device="cpu")  # under any default device
+    return kept_numbers(_check.real(who, name, value))
+
+
+def kept_numbers(values: float | list[float]) -> Tensor:
+    """A tensor in float64 on the CPU, under any default device; one to train with, even where it is made in inference
+    mode."""
+    if torch.is_inference_mode_enabled():
+        with torch.inference_mode(False):
+            return torch.tensor(values, dtype=torch.float64, device="cpu")
+    return torch.tensor(values, dtype=torch.float64, device="cpu")
 
 
 @functools.cache

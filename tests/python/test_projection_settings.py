@@ -179,3 +179,39 @@ def test_controllers_set_the_tolerance():
     controller.step(1e-3)
     flow(u)
     assert flow.info.iterations.item() > few
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "wall", ("open", "wall")])
+@pytest.mark.parametrize("made_there", [False, True])
+def test_a_flow_that_is_first_used_in_inference_mode_trains_later(boundary, made_there):
+    """As Lightning validates before it trains."""
+    u = 0.1 * random_velocity((8, 8))
+
+    def flow(backward):
+        force = (0.1, 0.2) if boundary == "wall" else None
+        inflow = (0.0, 0.3) if boundary[0] == "open" else None
+        return prdp.Flow((8, 8), 0.01, 0.01, boundary=boundary, force=force, inflow=inflow, backward=backward)
+
+    for backward in ("implicit", "unrolled"):
+        expected, found = [], []
+        for results, mode in ((expected, torch.no_grad()), (found, torch.inference_mode())):
+            step = flow(backward) if not made_there else None
+            with mode:
+                step = step or flow(backward)
+                results.append(step(u).clone())
+            x = u.clone().requires_grad_()
+            results.append(torch.autograd.grad(step.project(x).square().sum(), x)[0])
+            results.append(torch.autograd.grad(step(x).square().sum(), x, create_graph=True)[0])
+            results.append(torch.autograd.grad(results[-1].square().sum(), x)[0])
+        for mine, other in zip(found, expected, strict=True):
+            assert torch.equal(mine, other)
+
+
+def test_a_step_that_is_made_in_inference_mode_trains_later():
+    with torch.inference_mode():
+        step = prdp.Heat((8,), 0.1, 1.0, prdp.CG(100))
+    u = torch.randn(2, 1, 8, dtype=torch.float64, requires_grad=True)
+    expected = prdp.Heat((8,), 0.1, 1.0, prdp.CG(100))
+    for made in (step, expected):
+        made(u).square().sum().backward()
+    assert torch.equal(step(u), expected(u))

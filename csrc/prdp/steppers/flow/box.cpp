@@ -45,6 +45,7 @@ FlowBox::FlowBox(std::vector<int64_t> shape, const std::vector<FlowBoundary>& bo
     TORCH_CHECK_VALUE(std::isfinite(side) && side > 0, "Flow: length must be finite and > 0, got ", side);
   TORCH_CHECK_VALUE(std::count(boundary_.begin(), boundary_.end(), FlowBoundary::kOpen) <= 1,
                     "Flow: at most one axis may be 'open'");
+  const c10::InferenceMode may_be_recorded_later(false);
   if (obstacle_.defined()) {
     TORCH_CHECK_TYPE(obstacle_.scalar_type() == at::kBool,
                      "Flow: obstacle must be a bool tensor, true in solid cells, got ", obstacle_.scalar_type());
@@ -85,6 +86,7 @@ const FlowFields& FlowBox::fields(const at::TensorOptions& options) const {
   if (!is_new) return entry->second;
   auto& found = entry->second = fields_;
   const at::NoGradGuard no_grad;
+  const c10::InferenceMode may_be_recorded_later(false);
   for (auto* t : {&found.cells, &found.free, &found.inlet, &found.friction, &found.pressure, &found.closed_parts})
     if (t->defined()) *t = t->to(options.device(), dtype);
   for (auto* list : {&found.diffusion, &found.high_sign})
