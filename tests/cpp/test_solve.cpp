@@ -1,4 +1,5 @@
 #include <gtest/gtest.h>
+#include <torch/csrc/autograd/autograd.h>
 
 #include "helpers.h"
 #include "prdp/autograd/linear_solve.h"
@@ -219,6 +220,32 @@ TEST(Diffusion, RobinSidesStandInSeriesWithHalfACell) {
   EXPECT_NEAR(number.grad().item<double>(), -0.25 / 25.0, 1e-12);
   EXPECT_NEAR(field.grad().item<double>(), -0.25 / 25.0, 1e-12);
   EXPECT_THROW(prdp::diffusion(kappa, number, {{Side::kRobin, Side::kZero}}), c10::ValueError);
+}
+
+TEST(LinearSolve, ACsrMatrixHasTheGradientOfItsValues) {
+  const auto crow = at::tensor({0, 2, 4}, at::kLong), col = at::tensor({0, 1, 0, 1}, at::kLong);
+  const auto values = at::tensor({3.0, 1.0, -1.0, 4.0}, at::kDouble).requires_grad_();
+  const auto b = at::tensor({1.0, 2.0, 0.5, -1.0}, at::kDouble).view({2, 2});
+  const prdp::SolveOptions options{prdp::Direct{}};
+  const auto gradient = [&](const prdp::OperatorSpec& a) {
+    const std::vector<at::Tensor> loss{prdp::linear_solve(a, b, options).u.square().sum()}, leaves{values};
+    return torch::autograd::grad(loss, leaves)[0];
+  };
+  EXPECT_TRUE(at::allclose(gradient(prdp::csr_matrix(crow, col, values)), gradient(prdp::matrix(values.view({2, 2})))));
+  EXPECT_THROW(prdp::csr_matrix(crow, col, values.narrow(0, 0, 3)), c10::ValueError);
+  EXPECT_THROW(prdp::csr_matrix(crow.to(at::kDouble), col, values), c10::TypeError);
+  EXPECT_THROW(prdp::linear_solve(prdp::csr_matrix(crow, col, values), at::Tensor(), options), c10::ValueError);
+}
+
+TEST(LinearSolve, ADiffusionTakesEverythingWithANumberAsShift) {
+  const auto kappa = at::rand({1, 5}, at::kDouble) + 1.0, h = at::scalar_tensor(2.0, at::kDouble);
+  const std::vector<std::array<prdp::Side, 2>> sides{{prdp::Side::kRobin, prdp::Side::kZero}};
+  const auto b = at::rand({1, 1, 5}, at::kDouble);
+  const auto solve = [&](const auto& shift) {
+    const auto a = prdp::diffusion(kappa, shift, sides, {1.0}, prdp::FaceMean::kArithmetic, {h});
+    return prdp::linear_solve(a, b, {prdp::Direct{}}).u;
+  };
+  EXPECT_TRUE(at::equal(solve(10.0), solve(at::scalar_tensor(10.0, at::kDouble))));
 }
 
 }  // namespace

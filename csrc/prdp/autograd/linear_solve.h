@@ -25,7 +25,13 @@ SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const Solve
 SolveResult linear_solve_unrecorded(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                                     const at::Tensor& x0 = {});
 
-/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes.
+/// A matrix (n, n) or (batch, n, n), dense or sparse CSR, as an operator. Raises ValueError for other shapes. In C++ a
+/// sparse tensor has no gradient: LibTorch makes it without one, even of values that require it.
 OperatorSpec matrix(const at::Tensor& values);
+
+/// A sparse matrix by its compressed rows, whose values get a gradient. crow: (n + 1,), where each row starts; col:
+/// (nnz,), the column of each entry; both int32 or int64. values: (nnz,), or (batch, nnz) for a matrix per sample.
+/// Raises ValueError or TypeError where these do not fit together.
+OperatorSpec csr_matrix(const at::Tensor& crow, const at::Tensor& col, const at::Tensor& values);
 
 }  // namespace prdp

@@ -162,6 +162,7 @@ struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
 
 SolveResult linear_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options,
                          const at::Tensor& x0) {
+  TORCH_CHECK_VALUE(b.defined(), "linear_solve: b is an undefined tensor");
   const bool lone_vector = b.dim() == 1 && a.shape.empty();  // (n,), for matrices
   if (!lone_vector) return result_of(solve_or_dispatch(b, a, options, x0));
   auto result = result_of(solve_or_dispatch(b.unsqueeze(0), a, options, x0.defined() ? x0.unsqueeze(0) : x0));
@@ -208,6 +209,16 @@ OperatorSpec matrix(const at::Tensor& values) {
   TORCH_CHECK_VALUE(crow.sym_size(-1) == values.sym_size(-1) + 1, "linear_solve: a CSR matrix of ", values.sym_size(-1),
                     " rows needs a crow of one more, got ", crow.sym_size(-1));
   return {"csr", {}, {}, {crow, values.col_indices(), values.values()}};
+}
+
+OperatorSpec csr_matrix(const at::Tensor& crow, const at::Tensor& col, const at::Tensor& values) {
+  TORCH_CHECK_VALUE(crow.dim() == 1 && crow.numel() > 0 && col.dim() == 1 && (values.dim() == 1 || values.dim() == 2) &&
+                        values.size(-1) == col.numel(),
+                    "csr_matrix: crow must have shape (n + 1,), col (nnz,) and values (nnz,) or (batch, nnz), got ",
+                    crow.sizes(), ", ", col.sizes(), " and ", values.sizes());
+  OperatorSpec a{"csr", {}, {}, {crow, col, values}};
+  make_operator(a);  // looks at the rest
+  return a;
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }

@@ -30,8 +30,10 @@ OperatorSpec diffusion(const at::Tensor& kappa, const at::Tensor& shift,
 /// The same with a number as shift.
 inline OperatorSpec diffusion(const at::Tensor& kappa, double shift,
                               const std::vector<std::array<Side, 2>>& sides = {{Side::kZero, Side::kZero}},
-                              const std::vector<double>& lengths = {1.0}) {
-  return diffusion(kappa, at::full({}, shift, kappa.options().requires_grad(false)), sides, lengths);
+                              const std::vector<double>& lengths = {1.0}, FaceMean faces = FaceMean::kHarmonic,
+                              const std::vector<at::Tensor>& robin = {}, bool per_axis = false) {
+  return diffusion(kappa, at::full({}, shift, kappa.options().requires_grad(false)), sides, lengths, faces, robin,
+                   per_axis);
 }
 
 /// The operator of kind "diffusion", or "diffusion_per_axis". Parameters: the two sides of each axis, the lengths, the

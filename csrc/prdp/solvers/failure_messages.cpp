@@ -119,11 +119,19 @@ std::string nonfinite_preconditioner(const Solver& solver, const at::Tensor& b, 
   return "its preconditioner hands out NaN or Inf for a vector of ones; look at what M⁻¹ is made of";
 }
 
+/// Whether a preconditioner of the user's own hands out nothing.
+bool maps_ones_to_zero(const Preconditioner& m, const at::Tensor& b, int64_t sample) {
+  return m.is_operator() && !make_operator(m.spec())->apply(at::ones_like(b)).select(0, sample).any().item<bool>();
+}
+
 /// Why MINRES finds no direction.
 std::string not_minimal(const Solver& solver, const Operator& a, const at::Tensor& b, int64_t sample) {
   if (auto found = nonfinite_preconditioner(solver, b, sample); !found.empty()) return found;
   if (solver.preconditioner)
-    return "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is singular";
+    return std::string(
+               "v·M⁻¹ v is not positive for a vector v: its preconditioner is not positive definite, or A is "
+               "singular") +
+           (solver.preconditioner.is_operator() ? "" : "; take MINRES without it, or CG where A is negative definite");
   if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
   return "A is singular, and b lies outside its range; take a b without that part";
 }
@@ -165,6 +173,8 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
   if (traits(solver.method).made_for == MadeFor::kDefinite)
     return "r·A r is zero for a residual r: " + not_definite(a, b, sample);
   if (traits(solver.method).made_for == MadeFor::kSymmetric) return not_minimal(solver, a, b, sample);
+  if (maps_ones_to_zero(solver.preconditioner, b, sample))
+    return "its preconditioner maps a vector of ones to zero; look at what M⁻¹ is made of";
   if (traits(solver.method).counts == Counts::kIterations) return "r·A r is zero for a residual r; take GMRES";
   return "its space is exhausted and does not hold the solution: A is singular, and b lies outside its range; "
          "take a b without that part, or add a multiple of the identity to A";
