@@ -120,7 +120,8 @@ class _Asked(NamedTuple):
 
 def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
     """Whether a function has two arguments without a default. What takes any number, as compiled functions do, is asked
-    for the function that it wraps."""
+    for the function that it wraps, and a module that takes any number for the one module that it wraps, as those of
+    `torch.compile` and of data parallelism do."""
     if rhs is None:
         return False
     may_tell = [(rhs, False), (rhs, True)]  # the first that has a fixed number of arguments does
@@ -135,7 +136,8 @@ def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
         if all(p.kind is not p.VAR_POSITIONAL for p in parameters):
             positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
             return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
-    return False
+    inner = list(rhs.children()) if isinstance(rhs, torch.nn.Module) else []
+    return len(inner) == 1 and _takes_two(inner[0])
 
 
 class ConstantOperator(torch_private.HearsOfMoves):

@@ -5,9 +5,8 @@ All start from zero unless they are given a start, and stop, sample by sample, a
 Arguments out of range raise ValueError.
 """
 
-import struct
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, TypeAlias
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -56,11 +55,13 @@ class Solver:
             self.rtol = _check.real(who, "rtol", self.rtol)
             check_solver(who, self.method, self.max_iter, self.rtol, self.restart, self.preconditioner)
 
+    if not TYPE_CHECKING:
 
-def bits_of(number: float) -> int:
-    """The integer with the bits of a number in float64; of a tolerance, it is not negative."""
-    bits: int = struct.unpack("<q", struct.pack("<d", number))[0]
-    return bits
+        def __setattr__(self, name: str, value: object) -> None:
+            if name not in self.__dataclass_fields__ and type(self).__module__ == __name__:  # it would have no effect
+                allowed = ", ".join(f.name for f in fields(self) if f.init)
+                raise AttributeError(f"{type(self).__name__}: no setting '{name}'; allowed: {allowed}")
+            object.__setattr__(self, name, value)
 
 
 PRECONDITIONERS = ("diagonal", "multigrid")
@@ -96,7 +97,7 @@ def packed_options(
     adjoint_rtol_bits: int = -1,
 ) -> PackedOptions:
     """All options of a solve in the four lists that the ops take: csrc/prdp/autograd/packed_options.h unpacks them.
-    With `rtol_bits`, the `bits_of` a tolerance take its place."""
+    With `rtol_bits`, the bits of a tolerance take its place."""
     shape: list[int] = []
     parameters: list[float] = []
     tensors: list[Tensor] = []
@@ -189,8 +190,8 @@ class MINRES(Solver):
     """The minimal residual for symmetric operators, definite or not, as a Helmholtz equation or a saddle point.
 
     An iteration has one product with A, and memory does not grow with their number, as it does in a cycle of `GMRES`.
-    Where A is definite, `CG` takes less work per iteration. A preconditioner must be positive definite, also where A is
-    not; where it is not, a sample ends with BREAKDOWN.
+    Where A is definite, `CG` takes less work per iteration. A preconditioner must be positive definite, else a sample
+    ends with BREAKDOWN; the built-in ones are where A is, so not of `Poisson`, whose A is negative definite.
 
     Source: Paige and Saunders 1975.
     """

@@ -2,6 +2,7 @@
 
 import difflib
 import functools
+import struct
 from collections.abc import Callable
 from operator import is_
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,6 @@ from prdp_torch.solvers import (
     PackedOptions,
     Preconditioner,
     Solver,
-    bits_of,
     check_options,
     check_settings,
     check_solver,
@@ -133,8 +133,8 @@ class HasSettings(torch_private.HearsOfMoves):
 
     def _keep_bits(self) -> None:
         """The tolerances as compiled graphs take them."""
-        self._rtol_bits = bits_of(self._rtol)
-        self._adjoint_rtol_bits = bits_of(self._rtol if self._adjoint_rtol is None else self._adjoint_rtol)
+        self._rtol_bits = _bits_of(self._rtol)
+        self._adjoint_rtol_bits = _bits_of(self._rtol if self._adjoint_rtol is None else self._adjoint_rtol)
 
     def _settings(self) -> tuple[Backward, int | None, float | None, OnFailure, CheckpointEvery, Start]:
         others = self.on_failure, self.checkpoint_every, self.start
@@ -195,6 +195,12 @@ class HasSettings(torch_private.HearsOfMoves):
 
 
 @functools.cache
+def _bits_of(number: float) -> int:
+    """The integer with the bits of a number in float64; of a tolerance, it is not negative."""
+    bits: int = struct.unpack("<q", struct.pack("<d", number))[0]
+    return bits
+
+
 def _meant_setting(kind: type[HasSettings], name: str) -> str | None:
     """What to say of a new attribute that must be meant for a setting, which would stay as it is. Classes outside this
     library may have attributes of any name."""

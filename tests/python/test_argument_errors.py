@@ -148,8 +148,26 @@ def test_a_misspelt_setting_is_refused(name, expected):
     assert not hasattr(step, name) and step.max_iter == 3
 
 
+@pytest.mark.parametrize("solver, name, allowed", [
+    (prdp.CG(5), "max_itr", "max_iter, rtol, preconditioner"),
+    (prdp.GMRES(max_iter=5), "restrat", "max_iter, rtol, preconditioner, restart"),
+    (prdp.Multigrid(), "smooth", "max_iter, rtol, smoothing"),
+])  # fmt: skip
+def test_a_setting_that_no_solver_has_is_refused(solver, name, allowed):
+    with pytest.raises(AttributeError, match=f"^{type(solver).__name__}: no setting '{name}'; allowed: {allowed}$"):
+        setattr(solver, name, 50)
+    assert not hasattr(solver, name)
+
+
 def test_other_attributes_are_free():
-    """Those of another name, and all of a user's own stepper."""
+    """Those of another name, and all of a user's own stepper and solver."""
+
+    class OwnSolver(prdp.CG):
+        max_itr: int
+
+    solver = OwnSolver(5)
+    solver.max_itr = 3
+    assert solver.max_itr == 3 and solver.max_iter == 5
 
     class Own(prdp.Stepper):
         def __init__(self):

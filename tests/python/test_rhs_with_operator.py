@@ -89,6 +89,7 @@ wrapped.__wrapped__ = lambda u, factor: factor * u
 @pytest.mark.parametrize("rhs", [
     lambda u, factor=2.0: factor * u, lambda u, *rest: 2.0 * u, lambda u, *, factor=2.0: factor * u, OwnCall(), wrapped,
     functools.partial(torch.mul, other=2.0), torch.compile(lambda u: 2.0 * u, backend="eager"),
+    torch.compile(OwnCall(), backend="eager"), torch.nn.DataParallel(OwnCall()),
 ])  # fmt: skip
 def test_functions_of_u_alone_get_no_operator(rhs):
     u = field((N,))
@@ -100,6 +101,8 @@ def test_functions_of_u_alone_get_no_operator(rhs):
 
 @pytest.mark.parametrize("rhs", [
     lambda u, A: A.apply(u), WithOperator(), torch.compile(lambda u, A: A.apply(u), backend="eager"),
+    torch.compile(WithOperator(), backend="eager"), torch.nn.DataParallel(WithOperator()),
+    torch.compile(torch.nn.DataParallel(WithOperator()), backend="eager"),
 ])  # fmt: skip
 def test_functions_of_two_arguments_get_it(rhs):
     u = field((N,))
