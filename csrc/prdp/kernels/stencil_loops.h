@@ -115,6 +115,17 @@ void for_each_register(const NeighbourStencil<T>& a, Lines lines, const T* v, Bo
   else go_along_rows<Dim, false>(a, lines, v, body);
 }
 
+/// Adds to the values of points `begin` to `end` of a row what leaves it and comes back at its other end.
+template <class T>
+void add_wraps(const OffsetStencil<T>& a, const T* coefficients, const T* const* from, int64_t begin, int64_t end,
+               T* values) {
+  for (int64_t e = 0; e < a.wrap_count; ++e) {
+    const auto& wrap = a.wraps[e];
+    if (wrap.to >= begin && wrap.to < end)
+      values[wrap.to - begin] += coefficients[e] * from[wrap.coefficient][wrap.from];
+  }
+}
+
 template <class T, class Body>
 void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body& shared) {
   constexpr int most = 4;  // sums at once, as each waits for its last addition
@@ -122,8 +133,8 @@ void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body&
   const T* from[kMostOffsets];
   for (int64_t line = lines.begin; line < lines.end; ++line) {
     const int64_t at = line * a.row;
-    const T *const w = a.coefficients + line * a.count * a.row, *const wrap_values =
-                                                                    a.wrap_values + line * a.wrap_count;
+    const T* const w = a.coefficients + line * a.count * a.row;
+    const T* const wrap_values = a.wrap_values + line * a.wrap_count;
     for (int64_t k = 0; k < a.count; ++k) {
       const auto& o = a.offsets[k].along;
       from[k] =
@@ -137,14 +148,10 @@ void for_each_register(const OffsetStencil<T>& a, Lines lines, const T* v, Body&
           const int64_t i = begin + c * kWidth<T>;
           sums[c] += load(w + k * a.row + i) * load(from[k] + i);
         }
-      if (a.wrap_count > 0 && (begin < 2 || end > a.nx - 2)) {  // what leaves the row comes to its first or last two
+      if (a.wrap_count > 0 && (begin < 2 || end > a.nx - 2)) {  // to the first or last two
         T values[size.value * kWidth<T>];
         for (int c = 0; c < size.value; ++c) store(values + c * kWidth<T>, sums[c]);
-        for (int64_t e = 0; e < a.wrap_count; ++e) {
-          const auto& wrap = a.wraps[e];
-          if (wrap.to < begin || wrap.to >= end) continue;
-          values[wrap.to - begin] += wrap_values[e] * from[wrap.coefficient][wrap.from];
-        }
+        add_wraps(a, wrap_values, from, begin, end, values);
         for (int c = 0; c < size.value; ++c) sums[c] = load(values + c * kWidth<T>);
       }
       for (int c = 0; c < size.value; ++c) {
@@ -275,7 +282,8 @@ template <class T>
 void apply_staggered(const StaggeredStencil<T>& a, Lines lines, const T* v, T* out) {
   const auto& grid = a.velocity[0];
   const int64_t row = grid.row, field = grid.ny * row, last = grid.nx - 1;
-  const T *x = a.weights, *x_lower = x + row, *x_upper = x + 2 * row, *y = x + 3 * row;
+  const T *inverse_dx = a.weights, *inverse_dx_lower = inverse_dx + row, *inverse_dx_upper = inverse_dx + 2 * row,
+          *inverse_dy = inverse_dx + 3 * row;
   out += lines.begin * row;
   T *out1 = out, *out2 = out + field, *divergence = out + 2 * field;
   for (int64_t j = lines.begin; j < lines.end; ++j, out1 += row, out2 += row, divergence += row) {
@@ -285,15 +293,15 @@ void apply_staggered(const StaggeredStencil<T>& a, Lines lines, const T* v, T* o
     for (int64_t i = 0; i < row; i += kWidth<T>) {
       p.step_to(i);
       Register<T> c1 = u1.product(i), c2 = u2.product(i);
-      c1 = c1 + load(x + i) * p.here - load(x_lower + i) * p.left();
-      c2 = c2 + load(y + i) * (p.here - load(p_below + i));
+      c1 = c1 + load(inverse_dx + i) * p.here - load(inverse_dx_lower + i) * p.left();
+      c2 = c2 + load(inverse_dy + i) * (p.here - load(p_below + i));
       store<T>(out1 + i, u1.with_ends(i, c1));
       store<T>(out2 + i, u2.with_ends(i, c2));
-      store<T>(divergence + i, load(x_upper + i) * u1.line.right() - load(x + i) * u1.line.here +
-                                   load(y + i) * (load(u2.above + i) - u2.line.here));
+      store<T>(divergence + i, load(inverse_dx_upper + i) * u1.line.right() - load(inverse_dx + i) * u1.line.here +
+                                   load(inverse_dy + i) * (load(u2.above + i) - u2.line.here));
     }
-    out1[0] -= x[0] * p.v[last];
-    divergence[last] += x[0] * u1.line.v[0];
+    out1[0] -= inverse_dx[0] * p.v[last];
+    divergence[last] += inverse_dx[0] * u1.line.v[0];
   }
 }
 

@@ -9,15 +9,16 @@ namespace prdp::kernels {
 
 namespace {
 
-/// Rows that a thread keeps while it splits and merges them; at least n values each, with room for two more.
+/// What a thread splits a row of n points into: coarse points and those between, with room for what lies beyond the
+/// ends.
 template <class T>
 struct SplitRows {
-  std::vector<T> first, second, coarse;
+  std::vector<T> coarse, between;
 
   static SplitRows& local(int64_t n) {
     static thread_local SplitRows rows;
     const auto size = static_cast<size_t>(n + 4);
-    for (auto* row : {&rows.first, &rows.second, &rows.coarse})
+    for (auto* row : {&rows.coarse, &rows.between})
       if (row->size() < size) row->resize(size);
     return rows;
   }
@@ -27,7 +28,13 @@ struct SplitRows {
 
 template <class T>
 Transfer<T>::Transfer(const StencilGrid& grid, int axis, const AxisTransfer<T>& weights, bool symmetric)
-    : fine_(grid), coarse_(grid), axis_(axis), periodic_(grid.periodic[axis]), zeros_(grid.shape[2], T(0)) {
+    : fine_(grid),
+      coarse_(grid),
+      axis_(axis),
+      periodic_(grid.periodic[axis]),
+      first_coarse_(periodic_ ? 0 : 1),
+      first_between_(1 - first_coarse_),
+      zeros_(grid.shape[2], T(0)) {
   coarse_.shape[axis] = coarse_points(grid.shape[axis], periodic_);
   interpolation_ = compress(weights.interpolation);
   if (!symmetric) restriction_ = compress(weights.restriction);
@@ -48,7 +55,7 @@ template <class T>
 typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights) const {
   const auto& [nz, ny, nx] = fine_.shape;
   const RingedGrid ringed(fine_);
-  const int64_t first = periodic_ ? 1 : 0, count = between();
+  const int64_t count = between();
   int64_t extent[3] = {nz, ny, nx};
   extent[axis_] = axis_ == 2 ? count + 2 : count;
   Compressed c;
@@ -57,13 +64,14 @@ typename Transfer<T>::Compressed Transfer<T>::compress(const Weights<T>& weights
     for (int64_t z = 0; z < extent[0]; ++z)
       for (int64_t y = 0; y < extent[1]; ++y) {
         T* const to = some->data() + weights_at(z, y);
-        const int64_t fine_z = axis_ == 0 ? 2 * z + first : z, fine_y = axis_ == 1 ? 2 * y + first : y;
+        const int64_t fine_z = axis_ == 0 ? 2 * z + first_between_ : z;
+        const int64_t fine_y = axis_ == 1 ? 2 * y + first_between_ : y;
         const T* const row = all->data() + ringed.at(fine_z, fine_y, 0);
         if (axis_ != 2) {
           std::copy_n(row, nx, to);
           continue;
         }
-        for (int64_t k = 0; k < count; ++k) to[k + 1] = row[2 * k + first];
+        for (int64_t k = 0; k < count; ++k) to[k + 1] = row[2 * k + first_between_];
         if (periodic_ && nx % 2 == 0) to[0] = to[count];  // the last point lies before the first, too
       }
   }
@@ -84,22 +92,19 @@ void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right,
   const auto& loops = kernels::loops<T>();
   const int64_t nx = fine_.shape[2], count = between();
   auto& rows = SplitRows<T>::local(nx);
-  // What lies between coarse points, from place 1 on.
-  T* const others = (periodic_ ? rows.second : rows.first).data();
-  T* const here = (periodic_ ? rows.first : rows.second).data();
-  if (periodic_) loops.split(fine, here, others + 1, nx);
+  T *here = rows.coarse.data(), *others = rows.between.data();  // the latter from place 1 on
+  if (first_coarse_ == 0) loops.split(fine, here, others + 1, nx);
   else loops.split(fine, others + 1, here, nx);
   others[0] = others[count];
   others[count + 1] = T(0);
-  const int64_t before = periodic_ ? 0 : 1;
-  loops.restrict_row(here, others + before, right + before, others + before + 1, left + before + 1, coarse,
-                     coarse_.shape[2]);
+  const int64_t before = first_coarse_, after = before + 1;
+  loops.restrict_row(here, others + before, right + before, others + after, left + after, coarse, coarse_.shape[2]);
 }
 
 template <class T>
 template <class Row, class Weight>
 void Transfer<T>::restrict_row(int64_t j, const Row& row, const Compressed& w, const Weight& weight, T* coarse) const {
-  const int64_t n = fine_.shape[axis_], here = periodic_ ? 2 * j : 2 * j + 1, before = here - 1, after = here + 1;
+  const int64_t n = fine_.shape[axis_], here = 2 * j + first_coarse_, before = here - 1, after = here + 1;
   const bool wraps = before < 0 && periodic_ && n % 2 == 0;
   const T *row_before = zeros_.data(), *weight_before = row_before;
   const T *row_after = row_before, *weight_after = row_before;
@@ -137,15 +142,14 @@ void Transfer<T>::interpolate_along_x(const T* coarse, const T* left, const T* r
   const auto& loops = kernels::loops<T>();
   const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[2], count = between();
   auto& rows = SplitRows<T>::local(nx);
-  T* const others = (periodic_ ? rows.second : rows.first).data();
-  T* const here = rows.coarse.data();  // from place 1 on, with what lies beyond the ends
+  T *here = rows.coarse.data(), *others = rows.between.data();  // the former from place 1 on
   std::copy_n(coarse, coarse_count, here + 1);
   here[0] = T(0);
   here[coarse_count + 1] = periodic_ ? here[1] : T(0);
   std::fill_n(others, count, T(0));
-  const int64_t first = periodic_ ? 1 : 0;
-  loops.add_interpolated(here + first, left + 1, here + first + 1, right + 1, others, count);
-  if (periodic_) loops.add_merged(here + 1, others, fine, nx);
+  const int64_t before = first_between_, after = before + 1;
+  loops.add_interpolated(here + before, left + 1, here + after, right + 1, others, count);
+  if (first_coarse_ == 0) loops.add_merged(here + 1, others, fine, nx);
   else loops.add_merged(others, here + 1, fine, nx);
 }
 
@@ -153,9 +157,8 @@ template <class T>
 template <class Row, class Weight>
 void Transfer<T>::interpolate_row(int64_t i, const Row& row, const Compressed& w, const Weight& weight, T* fine) const {
   const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[axis_], k = i / 2;
-  const bool is_coarse = i % 2 == (periodic_ ? 0 : 1);
-  if (is_coarse) return loops<T>().axpy(T(1), row(k), fine, nx);
-  const int64_t left = periodic_ ? k : k - 1, right = periodic_ ? (k + 1) % coarse_count : k;
+  if (i % 2 == first_coarse_) return loops<T>().axpy(T(1), row(k), fine, nx);
+  const int64_t left = k - first_coarse_, right = periodic_ ? (k + 1) % coarse_count : k;
   const T* const row_left = left >= 0 ? row(left) : zeros_.data();
   const T* const row_right = right < coarse_count ? row(right) : zeros_.data();
   loops<T>().add_interpolated(row_left, weight(w.left, k), row_right, weight(w.right, k), fine, nx);

@@ -70,6 +70,7 @@ class Transfer {
   StencilGrid fine_, coarse_;
   int axis_;
   bool periodic_;
+  int64_t first_coarse_, first_between_;  // points along the axis: coarse ones and others take turns
   Compressed interpolation_, restriction_;  // the latter is empty if it is the same
   std::vector<T> zeros_;                    // a row, for neighbours that are not there
 };

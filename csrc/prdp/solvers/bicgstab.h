@@ -40,13 +40,7 @@ class BiCGStabMethod {
     inverse_hv_ = zero_ = rr_ * 0;
   }
   void step() {
-    Scalar rho = space_.dot(hat_, r_);
-    const Scalar lost = space_.is_rounding(rho, hh_, rr_, 200 * space_.epsilon());
-    space_.restore(lost, r_, hat_);
-    space_.restore(lost, rr_, hh_);
-    space_.restore(lost, rr_, rho);
-    space_.restore(lost, zero_, inverse_hv_);
-
+    Scalar rho = rho_or_anew();
     const Scalar over_omega = space_.guarded_quotient(tt_, st_, ss_, tt_);
     space_.xpby(v_, -over_omega, p_);
     space_.xpby(r_, -(rho * inverse_hv_), p_);
@@ -64,9 +58,7 @@ class BiCGStabMethod {
     tt_ = tt;
     rr_ = space_.update_iterate_and_residual(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x,
                                              r_);
-    space_.restore(starts_anew, r_, hat_);
-    space_.restore(starts_anew, rr_, hh_);
-    space_.restore(starts_anew, zero_, inverse_hv_);
+    start_anew_where(starts_anew);
   }
   auto residual2() const { return rr_; }
   /// From the true residual it starts anew.
@@ -85,6 +77,20 @@ class BiCGStabMethod {
   typename Space::Vector x;
 
  private:
+  /// ρ = r̂·r; where that is rounding, it starts anew with ρ = r·r.
+  Scalar rho_or_anew() {
+    Scalar rho = space_.dot(hat_, r_);
+    const Scalar lost = space_.is_rounding(rho, hh_, rr_, 200 * space_.epsilon());
+    start_anew_where(lost);
+    space_.restore(lost, rr_, rho);
+    return rho;
+  }
+  /// r̂ = r, and β = 0 in the next iteration, so that p = r.
+  void start_anew_where(const Scalar& mask) {
+    space_.restore(mask, r_, hat_);
+    space_.restore(mask, rr_, hh_);
+    space_.restore(mask, zero_, inverse_hv_);
+  }
   /// out = A v, or A M⁻¹ v with M⁻¹ v in z_; returns v·out and ‖out‖².
   std::array<Scalar, 2> apply_to(typename Space::Vector& v, typename Space::Vector& out) {
     if (!space_.is_preconditioned()) return space_.apply_with_dots(v, out);

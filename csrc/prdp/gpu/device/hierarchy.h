@@ -217,38 +217,59 @@ class HierarchyMaker {
     return index;
   }
 
-  /// All coefficients of coarse point i: R A P, for each column of neighbours.
-  void make_coarse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
-                         T* to) const {
-    const int n = a.points(), inner = line.inner, row = i / inner, j = row % line.coarse, outer = row / line.coarse;
-    const auto fine = [&](int cells) {  // that many from the fine point where the coarse one lies
-      return (outer * line.n + (line.of_coarse(j) + cells + line.n) % line.n) * inner + i % inner;
-    };
-    const int before = line.before(j), after = line.after(j), fine_points[3] = {fine(-1), fine(0), fine(1)};
-    const auto entry = shared(a.coefficients);
+  /// Coarse point i along an axis, and the fine points around it.
+  struct CoarsePoint {
+    int inner, j, outer;  // its place in the axes after this one, along it, and in those before
+    int fine[3];          // before it, where it lies, and after it
+    int before, after;    // the points between coarse ones on its two sides, -1 beyond the grid
+
+    CoarsePoint(const CoarsenedAxis& line, int i)
+        : inner(i % line.inner),
+          j(i / line.inner % line.coarse),
+          outer(i / line.inner / line.coarse),
+          before(line.before(j)),
+          after(line.after(j)) {
+      for (int p = 0; p < 3; ++p)
+        fine[p] = (outer * line.n + (line.of_coarse(j) + p - 1 + line.n) % line.n) * line.inner + inner;
+    }
+  };
+
+  /// The weights by which a coarse point meets the column of fine points at this offset.
+  kernels::GalerkinPoint<T> weights_of_column(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights,
+                                              const CoarsePoint& at, const int (&offset)[3]) const {
     const auto weight = shared(weights);
     const int of_left = 0, of_right = line.weights(), restriction = symmetric_ ? 0 : 2 * line.weights();
     const auto restrict_by = [&](int field, int between) {
-      return weight[restriction + field + (outer * line.between() + between) * inner + i % inner];
+      return weight[restriction + field + (at.outer * line.between() + between) * line.inner + at.inner];
     };
+    const auto interpolate_by = [&](int field, int between) {
+      const int index = weight_of_column(a, line, axis, at.fine[1], offset, between);
+      return index < 0 ? T(0) : weight[field + index];
+    };
+    kernels::GalerkinPoint<T> made;
+    if (at.before >= 0) {
+      made.before_left = interpolate_by(of_left, at.before);
+      made.before_right = interpolate_by(of_right, at.before);
+      made.restrict_before = restrict_by(of_right, at.before);
+    }
+    if (at.after >= 0) {
+      made.after_left = interpolate_by(of_left, at.after);
+      made.after_right = interpolate_by(of_right, at.after);
+      made.restrict_after = restrict_by(of_left, at.after);
+    }
+    return made;
+  }
+
+  /// All coefficients of coarse point i: R A P, for each column of neighbours.
+  void make_coarse_point(const Stencil& a, const CoarsenedAxis& line, int axis, const T* weights, int i, int points,
+                         T* to) const {
+    const CoarsePoint at(line, i);
+    const int n = a.points();
+    const auto entry = shared(a.coefficients);
+    const auto coefficient = [&](int place, int p) { return entry[place * n + at.fine[p]]; };
     for_each_column(axis, [&](int centre, const int (&offset)[3]) {
-      const auto interpolate_by = [&](int field, int between) {
-        const int index = weight_of_column(a, line, axis, fine_points[1], offset, between);
-        return index < 0 ? T(0) : weight[field + index];
-      };
-      kernels::GalerkinPoint<T> made;
-      if (before >= 0) {
-        made.before_left = interpolate_by(of_left, before);
-        made.before_right = interpolate_by(of_right, before);
-        made.restrict_before = restrict_by(of_right, before);
-      }
-      if (after >= 0) {
-        made.after_left = interpolate_by(of_left, after);
-        made.after_right = interpolate_by(of_right, after);
-        made.restrict_after = restrict_by(of_left, after);
-      }
+      auto made = weights_of_column(a, line, axis, weights, at, offset);
       const int lower = centre - Stencil::step(axis), upper = centre + Stencil::step(axis);
-      const auto coefficient = [&](int place, int p) { return entry[place * n + fine_points[p]]; };
       made.take_centres(coefficient(centre, 0), coefficient(centre, 1), coefficient(centre, 2));
       made.take_sides({coefficient(lower, 0), coefficient(lower, 1), coefficient(lower, 2)},
                       {coefficient(upper, 0), coefficient(upper, 1), coefficient(upper, 2)});
@@ -257,7 +278,7 @@ class HierarchyMaker {
       to[centre * points + i] = is_alone ? made.centre + made.left + made.right : made.centre;
       to[upper * points + i] = is_alone ? T(0) : made.right;
     });
-    keep_vanishing_diagonal(entry[kCentre * n + fine_points[1]], i, points, to);
+    keep_vanishing_diagonal(coefficient(kCentre, 1), i, points, to);
   }
   /// See kernels::kept_diagonal().
   static void keep_vanishing_diagonal(T fine, int i, int points, T* to) {

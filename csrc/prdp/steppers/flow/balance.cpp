@@ -9,7 +9,7 @@ namespace {
 constexpr double kLargestWhole = 4;
 
 bool is_incremental(const FlowEquation& e) {
-  return e.diffusion == FlowDiffusion::kImplicit && e.pressure == FlowPressure::kIncremental &&
+  return e.is_diffused_implicitly() && e.pressure == FlowPressure::kIncremental &&
          e.box->fields(e.nu.options()).free.defined();
 }
 

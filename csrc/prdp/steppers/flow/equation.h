@@ -33,6 +33,7 @@ struct FlowEquation {
   FlowDiffusion diffusion = FlowDiffusion::kImplicit;
   FlowPressure pressure = FlowPressure::kIncremental;
 
+  bool is_diffused_implicitly() const { return diffusion == FlowDiffusion::kImplicit; }
   /// Raises ValueError or TypeError for what is out of range or does not fit the box.
   void check() const;
   /// And for what does not fit the state.

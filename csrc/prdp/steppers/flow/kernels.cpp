@@ -52,7 +52,7 @@ std::optional<PaddedVelocity> pad_velocity(const FlowEquation& e, const at::Tens
   PaddedVelocity found{{}, at::empty(sizes, u.options()), at::empty({batch}, u.options().dtype(at::kLong))};
   found.velocity = found.padded;
   for (int64_t axis = 0; axis < d; ++axis) found.velocity = found.velocity.narrow(axis + 2, 1, box.shape()[axis]);
-  const bool grows_with_nu = e.advection == FlowAdvection::kCentral && e.diffusion == FlowDiffusion::kImplicit;
+  const bool grows_with_nu = e.advection == FlowAdvection::kCentral && e.is_diffused_implicitly();
   const bool launched = each_sample({"FlowStart", kFlow}, u, d * cells_of(box), [&]<class T>(T) {
     gpu::FlowStart<T> of{.boundary = {.grid = grid_of(box),
                                       .u = field_of<const T>(u),

@@ -1,195 +1,12 @@
 #include "prdp/steppers/flow/step.h"
 
-#include <ATen/core/grad_mode.h>
-#include <torch/csrc/autograd/autograd.h>
-
-#include <optional>
-
-#include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/balance.h"
 #include "prdp/steppers/flow/diffusion.h"
-#include "prdp/steppers/flow/explicit_loops.h"
-#include "prdp/steppers/flow/kernels.h"
-#include "prdp/steppers/flow/limits.h"
+#include "prdp/steppers/flow/explicit_part.h"
 #include "prdp/steppers/flow/projection.h"
 #include "prdp/steppers/flow/tendency.h"
 
 namespace prdp {
-
-namespace {
-
-/// t with zeros in these samples; either may be undefined.
-at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
-  return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
-}
-
-/// Without what the boundary brings into these samples: zero times NaN would be NaN. A value that all samples share is
-/// left, as all are refused then.
-FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples) {
-  if (!samples.defined()) return e;
-  const auto clear = [&](at::Tensor& t) {
-    if (t.defined() && t.dim() > 1 && t.size(0) == samples.size(0)) t = cleared(t, samples);
-  };
-  clear(e.inflow);
-  for (auto& velocity : e.wall_velocity) clear(velocity);
-  return e;
-}
-
-/// The velocity that the explicit part starts from, and its change by explicit Euler.
-struct ExplicitPart {
-  at::Tensor velocity, change;
-};
-ExplicitPart explicit_part(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused) {
-  const auto velocity = cleared(with_boundary, refused);
-  const auto change = cleared(tendency(without_boundary_of(e, refused), velocity), refused);
-  return {velocity, flow_has_loops(velocity) ? change.mul_(e.dt) : change * e.dt};
-}
-
-/// The state of a step with its boundary values, and the samples that it cannot take.
-struct Beginning {
-  at::Tensor velocity;
-  RefusedSamples refused;                           // with kernels, only where the host looks
-  std::optional<flow_kernels::PaddedVelocity> of_kernels{};  // its status names the refused, whose values are zero
-
-  /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
-  at::Tensor to_clear() const { return of_kernels ? at::Tensor() : refused.mask; }
-  /// 0, or why a sample was refused; undefined: none was.
-  at::Tensor status() const {
-    if (of_kernels) return of_kernels->status;
-    return refused.mask.defined() ? refused.status * refused.mask : at::Tensor();
-  }
-};
-Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks) {
-  if (auto start = flow_kernels::pad_velocity(e, u))
-    return {start->velocity, looks ? refused_by(start->status) : RefusedSamples{}, start};
-  const auto velocity = with_boundary_values(e, u);
-  return {velocity, find_refused(e, velocity.detach())};
-}
-
-/// The velocity of a beginning, and its change.
-ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning) {
-  if (!beginning.of_kernels) return explicit_part(e, beginning.velocity, beginning.refused.mask);
-  const auto change = flow_kernels::change(e, *beginning.of_kernels);
-  if (change.defined()) return {beginning.velocity, change};
-  return explicit_part(e, beginning.velocity, beginning.of_kernels->status.ne(0));
-}
-
-bool is_implicit(const FlowEquation& e) { return e.diffusion == FlowDiffusion::kImplicit; }
-
-/// Tensors to differentiate for. Where autograd records, they stay connected to what they came from.
-at::Tensor input_of(const at::Tensor& t, bool needed) {
-  if (!t.defined() || !needed) return t;
-  return at::GradMode::is_enabled() && t.requires_grad() ? t.alias() : t.detach().requires_grad_();
-}
-
-/// grad() of torch, for the inputs that are needed.
-std::vector<at::Tensor> gradients(std::vector<at::Tensor> outputs, std::vector<at::Tensor> cotangents,
-                                  const std::vector<at::Tensor>& inputs, at::IntArrayRef needed, bool create_graph) {
-  std::vector<at::Tensor> of, bars, wanted;
-  for (size_t i = 0; i < outputs.size(); ++i)
-    if (outputs[i].defined() && outputs[i].requires_grad() && cotangents[i].defined()) {
-      of.push_back(outputs[i]);
-      bars.push_back(cotangents[i]);
-    }
-  for (size_t i = 0; i < inputs.size(); ++i)
-    if (needed[i]) wanted.push_back(inputs[i]);
-  std::vector<at::Tensor> all(inputs.size());
-  if (of.empty() || wanted.empty()) return all;
-  const auto found = torch::autograd::grad(of, wanted, bars, create_graph, create_graph, /*allow_unused=*/true);
-  for (size_t i = 0, next = 0; i < inputs.size(); ++i)
-    if (needed[i]) all[i] = found[next++];
-  return all;
-}
-
-/// The gradients of a step by recording it and differentiating what was recorded; for derivatives of derivatives.
-std::vector<at::Tensor> recorded_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
-                                     SolveOptions options, at::IntArrayRef needed) {
-  options.adjoint_log = 0;  // the solves are nodes of their own here: each would log itself as the whole step
-  const auto given = equation.tensors();
-  std::vector<at::Tensor> inputs{input_of(u, needed[0])};
-  for (size_t i = 0; i < given.size(); ++i) inputs.push_back(input_of(given[i], needed[i + 1]));
-  const auto step =
-      flow_step(equation.with_tensors(at::TensorList(inputs).slice(1)), inputs[0], options, /*reported=*/false);
-  return gradients({step.u, step.potential}, {cotangent.u, cotangent.potential}, inputs, needed, /*create_graph=*/true);
-}
-
-/// The gradients of u and the tensors of the equation from the cotangents of the velocity with its boundary values, of
-/// its change, and of ν in the diffusion.
-std::vector<at::Tensor> explicit_vjp_by_autograd(const FlowEquation& equation, const at::Tensor& u,
-                                                 const at::Tensor& refused, const at::Tensor& velocity_bar,
-                                                 const DiffuseVjp& back, at::IntArrayRef needed) {
-  const at::AutoGradMode record(true);
-  std::vector<at::Tensor> inputs{u.detach().requires_grad_()};
-  const auto given = equation.tensors();
-  for (size_t i = 0; i < given.size(); ++i)
-    inputs.push_back(given[i].defined() ? given[i].detach().requires_grad_(needed[i + 1]) : given[i]);
-  const auto e = equation.with_tensors(at::TensorList(inputs).slice(1)).for_state(u);
-  const auto part = explicit_part(e, with_boundary_values(e, inputs[0]), refused);
-  return gradients({part.velocity, part.change, e.nu}, {velocity_bar, joined(back.change), back.nu}, inputs, needed,
-                   /*create_graph=*/false);
-}
-
-/// Those that are needed, of the sizes and options of what they belong to.
-std::vector<at::Tensor> as_given(const FlowEquation& equation, std::vector<at::Tensor> all, at::IntArrayRef needed) {
-  const auto given = equation.tensors();
-  for (size_t i = 0; i < all.size(); ++i) {
-    if (!needed[i]) all[i] = at::Tensor();
-    else if (i > 0 && all[i].defined()) all[i] = all[i].reshape(given[i - 1].sizes()).to(given[i - 1].options());
-  }
-  return all;
-}
-
-/// explicit_vjp_by_autograd() by the loops of the CPU.
-std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, const at::Tensor& u,
-                                              const at::Tensor& refused, const at::Tensor& velocity_bar,
-                                              const DiffuseVjp& back, at::IntArrayRef needed) {
-  const auto e = without_boundary_of(equation.for_state(u), refused);
-  const auto velocity = cleared(with_boundary_values(e, u), refused);
-  auto found = tendency_vjp(e, velocity, back.change[0] * e.dt);
-  add_to(found.nu, back.nu);
-  auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
-  add_to(of_boundary.inflow, found.inflow);
-  std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
-  all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
-  return as_given(equation, std::move(all), needed);
-}
-
-/// The way back through the diffusion and the balance.
-struct ImplicitBack {
-  const FlowEquation& e;
-  const at::Tensor &diffused_bar, &potential_bar;
-  const SolveOptions& options;
-  std::vector<OperatorSpec> operators{};
-  flow_kernels::ImplicitPart part{};
-
-  ImplicitBack(const FlowEquation& equation, const at::Tensor& bar_of_diffused, const at::Tensor& bar_of_potential,
-               const SolveOptions& o)
-      : e(equation), diffused_bar(bar_of_diffused), potential_bar(bar_of_potential), options(o) {
-    if (is_implicit(e)) operators = diffusion_operators(e, diffused_bar);
-  }
-
-  /// Balances and diffuses again: the gradient of ν needs what came of it.
-  void run_forward(const at::Tensor& change) {
-    CombinedInfo not_reported;
-    const auto balanced = balance(e, change, options, not_reported);
-    part = {.change = change,
-            .balanced = balanced.u,
-            .potential = balanced.potential,
-            .diffused = diffuse(e, operators, balanced.u, options, not_reported),
-            .potential_bar = potential_bar,
-            .largest_nu = largest_viscosity(e)};
-  }
-  /// The cotangents of the change and, with `of_nu`, of ν, for which run_forward() comes first.
-  DiffuseVjp back(bool of_nu, CombinedInfo& info) {
-    auto found = diffuse_vjp(e, operators, diffused_bar, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
-    part.lambda = found.change;
-    auto balanced = balance_vjp(e, found.change, potential_bar, of_nu ? part.change : at::Tensor(), options, info);
-    add_to(balanced.nu, found.nu);
-    return {balanced.change, balanced.nu};
-  }
-};
-
-}  // namespace
 
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
   const auto e = equation.for_state(u);
@@ -201,46 +18,13 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   const auto [velocity, change] = explicit_part(e, beginning);
   CombinedInfo info;
   const auto balanced = balance(e, change, options, info);
-  const auto diffused =
-      is_implicit(e) ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info) : FlowParts{change};
+  const auto diffused = e.is_diffused_implicitly()
+                            ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info)
+                            : FlowParts{change};
   const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
   const bool none_refused = looks && !refused.mask.defined();
   return {cleared(next, beginning.to_clear()), cleared(potential, beginning.to_clear()),
           info.info(none_refused ? at::Tensor() : beginning.status())};
-}
-
-std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Tensor& u, const FlowCotangent& cotangent,
-                                      const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
-  if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
-  const auto e = equation.for_state(u);
-  const bool needs_nu = needed[1] != 0;  // u is first, then equation.tensors(), ν at their head
-  const auto beginning = begin(e, u, /*looks=*/false);
-  const auto to_clear = beginning.to_clear();
-  CombinedInfo adjoint;
-  const auto potential_bar = cleared(cotangent.potential, to_clear);
-  const auto velocity_bar =
-      project_vjp(*e.box, cleared(cotangent.u, to_clear), potential_bar, beginning.status(), options, adjoint);
-  DiffuseVjp back{{velocity_bar.on_free_faces}, {}};
-  ImplicitBack implicit(e, velocity_bar.on_free_faces, potential_bar, options);
-  if (is_implicit(e)) {
-    if (needs_nu) implicit.run_forward(explicit_part(e, beginning).change);
-    // With kernels the share of ν is made below, of implicit.part; else it comes with this solve.
-    back = implicit.back(/*of_nu=*/needs_nu && !beginning.of_kernels, adjoint);
-  }
-  info = adjoint.info();
-  // Back through the explicit part: by kernels, which add the share of ν; where none can be made, by autograd.
-  if (beginning.of_kernels) {
-    auto found =
-        flow_kernels::explicit_vjp(e, *beginning.of_kernels, velocity_bar.u, back.change, implicit.part, needed);
-    if (found) return as_given(equation, *std::move(found), needed);
-    // The same adjoint solve again, now with the share of ν; `info`, taken above, does not count it.
-    if (is_implicit(e) && needs_nu) back = implicit.back(/*of_nu=*/true, adjoint);
-    return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar.u, back, needed);
-  }
-  // On the CPU by loops, else by autograd.
-  const auto by_loops = flow_has_loops(u);
-  return (by_loops ? explicit_vjp_by_loops : explicit_vjp_by_autograd)(equation, u, to_clear, velocity_bar.u, back,
-                                                                       needed);
 }
 
 }  // namespace prdp

@@ -189,7 +189,7 @@ SolveResult one_step(const FlowEquation& equation, const at::Tensor& u, Output o
 
 /// Whether the implicit diffusion takes the forces with their pressure, and commutes with the projection after it.
 bool is_diffused_with_pressure(const FlowEquation& e) {
-  return e.diffusion == FlowDiffusion::kImplicit && !e.box->fields(e.nu.options()).free.defined();
+  return e.is_diffused_implicitly() && !e.box->fields(e.nu.options()).free.defined();
 }
 
 SolveResult unrolled_rollout(const FlowEquation& equation, const at::Tensor& u, int64_t steps,

@@ -1,0 +1,37 @@
+#pragma once
+#include <optional>
+
+#include "prdp/steppers/flow/kernels.h"
+#include "prdp/steppers/flow/limits.h"
+
+namespace prdp {
+
+/// t with zeros in these samples; either may be undefined.
+at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples);
+
+/// Without what the boundary brings into these samples: zero times NaN would be NaN. A value that all samples share is
+/// left, as all are refused then.
+FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples);
+
+/// The state of a step with its boundary values, and the samples that it cannot take.
+struct Beginning {
+  at::Tensor velocity;
+  RefusedSamples refused;                                    // with kernels, only where the host looks
+  std::optional<flow_kernels::PaddedVelocity> of_kernels{};  // its status names the refused, whose values are zero
+
+  /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
+  at::Tensor to_clear() const { return of_kernels ? at::Tensor() : refused.mask; }
+  /// 0, or why a sample was refused; undefined: none was.
+  at::Tensor status() const;
+};
+Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks);
+
+/// The velocity that the explicit part starts from, and its change by explicit Euler.
+struct ExplicitPart {
+  at::Tensor velocity, change;
+};
+ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning);
+/// The same by tensor operations or loops, from u with its boundary values and the samples that are refused.
+ExplicitPart explicit_part_of(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused);
+
+}  // namespace prdp
