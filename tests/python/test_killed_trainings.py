@@ -53,14 +53,15 @@ def seconds_in(trainer, checkpoint):
     return state[state.index("seconds") + 1].tolist()  # names and tensors by turns
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
-@pytest.mark.parametrize(
-    "task, intervals, signals",
+@pytest.mark.parametrize(  # test_kills.py has more of both trainers
+    "trainer, task, intervals, signals",
     [
-        ("emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
-        ("parameters", 500, [SIGKILL]),
-        ("corrector", 40, [SIGKILL]),
-        ("field", 150, [SIGKILL]),
+        ("python", "emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
+        ("cpp", "emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
+        ("cpp", "parameters", 500, [SIGKILL]),
+        ("python", "corrector", 40, [SIGKILL]),
+        ("cpp", "corrector", 40, [SIGKILL]),
+        ("cpp", "field", 150, [SIGKILL]),
     ],
 )
 def test_a_killed_training_goes_on_bit_for_bit(tmp_path, trainer, task, intervals, signals):
@@ -142,9 +143,8 @@ def without_a_part(trainer, content):
     return changed.getvalue()
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
 @pytest.mark.parametrize(
-    "change", [lambda *_: b"no state at all", without_a_part], ids=["no state", "a part is missing"]
+    "trainer, change", [("cpp", lambda *_: b"no state at all"), ("cpp", without_a_part), ("python", without_a_part)]
 )
 def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_from(tmp_path, trainer, change):
     scene = scene_of("parameters", tmp_path)
