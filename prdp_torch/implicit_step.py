@@ -120,8 +120,7 @@ class _Asked(NamedTuple):
 
 def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
     """Whether a function has two arguments without a default. What takes any number, as compiled functions do, is asked
-    for the function that it wraps, and a module that takes any number for the one module that it wraps, as those of
-    `torch.compile` and of data parallelism do."""
+    for the function that it wraps, as the modules of `torch.compile` and of data parallelism are for theirs."""
     if rhs is None:
         return False
     may_tell = [(rhs, False), (rhs, True)]  # the first that has a fixed number of arguments does
@@ -136,8 +135,9 @@ def _takes_two(rhs: Callable[..., Tensor] | None) -> bool:
         if all(p.kind is not p.VAR_POSITIONAL for p in parameters):
             positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
             return sum(p.kind in positional and p.default is p.empty for p in parameters) == 2
-    inner = list(rhs.children()) if isinstance(rhs, torch.nn.Module) else []
-    return len(inner) == 1 and _takes_two(inner[0])
+    parallel = (torch.nn.DataParallel, torch.nn.parallel.DistributedDataParallel)
+    inner = rhs.module if isinstance(rhs, parallel) else getattr(rhs, "_orig_mod", None)  # that of torch.compile
+    return isinstance(inner, torch.nn.Module) and _takes_two(inner)
 
 
 class ConstantOperator(torch_private.HearsOfMoves):

@@ -194,13 +194,13 @@ class HasSettings(torch_private.HearsOfMoves):
         return f"solver={self.method}{by}, max_iter={self.max_iter}, rtol={self.rtol:g}, backward={self.backward}"
 
 
-@functools.cache
 def _bits_of(number: float) -> int:
     """The integer with the bits of a number in float64; of a tolerance, it is not negative."""
     bits: int = struct.unpack("<q", struct.pack("<d", number))[0]
     return bits
 
 
+@functools.cache
 def _meant_setting(kind: type[HasSettings], name: str) -> str | None:
     """What to say of a new attribute that must be meant for a setting, which would stay as it is. Classes outside this
     library may have attributes of any name."""

@@ -137,7 +137,7 @@ def real_tensor(who: str, name: str, value: Number) -> Tensor:
 def kept_numbers(values: float | list[float]) -> Tensor:
     """A tensor in float64 on the CPU, under any default device; one to train with, even where it is made in inference
     mode."""
-    if torch.is_inference_mode_enabled():
+    if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():
         with torch.inference_mode(False):
             return torch.tensor(values, dtype=torch.float64, device="cpu")
     return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -119,14 +119,54 @@ def test_nor_in_forward_mode():
     assert alone.abs().max() > 1e-3 and not tangent[1].any()
 
 
-def test_a_sample_beyond_the_range_of_unrolled_derivatives_loses_its_own():
-    """Its A scales by 1e160, whose squares leave float64."""
-    c = torch.tensor(0.5, dtype=F64, requires_grad=True)
-    t = torch.tensor([[1.0], [1e160]], dtype=F64)
-    A = operators.Function(lambda v, c, t: t * v + c * torch.linspace(0, 1, N, dtype=F64) * v, tensors=(c, t))
-    b = field((N,), batch=2, seed=3)[:, 0]
-    u, _ = prdp.linear_solve(A, b, prdp.BiCGStab(30, rtol=1e-6), backward="unrolled", on_failure="zero_grad")
-    found = torch.autograd.grad(u[0].square().sum(), c)[0]
-    d = torch.linspace(0, 1, N, dtype=F64)
-    expected = (-2 * b[0].square() * d / (1 + c.detach() * d) ** 3).sum()
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+def test_tensors_that_all_samples_share_stay_as_they_are_where_their_first_extent_is_the_batch():
+    """Shared weights of three, a tensor for the diagonal alone, and null vectors, in a batch of as many; sample 1 has a
+    right-hand side of zero, or NaN in a tensor of its own."""
+    b, s, _ = numbers("A")
+    weights = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
+
+    def gradient(b, s, rows=slice(None)):
+        c = weights.clone().requires_grad_()
+        A = operators.Function(
+            lambda v, c, s: s * v + c.exp().sum() * (2 * v - v.roll(1, -1) - v.roll(-1, -1)), tensors=(c, s)
+        )
+        for backward in ("unrolled", "implicit"):
+            u, _ = prdp.linear_solve(A, b, prdp.BiCGStab(3, rtol=0), backward=backward, on_failure="zero_grad")
+            yield torch.autograd.grad(u[rows].square().sum(), c)[0]
+
+    for mine, expected in zip(gradient(b[:, 0], s), gradient(b[HEALTHY, 0], s[HEALTHY]), strict=True):
+        torch.testing.assert_close(mine, expected, rtol=1e-9, atol=1e-12)
+
+    b[1], d = 0.0, torch.linspace(2, 3, N, dtype=F64)
+    batch = torch.arange(N).view(N, 1) % 3
+    many = b[:, 0][batch[:, 0]]  # as many samples as unknowns
+
+    def of_diagonal(b, solver):
+        c = torch.tensor(0.3, dtype=F64, requires_grad=True)
+        A = operators.Function(
+            lambda v, c, d: torch.linspace(2, 3, N, dtype=F64) * v + c * v.roll(1, -1),
+            tensors=(c, d),
+            diagonal=lambda c, d: d,
+        )
+        u, _ = prdp.linear_solve(A, b, solver, backward="unrolled", on_failure="return")
+        return torch.autograd.grad(u.square().sum(), c)[0]
+
+    for solver in (prdp.Jacobi(3, rtol=0), prdp.BiCGStab(2, rtol=0), prdp.GMRES(max_iter=1, restart=3, rtol=0)):
+        torch.testing.assert_close(of_diagonal(many, solver), of_diagonal(many[batch[:, 0] != 1], solver))
+
+    Z = torch.zeros(2, N, dtype=F64)
+    Z[0, : N // 2], Z[1, N // 2 :] = 1.0, 1.0
+
+    def two_rings(v, c):
+        halves = v.unflatten(-1, (2, N // 2))
+        return c * (2 * halves - halves.roll(1, -1) - halves.roll(-1, -1)).flatten(-2)
+
+    c = torch.tensor(0.7, dtype=F64, requires_grad=True)
+    A = operators.Function(two_rings, tensors=(c,), nullspace=Z)
+    f = b[:2, 0] - b[:2, 0] @ Z.mT @ Z / (N // 2)
+    for solver in (prdp.BiCGStab(2, rtol=0), prdp.GMRES(max_iter=1, restart=3, rtol=0)):
+        both, alone = (
+            torch.autograd.grad(prdp.linear_solve(A, of, solver, backward="unrolled")[0].square().sum(), c)[0]
+            for of in (f, f[:1])
+        )
+        torch.testing.assert_close(both, alone)

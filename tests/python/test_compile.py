@@ -122,3 +122,12 @@ def test_what_is_set_inside_a_compiled_function_breaks_the_graph_and_holds():
     torch._dynamo.reset()
     with pytest.raises(torch._dynamo.exc.Unsupported, match="is called between graphs, not traced"):
         torch.compile(update, backend="eager", fullgraph=True)(field((16,)), 0.1, 8)
+
+
+def test_operators_of_numbers_are_made_inside_a_graph():
+    def solve(b):
+        return prdp.linear_solve(operators.Heat((8,), 0.3, 0.1), b, prdp.CG(20))[0]
+
+    b = field((8,), batch=2)
+    compiled = torch.compile(solve, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(b), solve(b), rtol=0.0, atol=0.0)

@@ -15,10 +15,11 @@ bool is_of_samples(const OperatorSpec& a, size_t k, int64_t batch);
 /// Of each sample, whether its rows of these tensors are finite.
 Rows has_finite_tensors(const OperatorSpec& a, int64_t batch);
 
-/// t with the first of the other rows in place of these.
-at::Tensor with_healthy_rows(const at::Tensor& t, const Rows& replaced);
+/// t with the first of these rows in place of all others.
+at::Tensor with_healthy_rows(const at::Tensor& t, const Rows& healthy);
 
-/// A for the samples that take part, with vectors like b; the tensors of the others are those of one that does.
-OperatorSpec with_healthy_tensors(const OperatorSpec& a, const at::Tensor& b, const Rows& take_part);
+/// A for the samples that take part: in each tensor that is not finite in another sample, that has the rows of one that
+/// does. A tensor that all samples share is finite where any takes part, and stays as it is.
+OperatorSpec with_healthy_tensors(OperatorSpec a, const Rows& take_part);
 
 }  // namespace prdp

@@ -55,16 +55,16 @@ Rows misleading_a_bar(const OperatorSpec& spec, const std::vector<at::Tensor>& g
   const at::NoGradGuard no_grad;
   const auto batch = static_cast<int64_t>(rows.size());
   const auto allowed_of = at::tensor(allowed, at::kDouble).to(u.device());
-  const auto healthy = with_healthy_tensors(spec, u, rows);
+  const auto healthy = with_healthy_tensors(spec, rows);
   const auto of_solution = make_operator(healthy)->product_rule(only(gradients[0].detach(), rows), only(u, rows));
   Rows misleading(batch);
   for (size_t k = 0; k < of_solution.size(); ++k) {
     if (!needed[k + 1] || !gradients[k + 1].defined() || !of_solution[k].defined()) continue;
     const auto in_double = at::promote_types(of_solution[k].scalar_type(), at::kDouble);
-    const auto minus_right = of_solution[k].to(in_double), off = gradients[k + 1].detach() + minus_right;
+    const auto negated_implicit = of_solution[k].to(in_double), off = gradients[k + 1].detach() + negated_implicit;
     const bool of_samples = is_of_samples(spec, k, batch);
     const auto mark_by = [&](const auto& norm) {
-      const auto is_misleading = norm(off).gt(allowed_of * norm(minus_right)).expand({batch}).contiguous();
+      const auto is_misleading = norm(off).gt(allowed_of * norm(negated_implicit)).expand({batch}).contiguous();
       const auto judged = to_host<int64_t>(is_misleading.to(at::kLong), batch);
       for (int64_t i = 0; i < batch; ++i) misleading[i] = misleading[i] || (rows[i] && judged[i] != 0);
     };

@@ -100,7 +100,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
     products = of_tensors(lambda);
   } else {  // sum, look, and sum again without what overflowed
-    const auto healthy = with_healthy_tensors(a, u, not_refused(found.info.status));
+    const auto healthy = with_healthy_tensors(a, not_refused(found.info.status));
     Rows finite(cotangent.size(0), true);
     products = finite_sum(finite, [&](const Rows& some) { return product_rule_of(healthy, only(lambda, some)); });
     if (!all(finite)) {

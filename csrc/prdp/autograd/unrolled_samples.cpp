@@ -22,7 +22,7 @@ namespace {
 enum class Derivative {
   kOfIterations,
   kOfSolution,
-  kNone,     // its solve failed, and has none or is to have none
+  kNone,     // its solve failed: it has no derivative, or on_failure says that it is to get none
   kRefused,  // none: its cotangent is not finite
 };
 
@@ -115,9 +115,9 @@ class SampleVjps {
       const auto products = to_host<int64_t>(applications, batch_);
       for (int64_t i = 0; i < batch_; ++i)
         outcomes_[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
-      auto implicit = some;
-      for (int64_t i = 0; i < batch_; ++i) implicit[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
-      if (any(implicit)) add_adjoint_solves(implicit, sum);
+      auto solved = some;
+      for (int64_t i = 0; i < batch_; ++i) solved[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
+      if (any(solved)) add_adjoint_solves(solved, sum);
       return sum;
     });
   }
@@ -135,34 +135,32 @@ class SampleVjps {
     auto b = solved_.b;
     auto& m = solve.solver.preconditioner;
     if (!all(runs) && (is_function(spec_) || m.is_operator())) {  // these cannot leave out samples that do not run
-      auto replaced = runs;
-      replaced.flip();
-      solve.a = with_healthy_tensors(spec_, b, runs);
-      if (m.is_operator()) m = with_healthy_tensors(m.spec(), b, runs);
-      solve.x0 = with_healthy_rows(solved_.x0, replaced);
-      b = with_healthy_rows(b, replaced);
+      solve.a = with_healthy_tensors(spec_, runs);
+      if (m.is_operator()) m = with_healthy_tensors(m.spec(), runs);
+      solve.x0 = with_healthy_rows(solved_.x0, runs);
+      b = with_healthy_rows(b, runs);
     }
     return of_iterations_(only(finite_cotangent_, rows), b, solve, wanted_);
   }
 
   void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum) {
-    auto implicit = options_;
-    implicit.backward = Backward::kImplicit;
-    implicit.checkpoint_every = implicit.adjoint_log = 0;
-    implicit.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
-    implicit.adjoint_rtol = std::min(judged_rtol_, kRoundings / 2 * epsilon_of(solved_.b));
+    auto adjoint = options_;
+    adjoint.backward = Backward::kImplicit;
+    adjoint.checkpoint_every = adjoint.adjoint_log = 0;
+    adjoint.on_failure = OnFailure::kReturn;  // judged below, by the tolerance that was asked for
+    adjoint.adjoint_rtol = std::min(judged_rtol_, kRoundings / 2 * epsilon_of(solved_.b));
     const auto u = needs_gradient_of_a_ ? solution() : at::Tensor();
-    const auto found = implicit_vjp(only(finite_cotangent_, rows), u, spec_, implicit, wanted_, any_solve_);
+    const auto found = implicit_vjp(only(finite_cotangent_, rows), u, spec_, adjoint, wanted_, any_solve_);
     for (size_t i = 0; i < sum.size(); ++i) add_to(sum[i], found.gradients[i]);
     const auto iterations = to_host<int64_t>(found.info.iterations, batch_);
     const auto residual = to_host<double>(found.info.residual, batch_);
-    const auto status = to_host<int64_t>(found.info.status, batch_);
+    const auto statuses = to_host<int64_t>(found.info.status, batch_);
     const auto products = to_host<int64_t>(found.info.operator_applications, batch_);
     for (int64_t i = 0; i < batch_; ++i) {
       if (!rows[i]) continue;
-      const auto said = static_cast<SolveStatus>(status[i]);
+      const auto said = static_cast<SolveStatus>(statuses[i]);
       const bool has_none = is_refused(said) || said == SolveStatus::kOverflow;  // no gradient, whatever its residual
-      const bool good = status[i] < 0 && !has_none && residual[i] <= judged_rtol_;
+      const bool good = statuses[i] < 0 && !has_none && residual[i] <= judged_rtol_;
       outcomes_[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
     }
   }
