@@ -75,11 +75,12 @@ PRDP_NOINLINE void conclude(Space& space, Method& method, typename Space::States
     if (broken[i]) s.status = SolveStatus::kBreakdown;
     if (!ran_away(s)) judge(s, rtol);
   }
-  stop_at_rounding_floor(space, method, states, rtol, [rtol](const SampleState& s) {
+  const auto doubtful = [rtol](const SampleState& s) {
     const bool unsolved =
         s.status == SolveStatus::kMaxIter || (kMayExhaust<Method> && s.status == SolveStatus::kBreakdown);
     return rtol > 0.0 && !s.concluded && unsolved;
-  });
+  };
+  stop_at_rounding_floor(space, method, states, rtol, doubtful, kManyEstimates);
   for (auto& s : states) {
     s.active = false;
     s.concluded = true;

@@ -49,52 +49,59 @@ auto rounding_floors(Space& space, const Method& method) {
   return floors;
 }
 
-/// Stops those of the `doubtful` samples whose residual is rounding: at most slack · floor, with floor = ε ‖A‖ ‖u‖. The
-/// slack is 1, or 8 where rtol lies below the floor, or below 8 floors for direct methods, which reach no lower; or 100
-/// where a space is exhausted. As the floor overstates the rounding where columns of A differ in size, the residual
-/// must also be at most slack · 64 ε ‖|A| |u|‖, which componentwise_scale2() estimates: that is what a product rounds.
-/// A floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10: there u is garbage. In float64 no floor above
-/// 1e-5 ‖b‖ is taken for rounding: there u is that of a singular system, which a null vector that nobody named has made
+/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or below 8 floors for
+/// direct methods, which reach no lower; 100 where a space is exhausted.
+template <class Method>
+double slack_of_floor(const SampleState& s, double rtol, double floor) {
+  if (s.status == SolveStatus::kBreakdown) return 100.0;
+  return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
+}
+
+/// The floors of the `doubtful` samples whose residual is at most slack_of_floor() of them; zero for the others. There
+/// a floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10, as u is garbage then. In float64 no floor above
+/// 1e-5 ‖b‖ is taken for rounding: u is that of a singular system, which a null vector that nobody named has made
 /// large.
 template <class Space, class Method, class Predicate>
-PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
-                                          double rtol, const Predicate& doubtful) {
-  if (std::none_of(states.begin(), states.end(), doubtful)) return;
+auto floors_of_suspects(Space& space, const Method& method, const typename Space::States& states, double rtol,
+                        const Predicate& doubtful) {
   const auto all_floors = rounding_floors(space, method);
-  const auto slack_of = [&](const SampleState& s, double floor) {
-    if (s.status == SolveStatus::kBreakdown) return 100.0;
-    return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
-  };
   const double largest_floor = space.epsilon() < 1e-10 ? 1e-5 : 0.25;
   auto floors = space.map(states, [](const SampleState&) { return 0.0; });
   for (size_t i = 0; i < states.size(); ++i) {
     const auto& s = states[i];
-    const double floor = all_floors[i], b = std::sqrt(s.b2);
-    const double residual = std::sqrt(s.residual2);
+    const double floor = all_floors[i], b = std::sqrt(s.b2), residual = std::sqrt(s.residual2);
     const bool says_something = floor <= largest_floor * b && residual <= 0.1 * b;
-    if (doubtful(s) && says_something && residual <= slack_of(s, floor) * floor) floors[i] = floor;
+    if (doubtful(s) && says_something && residual <= slack_of_floor<Method>(s, rtol, floor) * floor) floors[i] = floor;
   }
-  if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
-  constexpr double roundings = 64.0;  // of a product
-  constexpr int64_t patterns = 8;     // one estimate misses the strongest coupling of two unknowns every second time
-  bool is_in_doubt = true;
-  for (int64_t p = 0; is_in_doubt && p < patterns; ++p) {
+  return floors;
+}
+
+/// Stops those of the `doubtful` samples whose residual is rounding: near the floor ε ‖A‖ ‖u‖, as above. As the floor
+/// overstates the rounding where columns of A differ in size, the residual must also be at most slack · 64 ε ‖|A| |u|‖,
+/// what a product rounds, by an estimate from below. It misses the strongest coupling of two unknowns every second
+/// time: more `estimates` find it. As the largest of several is less strict, they allow no slack, and a few roundings.
+template <class Space, class Method, class Predicate>
+PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
+                                          double rtol, const Predicate& doubtful, int64_t estimates = 1) {
+  if (std::none_of(states.begin(), states.end(), doubtful)) return;
+  auto floors = floors_of_suspects(space, method, states, rtol, doubtful);
+  for (int64_t p = 0; p < estimates; ++p) {
+    if (std::none_of(floors.begin(), floors.end(), [](double floor) { return floor > 0.0; })) return;
     const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, p));
-    is_in_doubt = false;
     for (size_t i = 0; i < states.size(); ++i) {
       auto& s = states[i];
       if (!(floors[i] > 0.0)) continue;
-      const double rounding_of_product = roundings * space.epsilon() * std::sqrt(componentwise_scale2[i]);
-      if (!(std::sqrt(s.residual2) <= slack_of(s, floors[i]) * rounding_of_product)) {
-        is_in_doubt = true;
-        continue;
-      }
+      const double rounding = space.epsilon() * std::sqrt(componentwise_scale2[i]), residual = std::sqrt(s.residual2);
+      const bool is_rounding = p == 0 ? residual <= slack_of_floor<Method>(s, rtol, floors[i]) * (64.0 * rounding)
+                                      : residual <= floors[i] && residual <= 4.0 * rounding;
+      if (!is_rounding) continue;
       s.stop(SolveStatus::kStagnated);
       s.floor2 = floors[i] * floors[i];
       floors[i] = 0.0;
     }
   }
 }
+inline constexpr int64_t kManyEstimates = 8;  // at most kSignPatterns
 
 /// Of each sample, whether the space of a method of least residuals is exhausted; nothing for other methods.
 template <class Space, class Method>
@@ -165,8 +172,12 @@ void confirm_candidates(Space& space, Method& method, typename Space::States& st
       if (s.status == SolveStatus::kConverged && exhausted[i] != 0.0) s.status = SolveStatus::kConvergedBreakdown;
     }
     s.rejected2 = s.residual2;
+    ++s.false_claims;
   }
   stop_at_rounding_floor(space, method, states, rtol, [](const SampleState& s) { return s.candidate && s.active; });
+  constexpr int64_t patience = 8;  // just above rtol, a method may claim falsely in every iteration
+  const auto claims_on = [](const SampleState& s) { return s.candidate && s.active && s.false_claims > patience; };
+  stop_at_rounding_floor(space, method, states, rtol, claims_on, kManyEstimates);
   for (auto& s : states)
     if (s.candidate) s.concluded = !s.active;
 }

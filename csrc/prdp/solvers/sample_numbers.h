@@ -5,8 +5,10 @@
 
 namespace prdp {
 
-/// Signs without a structure, the same for every sample: whether number i changes its own. There are many patterns, as
-/// two unknowns that A couples strongly may agree in a few. (splitmix64)
+/// Signs without a pattern, the same for every sample: whether number i changes its own.
+inline bool is_negated(int64_t i) { return std::sin(static_cast<double>((i + 1) * (i + 1))) < 0.0; }
+
+/// The same for many choices of signs, with which a few unknowns do not agree in all. (splitmix64)
 inline constexpr int64_t kSignPatterns = 16;
 inline bool is_negated(int64_t i, int64_t pattern) {
   auto bits = static_cast<uint64_t>(i * kSignPatterns + pattern + 1) * 0x9e3779b97f4a7c15;
@@ -14,6 +16,9 @@ inline bool is_negated(int64_t i, int64_t pattern) {
   bits = (bits ^ (bits >> 27)) * 0x94d049bb133111eb;
   return ((bits ^ (bits >> 31)) & 1) != 0;
 }
+
+/// The signs of several attempts at an estimate.
+inline bool is_negated_in(int64_t attempt, int64_t i) { return attempt == 0 ? is_negated(i) : is_negated(i, attempt); }
 
 /// What the spaces of one sample do with its numbers (space.h): quotients that tell a breakdown from a small number,
 /// and numbers that vanish where they are rounding. b and A are scaled to the order of one.

@@ -169,10 +169,10 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     const T* u = solution(x);
     return dot(u, u);
   }
-  Scalar componentwise_scale2(const T* x, int64_t pattern) {
+  Scalar componentwise_scale2(const T* x, int64_t attempt) {
     kernels::Workspace<T> memory;
     memory.prepare(2, length(), layout().halo);
-    apply_with_signs(solution(x), pattern, memory);
+    apply_with_signs(solution(x), [attempt](int64_t i) { return is_negated_in(attempt, i); }, memory);
     return dot(memory.vector(1), memory.vector(1));
   }
   /// Seldom: as many products, and then as many solves, as there are patterns.
@@ -181,7 +181,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     memory.prepare(2, length(), layout().halo);
     std::vector<T> values(unknowns()), scale2(unknowns(), T(0));  // of |A| |u|
     for (int64_t p = 0; p < kSignPatterns; ++p) {
-      apply_with_signs(solution(x), p, memory);
+      apply_with_signs(solution(x), [p](int64_t i) { return is_negated(i, p); }, memory);
       layout().store(memory.vector(1), T(1), values.data());
       for (int64_t i = 0; i < unknowns(); ++i) scale2[i] += values[i] * values[i];
     }
@@ -260,11 +260,12 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     return part * part < vv / 2 ? vv - part * part : dot(v, v);
   }
   /// In vector 1, A times v with signs changed.
-  void apply_with_signs(const T* v, int64_t pattern, kernels::Workspace<T>& memory) {
+  template <class Negated>
+  void apply_with_signs(const T* v, const Negated& negated, kernels::Workspace<T>& memory) {
     std::vector<T> values(unknowns());
     layout().store(v, T(1), values.data());
     for (int64_t i = 0; i < unknowns(); ++i)
-      if (is_negated(i, pattern)) values[i] = -values[i];
+      if (negated(i)) values[i] = -values[i];
     layout().load(values.data(), T(1), memory.vector(0));
     system_.a().apply(memory.vector(0), memory.vector(1));
   }

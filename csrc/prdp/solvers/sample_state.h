@@ -41,6 +41,7 @@ struct SampleState {
   double best2 = std::numeric_limits<double>::infinity();
   int64_t cycles_without_progress = 0;  // for methods whose residual never grows
   double last_progress2 = std::numeric_limits<double>::infinity();  // the residual that last fell
+  int64_t false_claims = 0;
   double rejected2 = std::numeric_limits<double>::infinity();  // true residual of the last false claim
   double floor2 = 0.0;  // where it stopped at rounding, the square of that: ε ‖A‖ ‖u‖, or what verdicts.h takes for it
   double rounding2 = 0.0;  // of b itself to the least numbers of its dtype, the square of its norm
@@ -64,7 +65,7 @@ struct SampleState {
     active = cap > 0;
     concluded = candidate = false;
     status = SolveStatus::kMaxIter;
-    iterations = cycles_without_progress = next_look = 0;
+    iterations = cycles_without_progress = next_look = false_claims = 0;
     floor2 = 0.0;
     last_progress2 = std::numeric_limits<double>::infinity();
     rejected2 = std::numeric_limits<double>::infinity();

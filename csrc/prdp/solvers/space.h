@@ -195,7 +195,8 @@ concept LoopSpace =
       s.surely_definite();
       /// ‖u‖², where u is x and the start.
       { s.solution2(x) } -> std::same_as<typename S::Scalar>;
-      /// Estimates ‖|A| |u|‖² from below as ‖A S u‖², where S is a diagonal of ±1: a pattern of is_negated().
+      /// Estimates ‖|A| |u|‖² from below as ‖A S u‖², where S is a diagonal of ±1: those of is_negated_in() for attempt
+      /// n.
       { s.componentwise_scale2(x, n) } -> std::same_as<typename S::Scalar>;
       /// A vector that the next operation may overwrite.
       { s.scratch() } -> std::convertible_to<typename S::Vector>;

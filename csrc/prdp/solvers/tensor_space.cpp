@@ -147,9 +147,11 @@ at::Tensor signs_like(const at::Tensor& v, int64_t first, int64_t pattern) {
 
 }  // namespace
 
-TensorSpace::Scalar TensorSpace::componentwise_scale2(const Vector& x, int64_t pattern) const {
+TensorSpace::Scalar TensorSpace::componentwise_scale2(const Vector& x, int64_t attempt) const {
   const auto u = solution(x).detach();
-  const auto terms = laid_out(system_.a.apply(u * signs_like(u, 0, pattern)));
+  // as is_negated_in() of sample_numbers.h
+  const auto signed_u = attempt == 0 ? at::where(unstructured_like(u).lt(0), -u, u) : u * signs_like(u, 0, attempt);
+  const auto terms = laid_out(system_.a.apply(signed_u));
   return dot(terms, terms);
 }
 

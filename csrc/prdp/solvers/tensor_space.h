@@ -160,7 +160,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     const auto u = solution(x);
     return dot(u, u);
   }
-  Scalar componentwise_scale2(const Vector& x, int64_t pattern) const;
+  Scalar componentwise_scale2(const Vector& x, int64_t attempt) const;
   Vector scratch() const { return vector(); }
   template <class Predicate>
   void freeze_unless(const States& states, const Predicate& predicate) {

@@ -145,10 +145,10 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
     const T* u = solution(x);
     return dot(u, u);
   }
-  PRDP_NOINLINE Scalar componentwise_scale2(const T* x, int64_t pattern) {
+  PRDP_NOINLINE Scalar componentwise_scale2(const T* x, int64_t attempt) {
     const T* const u = solution(x);
     Vector signed_u = scratch();
-    this->template each<1>([&](int i) { return is_negated(i, pattern) ? -u[i] : u[i]; }, into(signed_u));
+    this->template each<1>([&](int i) { return is_negated_in(attempt, i) ? -u[i] : u[i]; }, into(signed_u));
     T s = 0;
     product<1>(signed_u, [&](int, T value) { s += value * value; });
     --state_->applications;  // no part of the method
