@@ -125,9 +125,9 @@ def packed_options(
     return [method, backward, on_failure, start, kind], counts, numbers, tensors
 
 
-def check_solver(who: str, *solver: Any) -> _C.SolveOptions:
+def check_solver(who: str, *solver: Any, **others: Any) -> _C.SolveOptions:
     """Raise ValueError, in the name of `who`, unless the parts of a solver fit together; return them as options."""
-    options = _C.SolveOptions(*packed_options(*solver))
+    options = _C.SolveOptions(*packed_options(*solver, **others))
     options.check(who)
     return options
 
@@ -251,7 +251,7 @@ class Multigrid(Solver):
         self.smoothing = _check.whole("Multigrid", "smoothing", self.smoothing)
         if self.smoothing < 1:
             raise ValueError(f"Multigrid: smoothing must be >= 1, got {self.smoothing}")
-        self.preconditioner = self
+        self.preconditioner = self  # as a method, its cycles are M⁻¹
         super().__post_init__()
 
 
@@ -270,10 +270,10 @@ class Direct(Solver):
 
 
 def solve_options(
-    method: str, rtol: float, restart: int, preconditioner: Preconditioner, _: object, *others: Any
+    method: str, rtol: float, restart: int, preconditioner: Preconditioner, _made_of: object, *others: Any
 ) -> _C.SolveOptions:
-    """The options but for max_iter as the compiled library takes them past the dispatcher. The one that is left out
-    tells when the tensors of the preconditioner are new."""
+    """All options but max_iter, as the compiled library takes them past the dispatcher. `_made_of` only lets `Kept`
+    notice new tensors of the preconditioner."""
     return _C.SolveOptions(*packed_options(method, 0, rtol, restart, preconditioner, *others))
 
 
@@ -340,10 +340,10 @@ def check_settings(
         _check.real(who, "rtol", rtol),
         _check.whole(who, "restart", restart),
         preconditioner,
-        _check.string(who, "backward", backward),
-        _check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
-        _check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
-        _check.string(who, "on_failure", on_failure),
-        checkpoint_every,
-        _check.string(who, "start", start),
+        backward=_check.string(who, "backward", backward),
+        adjoint_max_iter=_check.optional(_check.whole, who, "adjoint_max_iter", adjoint_max_iter),
+        adjoint_rtol=_check.optional(_check.real, who, "adjoint_rtol", adjoint_rtol),
+        on_failure=_check.string(who, "on_failure", on_failure),
+        checkpoint_every=checkpoint_every,
+        start=_check.string(who, "start", start),
     )

@@ -9,8 +9,7 @@ template <class T>
 std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing) {
   const auto given = a.grid_operator();
   if (!given) return nullptr;
-  // A hierarchy without levels stands for one that could not be made.
-  struct Kept {
+  struct Kept {  // null stands for a hierarchy that could not be made: that is kept, too
     std::shared_ptr<const Hierarchy<T>> hierarchy;
     int64_t bytes() const { return hierarchy ? hierarchy->bytes() : 0; }
   };
@@ -26,18 +25,20 @@ std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kerne
 
 template <class T>
 Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Kernel<T>& a, const Kernel<T>* transpose,
-                        bool transposed, int64_t smoothing)
-    : hierarchy_(std::move(hierarchy)), transposed_(transposed) {
+                        bool kernel_is_transposed, int64_t smoothing)
+    : hierarchy_(std::move(hierarchy)), kernel_is_transposed_(kernel_is_transposed) {
   levels_.reserve(hierarchy_->levels().size());
   add_level(0, a, transpose, smoothing);
-  // Laplacians keep the planes of their one channel apart.
+  // In the layout of a Stencil, planes are channels; in that of a Laplacian, which has one, they are planes of the
+  // grid.
   const bool channels = dynamic_cast<const Stencil<T>*>(&a) != nullptr;
   const int64_t fields = channels ? a.layout().planes : 1;
   levels_[0].grid = PaddedGrid::of(a.layout(), hierarchy_->levels()[0].grid, channels);
   for (size_t l = 1; l < hierarchy_->levels().size(); ++l) {
-    auto own = std::make_unique<Stencil<T>>(hierarchy_->packed(l, transposed), fields, T(1));
+    auto own = std::make_unique<Stencil<T>>(hierarchy_->packed(l, kernel_is_transposed), fields, T(1));
     std::unique_ptr<Kernel<T>> own_transpose;
-    if (transpose) own_transpose = std::make_unique<Stencil<T>>(hierarchy_->packed(l, !transposed), fields, T(1));
+    if (transpose)
+      own_transpose = std::make_unique<Stencil<T>>(hierarchy_->packed(l, !kernel_is_transposed), fields, T(1));
     add_level(l, *own, own_transpose.get(), smoothing);
     levels_[l].own = std::move(own);
     levels_[l].own_transpose = std::move(own_transpose);
@@ -50,13 +51,11 @@ Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Ker
     for (size_t t = 0; t + 1 < transfers.size(); ++t) {
       const auto& grid = transfers[t].coarse();
       const auto layout = Layout<T>::of_fields(fields, grid.shape[0] * grid.shape[1], grid.shape[2]);
-      level.between.push_back(PaddedGrid::of(layout, grid, true));
+      level.part_way.push_back(PaddedGrid::of(layout, grid, true));
       length = std::max(length, layout.length());
     }
-    level.memory.prepare(kBetween + static_cast<int64_t>(level.between.size()), length, level.a->layout().halo);
+    level.memory.prepare(kPartWay + static_cast<int64_t>(level.part_way.size()), length, level.a->layout().halo);
   }
-  contiguous_.resize(hierarchy_->coarsest_inverse().size());
-  solved_.resize(contiguous_.size());
 }
 
 template <class T>
@@ -92,7 +91,7 @@ const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
   const auto& a = kernel(level, transposed);
   const int64_t length = a.length();
   T *x = level.memory.vector(kX), *y = level.memory.vector(kY), *r = level.memory.vector(kR);
-  const bool of_transpose = transposed != transposed_;
+  const bool of_transpose = transposed != kernel_is_transposed_;
 
   a.divide_by_diagonal(b, x);
   vectors_.scale(level.q[0], x, x, length);
@@ -101,9 +100,9 @@ const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
 
   a.residual(b, x, r);
   const auto vector = [&](size_t t) {
-    return t == 0 ? r : level.memory.vector(kBetween + static_cast<int64_t>(t) - 1);
+    return t == 0 ? r : level.memory.vector(kPartWay + static_cast<int64_t>(t) - 1);
   };
-  const auto grid = [&](size_t t) -> const PaddedGrid& { return t == 0 ? level.grid : level.between[t - 1]; };
+  const auto grid = [&](size_t t) -> const PaddedGrid& { return t == 0 ? level.grid : level.part_way[t - 1]; };
   auto& next = levels_[l + 1];
   const size_t last = transfers.size() - 1;
   for (size_t t = 0; t < last; ++t) transfers[t].restrict(grid(t), vector(t), grid(t + 1), vector(t + 1), of_transpose);
@@ -133,7 +132,7 @@ const T* Multigrid<T>::solve_coarsest(const T* b, bool transposed) {
   contiguous_.resize(layout.unknowns());
   solved_.resize(layout.unknowns());
   layout.store(b, T(1), contiguous_.data());
-  const bool by_columns = transposed != transposed_;
+  const bool by_columns = transposed != kernel_is_transposed_;
   for (int64_t f = 0; f < fields; ++f)
     for (int64_t i = 0; i < n; ++i) {
       T sum = 0;

@@ -25,14 +25,14 @@ class Multigrid final : public Preconditioner<T> {
     const Kernel<T>*a, *transpose;
     std::unique_ptr<Kernel<T>> own, own_transpose;  // of coarse levels
     PaddedGrid grid;
-    std::vector<PaddedGrid> between;  // grids behind each transfer but the last
-    std::vector<T> p, q;              // coefficients of the smoothing steps
-    Workspace<T> memory;              // b, x, y, r, and a vector for each of `between`
+    std::vector<PaddedGrid> part_way;  // grids behind each transfer but the last
+    std::vector<T> p, q;               // coefficients of the smoothing steps
+    Workspace<T> memory;               // b, x, y, r, and a vector for each of `part_way`
   };
-  enum Vector { kB, kX, kY, kR, kBetween };
+  enum Vector { kB, kX, kY, kR, kPartWay };
 
   Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Kernel<T>& a, const Kernel<T>* transpose,
-            bool transposed, int64_t smoothing);
+            bool kernel_is_transposed, int64_t smoothing);
   void add_level(size_t l, const Kernel<T>& a, const Kernel<T>* transpose, int64_t smoothing);
   const Kernel<T>& kernel(const Level& level, bool transposed) const {
     return transposed && level.transpose ? *level.transpose : *level.a;
@@ -42,7 +42,7 @@ class Multigrid final : public Preconditioner<T> {
   const T* solve_coarsest(const T* b, bool transposed);
 
   std::shared_ptr<const Hierarchy<T>> hierarchy_;
-  bool transposed_;  // the kernel is Aᵀ of what the hierarchy was made of
+  bool kernel_is_transposed_;  // it is Aᵀ of what the hierarchy was made of
   std::vector<Level> levels_;
   WholeVectors<T> vectors_;
   std::vector<T> contiguous_, solved_;

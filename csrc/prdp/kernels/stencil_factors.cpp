@@ -17,15 +17,15 @@ Eigen::VectorXd values_of(const T* v, const Layout<T>& layout) {
   layout.store(v, T(1), values.data());
   return values.template cast<double>();
 }
-/// Back into padded memory; false if they are not finite.
+/// Into padded memory; false if they are not finite.
 template <class T>
-bool give_back(const Eigen::VectorXd& x, const Layout<T>& layout, T* d) {
+bool store_if_finite(const Eigen::VectorXd& x, const Layout<T>& layout, T* d) {
   const Eigen::Matrix<T, Eigen::Dynamic, 1> values = x.template cast<T>();
   layout.load(values.data(), T(1), d);
   return values.allFinite();
 }
 
-/// One factorisation for all channels, in double whatever T is.
+/// One factorisation for all channels. It is made in double; a sum over axes is applied in T.
 template <class T>
 class StencilFactors final : public Factors<T> {
  public:
@@ -33,11 +33,11 @@ class StencilFactors final : public Factors<T> {
       : layout_(kernel.layout()), transposed_(transposed) {
     const auto& a = kernel.coefficients();
     if (a.pattern().nearest && a.rows() == 1 && !kernel.null_space()) thomas_.emplace(a);
-    if (thomas_ && thomas_->is_dominant()) return;
+    if (thomas_ && thomas_->is_dominant()) return;  // it exchanges no pivots
     thomas_.reset();
     if (a.rows() > 1)
       axes_ = fast_diagonalisation(a, key, kernel.null_space() ? kernel.null_space()->count_in_one_field() : 0);
-    if (axes_) return;
+    if (axes_) return;  // of a symmetric A, its own transpose
     sparse_ = sparse_factors(a, key, transposed, layout_.rows * layout_.nx,
                              pins_of(kernel.null_space(), kernel.left_null_space(), 0));
   }
@@ -52,10 +52,11 @@ class StencilFactors final : public Factors<T> {
         continue;
       }
       Eigen::VectorXd field = x.segment(channel * points, points);
-      sparse_->solve(field, transposed_);
+      sparse_->solve(field,
+                     transposed_);  // factors of the matrix that is not transposed; thomas_ has the rows as they are
       x.segment(channel * points, points) = field;
     }
-    return give_back(x, layout_, d);
+    return store_if_finite(x, layout_, d);
   }
 
  private:
@@ -94,10 +95,10 @@ class NavierStokesFactors final : public Factors<T> {
     if (!lu_->is_regular()) return false;
     Eigen::VectorXd x = values_of(r, layout_);
     auto pressure = x.tail(layout_.rows * layout_.nx);
-    pressure.array() -= pressure.mean();
+    pressure.array() -= pressure.mean();  // of the divergence, which its left null vector forbids
     lu_->solve(x, transposed_);
-    pressure.array() -= pressure.mean();
-    return give_back(x, layout_, d);
+    pressure.array() -= pressure.mean();  // of the pressure, one of which was held at zero
+    return store_if_finite(x, layout_, d);
   }
 
  private:

@@ -87,6 +87,9 @@ void Transfer<T>::for_each_row(const PaddedGrid& grid, const Body& body) const {
   });
 }
 
+// Along the axis, coarse points C and those between, b: C b C b … where it is periodic, first_coarse_ = 0; b C b C b
+// between two zeros where it is not, first_coarse_ = 1. So a row of b has one place more in front.
+
 template <class T>
 void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right, T* coarse) const {
   const auto& loops = kernels::loops<T>();
@@ -95,10 +98,11 @@ void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right,
   T *here = rows.coarse.data(), *others = rows.between.data();  // the latter from place 1 on
   if (first_coarse_ == 0) loops.split(fine, here, others + 1, nx);
   else loops.split(fine, others + 1, here, nx);
-  others[0] = others[count];
+  others[0] = others[count];  // of an odd periodic axis, two C meet there, and compress() has left a weight of zero
   others[count + 1] = T(0);
-  const int64_t before = first_coarse_, after = before + 1;
-  loops.restrict_row(here, others + before, right + before, others + after, left + after, coarse, coarse_.shape[2]);
+  const int64_t place_before = first_coarse_, place_after = place_before + 1;
+  loops.restrict_row(here, others + place_before, right + place_before, others + place_after, left + place_after,
+                     coarse, coarse_.shape[2]);
 }
 
 template <class T>
@@ -147,8 +151,8 @@ void Transfer<T>::interpolate_along_x(const T* coarse, const T* left, const T* r
   here[0] = T(0);
   here[coarse_count + 1] = periodic_ ? here[1] : T(0);
   std::fill_n(others, count, T(0));
-  const int64_t before = first_between_, after = before + 1;
-  loops.add_interpolated(here + before, left + 1, here + after, right + 1, others, count);
+  const int64_t place_before = first_between_, place_after = place_before + 1;
+  loops.add_interpolated(here + place_before, left + 1, here + place_after, right + 1, others, count);
   if (first_coarse_ == 0) loops.add_merged(here + 1, others, fine, nx);
   else loops.add_merged(others, here + 1, fine, nx);
 }

@@ -22,6 +22,7 @@ at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
 
 Separability::Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic)
     : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
+  // Joined into one tensor, for one copy to the host, and taken apart there in this order: lines, ends, Sizes.
   std::vector<at::Tensor> lines, columns;
   for (int64_t axis = 0; axis < dim(); ++axis) lines.push_back(middle_line(coefficients, axis));
   for (const auto& line : lines) columns.push_back(line.flatten(1));
@@ -44,7 +45,7 @@ Separability::Separability(const at::Tensor& coefficients, const std::vector<boo
   for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) columns.push_back(largest_inside(t));
   columns.push_back(largest(size));
   host_ = at::cat(columns, 1).to(at::kCPU, at::kDouble).contiguous();
-  int64_t column = 0;  // the columns back in the order in which they were joined
+  int64_t column = 0;
   const auto next = [&](int64_t count) { return host_.narrow(1, std::exchange(column, column + count), count); };
   for (const auto& line : lines)
     lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
@@ -115,7 +116,7 @@ InnerBox Separability::inner_box(int64_t s) const {
 
 kernels::FactorKey Separability::key(int64_t s, int64_t null_vectors, const at::TensorOptions& options) const {
   kernels::FactorKeyMaker key;
-  const auto row = host_.select(0, s);  // without the sizes: where there is a sum, the others tell all of it
+  const auto row = host_.select(0, s);  // without the sizes: once A is known to be a sum, lines and ends determine it
   key.add(row.const_data_ptr<double>(), row.size(0) - sizes_.size(1)).add(shape_.data(), dim()).add(null_vectors);
   for (const bool closed : periodic_) key.add(int64_t{closed});
   key.add(static_cast<int64_t>(c10::typeMetaToScalarType(options.dtype())));

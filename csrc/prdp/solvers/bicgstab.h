@@ -13,8 +13,8 @@ namespace prdp {
 /// ω = s·t / t·t, x += α p + ω s, r = s - ω t. Preconditioned from the right: A M⁻¹ takes the place of A, and x moves
 /// along M⁻¹ p and M⁻¹ s.
 ///
-/// Where r has become all but orthogonal to r̂, so that two digits of ρ are left at most, it starts anew from
-/// r̂ = p = r. Where r̂·v is rounding, it leaves out the half of the iteration with α, and starts anew after the other.
+/// It starts anew from r̂ = p = r where r is all but orthogonal to r̂, so that at most two digits of ρ are left. Where
+/// r̂·v is rounding, it leaves out the step along p, takes the one along s, and then starts anew.
 /// It breaks down where r·A r is rounding: as r̂·v of a start, or as s·t of the iteration before.
 template <VectorSpace Space>
 class BiCGStabMethod {

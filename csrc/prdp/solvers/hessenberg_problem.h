@@ -91,6 +91,8 @@ class HessenbergProblem {
     Scalar inverse_diagonal{};  // 1/R_jj, or zero
     Scalar g{}, y{};
   };
+  static constexpr int64_t kNumbersOfColumn = 6;  // solve_kernel_text.cpp counts the memory of a kernel by it
+  static_assert(sizeof(Column) == kNumbersOfColumn * sizeof(Scalar));
   static constexpr double kOneUnit = 1.0 / 16;  // numbers vanish at sixteen units of rounding
   static constexpr double kSolved2 = 1e-6;      // a cycle that takes a thousandth off its residual solves
 

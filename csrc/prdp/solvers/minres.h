@@ -45,26 +45,29 @@ class MinresMethod {
   void step() {
     const Scalar inverse = space_.ratio(one_, gamma_);
     const Scalar delta = space_.apply_with_dots(space_.is_preconditioned() ? z_ : v_, az_)[0] * inverse * inverse;
-    combine(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
+    // next = A z/γ - (δ/γ) v - (γ/γ₋) v₋, the next Lanczos vector
+    combine_into_next(az_, inverse, v_, -delta * inverse, last_v_, -space_.ratio(coupling_, last_gamma_));
     space_.keep_in_range(next_);  // where rounding grows as fast as the residual falls
-    turn(v_, last_v_);
+    shift_in_next(v_, last_v_);  // v of this iteration is last_v_ from here on
     const Vector& z = space_.is_preconditioned() ? z_ : last_v_;
     const Scalar square = space_.is_preconditioned() ? space_.precondition(v_, next_z_) : space_.dot(v_, v_);
-    const Scalar zero = space_.is_zero(square), holds = space_.is_larger(square, square * 0) + zero;
+    const Scalar zero = space_.is_zero(square);
+    const Scalar is_not_negative = space_.is_larger(square, square * 0) + zero;
     space_.break_down_unless_positive(square + zero, rr_);
-    const Scalar gamma = root(square * holds);
+    const Scalar gamma = root(square * is_not_negative);
     const Scalar a0 = c_ * delta - last_c_ * s_ * coupling_, a2 = s_ * delta + last_c_ * c_ * coupling_;
-    const Scalar a3 = last_s_ * coupling_, a1 = root(a0 * a0 + square * holds);
+    const Scalar a3 = last_s_ * coupling_, a1 = root(a0 * a0 + square * is_not_negative);
     const Scalar row2 = delta * delta + coupling_ * coupling_ + square;
-    space_.break_down_unless_positive(one_ - space_.breaks_down(a1, 100 * row2, one_, rr_), rr_);
+    const Scalar is_singular = space_.breaks_down(a1, 100 * row2, one_, rr_);  // α₁ is rounding
+    space_.break_down_unless_positive(one_ - is_singular, rr_);
     last_c_ = c_;
     last_s_ = s_;
     c_ = space_.ratio(a0, a1);
     s_ = space_.ratio(gamma, a1);
-    combine(z, inverse * space_.ratio(one_, a1), w_, -space_.ratio(a2, a1), last_w_, -space_.ratio(a3, a1));
-    turn(w_, last_w_);
+    combine_into_next(z, inverse * space_.ratio(one_, a1), w_, -space_.ratio(a2, a1), last_w_, -space_.ratio(a3, a1));
+    shift_in_next(w_, last_w_);
     parts_[0] = w_;
-    weights_[0] = c_ * eta_ * holds;
+    weights_[0] = c_ * eta_ * is_not_negative;
     space_.add_combination(weights_.data(), parts_, 1, x);
     eta_ = -s_ * eta_;
     last_gamma_ = gamma_;
@@ -109,7 +112,7 @@ class MinresMethod {
       return;
     }
     std::swap(z_, next_z_);
-    combine(r_, s_ * s_, v_, space_.ratio(c_ * eta_, gamma_), v_, eta_ * 0);
+    combine_into_next(r_, s_ * s_, v_, space_.ratio(c_ * eta_, gamma_), v_, eta_ * 0);
     std::swap(r_, next_);
     rr_ = space_.dot(r_, r_);
   }
@@ -120,7 +123,8 @@ class MinresMethod {
     return sqrt(value + nothing) - nothing;
   }
   /// next = a u + b v + c w
-  void combine(const Vector& u, const Scalar& a, const Vector& v, const Scalar& b, const Vector& w, const Scalar& c) {
+  void combine_into_next(const Vector& u, const Scalar& a, const Vector& v, const Scalar& b, const Vector& w,
+                         const Scalar& c) {
     parts_[0] = u;
     parts_[1] = v;
     parts_[2] = w;
@@ -131,7 +135,7 @@ class MinresMethod {
     space_.add_combination(weights_.data(), parts_, kTerms, next_);
   }
   /// `last` takes the value of `now`, and `now` that of next.
-  void turn(Vector& now, Vector& last) {
+  void shift_in_next(Vector& now, Vector& last) {
     std::swap(last, now);
     std::swap(now, next_);
   }

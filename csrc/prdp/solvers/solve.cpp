@@ -40,19 +40,20 @@ SolveResult solve_samples_of(const kernels::KernelBatch<T>& kernels, const Share
   const int64_t size = rhs.size(0), unknowns = rhs.numel() / std::max<int64_t>(size, 1);
   const auto caps = request.caps ? request.caps->contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
-  const SampleBatch<T> batch{solver,
-                             solver.max_iter.expect_int(),
-                             unknowns,
-                             caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
-                             request.guarded,
-                             rhs.const_data_ptr<T>(),
-                             x0.defined() ? x0.const_data_ptr<T>() : nullptr,
-                             result.u.mutable_data_ptr<T>(),
-                             result.info.iterations.mutable_data_ptr<int64_t>(),
-                             result.info.residual.mutable_data_ptr<T>(),
-                             result.info.status.mutable_data_ptr<int64_t>(),
-                             result.info.operator_applications.mutable_data_ptr<int64_t>(),
-                             result.info.floor.mutable_data_ptr<T>()};
+  auto& info = result.info;
+  const SampleBatch<T> batch{.solver = solver,
+                             .max_iter = solver.max_iter.expect_int(),
+                             .unknowns = unknowns,
+                             .caps = caps.defined() ? caps.const_data_ptr<int64_t>() : nullptr,
+                             .guarded = request.guarded,
+                             .b = rhs.const_data_ptr<T>(),
+                             .x0 = x0.defined() ? x0.const_data_ptr<T>() : nullptr,
+                             .u = result.u.mutable_data_ptr<T>(),
+                             .iterations = info.iterations.mutable_data_ptr<int64_t>(),
+                             .residual = info.residual.mutable_data_ptr<T>(),
+                             .status = info.status.mutable_data_ptr<int64_t>(),
+                             .applications = info.operator_applications.mutable_data_ptr<int64_t>(),
+                             .floor = info.floor.mutable_data_ptr<T>()};
   const auto solve_range = [&](int64_t begin, int64_t end) { solve_samples(kernels, shared, batch, begin, end); };
   share_samples(size, unknowns, grain_size(solver.method, size, unknowns, batch.max_iter, solver.restart), solve_range);
   return result;
@@ -115,6 +116,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   if (traits(request.solver.method).made_for == MadeFor::kKnownSpectrum && !a.knows_jacobi_radius())
     a.jacobi_radius();  // raises
   auto found = gpu::solve(a, b, request);
+  // A kernel looks at them on the device. None ran: the host does.
   if (!found && gpu::takes(b, request.solver)) a.check_parameters(request.checks);
   const char* how = "kernel";
   if (!found && b.is_cpu() && runs_on_loops(request.solver)) {
@@ -128,7 +130,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
     if (!found) found = solve_with_tensors(a, b, request);
   }
   way = how;
-  // Where nobody waits for a GPU it would take some sixty operations of torch after each launch.
+  // Left out after a kernel that nobody waits for: on a GPU it takes some sixty operations of torch.
   const bool is_awaited = request.may_wait || found->info.status.is_cpu() || std::string_view(how) != "kernel";
   if (is_awaited) find_inconsistent_constants(a, b, request, *found);
   return *std::move(found);

@@ -23,7 +23,8 @@ int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
   if (method == Method::kMinres) return 3 * pointer + 3 * 8;  // three vectors of its basis, and their weights
   if (traits(method).counts != Counts::kCycles) return 0;
   const int64_t columns = restart + 1;
-  const int64_t of_triangle = restart * columns, of_columns = 6 * columns;  // h_, columns_ of HessenbergProblem
+  constexpr int64_t of_column = 6;  // HessenbergProblem::kNumbersOfColumn
+  const int64_t of_triangle = restart * columns, of_columns = of_column * columns;  // h_, columns_ of HessenbergProblem
   const int64_t of_rhs = 2 * restart, of_weights = 2 * columns;  // rhs_, damped_; again_, weights_ of GMRES
   constexpr int64_t arrays = 8;  // those, u_ and products_
   return columns * pointer + (of_triangle + of_columns + of_rhs + of_weights) * number + arrays * 8;
@@ -57,10 +58,11 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
        << "using namespace prdp::gpu;\n"
-       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", " << blocks << ", " << threads
-       << ", " << vectors << ", " << in_block << ", " << solver.preconditioner.is_diagonal() << ", "
-       << divides_by_diagonal(solver) << ", " << bytes_of_arrays(solver.method, restart, number) << ", " << restart
-       << ", ";
+       << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", ";  // as setting.h names them
+  for (const int64_t n :
+       {blocks, threads, vectors, in_block, int64_t{solver.preconditioner.is_diagonal()},
+        int64_t{divides_by_diagonal(solver)}, bytes_of_arrays(solver.method, restart, number), restart})
+    text << n << ", ";
   if (by_multigrid)
     text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
   else text << "NoCycleSetting";

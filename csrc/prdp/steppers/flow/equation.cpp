@@ -130,9 +130,10 @@ FlowEquation FlowEquation::for_state(const at::Tensor& u) const {
   auto all = tensors();
   // Kernels take a number of the host as it is: a copy would make the host wait.
   const bool stays = nu.is_cpu() && flow_kernels::can_run(u);
-  all[0] = stays ? nu.to(u.scalar_type()) : nu.to(u.options());
-  for (size_t i = 1; i < all.size(); ++i) {
-    if (i > 2 && all[i].defined() && all[i].dim() > 1) all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - 3) / 2);
+  all[kNu] = stays ? nu.to(u.scalar_type()) : nu.to(u.options());
+  for (size_t i = kForce; i < all.size(); ++i) {
+    if (i >= kFirstWall && all[i].defined() && all[i].dim() > 1)
+      all[i] = all[i].unsqueeze(2 + static_cast<int64_t>(i - kFirstWall) / 2);
     all[i] = with_all_axes(all[i], u);
   }
   return with_tensors(all);
@@ -150,10 +151,10 @@ at::Tensor FlowEquation::velocity_of_wall(int64_t axis, bool high) const {
 
 FlowEquation FlowEquation::with_tensors(at::TensorList tensors) const {
   auto other = *this;
-  other.nu = tensors[0];
-  other.force = tensors[1];
-  other.inflow = tensors[2];
-  other.wall_velocity = tensors.slice(3).vec();
+  other.nu = tensors[kNu];
+  other.force = tensors[kForce];
+  other.inflow = tensors[kInflow];
+  other.wall_velocity = tensors.slice(kFirstWall).vec();
   return other;
 }
 

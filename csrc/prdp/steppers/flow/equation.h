@@ -21,6 +21,9 @@ FlowPressure flow_pressure_from_name(const std::string& name);
 
 /// u_t + (u·∇)u + ∇p = ν Δu + f with ∇·u = 0 in a box, and how a time step treats it.
 struct FlowEquation {
+  /// Places in tensors(). Behind the first wall come the others, low and high along each axis.
+  enum Tensor : size_t { kNu, kForce, kInflow, kFirstWall };
+
   std::shared_ptr<const FlowBox> box;
   double dt;
   at::Tensor nu;          // 0-dimensional

@@ -25,9 +25,9 @@ at::Tensor Beginning::status() const {
   return refused.mask.defined() ? refused.status * refused.mask : at::Tensor();
 }
 
-Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks) {
+Beginning begin_step(const FlowEquation& e, const at::Tensor& u, bool host_looks) {
   if (auto start = flow_kernels::pad_velocity(e, u))
-    return {start->velocity, looks ? refused_by(start->status) : RefusedSamples{}, start};
+    return {start->velocity, host_looks ? refused_by(start->status) : RefusedSamples{}, start};
   const auto velocity = with_boundary_values(e, u);
   return {velocity, find_refused(e, velocity.detach())};
 }
@@ -42,6 +42,7 @@ ExplicitPart explicit_part(const FlowEquation& e, const Beginning& beginning) {
 ExplicitPart explicit_part_of(const FlowEquation& e, const at::Tensor& with_boundary, const at::Tensor& refused) {
   const auto velocity = cleared(with_boundary, refused);
   const auto change = cleared(tendency(without_boundary_of(e, refused), velocity), refused);
+  // Where autograd may record, a tensor stays as it is.
   return {velocity, flow_has_loops(velocity) ? change.mul_(e.dt) : change * e.dt};
 }
 

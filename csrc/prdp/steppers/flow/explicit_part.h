@@ -9,14 +9,14 @@ namespace prdp {
 /// t with zeros in these samples; either may be undefined.
 at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples);
 
-/// Without what the boundary brings into these samples: zero times NaN would be NaN. A value that all samples share is
-/// left, as all are refused then.
+/// The equation without its boundary values in these samples, as zero times NaN is NaN. A value that all samples share
+/// stays: if it is not finite, all are refused anyway.
 FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples);
 
 /// The state of a step with its boundary values, and the samples that it cannot take.
 struct Beginning {
   at::Tensor velocity;
-  RefusedSamples refused;                                    // with kernels, only where the host looks
+  RefusedSamples refused;                                    // with kernels, only where `host_looks`
   std::optional<flow_kernels::PaddedVelocity> of_kernels{};  // its status names the refused, whose values are zero
 
   /// Samples yet to be cleared: with kernels undefined, as their values are zero already.
@@ -24,7 +24,8 @@ struct Beginning {
   /// 0, or why a sample was refused; undefined: none was.
   at::Tensor status() const;
 };
-Beginning begin(const FlowEquation& e, const at::Tensor& u, bool looks);
+/// `host_looks`: whether `refused` is filled in where kernels run, which waits for the device.
+Beginning begin_step(const FlowEquation& e, const at::Tensor& u, bool host_looks);
 
 /// The velocity that the explicit part starts from, and its change by explicit Euler.
 struct ExplicitPart {

@@ -10,9 +10,15 @@ namespace prdp::flow_kernels {
 
 namespace {
 
-/// At the faces of an end of an axis; later summed where samples or faces share it.
+using Tensor = FlowEquation::Tensor;
+
+/// Where u and the tensors of the equation are in what is found and wanted: u first.
+constexpr size_t kState = 0;
+constexpr size_t place_of(size_t tensor) { return tensor + 1; }
+
+/// The cotangents on the faces at one end of an axis; summed afterwards where samples or faces share the given value.
 struct End {
-  size_t place;  // among the tensors
+  size_t place;
   int64_t axis;
   bool high;
   at::Tensor bar;
@@ -20,7 +26,7 @@ struct End {
 
 /// The inflow comes in through the open axis; each wall is at an end of its own.
 std::vector<End> ends_of(const FlowBox& box, const at::Tensor& like, const std::vector<bool>& wanted) {
-  constexpr size_t inflow = 3, walls = 4;
+  constexpr size_t inflow = place_of(Tensor::kInflow), walls = place_of(Tensor::kFirstWall);
   std::vector<End> ends;
   for (size_t i = inflow; i < wanted.size(); ++i) {
     if (!wanted[i]) continue;
@@ -33,7 +39,7 @@ std::vector<End> ends_of(const FlowBox& box, const at::Tensor& like, const std::
 }
 
 template <class T>
-gpu::FlowEndBars<T> bars_of(const FlowBox& box, const End& end) {
+gpu::FlowEndBars<T> end_bars_of(const FlowBox& box, const End& end) {
   const bool is_inflow = box.boundary(end.axis) == FlowBoundary::kOpen;
   gpu::FlowEndBars<T> of{.inlet = field_of<const T>(is_inflow ? box.fields(end.bar.options()).inlet : at::Tensor()),
                          .axis = static_cast<int>(end.axis + 3 - box.dim()),
@@ -48,7 +54,7 @@ gpu::FlowEndBars<T> bars_of(const FlowBox& box, const End& end) {
 }
 
 template <class T>
-gpu::FlowViscosityBars<T> bars_of(const FlowBox& box, const ImplicitPart& part) {
+gpu::FlowViscosityBars<T> viscosity_bars_of(const FlowBox& box, const ImplicitPart& part) {
   gpu::FlowViscosityBars<T> of{.diffused = field_of<const T>(part.diffused),
                                .lambda = field_of<const T>(part.lambda),
                                .patterns = {},
@@ -75,33 +81,35 @@ std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation
   std::vector<at::Tensor> found(given.size() + 1);
   std::vector<bool> wanted(found.size());
   for (size_t i = 0; i < found.size(); ++i) wanted[i] = needed[i] && (i == 0 || given[i - 1].defined());
-  if (wanted[0]) found[0] = by_channels(like, box);
+  const bool wants_nu = wanted[place_of(Tensor::kNu)], wants_force = wanted[place_of(Tensor::kForce)];
+  if (wanted[kState]) found[kState] = by_channels(like, box);
   const auto ends = ends_of(box, like, wanted);
   BroadcastSums sums(like);
   const auto nothing = gpu::BroadcastSum{};
-  const auto of_nu = wanted[1] ? sums.add(equation.nu) : nothing;
-  const auto force = wanted[2] ? sums.add(equation.force) : nothing;
-  int64_t count = sums.count() + (wanted[0] ? found[0].numel() : 0);
+  const auto of_nu = wants_nu ? sums.add(equation.nu) : nothing;
+  const auto force = wants_force ? sums.add(equation.force) : nothing;
+  const size_t nu_sum = 0, force_sum = wants_nu ? 1 : 0;  // in the order of add()
+  int64_t count = sums.count() + (wanted[kState] ? found[kState].numel() : 0);
   for (const auto& end : ends) count += end.bar.numel();
   if (count == 0) return found;
   const bool launched = each_point({"FlowBars", "prdp/gpu/device/flow_back.h"}, like, count, [&]<class T>(T) {
     gpu::FlowBars<T> of{.state = {{terms_of<T>(equation, start.padded), field_of<const T>(change_bar)},
                                   field_of<const T>(velocity_bar),
-                                  field_of<T>(found[0])},
-                        .of_state = static_cast<int>(wanted[0] ? found[0].numel() : 0),
+                                  field_of<T>(found[kState])},
+                        .of_state = static_cast<int>(wanted[kState] ? found[kState].numel() : 0),
                         .ends = static_cast<int>(ends.size()),
                         .end = {},
                         .force = force,
                         .of_nu = of_nu,
-                        .nu = bars_of<T>(box, part),
-                        .force_out = wanted[2] ? sums.memory(wanted[1]) : nullptr,
-                        .nu_out = wanted[1] ? sums.memory(0) : nullptr};
-    for (size_t k = 0; k < ends.size(); ++k) of.end[k] = bars_of<T>(box, ends[k]);
+                        .nu = viscosity_bars_of<T>(box, part),
+                        .force_out = wants_force ? sums.memory(force_sum) : nullptr,
+                        .nu_out = wants_nu ? sums.memory(nu_sum) : nullptr};
+    for (size_t k = 0; k < ends.size(); ++k) of.end[k] = end_bars_of<T>(box, ends[k]);
     return of;
   });
   if (!launched) return std::nullopt;
-  if (wanted[1]) found[1] = sums.result(0);
-  if (wanted[2]) found[2] = sums.result(wanted[1]);
+  if (wants_nu) found[place_of(Tensor::kNu)] = sums.result(nu_sum);
+  if (wants_force) found[place_of(Tensor::kForce)] = sums.result(force_sum);
   for (const auto& end : ends) found[end.place] = at::sum_to(end.bar, given[end.place - 1].sizes());
   return found;
 }

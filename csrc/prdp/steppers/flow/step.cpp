@@ -10,8 +10,9 @@ namespace prdp {
 
 FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options, bool reported) {
   const auto e = equation.for_state(u);
-  const bool looks = reported && (options.on_failure == OnFailure::kRaise || options.on_failure == OnFailure::kWarn);
-  const auto beginning = begin(e, u, looks);
+  const bool host_looks =
+      reported && (options.on_failure == OnFailure::kRaise || options.on_failure == OnFailure::kWarn);
+  const auto beginning = begin_step(e, u, host_looks);
   const auto& refused = beginning.refused;
   if (reported && refused.mask.defined())
     report_refused(e, with_boundary_values(e, u).detach(), refused, options.on_failure);
@@ -22,7 +23,7 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
                             ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info)
                             : FlowParts{change};
   const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
-  const bool none_refused = looks && !refused.mask.defined();
+  const bool none_refused = host_looks && !refused.mask.defined();
   return {cleared(next, beginning.to_clear()), cleared(potential, beginning.to_clear()),
           info.info(none_refused ? at::Tensor() : beginning.status())};
 }

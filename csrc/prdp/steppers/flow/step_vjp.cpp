@@ -83,10 +83,11 @@ std::vector<at::Tensor> explicit_vjp_by_loops(const FlowEquation& equation, cons
                                               const DiffuseVjp& back, at::IntArrayRef needed) {
   const auto e = without_boundary_of(equation.for_state(u), refused);
   const auto velocity = cleared(with_boundary_values(e, u), refused);
-  auto found = tendency_vjp(e, velocity, back.change[0] * e.dt);
+  auto found = tendency_vjp(e, velocity, joined(back.change) * e.dt);
   add_to(found.nu, back.nu);
   auto of_boundary = boundary_values_vjp(e, velocity_bar + found.u);
   add_to(of_boundary.inflow, found.inflow);
+  // u, and then as FlowEquation::Tensor has them
   std::vector<at::Tensor> all{cleared(of_boundary.u, refused), found.nu, found.force, of_boundary.inflow};
   all.insert(all.end(), found.wall_velocity.begin(), found.wall_velocity.end());
   return as_given(equation, std::move(all), needed);
@@ -119,19 +120,19 @@ struct ImplicitBack {
   }
   bool has_run_forward() const { return part.change.defined(); }
 
-  /// The cotangents of the change and, with `of_nu`, of ν, for which run_forward() comes first.
-  DiffuseVjp back(bool of_nu, CombinedInfo& info) {
+  /// The cotangents of the change and, with `with_nu`, of ν, for which run_forward() comes first.
+  DiffuseVjp to_change(bool with_nu, CombinedInfo& info) {
     if (!e.is_diffused_implicitly()) return {{diffused_bar}, {}};
-    auto found = diffuse_vjp(e, operators, diffused_bar, of_nu ? joined(part.diffused) : at::Tensor(), options, info);
-    part.lambda = found.change;
-    auto balanced = balance_vjp(e, found.change, potential_bar, of_nu ? part.change : at::Tensor(), options, info);
+    auto found = diffuse_vjp(e, operators, diffused_bar, with_nu ? joined(part.diffused) : at::Tensor(), options, info);
+    part.lambda = found.change;  // explicit_vjp() by kernels reads it
+    auto balanced = balance_vjp(e, found.change, potential_bar, with_nu ? part.change : at::Tensor(), options, info);
     add_to(balanced.nu, found.nu);
     return {balanced.change, balanced.nu};
   }
 };
 
 /// Back through the explicit part: by kernels, which add the share of ν in `implicit`, by the loops of the CPU, or by
-/// autograd. `bar`: what came back through `implicit`, with its share of ν where there are no kernels.
+/// autograd. `bar`: what implicit.to_change() gave, with the share of ν where there are no kernels.
 std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Tensor& u, const Beginning& beginning,
                                      const at::Tensor& velocity_bar, ImplicitBack& implicit, DiffuseVjp bar,
                                      at::IntArrayRef needed) {
@@ -144,7 +145,7 @@ std::vector<at::Tensor> explicit_vjp(const FlowEquation& equation, const at::Ten
   if (found) return as_given(equation, *std::move(found), needed);
   if (implicit.has_run_forward()) {  // no kernel could be made: the same adjoint solve again, now with the share of ν
     CombinedInfo counted_before;
-    bar = implicit.back(/*of_nu=*/true, counted_before);
+    bar = implicit.to_change(/*with_nu=*/true, counted_before);
   }
   return explicit_vjp_by_autograd(equation, u, beginning.of_kernels->status.ne(0), velocity_bar, bar, needed);
 }
@@ -155,16 +156,17 @@ std::vector<at::Tensor> flow_step_vjp(const FlowEquation& equation, const at::Te
                                       const SolveOptions& options, at::IntArrayRef needed, SolveInfo& info) {
   if (at::GradMode::is_enabled()) return recorded_vjp(equation, u, cotangent, options, needed);
   const auto e = equation.for_state(u);
-  const auto beginning = begin(e, u, /*looks=*/false);
+  const auto beginning = begin_step(e, u, /*host_looks=*/false);
   const auto to_clear = beginning.to_clear();
   CombinedInfo adjoint;
   const auto potential_bar = cleared(cotangent.potential, to_clear);
   const auto velocity_bar =
       project_vjp(*e.box, cleared(cotangent.u, to_clear), potential_bar, beginning.status(), options, adjoint);
   ImplicitBack implicit(e, velocity_bar.on_free_faces, potential_bar, options);
-  const bool needs_nu = needed[1] != 0;  // u is first, then equation.tensors(), ν at their head
+  const bool needs_nu = needed[1 + FlowEquation::kNu] != 0;  // u is first
   if (needs_nu && e.is_diffused_implicitly()) implicit.run_forward(explicit_part(e, beginning).change);
-  const auto bar = implicit.back(/*of_nu=*/implicit.has_run_forward() && !beginning.of_kernels, adjoint);
+  const bool with_nu = implicit.has_run_forward() && !beginning.of_kernels;  // kernels add its share themselves
+  const auto bar = implicit.to_change(with_nu, adjoint);
   info = adjoint.info();
   return explicit_vjp(equation, u, beginning, velocity_bar.u, implicit, bar, needed);
 }
