@@ -208,6 +208,11 @@ def test_a_torch_that_is_too_old_is_refused_in_one_sentence(tmp_path):
     assert status != 0 and "prdp: needs PyTorch 2.11 or newer, found 2.10.1 in " in said
 
 
+def test_a_folder_without_torch_is_named(tmp_path):
+    status, said = configure(tmp_path / "build", f"-DTorch_DIR={tmp_path / 'moved'}")
+    assert status != 0 and f"prdp: Torch_DIR is {tmp_path / 'moved'}, where there is no LibTorch; leave it out" in said
+
+
 def test_warnings_stop_no_user():
     """A newer compiler than ours may warn of something new. The Makefile makes them errors."""
     assert 'option(PRDP_WERROR "Treat warnings as errors" OFF)' in (ROOT / "CMakeLists.txt").read_text()

@@ -151,3 +151,17 @@ def test_minres_tells_nan_of_its_preconditioner_from_one_that_is_not_definite():
         m = operators.Function(lambda r, bad=bad: bad * r, symmetric=True)
         with pytest.raises(torch.linalg.LinAlgError, match=f"its preconditioner {said}"):
             prdp.linear_solve(MATRICES[0], rhs((6,)), prdp.MINRES(9, preconditioner=m))
+
+
+@pytest.mark.parametrize("solver", [prdp.GMRES(max_iter=5, restart=3), prdp.BiCGStab(5)])
+def test_a_preconditioner_that_hands_out_nothing_is_named(solver):
+    solver.preconditioner = operators.Function(lambda r: 0 * r)
+    b = torch.ones(1, 4, dtype=torch.float64)
+    with pytest.raises(torch.linalg.LinAlgError, match="its preconditioner maps a vector of ones to zero"):
+        prdp.linear_solve(2 * torch.eye(4, dtype=torch.float64), b, solver)
+
+
+def test_minres_with_the_diagonal_of_a_negative_definite_operator_names_a_way():
+    solver = prdp.MINRES(20, preconditioner="diagonal")
+    with pytest.raises(torch.linalg.LinAlgError, match="take MINRES without it, or CG where A is negative definite"):
+        prdp.linear_solve(operators.Poisson((8,)), torch.randn(1, 1, 8, dtype=torch.float64), solver)

@@ -83,26 +83,25 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   if (needed[0]) found.gradients[0] = lambda;
   const bool needs_a = std::find(needed.begin() + 1, needed.end(), 1) != needed.end();
   if (!u.defined() || !needs_a) return found;
-  const auto product_rule_of = [&](const OperatorSpec& of, const at::Tensor& of_lambda) {
-    auto products = make_operator(of)->product_rule(of_lambda, u);
+  const auto products_of = [&](const Operator& op, const at::Tensor& of_lambda) {
+    auto products = op.product_rule(of_lambda, u);
     for (size_t i = 0; i < products.size(); ++i)
       products[i] = needed[i + 1] && products[i].defined() ? products[i].neg() : at::Tensor();
     return products;
   };
-  const auto of_tensors = [&](const at::Tensor& of_lambda) { return product_rule_of(a, of_lambda); };
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
   if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
     leave_out_overflow_on_device(lambda, u, found.info.status);
     if (needed[0]) found.gradients[0] = lambda;
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);
-    products = of_tensors(lambda);
+    products = products_of(*make_operator(a), lambda);
   } else if (at::isTensorSubclassLike(lambda) || at::isTensorSubclassLike(u)) {  // no numbers to look at
-    products = of_tensors(lambda);
+    products = products_of(*make_operator(a), lambda);
   } else {  // sum, look, and sum again without what overflowed
-    const auto healthy = with_healthy_tensors(a, not_refused(found.info.status));
+    const auto healthy = make_operator(with_healthy_tensors(a, not_refused(found.info.status)));
     Rows finite(cotangent.size(0), true);
-    products = finite_sum(finite, [&](const Rows& some) { return product_rule_of(healthy, only(lambda, some)); });
+    products = finite_sum(finite, [&](const Rows& some) { return products_of(*healthy, only(lambda, some)); });
     if (!all(finite)) {
       if (needed[0]) found.gradients[0] = only(lambda, finite);
       report_overflow(found.info, finite, transpose, cotangent, o);

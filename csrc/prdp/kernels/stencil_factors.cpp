@@ -52,8 +52,7 @@ class StencilFactors final : public Factors<T> {
         continue;
       }
       Eigen::VectorXd field = x.segment(channel * points, points);
-      sparse_->solve(field,
-                     transposed_);  // factors of the matrix that is not transposed; thomas_ has the rows as they are
+      sparse_->solve(field, transposed_);  // its factors are those of A; thomas_ has the rows as they are
       x.segment(channel * points, points) = field;
     }
     return store_if_finite(x, layout_, d);
