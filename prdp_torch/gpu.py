@@ -1,6 +1,7 @@
 """Kernels of a GPU: compiled when they are first needed, or before."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -8,15 +9,16 @@ from torch import Tensor
 from prdp_torch import _C
 
 
-def warm_up(step: Callable[[Tensor], Tensor], example: Tensor, backward: bool = True) -> list[str]:
-    """Compile and load the kernels that `step(example)` needs, and those of its backward pass.
+def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = True) -> list[str]:
+    """Compile and load the kernels that `step(example)` needs, and those of its backward pass: of the gradients of the
+    state and of every parameter that requires one.
 
     A kernel takes seconds to compile when it is first needed, and milliseconds to load in later processes. Call this
     before a clock starts, and before a CUDA graph is captured: meanwhile nothing can be compiled. `step` is run once;
     gradients that are there stay as they are.
 
     Args:
-        step: a step such as `prdp.Heat`, or any function of a state.
+        step: a step such as `prdp.Heat`, or any function of a state. It returns a tensor, or several.
         example: a state with the shape, dtype and device that the step will be called with.
         backward: whether gradients will be taken.
 
@@ -27,7 +29,25 @@ def warm_up(step: Callable[[Tensor], Tensor], example: Tensor, backward: bool = 
     before = set(_C.kernels_made())
     state = example.detach().clone().requires_grad_(backward)
     with torch.enable_grad() if backward else torch.no_grad():
-        u = step(state)
-        if backward and u.requires_grad:
-            torch.autograd.grad(u.sum(), state, allow_unused=True)
+        found = step(state)
+        results = [u for u in ([found] if isinstance(found, Tensor) else found) if u.requires_grad]
+        parameters = [leaf for leaf in leaves_of(results) if leaf is not state]
+        for wanted in ([state], parameters, [state, *parameters]):  # kernels differ by what a gradient is asked of
+            if results and wanted:
+                ones = [torch.ones_like(u) for u in results]
+                torch.autograd.grad(results, wanted, ones, retain_graph=True, allow_unused=True)
     return [name for name in _C.kernels_made() if name not in before]
+
+
+def leaves_of(results: list[Tensor]) -> Iterator[Tensor]:
+    """The tensors that a backward pass from these would leave a gradient in."""
+    seen: set[Any] = set()
+    nodes: list[Any] = [u.grad_fn for u in results]
+    while nodes:
+        node = nodes.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if hasattr(node, "variable"):  # torch's AccumulateGrad
+            yield node.variable
+        nodes += [below for below, _ in node.next_functions]

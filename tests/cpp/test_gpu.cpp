@@ -24,7 +24,7 @@ TEST(Gpu, ASolveWithItsGradientIsTwoLaunchesWithoutPython) {
   const auto leaf = b.clone().requires_grad_();
 
   setenv("PRDP_GPU", "required", 1);
-  prdp_fibers_begin(96 << 10, 16384, 64, 0, 0, true, false, 0, false);
+  prdp_fibers_begin(96 << 10, 16384, 64, 0, 0, true, false, 132, false);
   const auto before = prdp_fibers_launches();
   const auto u = prdp::linear_solve(heat, leaf, {prdp::CG{.max_iter = 100, .rtol = 1e-12}}).u;
   EXPECT_STREQ(prdp::way_of_last_solve(), "kernel");

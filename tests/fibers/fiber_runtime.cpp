@@ -13,6 +13,7 @@
 #include <functional>
 #include <map>
 #include <mutex>
+#include <thread>
 #include <vector>
 
 #include "prdp/gpu/cuda_runtime.h"
@@ -33,7 +34,6 @@ struct Settings {
   int left_out = 0;  // the line of the barrier that is left out; 0: none
   bool poisons = true;  // memory of a block
   bool captures = false;  // a graph, on all streams
-  int64_t most_blocks = 0;  // that are at work at the same time; 0: as many as there are
   bool from_ptx = false;  // the fibers run what NVRTC makes of the text
 };
 Settings settings;
@@ -117,7 +117,6 @@ class FiberKernel final : public prdp::gpu::Kernel {
     run_ = reinterpret_cast<decltype(run_)>(dlsym(library, "run"));
   }
   int64_t teams() const override { return 2; }
-  bool may_wait() const override { return !settings.captures; }
   void launch(int64_t teams, const void* arguments) const override {
     constexpr long spare = 64;
     ++launches;
@@ -138,12 +137,11 @@ class FiberRuntime final : public prdp::gpu::Runtime {
   std::shared_ptr<const prdp::gpu::Kernel> kernel(c10::Device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
     if (std::ranges::find(asked_for, source.text, &KernelSource::text) == asked_for.end()) asked_for.push_back(source);
-    if (settings.most_blocks > 0 && source.blocks_of_team > settings.most_blocks)
-      throw Unavailable("a sample of this size needs more blocks than the device runs at the same time");
     auto& kernel = kernels_[{source.text, settings.from_ptx}];
     if (!kernel) kernel = std::make_shared<FiberKernel>(source);
     return kernel;
   }
+  bool is_capturing(c10::Device) override { return settings.captures; }
 
  private:
   std::mutex mutex_;
@@ -164,10 +162,19 @@ const char* said_by(const Run& run) {
 }
 
 const c10::Device kCuda(c10::DeviceType::CUDA, 0);
-/// A torch without CUDA knows no current device of that kind.
+/// A torch without CUDA knows no current device of that kind. Here, devices have streams, and threads no context.
 struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::CUDA> {
-  void* getStreamNativeHandle(const c10::Stream) const override { return nullptr; }
+  c10::Stream getStream(c10::Device device) const noexcept override {
+    return c10::Stream(c10::Stream::UNSAFE, device, 7);
+  }
+  void* getStreamNativeHandle(const c10::Stream stream) const override {
+    return reinterpret_cast<void*>(100 * stream.device_index() + stream.id());
+  }
 };
+void register_cuda() {
+  static auto* const guard = new CudaWithoutTorch;  // outlives every thread
+  static const c10::impl::DeviceGuardImplRegistrar registered(c10::DeviceType::CUDA, guard);
+}
 
 }  // namespace
 
@@ -175,7 +182,7 @@ struct CudaWithoutTorch final : c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
                                   int left_out, bool poisons, bool captures, int64_t most_blocks, bool from_ptx) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads}, order, left_out, poisons, captures, most_blocks, from_ptx};
+  settings = {{block_memory, cells_of_block, threads, most_blocks}, order, left_out, poisons, captures, from_ptx};
   asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }
@@ -201,16 +208,32 @@ extern "C" const char* prdp_resources_of(const char* text, int capability) {
 extern "C" const char* prdp_why_no_cuda() {
   return said_by([] { prdp::gpu::cuda_runtime().limits(kCuda); });
 }
-/// Why CUDA makes no kernel of this text here, for a team of so many blocks.
-extern "C" const char* prdp_why_no_kernel_of_cuda(const char* text, int64_t blocks) {
-  static auto* const guard = new CudaWithoutTorch;  // outlives every thread
-  static const c10::impl::DeviceGuardImplRegistrar registered(c10::DeviceType::CUDA, guard);
-  return said_by([&] { prdp::gpu::cuda_runtime().kernel(kCuda, {text, 32, 0, blocks}); });
+/// Why CUDA makes no kernel of this text here, at the last of so many tries.
+extern "C" const char* prdp_why_no_kernel_of_cuda(const char* text, int64_t tries) {
+  register_cuda();
+  const char* said = "";
+  for (int64_t k = 0; k < tries; ++k)
+    said = said_by([&] { prdp::gpu::cuda_runtime().kernel(kCuda, {text, 32, 0, 1}); });
+  return said;
+}
+/// Launches a kernel of this text, for two teams of so many blocks, in a thread of its own. Returns what went wrong.
+extern "C" const char* prdp_launch_on_cuda(const char* text, int64_t blocks, int64_t device) {
+  register_cuda();
+  static std::string said;
+  std::thread([&] {
+    said = said_by([&] {
+      const c10::Device cuda(c10::DeviceType::CUDA, static_cast<c10::DeviceIndex>(device));
+      const int argument = 42;
+      prdp::gpu::cuda_runtime().kernel(cuda, {text, 64, 60000, blocks})->launch(2, &argument);
+    });
+  }).join();
+  return said.c_str();
 }
 /// Why a sample of this size has no kernel.
 extern "C" const char* prdp_why_too_large(int64_t unknowns) {
   return said_by([&] {
-    prdp::gpu::solve_kernel({"A"}, false, prdp::CG{}, at::empty({1}).expand({1, unknowns}), {96 << 10, 16384, 1024});
+    prdp::gpu::solve_kernel({"A"}, false, prdp::CG{}, at::empty({1}).expand({1, unknowns}),
+                            {96 << 10, 16384, 1024, 132});
   });
 }
 /// How many kernels were launched so far.

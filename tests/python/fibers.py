@@ -48,10 +48,10 @@ class Kernel(NamedTuple):
 
 
 class Fibers:
-    """A device whose blocks have so much memory, and teams of one block for so many unknowns; with `most_blocks`, teams
-    have no more. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch, unless
-    `poison` is False. With `captures`, its streams capture a graph. With `from_ptx` the fibers run the PTX that NVRTC
-    makes of the text, instruction by instruction, in place of the text (tests/fibers/ptx.py)."""
+    """A device whose blocks have so much memory, and teams of one block for so many unknowns, but of `most_blocks` at
+    most. Memory of a block, and what torch makes anew, begins as NaN, which takes an operation of torch,
+    unless `poison` is False. With `captures`, its streams capture a graph. With `from_ptx` the fibers run the PTX that
+    NVRTC makes of the text, instruction by instruction, in place of the text (tests/fibers/ptx.py)."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Fibers:
         threads=64,
         order=FORWARD,
         left_out=0,
-        most_blocks=0,
+        most_blocks=132,
         poison=True,
         captures=False,
         from_ptx=False,
@@ -82,8 +82,10 @@ class Fibers:
         library.prdp_compile.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.POINTER(ctypes.c_int64)]
         library.prdp_resources_of.argtypes = [ctypes.c_char_p, ctypes.c_int]
         library.prdp_why_no_kernel_of_cuda.argtypes = [ctypes.c_char_p, ctypes.c_int64]
+        library.prdp_launch_on_cuda.argtypes = [ctypes.c_char_p, ctypes.c_int64, ctypes.c_int64]
         library.prdp_why_too_large.argtypes = [ctypes.c_int64]
-        for name in ("compile", "resources_of", "why_no_cuda", "why_no_kernel_of_cuda", "why_too_large"):
+        texts = "compile resources_of why_no_cuda why_no_kernel_of_cuda launch_on_cuda why_too_large"
+        for name in texts.split():
             getattr(library, f"prdp_{name}").restype = ctypes.c_char_p
         return library
 

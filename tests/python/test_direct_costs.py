@@ -1,6 +1,7 @@
 """What `Direct` takes on a device, by the stand-in: memory, operations and looks of the host; and what is refused."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -120,6 +121,21 @@ def test_what_would_take_a_large_dense_matrix_is_refused(name):
         with pytest.raises(NotImplementedError, match=r"Direct on lazy:0 solves .* take CG .* or GMRES"):
             prdp.linear_solve(a, b, prdp.Direct())
     assert device.largest < 4096**2
+
+
+def test_a_dense_matrix_of_a_grid_is_not_made_in_silence(capfd):
+    device = StandIn()
+    with device:
+        for size, words in (
+            (16, ""),
+            (17, "Direct on lazy:0 has no fast way .* dense matrix of 289 unknowns, .*; take CG"),
+        ):
+            kappa = device.send(random(1, size, size).exp())
+            torch.set_warn_always(True)
+            prdp.linear_solve(operators.Diffusion(kappa, 1.0), device.send(random(1, 1, size, size)), prdp.Direct())
+            torch.set_warn_always(False)
+            said = capfd.readouterr().err  # where warnings go while a mode of torch is at work
+            assert re.search(words, said) if words else not said
 
 
 def test_a_large_sparse_matrix_is_refused():

@@ -283,6 +283,27 @@ def test_the_coarse_grids_of_the_pressure_are_made_once():
     assert launches[0] == launches[1]
 
 
+def test_coarse_grids_of_a_captured_graph_are_its_own():
+    """They are there once it runs, so no solve outside may take them; and it keeps none of theirs alive."""
+    u = 0.5 * noise(2, 2, *PLANE, seed=1)
+    solver = prdp.CG(200, rtol=1e-12, preconditioner="multigrid")
+
+    def launches_of_steps(*captures):
+        step = prdp.Flow(PLANE, dt=0.01, nu=0.01, diffusion="explicit", solver=solver, on_failure="return")
+        counts = []
+        for captured in captures:
+            with Fibers(captures=captured) as fibers:
+                before = fibers.launches()
+                step(u)
+                counts.append(fibers.launches() - before)
+        return counts
+
+    launches_of_steps(False)  # looks at the first result of a kernel
+    first, second = launches_of_steps(False, False)
+    assert second == first - 1
+    assert launches_of_steps(True, False, True, False) == [first, first, first, second]
+
+
 # Operations that compute nothing: memory, views, and reading a number of the host.
 FREE = {
     f"aten::{name}"

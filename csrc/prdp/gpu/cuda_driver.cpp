@@ -10,6 +10,7 @@ const CudaDriver& CudaDriver::get() {
     if (!library) throw Unavailable("there is no libcuda.so.1: is NVIDIA's driver installed?");
     CudaDriver d{};
     library.bind(d.init, "cuInit");
+    library.bind(d.version, "cuDriverGetVersion");
     library.bind(d.error_text, "cuGetErrorString");
     library.bind(d.device, "cuDeviceGet");
     library.bind(d.attribute, "cuDeviceGetAttribute");
@@ -33,7 +34,11 @@ void CudaDriver::check(int result, const char* what) const {
   if (result == 0) return;
   const char* text = nullptr;
   error_text(result, &text);
-  throw Unavailable(std::string(what) + ": " + (text ? text : "unknown error") + " (" + std::to_string(result) + ")");
+  const std::string why =
+      std::string(what) + ": " + (text ? text : "unknown error") + " (" + std::to_string(result) + ")";
+  constexpr int out_of_memory = 2, first_of_capture = 900, last_of_capture = 909;  // CUresult in cuda.h
+  if (result == out_of_memory || (result >= first_of_capture && result <= last_of_capture)) throw UnavailableNow(why);
+  throw Unavailable(why);
 }
 
 }  // namespace prdp::gpu

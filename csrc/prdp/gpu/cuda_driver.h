@@ -6,6 +6,7 @@ namespace prdp::gpu {
 /// The functions of NVIDIA's driver that the library calls, as cuda.h declares them. A result of 0 is success.
 struct CudaDriver {
   int (*init)(unsigned);
+  int (*version)(int*);
   int (*error_text)(int, const char**);
   int (*device)(int*, int index);
   int (*attribute)(int*, int which, int device);

@@ -17,7 +17,7 @@ namespace {
 constexpr int kMultiprocessors = 16, kCapabilityMajor = 75, kCapabilityMinor = 76, kMostBlockMemory = 97;
 constexpr int kDynamicMemory = 8;
 
-/// Unknowns of a sample for each block of its team: sixteen for each thread.
+/// Unknowns of a sample for each block of its team, while there are blocks: sixteen for each thread.
 constexpr int64_t kCellsOfBlock = 16384;
 /// Of a block's memory, for what the kernel keeps beside its vectors.
 constexpr int64_t kOwnBlockMemory = 8192;
@@ -32,13 +32,6 @@ int attribute(int which, c10::Device device) {
 
 void* stream_of(c10::Device device) {
   return c10::impl::VirtualGuardImpl(device.type()).getStream(device).native_handle();
-}
-
-bool is_capturing(c10::Device device) {
-  const auto& driver = CudaDriver::get();
-  int capturing = 0;
-  driver.check(driver.is_capturing(stream_of(device), &capturing), "no stream");
-  return capturing != 0;
 }
 
 /// While it lives, the device is this thread's, and so is its context: a thread of autograd may have none.
@@ -59,11 +52,19 @@ class OnDevice {
   c10::DeviceGuard guard_;
 };
 
+bool captures(c10::Device device) {
+  const OnDevice here(device);
+  const auto& driver = CudaDriver::get();
+  int capturing = 0;
+  driver.check(driver.is_capturing(stream_of(device), &capturing), "no stream");
+  return capturing != 0;
+}
+
 class CudaKernel final : public Kernel {
  public:
   CudaKernel(c10::Device device, const KernelSource& source) : device_(device), source_(source) {
     const auto& driver = CudaDriver::get();
-    TORCH_CHECK(!is_capturing(device),
+    TORCH_CHECK(!captures(device),
                 "prdp: a kernel is to be compiled while a CUDA graph is captured; call prdp.warm_up() before");
     const int capability = 10 * attribute(kCapabilityMajor, device) + attribute(kCapabilityMinor, device);
     const auto binary = nvrtc::compile(source.text, capability);
@@ -76,10 +77,9 @@ class CudaKernel final : public Kernel {
     driver.check(driver.blocks_at_once(&blocks, function_, static_cast<int>(source.threads), source.block_memory),
                  "no occupancy");
     teams_ = static_cast<int64_t>(blocks) * attribute(kMultiprocessors, device) / source.blocks_of_team;
-    if (teams_ == 0) throw Unavailable("a sample of this size needs more blocks than the device runs at the same time");
+    if (teams_ == 0) throw Unavailable("the device has no room for a block of this kernel");
   }
   int64_t teams() const override { return teams_; }
-  bool may_wait() const override { return !is_capturing(device_); }
   void launch(int64_t teams, const void* arguments) const override {
     const auto& driver = CudaDriver::get();
     const OnDevice here(device_);
@@ -107,8 +107,12 @@ class CudaRuntime final : public Runtime {
     const std::lock_guard lock(mutex_);
     const auto found = limits_.find(device.index());
     if (found != limits_.end()) return found->second;
-    return limits_[device.index()] = {attribute(kMostBlockMemory, device) - kOwnBlockMemory, kCellsOfBlock, 1024};
+    return limits_[device.index()] = {.block_memory = attribute(kMostBlockMemory, device) - kOwnBlockMemory,
+                                      .cells_of_block = kCellsOfBlock,
+                                      .threads = 1024,
+                                      .blocks = attribute(kMultiprocessors, device)};
   }
+  bool is_capturing(c10::Device device) override { return captures(device); }
   std::shared_ptr<const Kernel> kernel(c10::Device device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
     auto& [kernel, failure] = kernels_[{device.index(), source.text}];
@@ -117,6 +121,8 @@ class CudaRuntime final : public Runtime {
       try {
         const OnDevice here(device);
         kernel = std::make_shared<CudaKernel>(device, source);
+      } catch (const UnavailableNow&) {
+        throw;
       } catch (const Unavailable& reason) {  // not tried again, as that may take seconds in every solve
         failure = reason.what();
         throw;

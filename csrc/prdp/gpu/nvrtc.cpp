@@ -4,6 +4,7 @@
 #include <cstdlib>
 #include <filesystem>
 
+#include "prdp/gpu/cuda_driver.h"
 #include "prdp/gpu/embedded_headers.h"
 #include "prdp/gpu/kernel_cache.h"
 #include "prdp/gpu/shared_library.h"
@@ -36,12 +37,26 @@ fs::path folder_of(const void* function) {
   return dladdr(function, &found) && found.dli_fname ? fs::path(found.dli_fname).parent_path() : fs::path();
 }
 
-/// Where NVRTC may be: the one that torch has loaded, beside torch's wheel, or the system's.
+/// Whether a driver is here that may not load what CUDA 13 compiles.
+bool is_driver_of_cuda_12() {
+  try {
+    const auto& driver = CudaDriver::get();
+    int version = 0;
+    driver.check(driver.version(&version), "no version");
+    return version < 13000;  // 1000 major + 10 minor
+  } catch (const Unavailable&) {  // none: nothing that is compiled runs here
+    return false;
+  }
+}
+
+/// Where NVRTC may be: the one that torch has loaded, beside torch's wheel, or the system's. That of the driver's
+/// version comes first.
 std::vector<std::string> names() {
   std::vector<std::string> all;
   if (const char* named = std::getenv("PRDP_NVRTC")) return {named};
   const auto packages = folder_of(reinterpret_cast<const void*>(&at::globalContext)).parent_path().parent_path();
-  for (const char* version : {"13", "12"}) {
+  const bool is_older = is_driver_of_cuda_12();
+  for (const char* version : {is_older ? "12" : "13", is_older ? "13" : "12"}) {
     const std::string name = std::string("libnvrtc.so.") + version;
     all.push_back(name);
     for (const char* folder : {"cu13", "cuda_nvrtc"}) all.push_back(packages / "nvidia" / folder / "lib" / name);

@@ -15,11 +15,18 @@ class Unavailable : public std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
+/// The same, of a moment: another try may succeed, as where memory was short.
+class UnavailableNow : public Unavailable {
+ public:
+  using Unavailable::Unavailable;
+};
+
 /// What a kernel may use of a device.
 struct Limits {
   int64_t block_memory;     // bytes that the vectors of a block may take
   int64_t cells_of_block;   // unknowns of a sample for each block of its team
   int64_t threads;          // of a block, at most
+  int64_t blocks;           // of a team, at most: so many are at work at the same time
 };
 
 /// A kernel in the device's language, with what its launch needs.
@@ -40,8 +47,6 @@ class Kernel {
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
   virtual int64_t teams() const = 0;
-  /// Whether the host may wait for the device's current stream: no graph is being captured.
-  virtual bool may_wait() const = 0;
   /// On the device's current stream. `arguments` are what its text calls Arguments.
   virtual void launch(int64_t teams, const void* arguments) const = 0;
 };
@@ -52,6 +57,9 @@ class Runtime {
   virtual Limits limits(c10::Device device) = 0;
   /// Compiles it, or finds it. Raises Unavailable.
   virtual std::shared_ptr<const Kernel> kernel(c10::Device device, const KernelSource& source) = 0;
+  /// Whether the device's current stream captures a graph: the host may not wait for it, and what its launches write
+  /// is not there before the graph is run.
+  virtual bool is_capturing(c10::Device device) = 0;
 };
 
 /// The runtime of a device; null if it has none.

@@ -69,17 +69,21 @@ at::Tensor matrix_by_columns(const std::function<at::Tensor(const at::Tensor&)>&
 
 void check_dense_fits(const at::Tensor& b, int64_t n, int64_t matrices) {
   // Beyond that the factors take longer than any iteration of the same system, whose vectors are n times smaller.
-  constexpr int64_t most_unknowns = 4096, most_numbers = int64_t{1} << 26;
-  if (b.is_cpu() || (n <= most_unknowns && matrices * n * n <= most_numbers)) return;
+  constexpr int64_t most_unknowns = 4096, most_numbers = int64_t{1} << 26, few_unknowns = 256;
+  if (b.is_cpu()) return;
+  constexpr const char* instead =
+      "take CG (if A is symmetric) or GMRES, with preconditioner=\"multigrid\" where the operator has it, or solve on "
+      "the CPU";
   TORCH_CHECK_NOT_IMPLEMENTED(
-      false, "linear_solve: Direct on ", b.device(),
+      n <= most_unknowns && matrices * n * n <= most_numbers, "linear_solve: Direct on ", b.device(),
       " solves equations in 1D, stencils with constant coefficients in a box (sums of symmetric operators along the "
       "axes), and others of at most ",
       most_unknowns, " unknowns with ", most_numbers, " numbers in all matrices of a batch, got ", matrices,
-      matrices == 1 ? " matrix" : " matrices", " of ", n,
-      " unknowns; take CG (if A is symmetric) or GMRES, with preconditioner=\"multigrid\" where the operator has it, "
-      "or "
-      "solve on the CPU");
+      matrices == 1 ? " matrix" : " matrices", " of ", n, " unknowns; ", instead);
+  if (n > few_unknowns) {
+    TORCH_WARN_ONCE("prdp: Direct on ", b.device(), " has no fast way for this A, so it factors a dense matrix of ", n,
+                    " unknowns, which is slow; ", instead);
+  }
 }
 
 at::Tensor channel_matrix(const Operator& a, const at::TensorOptions& options) {

@@ -1,5 +1,7 @@
 #include "prdp/operators/dense_operator.h"
 
+#include <ATen/Context.h>
+
 #include "prdp/gpu/operator_view.h"
 #include "prdp/kernels/matrix.h"
 #include "prdp/operators/dense.h"
@@ -20,6 +22,7 @@ at::Tensor matvec(const at::Tensor& matrix, const at::Tensor& v) {
     for (const auto& sample : v.unbind()) products.push_back(at::mv(matrix, sample.clone()));  // all aligned alike
     return at::stack(products);
   }
+  const at::NoTF32Guard full_precision;  // a residual below 1e-3 would be rounding
   return at::matmul(matrix, v.unsqueeze(-1)).squeeze(-1);
 }
 
@@ -58,6 +61,7 @@ at::Tensor DenseOperator::solve_directly(const at::Tensor& b, bool transposed) c
 std::vector<at::Tensor> DenseOperator::product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   // ∂⟨λ, A u⟩/∂A = λ uᵀ, summed over the samples that share A
   if (matrix_.dim() == 3) return {lambda.unsqueeze(-1) * u.unsqueeze(-2)};
+  const at::NoTF32Guard full_precision;
   const auto of_all = at::matmul(lambda.mT(), u);
   return {had_axis_of_one_ ? of_all.unsqueeze(0) : of_all};
 }

@@ -94,6 +94,7 @@ at::Tensor by_vector(const at::Tensor& v, bool spans_channels) {
 
 at::Tensor follow_null_space(const at::Tensor& u, const at::Tensor& basis) {
   const WithoutAutocast full_precision;
+  const at::NoTF32Guard of_matrix_products;
   const auto parts = by_vector(u, u.dim() > 2 && basis.dim() == u.dim());
   const auto rows = basis.flatten(1).to(u.scalar_type());
   const auto gram = at::matmul(rows, rows.t());

@@ -140,7 +140,8 @@ std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Te
 }  // namespace
 
 std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
-  if (!runtime_of(b.device())) return std::nullopt;
+  auto* const runtime = runtime_of(b.device());
+  if (!runtime) return std::nullopt;
   const at::NoGradGuard no_grad;
   const auto rhs = b.contiguous();
   const auto prepared = prepare(a, /*transposed=*/false, rhs, request.solver, request.hierarchy);
@@ -152,7 +153,7 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
     auto found = run(*prepared, rhs, request);
     constexpr int few = 3;  // a look waits for the device, and there may be nothing to judge, as where b is 0
     const bool looks = trust == Trust::kUnknown && request.guarded && prepared->kernel->looks < few;
-    if (looks && prepared->kernel->may_wait()) {
+    if (looks && !runtime->is_capturing(b.device())) {
       ++prepared->kernel->looks;
       trust = verify_first_result(a, rhs, request, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
@@ -177,6 +178,15 @@ bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.devi
 void share_hierarchy(SolveOptions& options, const at::Tensor& b, int64_t solves) {
   if (options.hierarchy || !options.solver.preconditioner.is_multigrid() || !runtime_of(b.device())) return;
   options.hierarchy = std::make_shared<KeptHierarchy>(4 * solves * static_cast<int64_t>(b.nbytes()));
+}
+
+void share_hierarchy(SolveOptions& options, const at::Tensor& b, std::shared_ptr<KeptHierarchy> of_all) {
+  auto* const runtime = runtime_of(b.device());
+  if (!runtime || !options.solver.preconditioner.is_multigrid()) return;
+  or_fall_back([&] {
+    if (!runtime->is_capturing(b.device())) options.hierarchy = std::move(of_all);
+    return true;
+  });
 }
 
 }  // namespace prdp::gpu

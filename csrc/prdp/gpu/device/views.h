@@ -237,7 +237,8 @@ class Dense : public Rows<Dense<T, n, kTransposed>, T> {
 
   template <class F>
   void for_each_entry(int i, const F& f) const {
-    for (int j = 0; j < n; ++j) f(kTransposed ? matrix_[j * n + i] : matrix_[i * n + j], j);
+    constexpr int64_t row = n;  // n² may be more than an int holds
+    for (int j = 0; j < n; ++j) f(kTransposed ? matrix_[j * row + i] : matrix_[i * row + j], j);
   }
 
  private:

@@ -7,6 +7,7 @@
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/sums_in_order.h"
 #include "prdp/operators/tensors.h"
+#include "prdp/solvers/kept_hierarchy.h"
 #include "prdp/solvers/prepared_batch.h"
 #include "prdp/steppers/flow/explicit_loops.h"
 #include "prdp/steppers/flow/projection_loops.h"
@@ -25,7 +26,7 @@ OperatorSpec pressure_operator(const FlowBox& box, const at::Tensor& u) {
 
 /// All solves for the pressure share the coarse grids, and have right-hand sides without_means().
 SolveOptions for_pressure(const FlowBox& box, const at::Tensor& b, SolveOptions options) {
-  options.hierarchy = box.fields(b.options()).coarse_grids;
+  gpu::share_hierarchy(options, b, box.fields(b.options()).coarse_grids);
   options.cotangent_is_in_range = true;
   return options;
 }
