@@ -209,8 +209,7 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     return values_.lost_orthogonality(left2.value, taken2.value, loss.value);
   }
   Scalar inverse(const Scalar& a, const Scalar& scale) const { return values_.inverse(a.value, scale.value); }
-  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
-            Scalar* y) const {
+  void damp(const Scalar* r, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep, Scalar* y) const {
     const auto plain = [](const Scalar* from, int64_t count) {
       std::vector<T> values(count);
       for (int64_t i = 0; i < count; ++i) values[i] = from[i].value;
@@ -218,7 +217,8 @@ class TapeSpace : public SpaceDefaults<TapeSpace<T>> {
     };
     if (keep.value != 0) return;
     auto found = plain(y, n);
-    values_.damp(plain(r, n * stride).data(), stride, plain(g, n).data(), n, scale.value, keep.value, found.data());
+    const auto triangle = plain(r, hessenberg_column(n));
+    values_.damp(triangle.data(), plain(g, n).data(), n, scale.value, keep.value, found.data());
     std::copy(found.begin(), found.end(), y);
   }
   Scalar larger(const Scalar& a, const Scalar& b) const { return values_.larger(a.value, b.value); }

@@ -16,8 +16,7 @@ class HessenbergProblem {
   /// For at most m columns.
   HessenbergProblem(const Numbers& numbers, int64_t m)
       : numbers_(numbers),
-        m_(m),
-        h_(numbers.template array<Scalar>(m * (m + 1))),
+        h_(numbers.template array<Scalar>(hessenberg_column(m))),
         columns_(numbers.template array<Column>(m + 1)),
         rhs_(numbers.template array<Scalar>(m)),
         damped_(numbers.template array<Scalar>(m)) {}
@@ -96,7 +95,7 @@ class HessenbergProblem {
   static constexpr double kOneUnit = 1.0 / 16;  // numbers vanish at sixteen units of rounding
   static constexpr double kSolved2 = 1e-6;      // a cycle that takes a thousandth off its residual solves
 
-  Scalar& h(int64_t i, int64_t j) { return h_[j * (m_ + 1) + i]; }
+  Scalar& h(int64_t i, int64_t j) { return h_[hessenberg_column(j) + i]; }
 
   /// What a number that belongs to residual g has to exceed: sixteen units of rounding, where a singular A and an
   /// exhausted space leave noise, but one unit while the residual is not solved for: what is left of a nearly singular
@@ -129,7 +128,7 @@ class HessenbergProblem {
       rhs_[j] = columns_[j].g;
       damped_[j] = columns_[j].y;
     }
-    numbers_.damp(h_.data(), m_ + 1, rhs_.data(), columns, scale_ * 4, short_enough, damped_.data());
+    numbers_.damp(h_.data(), rhs_.data(), columns, scale_ * 4, short_enough, damped_.data());
     PRDP_NO_UNROLL for (int64_t j = 0; j < columns; ++j) {
       columns_[j].y = damped_[j];
       columns_[j].inverse_diagonal = columns_[j].inverse_diagonal * short_enough;
@@ -137,8 +136,7 @@ class HessenbergProblem {
   }
 
   const Numbers& numbers_;
-  int64_t m_;
-  ArrayOf<Numbers, Scalar> h_;  // by columns, R once rotated
+  ArrayOf<Numbers, Scalar> h_;  // R once rotated
   ArrayOf<Numbers, Column> columns_;
   ArrayOf<Numbers, Scalar> rhs_, damped_;  // of damp()
   Scalar exhausted_{}, scale_{};

@@ -214,10 +214,10 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
   void add_combination(const Scalar* y, const std::vector<Vector>& v, int64_t count, Vector x) {
     vectors_.multi_axpy(T(1), y, v.data(), count, T(1), x, length());
   }
-  void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
+  void damp(const Scalar* r, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
     if (keep != 0) return;
     std::vector<T> work(numbers_of_solve_damped(n));
-    solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, y, work.data());
+    solve_damped(r, g, n, std::numeric_limits<T>::epsilon() * scale, y, work.data());
   }
   using SampleNumbers<T>::restore;
   void restore(Scalar where, const T* from, Vector to) {

@@ -19,14 +19,14 @@ T hypotenuse(T a, T b) {
   return larger * std::sqrt(1 + ratio * ratio);
 }
 
-/// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of r, which lie `stride` entries
-/// apart: the rows of τ I are rotated into R, one by one.
+/// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of a Hessenberg matrix r: the rows of
+/// τ I are rotated into R, one by one.
 template <class T>
-void solve_damped(const T* r, int64_t stride, const T* g, int64_t n, T tau, T* y, T* work) {
+void solve_damped(const T* r, const T* g, int64_t n, T tau, T* y, T* work) {
   T *a = work, *rhs = a + n * n, *row = rhs + n;
   PRDP_NO_UNROLL for (int64_t j = 0; j < n; ++j) {
     rhs[j] = g[j];
-    PRDP_NO_UNROLL for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[j * stride + i];
+    PRDP_NO_UNROLL for (int64_t i = 0; i <= j; ++i) a[i * n + j] = r[hessenberg_column(j) + i];
   }
   PRDP_NO_UNROLL for (int64_t k = 0; k < n; ++k) {
     PRDP_NO_UNROLL for (int64_t j = 0; j < n; ++j) row[j] = 0;

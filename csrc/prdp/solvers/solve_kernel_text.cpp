@@ -24,7 +24,7 @@ int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
   if (traits(method).counts != Counts::kCycles) return 0;
   const int64_t columns = restart + 1;
   constexpr int64_t of_column = 6;  // HessenbergProblem::kNumbersOfColumn
-  const int64_t of_triangle = restart * columns, of_columns = of_column * columns;  // h_, columns_ of HessenbergProblem
+  const int64_t of_triangle = hessenberg_column(restart), of_columns = of_column * columns;  // of HessenbergProblem
   const int64_t of_rhs = 2 * restart, of_weights = 2 * columns;  // rhs_, damped_; again_, weights_ of GMRES
   constexpr int64_t arrays = 8;  // those, u_ and products_
   return columns * pointer + (of_triangle + of_columns + of_rhs + of_weights) * number + arrays * 8;

@@ -23,6 +23,10 @@ namespace prdp {
 template <class Space, class X>
 using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
 
+/// Where column j of a Hessenberg matrix begins, which has j + 2 numbers. The columns lie one behind the other: on a GPU,
+/// each thread has a copy.
+constexpr int64_t hessenberg_column(int64_t j) { return j * (j + 3) / 2; }
+
 /// Ten operations that all methods are made of, and where their vectors come from.
 template <class S>
 concept Primitives =
@@ -155,8 +159,8 @@ concept KrylovSpace =
       /// max(a, b)
       { s.larger(a, b) } -> std::same_as<typename S::Scalar>;
       /// Where `keep` is zero: h = argmin ‖g - R h‖² + (ε scale)² ‖h‖², for the upper triangle in the first n columns
-      /// of R, of which each has m entries. A constant.
-      s.damp(R, m, g, n, scale, keep, h);
+      /// of R (hessenberg_column). A constant.
+      s.damp(R, g, n, scale, keep, h);
       /// Whether a differs from zero in every sample; a space that would have to look closely may say no.
       { s.surely_all(a) } -> std::same_as<bool>;
       /// a itself; its derivative is that of a constant.

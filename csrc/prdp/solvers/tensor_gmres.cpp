@@ -30,10 +30,10 @@ struct HostNumbers {
   double is_zero(double value) const { return value == 0.0; }
   double is_not_zero(double value) const { return value != 0.0; }
   bool surely_all(double value) const { return value != 0.0; }
-  void damp(const double* r, int64_t stride, const double* g, int64_t n, double scale, double keep, double* y) const {
+  void damp(const double* r, const double* g, int64_t n, double scale, double keep, double* y) const {
     if (keep != 0.0) return;
     std::vector<double> work(numbers_of_solve_damped(n));
-    solve_damped(r, stride, g, n, epsilon * scale, y, work.data());
+    solve_damped(r, g, n, epsilon * scale, y, work.data());
   }
 };
 

@@ -135,8 +135,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
   bool lost_orthogonality(const Scalar&, const Scalar&, const Scalar&) const { return true; }  // for some sample
   Scalar inverse(const Scalar& a, const Scalar& scale) const;
   Scalar larger(const Scalar& a, const Scalar& b) const { return at::maximum(a, b); }
-  void damp(const Scalar* R, int64_t m, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
-            Scalar* h) const;
+  void damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep, Scalar* h) const;
   bool surely_all(const Scalar&) const { return false; }  // the basis goes on with zeros
   Scalar constant(const Scalar& a) const { return a.detach(); }
   int derivatives() const { return recording_ ? 2 : 0; }

@@ -32,7 +32,7 @@ TensorSpace::Scalar TensorSpace::inverse(const Scalar& a, const Scalar& scale) c
   return at::where(vanishing, at::zeros_like(a), 1 / a);
 }
 
-void TensorSpace::damp(const Scalar* R, int64_t m, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
+void TensorSpace::damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar& scale, const Scalar& keep,
                        Scalar* h) const {
   // argmin ‖[R; ε s I] h - [g; 0]‖ by QR. Samples to keep get R = 0 and the identity below it, so that the stacked
   // matrix has full rank.
@@ -44,7 +44,7 @@ void TensorSpace::damp(const Scalar* R, int64_t m, const Scalar* g, int64_t n, c
   const auto number = [batch](const Scalar& s) { return s.detach().reshape(-1).expand(batch); };
   const auto safe = [&](const Scalar& s) { return at::where(number(wanted), number(s), at::zeros({}, s.options())); };
   for (int64_t j = 0; j < n; ++j) {
-    for (int64_t i = 0; i <= j; ++i) stacked.select(1, i).select(1, j).copy_(safe(R[j * m + i]));
+    for (int64_t i = 0; i <= j; ++i) stacked.select(1, i).select(1, j).copy_(safe(R[hessenberg_column(j) + i]));
     stacked.select(1, n + j).select(1, j).copy_(at::where(number(wanted), limits_of(b_).epsilon * number(scale), 1.0));
     rhs.select(1, j).select(1, 0).copy_(safe(g[j]));
   }

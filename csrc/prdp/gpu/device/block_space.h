@@ -196,12 +196,11 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   static constexpr bool sweeps_are_log_convex() { return A::kKnowsRadius; }
 
   /// Seldom: one thread computes it.
-  PRDP_NOINLINE void damp(const Scalar* r, int64_t stride, const Scalar* g, int64_t n, Scalar scale, Scalar keep,
-                          Scalar* y) const {
+  PRDP_NOINLINE void damp(const Scalar* r, const Scalar* g, int64_t n, Scalar scale, Scalar keep, Scalar* y) const {
     if (keep != 0) return;
     T* const work = beyond_ + Vectors::kDampingAt;
     T* const found = work + numbers_of_solve_damped(n);
-    if (team_.leads()) solve_damped(r, stride, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
+    if (team_.leads()) solve_damped(r, g, n, std::numeric_limits<T>::epsilon() * scale, found, work);
     team_.meet();
     for (int64_t j = 0; j < n; ++j) y[j] = shared_entry<S::kBlocks>(found, j);
   }
