@@ -98,8 +98,9 @@ class Stepper(HasSettings):
         Raises ValueError or TypeError for a u that does not fit, and with on_failure="raise" `torch.linalg.LinAlgError`
         where a sample fails."""
         found = self._solve(u, self._adjoint_log)
-        self._keep(found[1:], self._adjoint_log, found[0])
-        return found[0]
+        u_next, report = found[0], found[1:]
+        self._keep(report, self._adjoint_log, u_next)
+        return u_next
 
     @forgets_if_it_raises
     def rollout(self, u: Tensor, steps: int) -> Tensor:
@@ -123,8 +124,9 @@ class Stepper(HasSettings):
             else:
                 with _C.StepOfRollout(step + 1, steps):
                     found = step_from(states[-1], logs[step])
-            states.append(found[0])
-            reports.append(found[1:])
+            u_next, *of_step = found
+            states.append(u_next)
+            reports.append(of_step)
         if steps > 0:
             report = [torch.stack(of_steps, 1) for of_steps in zip(*reports, strict=False)]
         else:
@@ -183,13 +185,13 @@ class Stepper(HasSettings):
         may_lose = self.on_failure != "raise" and not compiling and u.requires_grad
         if not may_lose or u.is_cpu:
             found = self._solve_from(u, log)
-            if not may_lose or not _C.any_nonfinite(found[3]):
+            if not may_lose or not _C.any_nonfinite(_status_of(found)):
                 return found
         # The hook sits on a view, to see the cotangent of this step alone. Gradients through a view are summed in
         # another order. On the CPU, where looking is free, u becomes one only once a sample was refused.
         state = u.view_as(u)
         found = self._solve_from(state, log)
-        _C.block_gradients_of_failed(state, found[3], self.on_failure)
+        _C.block_gradients_of_failed(state, _status_of(found), self.on_failure)
         return found
 
     def _solve_from(self, u: Tensor, log: AdjointLog) -> Solution:
@@ -228,6 +230,11 @@ class Stepper(HasSettings):
         the last backward pass if any."""
         reports = [report for report in (self.info, self.adjoint_info) if report is not None]
         return self.info is not None and all(bool(report.solved.all()) for report in reports)
+
+
+def _status_of(found: Solution) -> Tensor:
+    _u, _iterations, _residual, status, _operator_applications, _floor = found
+    return status
 
 
 def _unknown_argument(kind: type[Stepper], unknown: Mapping[str, object]) -> str:

@@ -25,7 +25,7 @@ at::Tensor only(const at::Tensor& t, const Rows& rows) {
   if (all(rows)) return t;
   auto others = at::empty({static_cast<int64_t>(rows.size())}, at::kBool);
   for (size_t i = 0; i < rows.size(); ++i) others.mutable_data_ptr<bool>()[i] = !rows[i];
-  return t.masked_fill(per_sample(others.to(t.device()), t), 0.0);
+  return cleared(t, others.to(t.device()));
 }
 
 Rows finite_rows(const at::Tensor& t) {

@@ -29,7 +29,7 @@ std::vector<at::Tensor> finite_sum(Rows& rows, const Share& share) {
   auto sum = share(rows);
   if (all_finite(sum)) return sum;
   const auto of_none = share(Rows(rows.size(), false));
-  const auto cleared = [&](const Rows& some) {
+  const auto finite_share = [&](const Rows& some) {
     auto found = share(some);
     clear_where_not_finite(found, of_none);
     return found;
@@ -38,9 +38,9 @@ std::vector<at::Tensor> finite_sum(Rows& rows, const Share& share) {
   for (size_t i = 0; i < rows.size(); ++i) {
     Rows alone(rows.size(), false);
     alone[i] = true;
-    if (before[i]) rows[i] = all_finite(cleared(alone));
+    if (before[i]) rows[i] = all_finite(finite_share(alone));
   }
-  sum = cleared(rows);
+  sum = finite_share(rows);
   if (all_finite(sum)) return sum;
   rows.assign(rows.size(), false);  // each is finite and their sum is not
   for (auto& t : sum)

@@ -22,7 +22,7 @@ constexpr const char* kSchema = "linear_solve(Tensor b, " PRDP_SOLVE_SCHEMA ") -
 using Signature = WithSolve<SolveOutputs(const at::Tensor&)>;
 
 // The way of a solve, each function calling the next. Plain tensors take it all; for others `call_op` goes through the
-// dispatcher, from the second step to `autograd` below, and from the fifth to `solve`.
+// dispatcher, from the second step to `autograd_op` below, and from the fifth to `solve_op`.
 //   1. linear_solve: a lone vector (n,) as a batch of one
 //   2. solve_or_dispatch
 //   3. solve_and_differentiate_null_space: the part of u̇ that comes of a null space which depends on parameters
@@ -73,14 +73,14 @@ std::unique_ptr<Operator> checked_operator(const OperatorSpec& spec, const at::T
 }
 
 template <class... Args>
-SolveOutputs solve_op(const at::Tensor& b, const Args&... args) {
+SolveOutputs solve_op(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack_op(args...);
   return outputs_of(linear_solve_unrecorded(a, b, options, x0));
 }
 
 /// Shapes and dtypes only, for fake tensors.
 template <class... Args>
-SolveOutputs fake_op(const at::Tensor& b, const Args&... args) {
+SolveOutputs fake_op(const at::Tensor& b, Args... args) {
   const auto [a, options, x0] = unpack_op(args...);
   checked_operator(a, b, options, x0);
   return outputs_of({at::empty_symint(b.sym_sizes(), b.options()), empty_info(b, {b.sym_size(0)})});
@@ -145,18 +145,11 @@ SolveOutputs solve_or_dispatch(const at::Tensor& b, const OperatorSpec& a, const
   return solve_and_differentiate_null_space(b, a, options, x0);
 }
 
-/// A function pointer with the op's signature out of a template over its arguments.
-template <class>
-struct OpKernels;
 template <class... Args>
-struct OpKernels<SolveOutputs(const at::Tensor&, Args...)> {
-  static SolveOutputs solve(const at::Tensor& b, Args... args) { return solve_op(b, args...); }
-  static SolveOutputs fake(const at::Tensor& b, Args... args) { return fake_op(b, args...); }
-  static SolveOutputs autograd(const at::Tensor& b, Args... args) {
-    const auto [a, options, x0] = unpack_op(args...);
-    return solve_and_differentiate_null_space(b, a, options, x0);
-  }
-};
+SolveOutputs autograd_op(const at::Tensor& b, Args... args) {
+  const auto [a, options, x0] = unpack_op(args...);
+  return solve_and_differentiate_null_space(b, a, options, x0);
+}
 
 }  // namespace
 
@@ -222,8 +215,8 @@ OperatorSpec csr_matrix(const at::Tensor& crow, const at::Tensor& col, const at:
 }
 
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
-TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", OpKernels<Signature>::solve); }
-TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", OpKernels<Signature>::fake); }
-TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", OpKernels<Signature>::autograd); }
+TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", static_cast<Signature*>(solve_op)); }
+TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", static_cast<Signature*>(fake_op)); }
+TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", static_cast<Signature*>(autograd_op)); }
 
 }  // namespace prdp

@@ -18,19 +18,23 @@ namespace prdp {
 
 namespace detail {
 
-template <class Signature>
-struct AddOptions;
-template <class Result, class... Front>
-struct AddOptions<Result(Front...)> {
-  using Type = Result(Front..., const c10::List<std::string>&, c10::SymIntArrayRef, at::ArrayRef<double>,
-                      at::TensorList);
+template <class Signature, class... Types>
+struct AppendTypes;
+template <class Result, class... Front, class... Types>
+struct AppendTypes<Result(Front...), Types...> {
+  using Type = Result(Front..., Types...);
 };
 
 }  // namespace detail
 
+/// The type of a function that takes arguments of these types behind those of `Signature`.
+template <class Signature, class... Types>
+using Append = typename detail::AppendTypes<Signature, Types...>::Type;
+
 /// The type of the kernel of an op whose schema ends in PRDP_OPTIONS_SCHEMA.
 template <class Signature>
-using WithOptions = typename detail::AddOptions<Signature>::Type;
+using WithOptions =
+    Append<Signature, const c10::List<std::string>&, c10::SymIntArrayRef, at::ArrayRef<double>, at::TensorList>;
 
 /// Where each option stands in its list. `packed_options` in prdp_torch/solvers.py writes the same lists: change both
 /// together. An operator as preconditioner puts its tensors into the fourth list, and its shape and its parameters
@@ -161,21 +165,10 @@ struct SolveCall {
 #define PRDP_SOLVE_SCHEMA \
   "Tensor[] tensors, str kind, int[] shape, float[] parameters, bool transposed, Tensor? x0, " PRDP_OPTIONS_SCHEMA
 
-namespace detail {
-
-template <class Signature>
-struct AddSolve;
-template <class Result, class... Front>
-struct AddSolve<Result(Front...)> {
-  using Type = WithOptions<Result(Front..., at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
-                                  bool, const OptionalTensor&)>;
-};
-
-}  // namespace detail
-
 /// The type of the kernel of an op whose schema ends in PRDP_SOLVE_SCHEMA.
 template <class Signature>
-using WithSolve = typename detail::AddSolve<Signature>::Type;
+using WithSolve = WithOptions<Append<Signature, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>,
+                                     bool, const OptionalTensor&>>;
 
 /// Raises as unpack() of its options.
 template <class... Options>
@@ -193,7 +186,15 @@ auto call_with_solve(const Op& op, const OperatorSpec& a, const at::Tensor& x0, 
   return call_with_options(op, o, front..., a.tensors, a.kind, a.shape, a.parameters, a.transposed, or_none(x0));
 }
 
-/// The gradients as an op returns them, those alone that are `needed`, each in the place of its input.
+/// Of the gradients of all inputs, those that are `needed`, as an op returns them.
+inline std::vector<at::Tensor> only_needed(const std::vector<at::Tensor>& gradients, at::IntArrayRef needed) {
+  std::vector<at::Tensor> all;
+  for (size_t i = 0; i < needed.size(); ++i)
+    if (needed[i]) all.push_back(gradients[i]);
+  return all;
+}
+
+/// The reverse: each in the place of its input.
 inline std::vector<at::Tensor> in_places(const std::vector<at::Tensor>& gradients, at::IntArrayRef needed) {
   std::vector<at::Tensor> of_inputs(needed.size());
   for (size_t i = 0, next = 0; i < needed.size(); ++i)
@@ -218,6 +219,16 @@ inline SolveResult result_of(SolveOutputs outputs) {
   auto& [u, iterations, residual, status, applications, floor] = outputs;
   return {std::move(u),
           {std::move(iterations), std::move(residual), std::move(status), std::move(applications), std::move(floor)}};
+}
+
+/// only_needed() of gradients without values: of an input of these sizes in the dtype of `like`, and of `tensors`.
+inline std::vector<at::Tensor> empty_gradients(const at::Tensor& like, c10::SymIntArrayRef sizes,
+                                               at::TensorList tensors, at::IntArrayRef needed) {
+  std::vector<at::Tensor> all;
+  if (needed[0]) all.push_back(at::empty_symint(sizes, like.options()));
+  for (size_t i = 0; i < tensors.size(); ++i)
+    if (needed[i + 1]) all.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
+  return all;
 }
 
 /// A report of these sizes without values, in the dtype of `like`; of fake tensors, too.

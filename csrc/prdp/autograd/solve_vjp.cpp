@@ -31,7 +31,7 @@ at::Tensor without_failed(const at::Tensor& derivative, const at::Tensor& status
   const auto lost = all_failures ? status.lt(static_cast<int64_t>(SolveStatus::kStagnated))
                                  : status.eq(static_cast<int64_t>(SolveStatus::kZeroDiagonal))
                                        .logical_or(status.le(static_cast<int64_t>(SolveStatus::kNonfiniteInput)));
-  return derivative.masked_fill(per_sample(lost, derivative), 0.0);
+  return cleared(derivative, lost);
 }
 
 namespace {
@@ -45,7 +45,7 @@ at::Tensor may_overflow(const at::Tensor& lambda, const at::Tensor& u) {
 /// Takes the samples whose ḡ may overflow out of λ and marks them, without a look by the host.
 void leave_out_overflow_on_device(at::Tensor& lambda, const at::Tensor& u, at::Tensor& status) {
   const auto overflowing = may_overflow(lambda, u);
-  lambda = lambda.masked_fill(per_sample(overflowing, lambda), 0.0);
+  lambda = cleared(lambda, overflowing);
   status = status.masked_fill(overflowing & (status >= static_cast<int64_t>(SolveStatus::kStagnated)),
                               static_cast<int64_t>(SolveStatus::kOverflow));
 }

@@ -39,20 +39,26 @@ class SampleVjps {
         of_iterations_(of_iterations),
         any_solve_(any_solve) {}
 
-  SolveVjp take() {
+  SolveVjp run() {
     if (needs_gradient_of_a_ && options_.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
     classify();
-    differentiate(finite_);
+    found_ = differentiate(accepted_);
     retry_implicitly();
     if (zero_grad_) leave_out_failed_adjoints();
-    if (!needed_[0]) gradients_[0] = at::Tensor();
+    auto& gradients = found_.gradients;
+    if (!needed_[0]) gradients[0] = at::Tensor();
     for (size_t i = 0; i < needed_.size(); ++i)
-      if (needed_[i] && !gradients_[i].defined())
-        gradients_[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
-    return {std::move(gradients_), report()};
+      if (needed_[i] && !gradients[i].defined())
+        gradients[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
+    return {std::move(gradients), report()};
   }
 
  private:
+  struct Differentiated {
+    std::vector<at::Tensor> gradients;    // summed over samples
+    std::vector<SampleOutcome> outcomes;  // of each sample
+  };
+
   const at::Tensor& cotangent_;
   const Solved& solved_;
   const OperatorSpec& spec_;
@@ -75,10 +81,9 @@ class SampleVjps {
   const double judged_rtol_ =
       options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
   std::vector<Derivative> derivatives_{};
-  Rows finite_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
-  at::Tensor finite_cotangent_ = only(cotangent_, finite_);  // the cotangent of samples that are not refused
-  std::vector<SampleOutcome> outcomes_ = std::vector<SampleOutcome>(batch_);
-  std::vector<at::Tensor> gradients_{};
+  Rows accepted_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
+  at::Tensor finite_cotangent_ = only(cotangent_, accepted_);  // the cotangent of samples that are not refused
+  Differentiated found_{};
   at::Tensor u_{};
 
   Rows finite_inverses() const {
@@ -101,25 +106,27 @@ class SampleVjps {
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
     for (int64_t i = 0; i < batch_; ++i)
-      derivatives_.push_back(!finite_[i]          ? Derivative::kRefused
+      derivatives_.push_back(!accepted_[i]        ? Derivative::kRefused
                              : exact[i]           ? Derivative::kOfSolution
                              : !has_derivative(i) ? Derivative::kNone
                                                   : Derivative::kOfIterations);
   }
 
-  /// Sums the gradients of these samples, and notes their outcomes; those whose gradient is not finite leave `rows`.
-  /// finite_sum() may ask for fewer samples in between, and last for those that stay, so that outcomes_ ends as theirs.
-  void differentiate(Rows& rows) {
-    gradients_ = finite_sum(rows, [this](const Rows& some) {
+  /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`. finite_sum() may ask for
+  /// fewer samples in between, and last for those that stay, so that the outcomes end as theirs.
+  Differentiated differentiate(Rows& rows) {
+    std::vector<SampleOutcome> outcomes(batch_);
+    auto gradients = finite_sum(rows, [&](const Rows& some) {
       auto [sum, applications] = vjp_of_iterations(some);
       const auto products = to_host<int64_t>(applications, batch_);
       for (int64_t i = 0; i < batch_; ++i)
-        outcomes_[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
+        outcomes[i] = {status(i), counts_[i], products[i], std::numeric_limits<double>::quiet_NaN()};
       auto solved = some;
       for (int64_t i = 0; i < batch_; ++i) solved[i] = some[i] && derivatives_[i] == Derivative::kOfSolution;
-      if (any(solved)) add_adjoint_solves(solved, sum);
+      if (any(solved)) add_adjoint_solves(solved, sum, outcomes);
       return sum;
     });
+    return {std::move(gradients), std::move(outcomes)};
   }
 
   UnrolledVjp vjp_of_iterations(const Rows& rows) const {
@@ -143,7 +150,8 @@ class SampleVjps {
     return of_iterations_(only(finite_cotangent_, rows), b, solve, wanted_);
   }
 
-  void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum) {
+  /// Adds the gradients of these samples to `sum`, and notes what came of their adjoint solves.
+  void add_adjoint_solves(const Rows& rows, std::vector<at::Tensor>& sum, std::vector<SampleOutcome>& outcomes) {
     auto adjoint = options_;
     adjoint.backward = Backward::kImplicit;
     adjoint.checkpoint_every = adjoint.adjoint_log = 0;
@@ -161,19 +169,19 @@ class SampleVjps {
       const auto said = static_cast<SolveStatus>(statuses[i]);
       const bool has_none = is_refused(said) || said == SolveStatus::kOverflow;  // no gradient, whatever its residual
       const bool good = statuses[i] < 0 && !has_none && residual[i] <= judged_rtol_;
-      outcomes_[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
+      outcomes[i] = {good ? SolveStatus::kConverged : said, iterations[i], products[i], residual[i]};
     }
   }
 
   /// The implicit gradient takes the place of those that mislead (misleading_derivatives.h).
   void retry_implicitly() {
-    if (!may_mislead_ || !gradients_[0].defined()) return;
+    if (!may_mislead_ || !found_.gradients[0].defined()) return;
     auto rows = solved_samples(solved_);
     for (int64_t i = 0; i < batch_; ++i)
-      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && finite_[i];
+      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && accepted_[i];
     if (!any(rows)) return;
     const auto allowed = allowed_disagreement(solved_, options_.solver);
-    auto misleading = misleading_b_bar(*a_, finite_cotangent_, gradients_[0], rows, allowed);
+    auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
     for (int64_t i = 0; i < batch_; ++i) rows[i] = rows[i] && !misleading[i];
     if (needs_gradient_of_a_ && any(rows)) {
       const auto found = gradients_of(rows);
@@ -185,37 +193,34 @@ class SampleVjps {
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
       if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
-    differentiate(finite_);
+    found_ = differentiate(accepted_);
   }
 
   /// Those of the iterations of these samples alone; undefined where none ran.
   std::vector<at::Tensor> gradients_of(const Rows& rows) const {
     for (int64_t i = 0; i < batch_; ++i)
-      if (!rows[i] && finite_[i] && derivatives_[i] != Derivative::kNone) return vjp_of_iterations(rows).gradients;
-    return gradients_;  // no other sample contributes
+      if (!rows[i] && accepted_[i] && derivatives_[i] != Derivative::kNone) return vjp_of_iterations(rows).gradients;
+    return found_.gradients;  // no other sample contributes
   }
 
   void leave_out_failed_adjoints() {
-    auto good = finite_;
-    for (int64_t i = 0; i < batch_; ++i) good[i] = finite_[i] && !adjoint_failed(i);
-    if (good == finite_) return;
-    const auto outcomes_before = outcomes_;  // for the sums alone: the failed adjoint solves stay in the report
-    differentiate(good);
-    outcomes_ = outcomes_before;
+    auto good = accepted_;
+    for (int64_t i = 0; i < batch_; ++i) good[i] = accepted_[i] && !adjoint_failed(i);
+    if (good != accepted_) found_.gradients = differentiate(good).gradients;  // the failed stay in the report
   }
   bool adjoint_failed(int64_t i) const {
-    return derivatives_[i] == Derivative::kOfSolution && is_failure(outcomes_[i].status);
+    return derivatives_[i] == Derivative::kOfSolution && is_failure(found_.outcomes[i].status);
   }
 
   SolveInfo report() {
     for (int64_t i = 0; i < batch_; ++i)
-      if (!finite_[i])
-        outcomes_[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
-                                                                            : SolveStatus::kOverflow);
-    auto failures = outcomes_;  // the forward solve has reported its own
+      if (!accepted_[i])
+        found_.outcomes[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
+                                                                                  : SolveStatus::kOverflow);
+    auto failures = found_.outcomes;  // the forward solve has reported its own
     for (int64_t i = 0; i < batch_; ++i)
-      if (finite_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
-    auto info = info_of(outcomes_, solved_.b.scalar_type());
+      if (accepted_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
+    auto info = info_of(found_.outcomes, solved_.b.scalar_type());
     if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
     report_failures({spec_, options_.solver, /*adjoint=*/true}, *a_, cotangent_,
                     info_of(failures, solved_.b.scalar_type()), options_.on_failure);
@@ -238,7 +243,7 @@ class SampleVjps {
 SolveVjp vjp_of_samples(const at::Tensor& cotangent, const Solved& solved, const OperatorSpec& spec,
                         const SolveOptions& options, at::IntArrayRef needed, OfIterations of_iterations,
                         decltype(linear_solve)& any_solve) {
-  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).take();
+  return SampleVjps(cotangent, solved, spec, options, needed, of_iterations, any_solve).run();
 }
 
 }  // namespace prdp

@@ -67,9 +67,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
   make_operator(a)->check_parameters(checks_of(options.on_failure));
   const auto found = vjp_of_samples(cotangent, {b.detach(), {}, iterations, status, residual, x0}, a, options, needed,
                                     run_iterations_back, linear_solve_unrecorded);
-  std::vector<at::Tensor> gradients;
-  for (size_t i = 0; i < needed.size(); ++i)
-    if (needed[i]) gradients.push_back(found.gradients[i]);
+  const auto gradients = only_needed(found.gradients, needed);
   const auto& info = found.info;
   // -1 crosses the op for no residual: torch's checks of ops compare outputs, and NaN equals nothing.
   const auto residual_or_not = info.residual.masked_fill(info.residual.isnan(), -1.0);
@@ -79,10 +77,7 @@ Outputs vjp_kernel(const at::Tensor& cotangent, const at::Tensor& b, const at::T
 template <class... Others>
 Outputs fake_kernel(const at::Tensor&, const at::Tensor& b, const at::Tensor&, const at::Tensor&, const at::Tensor&,
                     at::IntArrayRef needed, at::TensorList tensors, Others...) {
-  std::vector<at::Tensor> gradients;
-  if (needed[0]) gradients.push_back(at::empty_symint(b.sym_sizes(), b.options()));
-  for (size_t i = 0; i < tensors.size(); ++i)
-    if (needed[i + 1]) gradients.push_back(at::empty_symint(tensors[i].sym_sizes(), tensors[i].options()));
+  const auto gradients = empty_gradients(b, b.sym_sizes(), tensors, needed);
   const auto info = empty_info(b, {b.sym_size(0)});
   return {gradients, info.iterations, info.residual, info.status, info.operator_applications, info.floor};
 }

@@ -40,8 +40,6 @@ class Laplacian final : public Kernel<T> {
 
   explicit Laplacian(const LaplacianParameters& given) : Laplacian(given, scale_of(given)) {}
 
-  /// Of factor()·A.
-  const LaplacianParameters& parameters() const { return parameters_; }
   double norm() const override { return norm_; }
   bool has_zero_diagonal() const override { return centre_ == T(0); }
   void divide_by_diagonal(const T* b, T* c) const override { Base::vectors_.scale(T(1) / centre_, b, c, length()); }
@@ -135,7 +133,7 @@ class Laplacian final : public Kernel<T> {
   }
 
   const Loops<T>& loops_ = loops<T>();
-  LaplacianParameters parameters_;
+  LaplacianParameters parameters_;  // of factor()·A
   T centre_;
   double norm_, radius_;
   std::vector<T> apply_weights_, sweep_weights_;  // rows by lane: x, y, z

@@ -25,8 +25,8 @@ std::unique_ptr<Multigrid<T>> Multigrid<T>::make(const Kernel<T>& a, const Kerne
 
 template <class T>
 Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Kernel<T>& a, const Kernel<T>* transpose,
-                        bool kernel_is_transposed, int64_t smoothing)
-    : hierarchy_(std::move(hierarchy)), kernel_is_transposed_(kernel_is_transposed) {
+                        bool given_transposed, int64_t smoothing)
+    : hierarchy_(std::move(hierarchy)), given_transposed_(given_transposed) {
   levels_.reserve(hierarchy_->levels().size());
   add_level(0, a, transpose, smoothing);
   // In the layout of a Stencil, planes are channels; in that of a Laplacian, which has one, they are planes of the
@@ -35,10 +35,9 @@ Multigrid<T>::Multigrid(std::shared_ptr<const Hierarchy<T>> hierarchy, const Ker
   const int64_t fields = channels ? a.layout().planes : 1;
   levels_[0].grid = PaddedGrid::of(a.layout(), hierarchy_->levels()[0].grid, channels);
   for (size_t l = 1; l < hierarchy_->levels().size(); ++l) {
-    auto own = std::make_unique<Stencil<T>>(hierarchy_->packed(l, kernel_is_transposed), fields, T(1));
+    auto own = std::make_unique<Stencil<T>>(hierarchy_->packed(l, given_transposed), fields, T(1));
     std::unique_ptr<Kernel<T>> own_transpose;
-    if (transpose)
-      own_transpose = std::make_unique<Stencil<T>>(hierarchy_->packed(l, !kernel_is_transposed), fields, T(1));
+    if (transpose) own_transpose = std::make_unique<Stencil<T>>(hierarchy_->packed(l, !given_transposed), fields, T(1));
     add_level(l, *own, own_transpose.get(), smoothing);
     levels_[l].own = std::move(own);
     levels_[l].own_transpose = std::move(own_transpose);
@@ -86,12 +85,10 @@ void Multigrid<T>::apply_transpose(const T* r, T* z) {
 template <class T>
 const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
   auto& level = levels_[l];
-  const auto& transfers = hierarchy_->levels()[l].transfers;
-  if (transfers.empty()) return solve_coarsest(b, transposed);
+  if (hierarchy_->levels()[l].transfers.empty()) return solve_coarsest(b, transposed);
   const auto& a = kernel(level, transposed);
   const int64_t length = a.length();
   T *x = level.memory.vector(kX), *y = level.memory.vector(kY), *r = level.memory.vector(kR);
-  const bool of_transpose = transposed != kernel_is_transposed_;
 
   a.divide_by_diagonal(b, x);
   vectors_.scale(level.q[0], x, x, length);
@@ -99,27 +96,41 @@ const T* Multigrid<T>::cycle(size_t l, const T* b, bool transposed) {
   for (size_t s = 1; s < level.p.size(); ++s, std::swap(x, y)) a.smooth(b, x, y, level.p[s], level.q[s]);
 
   a.residual(b, x, r);
-  const auto vector = [&](size_t t) {
-    return t == 0 ? r : level.memory.vector(kPartWay + static_cast<int64_t>(t) - 1);
-  };
-  const auto grid = [&](size_t t) -> const PaddedGrid& { return t == 0 ? level.grid : level.part_way[t - 1]; };
-  auto& next = levels_[l + 1];
-  const size_t last = transfers.size() - 1;
-  for (size_t t = 0; t < last; ++t) transfers[t].restrict(grid(t), vector(t), grid(t + 1), vector(t + 1), of_transpose);
-  T* const next_b = next.memory.vector(kB);
-  transfers[last].restrict(grid(last), vector(last), next.grid, next_b, of_transpose);
-  const T* correction = cycle(l + 1, next_b, transposed);
-  const PaddedGrid* from = &next.grid;
-  for (size_t t = last; t > 0; --t) {
-    vectors_.fill_zero(vector(t), grid(t).fields * grid(t).field);
-    transfers[t].add_interpolated(*from, correction, grid(t), vector(t), of_transpose);
-    correction = vector(t);
-    from = &grid(t);
-  }
-  transfers[0].add_interpolated(*from, correction, level.grid, x, of_transpose);
+  const T* const coarse_b = restrict_residual(l, transposed);
+  add_correction(l, cycle(l + 1, coarse_b, transposed), x, transposed);
 
   for (size_t s = 0; s < level.p.size(); ++s, std::swap(x, y)) a.smooth(b, x, y, level.p[s], level.q[s]);
   return x;
+}
+
+template <class T>
+const T* Multigrid<T>::restrict_residual(size_t l, bool transposed) {
+  auto &level = levels_[l], &next = levels_[l + 1];
+  const auto& transfers = hierarchy_->levels()[l].transfers;
+  const size_t last = transfers.size() - 1;
+  for (size_t t = 0; t < last; ++t)
+    transfers[t].restrict(level.grid_before(t), level.vector_before(t), level.grid_before(t + 1),
+                          level.vector_before(t + 1), is_of_transpose(transposed));
+  T* const coarse_b = next.memory.vector(kB);
+  transfers[last].restrict(level.grid_before(last), level.vector_before(last), next.grid, coarse_b,
+                           is_of_transpose(transposed));
+  return coarse_b;
+}
+
+template <class T>
+void Multigrid<T>::add_correction(size_t l, const T* correction, T* x, bool transposed) {
+  auto& level = levels_[l];
+  const auto& transfers = hierarchy_->levels()[l].transfers;
+  const PaddedGrid* from = &levels_[l + 1].grid;
+  for (size_t t = transfers.size() - 1; t > 0; --t) {
+    const PaddedGrid& to = level.grid_before(t);
+    T* const finer = level.vector_before(t);
+    vectors_.fill_zero(finer, to.fields * to.field);
+    transfers[t].add_interpolated(*from, correction, to, finer, is_of_transpose(transposed));
+    correction = finer;
+    from = &to;
+  }
+  transfers[0].add_interpolated(*from, correction, level.grid, x, is_of_transpose(transposed));
 }
 
 template <class T>
@@ -132,7 +143,7 @@ const T* Multigrid<T>::solve_coarsest(const T* b, bool transposed) {
   contiguous_.resize(layout.unknowns());
   solved_.resize(layout.unknowns());
   layout.store(b, T(1), contiguous_.data());
-  const bool by_columns = transposed != kernel_is_transposed_;
+  const bool by_columns = is_of_transpose(transposed);
   for (int64_t f = 0; f < fields; ++f)
     for (int64_t i = 0; i < n; ++i) {
       T sum = 0;

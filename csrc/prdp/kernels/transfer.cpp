@@ -87,22 +87,39 @@ void Transfer<T>::for_each_row(const PaddedGrid& grid, const Body& body) const {
   });
 }
 
-// Along the axis, coarse points C and those between, b: C b C b … where it is periodic, first_coarse_ = 0; b C b C b
-// between two zeros where it is not, first_coarse_ = 1. So a row of b has one place more in front.
+template <class T>
+template <class AlongX, class Across>
+void Transfer<T>::make_rows(const PaddedGrid& from, const T* in, const PaddedGrid& to, T* out, const Compressed& w,
+                            const AlongX& along_x, const Across& across) const {
+  for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
+    T* const made = out + to.at(f, z, y);
+    if (axis_ == 2) {
+      const int64_t at = weights_at(z, y);
+      return along_x(in + from.at(f, z, y), w.left.data() + at, w.right.data() + at, made);
+    }
+    const auto row = [&](int64_t i) { return in + (axis_ == 0 ? from.at(f, i, y) : from.at(f, z, i)); };
+    const auto weight = [&](const std::vector<T>& field, int64_t k) {
+      return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
+    };
+    across(axis_ == 0 ? z : y, row, w, weight, made);
+  });
+}
 
 template <class T>
 void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right, T* coarse) const {
   const auto& loops = kernels::loops<T>();
   const int64_t nx = fine_.shape[2], count = between();
   auto& rows = SplitRows<T>::local(nx);
-  T *here = rows.coarse.data(), *others = rows.between.data();  // the latter from place 1 on
-  if (first_coarse_ == 0) loops.split(fine, here, others + 1, nx);
-  else loops.split(fine, others + 1, here, nx);
-  others[0] = others[count];  // of an odd periodic axis, two C meet there, and compress() has left a weight of zero
-  others[count + 1] = T(0);
-  const int64_t place_before = first_coarse_, place_after = place_before + 1;
-  loops.restrict_row(here, others + place_before, right + place_before, others + place_after, left + place_after,
-                     coarse, coarse_.shape[2]);
+  // The points between start at place 1: place 0 is for what lies before the first coarse point.
+  T *coarse_points = rows.coarse.data(), *between_points = rows.between.data();
+  if (first_coarse_ == 0) loops.split(fine, coarse_points, between_points + 1, nx);
+  else loops.split(fine, between_points + 1, coarse_points, nx);
+  // Where the last C meets the first, on an odd periodic axis, compress() has left a weight of zero for it.
+  between_points[0] = between_points[count];
+  between_points[count + 1] = T(0);
+  const int64_t first_before = first_coarse_, first_after = first_before + 1;  // of the first coarse point
+  loops.restrict_row(coarse_points, between_points + first_before, right + first_before, between_points + first_after,
+                     left + first_after, coarse, coarse_.shape[2]);
 }
 
 template <class T>
@@ -126,19 +143,9 @@ void Transfer<T>::restrict_row(int64_t j, const Row& row, const Compressed& w, c
 template <class T>
 void Transfer<T>::restrict(const PaddedGrid& from, const T* fine, const PaddedGrid& to, T* coarse,
                            bool transposed) const {
-  const auto& w = of_restriction(transposed);
-  for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
-    T* const out = coarse + to.at(f, z, y);
-    if (axis_ == 2) {
-      const int64_t at = weights_at(z, y);
-      return restrict_along_x(fine + from.at(f, z, y), w.left.data() + at, w.right.data() + at, out);
-    }
-    const auto row = [&](int64_t i) { return fine + (axis_ == 0 ? from.at(f, i, y) : from.at(f, z, i)); };
-    const auto weight = [&](const std::vector<T>& field, int64_t k) {
-      return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
-    };
-    restrict_row(axis_ == 0 ? z : y, row, w, weight, out);
-  });
+  make_rows(
+      from, fine, to, coarse, of_restriction(transposed), [this](auto... row) { restrict_along_x(row...); },
+      [this](const auto&... row) { restrict_row(row...); });
 }
 
 template <class T>
@@ -146,15 +153,17 @@ void Transfer<T>::interpolate_along_x(const T* coarse, const T* left, const T* r
   const auto& loops = kernels::loops<T>();
   const int64_t nx = fine_.shape[2], coarse_count = coarse_.shape[2], count = between();
   auto& rows = SplitRows<T>::local(nx);
-  T *here = rows.coarse.data(), *others = rows.between.data();  // the former from place 1 on
-  std::copy_n(coarse, coarse_count, here + 1);
-  here[0] = T(0);
-  here[coarse_count + 1] = periodic_ ? here[1] : T(0);
-  std::fill_n(others, count, T(0));
-  const int64_t place_before = first_between_, place_after = place_before + 1;
-  loops.add_interpolated(here + place_before, left + 1, here + place_after, right + 1, others, count);
-  if (first_coarse_ == 0) loops.add_merged(here + 1, others, fine, nx);
-  else loops.add_merged(others, here + 1, fine, nx);
+  // The coarse points start at place 1: place 0 is for what lies before the first point between.
+  T *coarse_points = rows.coarse.data(), *between_points = rows.between.data();
+  std::copy_n(coarse, coarse_count, coarse_points + 1);
+  coarse_points[0] = T(0);
+  coarse_points[coarse_count + 1] = periodic_ ? coarse_points[1] : T(0);
+  std::fill_n(between_points, count, T(0));
+  const int64_t first_before = first_between_, first_after = first_before + 1;  // of the first point between
+  loops.add_interpolated(coarse_points + first_before, left + 1, coarse_points + first_after, right + 1, between_points,
+                         count);
+  if (first_coarse_ == 0) loops.add_merged(coarse_points + 1, between_points, fine, nx);
+  else loops.add_merged(between_points, coarse_points + 1, fine, nx);
 }
 
 template <class T>
@@ -171,19 +180,9 @@ void Transfer<T>::interpolate_row(int64_t i, const Row& row, const Compressed& w
 template <class T>
 void Transfer<T>::add_interpolated(const PaddedGrid& from, const T* coarse, const PaddedGrid& to, T* fine,
                                    bool transposed) const {
-  const auto& w = of_interpolation(transposed);
-  for_each_row(to, [&](int64_t f, int64_t z, int64_t y) {
-    T* const out = fine + to.at(f, z, y);
-    if (axis_ == 2) {
-      const int64_t at = weights_at(z, y);
-      return interpolate_along_x(coarse + from.at(f, z, y), w.left.data() + at, w.right.data() + at, out);
-    }
-    const auto row = [&](int64_t j) { return coarse + (axis_ == 0 ? from.at(f, j, y) : from.at(f, z, j)); };
-    const auto weight = [&](const std::vector<T>& field, int64_t k) {
-      return field.data() + (axis_ == 0 ? weights_at(k, y) : weights_at(z, k));
-    };
-    interpolate_row(axis_ == 0 ? z : y, row, w, weight, out);
-  });
+  make_rows(
+      from, coarse, to, fine, of_interpolation(transposed), [this](auto... row) { interpolate_along_x(row...); },
+      [this](const auto&... row) { interpolate_row(row...); });
 }
 
 template class Transfer<float>;

@@ -21,7 +21,11 @@ struct PaddedGrid {
   int64_t at(int64_t f, int64_t z, int64_t y) const { return f * field + z * plane + y * row; }
 };
 
-/// Restriction and interpolation along one axis, for fields in padded memory; the same for every field.
+/// Restriction and interpolation along one axis, for fields in padded memory; the same for every field. Along the axis,
+/// coarse points C and those between, b, take turns:
+///
+///     C b C b …  (C)   on a periodic axis, where the first C follows the last b, or the last C if their number is odd;
+///     0 b C b C b 0    on any other, where zeros lie beyond the ends.
 template <class T>
 class Transfer {
  public:
@@ -55,8 +59,13 @@ class Transfer {
 
   template <class Body>
   void for_each_row(const PaddedGrid& grid, const Body& body) const;
-  /// One row of the above. Along x a row is split into its coarse and its other points, and merged again; along another
-  /// axis whole rows are combined.
+  /// Makes each row of `out`: where the axis is x, by along_x(row of `in`, left, right, row of `out`), and else by
+  /// across(i, row, w, weight, row of `out`), as restrict_row() and interpolate_row() take them.
+  template <class AlongX, class Across>
+  void make_rows(const PaddedGrid& from, const T* in, const PaddedGrid& to, T* out, const Compressed& w,
+                 const AlongX& along_x, const Across& across) const;
+  /// One row. Along x it is split into its coarse points and those between, and merged again; along another axis whole
+  /// rows are combined.
   void restrict_along_x(const T* fine, const T* left, const T* right, T* coarse) const;
   void interpolate_along_x(const T* coarse, const T* left, const T* right, T* fine) const;
   /// Row j of the coarse grid along the axis, from row(i) of the fine one; weight(field, k) is that of the k-th row

@@ -16,6 +16,8 @@ class BroadcastSums {
   /// For a tensor with the axes of the products, each of the same extent or of one; or without axes. The products
   /// have one point along the axis `across` of the grid, if there is such an axis.
   gpu::BroadcastSum add(const at::Tensor& of, int64_t across = -1);
+  /// How many have been added: the index that the next one gets.
+  size_t size() const { return sums_.size(); }
   /// Of all sums.
   int64_t count() const { return count_; }
   /// Where the kernel puts the k-th sum. All have been added.

@@ -18,6 +18,13 @@ gpu::SideField<T> side_field(const at::Tensor& h) {
   return {h.const_data_ptr<T>(), h.size(0) == 1 ? 0 : h.stride(0), 1, T(0)};
 }
 
+/// A side whose h gets a derivative.
+struct RobinSide {
+  int64_t axis, number;  // the latter as the kernel counts sides
+  size_t sum;            // its index among all sums
+  at::Tensor h;          // as the kernel reads it
+};
+
 }  // namespace
 
 template <class T>
@@ -38,33 +45,30 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
       of.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
   }
   BroadcastSums sums(l);
+  const size_t shift_sum = sums.size();
   of.sums[0] = sums.add(shift_);
-  std::vector<at::Tensor> h;
+  std::vector<RobinSide> robin_sides;
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (size_t end = 0; end < 2; ++end) {
       if (sides_[axis][end] != Side::kRobin) continue;
-      const int64_t side = 2 * axis_of_kernel(axis, dim()) + static_cast<int64_t>(end);
-      h.push_back(robin(axis, end).detach().contiguous());
-      of.robin[side] = side_field<T>(h.back());
-      of.sums[1 + side] = sums.add(robin(axis, end), axis);
+      const int64_t number = 2 * axis_of_kernel(axis, dim()) + static_cast<int64_t>(end);
+      robin_sides.push_back({axis, number, sums.size(), robin(axis, end).detach().contiguous()});
+      of.robin[number] = side_field<T>(robin_sides.back().h);
+      of.sums[1 + number] = sums.add(robin(axis, end), axis);
     }
-  size_t next = 0;
-  for (int k = 0; k < of.kSums; ++k)
-    if (of.sums[k].count > 0) of.of_sums[k] = sums.memory(next++);
+  of.of_sums[0] = sums.memory(shift_sum);
+  for (const auto& side : robin_sides) of.of_sums[1 + side.number] = sums.memory(side.sum);
   const int64_t count = of_kappa.numel() + sums.count();
   if (!gpu::each_point(l.device(),
                        product_rule_body<T>("DiffusionProductRule", "prdp/gpu/device/diffusion_product_rule.h"), of,
                        count))
     return {};
-  next = 0;
-  const auto of_shift = sums.result(next++);
+  const auto of_shift = sums.result(shift_sum);
   std::vector<at::Tensor> found{of_kappa.squeeze(1), shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
-  for (int64_t axis = 0; axis < dim(); ++axis)
-    for (const auto side : sides_[axis]) {
-      if (side != Side::kRobin) continue;
-      const auto bar = sums.result(next++);
-      found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + axis).squeeze(1));
-    }
+  for (const auto& side : robin_sides) {
+    const auto bar = sums.result(side.sum);
+    found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + side.axis).squeeze(1));
+  }
   return found;
 }
 

@@ -22,35 +22,17 @@ at::Tensor along(const at::Tensor& t, int64_t axis, int64_t dim) {
 
 Separability::Separability(const at::Tensor& coefficients, const std::vector<bool>& periodic)
     : shape_(coefficients.sizes().slice(2).vec()), periodic_(periodic), epsilon_(epsilon_of(coefficients)) {
-  // Joined into one tensor, for one copy to the host, and taken apart there in this order: lines, ends, Sizes.
-  std::vector<at::Tensor> lines, columns;
-  for (int64_t axis = 0; axis < dim(); ++axis) lines.push_back(middle_line(coefficients, axis));
-  for (const auto& line : lines) columns.push_back(line.flatten(1));
-  at::Tensor outer;
+  std::vector<at::Tensor> lines, ends;
   for (int64_t axis = 0; axis < dim(); ++axis) {
-    const auto ends = decoupled_ends(coefficients, axis);
-    columns.push_back(ends.to(coefficients.scalar_type()));
-    if (periodic_[axis]) continue;
-    const auto between = ends.new_zeros({ends.size(0), shape_[axis] - 2});
-    const auto of_axis = along(at::cat({ends.narrow(1, 0, 1), between, ends.narrow(1, 1, 1)}, 1), axis, dim());
-    outer = outer.defined() ? outer.logical_or(of_axis) : of_axis;
+    lines.push_back(middle_line(coefficients, axis));
+    ends.push_back(decoupled_ends(coefficients, axis));
   }
-  const auto largest = [](const at::Tensor& t) { return t.flatten(1).amax(1, /*keepdim=*/true); };
-  const auto largest_inside = [&](const at::Tensor& t) {
-    return largest(outer.defined() ? t.masked_fill(outer, 0.0) : t);
-  };
-  const auto size = coefficients.abs(), diagonal = size.select(1, 0);
-  const auto distance = distance_from_sum(coefficients, lines);
-  // As Sizes has them.
-  for (const auto& t : {distance, size.sum(1), diagonal, diagonal.reciprocal()}) columns.push_back(largest_inside(t));
-  columns.push_back(largest(size));
+  std::vector<at::Tensor> columns;  // as take_apart() expects them, and key() hashes them
+  for (const auto& line : lines) columns.push_back(line.flatten(1));
+  for (const auto& of_axis : ends) columns.push_back(of_axis.to(coefficients.scalar_type()));
+  for (const auto& size : largest_sizes(coefficients, lines, decoupled_planes(ends))) columns.push_back(size);
   host_ = at::cat(columns, 1).to(at::kCPU, at::kDouble).contiguous();
-  int64_t column = 0;
-  const auto next = [&](int64_t count) { return host_.narrow(1, std::exchange(column, column + count), count); };
-  for (const auto& line : lines)
-    lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
-  for (int64_t axis = 0; axis < dim(); ++axis) ends_.push_back(next(2));
-  sizes_ = next(5);
+  take_apart(lines);
 }
 
 at::Tensor Separability::middle_line(const at::Tensor& coefficients, int64_t axis) const {
@@ -72,6 +54,30 @@ at::Tensor Separability::decoupled_ends(const at::Tensor& coefficients, int64_t 
   return at::stack(ends, 1);
 }
 
+at::Tensor Separability::decoupled_planes(const std::vector<at::Tensor>& ends) const {
+  at::Tensor planes;
+  for (int64_t axis = 0; axis < dim(); ++axis) {
+    if (periodic_[axis]) continue;
+    const auto& of_ends = ends[axis];
+    const auto between = of_ends.new_zeros({of_ends.size(0), shape_[axis] - 2});
+    const auto of_axis = along(at::cat({of_ends.narrow(1, 0, 1), between, of_ends.narrow(1, 1, 1)}, 1), axis, dim());
+    planes = planes.defined() ? planes.logical_or(of_axis) : of_axis;
+  }
+  return planes;
+}
+
+std::vector<at::Tensor> Separability::largest_sizes(const at::Tensor& coefficients,
+                                                    const std::vector<at::Tensor>& lines,
+                                                    const at::Tensor& outer) const {
+  const auto largest = [](const at::Tensor& t) { return t.flatten(1).amax(1, /*keepdim=*/true); };
+  const auto largest_inside = [&](const at::Tensor& t) {
+    return largest(outer.defined() ? t.masked_fill(outer, 0.0) : t);
+  };
+  const auto size = coefficients.abs(), diagonal = size.select(1, 0);
+  return {largest_inside(distance_from_sum(coefficients, lines)), largest_inside(size.sum(1)), largest_inside(diagonal),
+          largest_inside(diagonal.reciprocal()), largest(size)};
+}
+
 at::Tensor Separability::distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const {
   at::Tensor diagonal;
   std::vector<at::Tensor> apart;
@@ -85,6 +91,15 @@ at::Tensor Separability::distance_from_sum(const at::Tensor& coefficients, const
   return at::stack(apart, 1).abs().amax(1);
 }
 
+void Separability::take_apart(const std::vector<at::Tensor>& lines) {
+  int64_t column = 0;
+  const auto next = [&](int64_t count) { return host_.narrow(1, std::exchange(column, column + count), count); };
+  for (const auto& line : lines)
+    lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
+  for (int64_t axis = 0; axis < dim(); ++axis) ends_.push_back(next(2));
+  sizes_ = next(5);
+}
+
 Separability::Sizes Separability::sizes(int64_t s) const {
   const auto of = sizes_.accessor<double, 2>()[s];
   return {of[0], of[1], of[2], of[3], of[4]};
@@ -93,12 +108,12 @@ Separability::Sizes Separability::sizes(int64_t s) const {
 bool Separability::is_finite(int64_t s) const { return std::isfinite(sizes(s).largest); }
 
 std::optional<kernels::SumOverAxes> Separability::sum(int64_t s) const {
-  const auto [distance, norm, diagonal, inverse_diagonal, largest] = sizes(s);
+  const auto [distance_from_sum, norm, diagonal, inverse_diagonal, largest] = sizes(s);
   const double slack = kernels::slack_of_sum(norm, epsilon_);
   const auto box = inner_box(s);
   const bool has_axes = std::all_of(box.shape.begin(), box.shape.end(), [](int64_t n) { return n >= 3; });
   const bool has_even_rows = diagonal * inverse_diagonal <= kernels::kWidestRows;
-  if (!has_axes || !has_even_rows || !(distance <= slack)) return std::nullopt;
+  if (!has_axes || !has_even_rows || !(distance_from_sum <= slack)) return std::nullopt;
   const auto a = sum_of_lines(s, box);
   const auto is_symmetric = [slack](const Eigen::MatrixXd& m) { return kernels::is_symmetric(m, slack); };
   return std::all_of(a.begin(), a.end(), is_symmetric) ? std::optional(a) : std::nullopt;

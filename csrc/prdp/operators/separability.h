@@ -32,8 +32,16 @@ class Separability {
   at::Tensor middle_line(const at::Tensor& coefficients, int64_t axis) const;
   /// Whether nothing couples the points of the first, and of the last plane to any others: (batch or 1, 2).
   at::Tensor decoupled_ends(const at::Tensor& coefficients, int64_t axis) const;
+  /// Where the points of the decoupled ends are, for which A is diagonal: bool, broadcast over the grid; undefined if
+  /// all axes are periodic.
+  at::Tensor decoupled_planes(const std::vector<at::Tensor>& ends) const;
+  /// As Sizes has them, (batch or 1, 1) each. The inner points are those that `outer` does not mark.
+  std::vector<at::Tensor> largest_sizes(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines,
+                                        const at::Tensor& outer) const;
   /// The largest of all coefficients of a point.
   at::Tensor distance_from_sum(const at::Tensor& coefficients, const std::vector<at::Tensor>& lines) const;
+  /// The columns of `host_`, in their order: lines, ends, sizes.
+  void take_apart(const std::vector<at::Tensor>& lines);
   kernels::SumOverAxes sum_of_lines(int64_t s, const InnerBox& box) const;
 
   struct Sizes {

@@ -18,7 +18,6 @@ at::Tensor along_axes(const at::Tensor& v, at::TensorList matrices, bool transpo
 /// The points of a grid without some planes at the ends of its axes: those from `first` on.
 struct InnerBox {
   std::vector<int64_t> first, shape;
-  bool operator==(const InnerBox&) const = default;
   /// t, whose last axes are those of the grid, there.
   at::Tensor of(at::Tensor t) const;
 };

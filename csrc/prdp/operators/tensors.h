@@ -15,6 +15,12 @@ inline at::Tensor per_sample(at::Tensor t, const at::Tensor& like) {
   return t;
 }
 
+/// t with zeros in these samples, of a mask (batch,), even if they were not finite; either may be undefined.
+/// Differentiable.
+inline at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
+  return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
+}
+
 /// The unknowns of one channel of v, as its last axis: (…, n).
 inline at::Tensor by_channel(const at::Tensor& v) { return v.dim() < 3 ? v : v.flatten(2); }
 

@@ -2,7 +2,7 @@
 
 #include <ATen/EmptyTensor.h>
 
-#include <string_view>
+#include <optional>
 
 #include "prdp/kernels/factor_cache.h"
 #include "prdp/solvers/methods.h"
@@ -16,7 +16,9 @@ namespace prdp {
 
 namespace {
 
-thread_local const char* way = "";
+/// How a solve is computed: in one launch on a GPU, by the loops of the CPU, or by tensor operations.
+enum class Way { kKernel, kLoops, kTensors };
+thread_local std::optional<Way> last_way;
 
 /// Past the dispatcher: small solves take no longer than a few of its calls.
 at::Tensor empty(at::IntArrayRef sizes, at::ScalarType dtype) { return at::detail::empty_cpu(sizes, dtype); }
@@ -85,7 +87,14 @@ std::optional<SolveResult> solve_on_loops(const Operator& a, const at::Tensor& b
 
 }  // namespace
 
-const char* way_of_last_solve() { return way; }
+const char* way_of_last_solve() {
+  if (!last_way) return "";
+  switch (*last_way) {
+    case Way::kKernel: return "kernel";
+    case Way::kLoops: return "loops";
+    default: return "tensors";
+  }
+}
 
 SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real) {
   const auto batch = static_cast<int64_t>(outcomes.size());
@@ -118,20 +127,20 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
   auto found = gpu::solve(a, b, request);
   // A kernel looks at them on the device. None ran: the host does.
   if (!found && gpu::takes(b, request.solver)) a.check_parameters(request.checks);
-  const char* how = "kernel";
+  auto way = Way::kKernel;
   if (!found && b.is_cpu() && runs_on_loops(request.solver)) {
-    how = "loops";
+    way = Way::kLoops;
     found =
         b.scalar_type() == at::kFloat ? solve_on_loops<float>(a, b, request) : solve_on_loops<double>(a, b, request);
   }
   if (!found) {
-    how = "tensors";
+    way = Way::kTensors;
     found = solve_direct_at_once(a, b, request);
     if (!found) found = solve_with_tensors(a, b, request);
   }
-  way = how;
+  last_way = way;
   // Left out after a kernel that nobody waits for: on a GPU it takes some sixty operations of torch.
-  const bool is_awaited = request.may_wait || found->info.status.is_cpu() || std::string_view(how) != "kernel";
+  const bool is_awaited = request.may_wait || found->info.status.is_cpu() || way != Way::kKernel;
   if (is_awaited) find_inconsistent_constants(a, b, request, *found);
   return *std::move(found);
 }

@@ -39,7 +39,8 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
 /// The report of what came of these samples, with numbers of this dtype.
 SolveInfo info_of(const std::vector<SampleOutcome>& outcomes, at::ScalarType real);
 
-/// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors".
+/// How the last solve of this thread was computed: "kernel", in one launch on a GPU, "loops" of the CPU, or "tensors";
+/// "" before the first.
 const char* way_of_last_solve();
 
 /// solve() by plain tensor operations alone: for other devices, and as the tests' reference.

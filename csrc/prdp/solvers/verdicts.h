@@ -7,9 +7,9 @@
 #include "prdp/solvers/sample_state.h"
 
 /// What may happen to a sample: each rule that gives it a status, in the CPU loops, in tensors and in kernels of GPUs.
-/// What takes products to tell is in observe.h, energy.h, iterate.h and unnamed_null_space.cpp; what is settled before
-/// the first iteration, as NaN in b, in solve_sample.h and prepared_batch.cpp. A `Flow` refuses samples before it
-/// solves (steppers/flow/limits.cpp, gpu/device/flow.h).
+/// What takes products to tell is in observe.h, rounding_floor.h, energy.h, iterate.h and unnamed_null_space.cpp; what
+/// is settled before the first iteration, as NaN in b, in solve_sample.h and prepared_batch.cpp. A `Flow` refuses
+/// samples before it solves (steppers/flow/limits.cpp, gpu/device/flow.h).
 namespace prdp {
 
 // ---- while it is iterated

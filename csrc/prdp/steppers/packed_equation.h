@@ -9,21 +9,10 @@ namespace prdp {
 
 #define PRDP_EQUATION_SCHEMA "Tensor[] tensors, str kind, int[] shape, float[] parameters, int picard_steps"
 
-namespace detail {
-
-template <class Signature, class... Back>
-struct AddEquation;
-template <class Result, class... Front, class... Back>
-struct AddEquation<Result(Front...), Back...> {
-  using Type = Result(Front..., at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t,
-                      Back...);
-};
-
-}  // namespace detail
-
 /// The type of the kernel of an op with PRDP_EQUATION_SCHEMA behind the arguments of `Signature` and before `Back`.
 template <class Signature, class... Back>
-using WithEquation = typename detail::AddEquation<Signature, Back...>::Type;
+using WithEquation =
+    Append<Signature, at::TensorList, c10::string_view, at::IntArrayRef, at::ArrayRef<double>, int64_t, Back...>;
 
 /// kernel(equation, back...), the equation made of the five arguments of PRDP_EQUATION_SCHEMA.
 template <class Kernel, class... Back>

@@ -72,14 +72,11 @@ SolveOutputs fake_solves(const Equation& equation, const at::Tensor& u, const c1
 std::vector<at::Tensor> solve_all_back(const at::Tensor& cotangent, const KeptSolves& kept, const Equation& equation,
                                        const SolveOptions& options, at::IntArrayRef needed) {
   const at::NoGradGuard no_grad;
-  const auto found = vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve_unrecorded);
-  std::vector<at::Tensor> gradients;
-  for (size_t i = 0; i < found.size(); ++i) {
-    if (!needed[i]) continue;
-    if (i == 0) gradients.push_back(found[0].contiguous());  // defined where it is needed
-    else gradients.push_back(found[i].defined() ? found[i] : at::zeros_like(equation.tensors[i - 1]));
-  }
-  return gradients;
+  auto found = vjp_of_solves(cotangent, kept, equation, options, needed, linear_solve_unrecorded);
+  if (needed[0]) found[0] = found[0].contiguous();  // defined where it is needed
+  for (size_t i = 1; i < found.size(); ++i)
+    if (needed[i] && !found[i].defined()) found[i] = at::zeros_like(equation.tensors[i - 1]);
+  return only_needed(found, needed);
 }
 
 template <class... Args>
@@ -99,15 +96,9 @@ template <class... Args>
 std::vector<at::Tensor> fake_vjp(const at::Tensor& cotangent, const OptionalTensor&, const OptionalTensor&,
                                  const OptionalTensor&, const OptionalTensor&, at::IntArrayRef needed, Args... args) {
   const auto kernel = [&](const Equation& equation, const auto&...) {
-    std::vector<at::Tensor> gradients;
     auto sizes = cotangent.sym_sizes().vec();
     sizes.erase(sizes.begin() + 1);
-    if (needed[0]) gradients.push_back(at::empty_symint(sizes, cotangent.options()));
-    for (size_t i = 0; i < equation.tensors.size(); ++i) {
-      const auto& t = equation.tensors[i];
-      if (needed[i + 1]) gradients.push_back(at::empty_symint(t.sym_sizes(), t.options()));
-    }
-    return gradients;
+    return empty_gradients(cotangent, sizes, equation.tensors, needed);
   };
   return with_equation(kernel, args...);
 }

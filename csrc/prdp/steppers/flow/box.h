@@ -51,7 +51,6 @@ class FlowBox {
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   const std::vector<int64_t>& shape() const { return shape_; }
   FlowBoundary boundary(int64_t axis) const { return boundary_[axis]; }
-  double length(int64_t axis) const { return length_[axis]; }
   double dx(int64_t axis) const { return length_[axis] / static_cast<double>(shape_[axis]); }
   const at::Tensor& obstacle() const { return obstacle_; }
   /// The axis with an inflow, or -1.

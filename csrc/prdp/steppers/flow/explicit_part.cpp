@@ -6,10 +6,6 @@
 
 namespace prdp {
 
-at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples) {
-  return samples.defined() && t.defined() ? t.masked_fill(per_sample(samples, t), 0.0) : t;
-}
-
 FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples) {
   if (!samples.defined()) return e;
   const auto clear = [&](at::Tensor& t) {

@@ -6,9 +6,6 @@
 
 namespace prdp {
 
-/// t with zeros in these samples; either may be undefined.
-at::Tensor cleared(const at::Tensor& t, const at::Tensor& samples);
-
 /// The equation without its boundary values in these samples, as zero times NaN is NaN. A value that all samples share
 /// stays: if it is not finite, all are refused anyway.
 FlowEquation without_boundary_of(FlowEquation e, const at::Tensor& samples);

@@ -38,6 +38,17 @@ std::vector<End> ends_of(const FlowBox& box, const at::Tensor& like, const std::
   return ends;
 }
 
+/// The sum over the products that a tensor of the equation is part of; nothing, if its gradient is not wanted.
+struct WantedSum {
+  gpu::BroadcastSum terms{};
+  std::optional<size_t> index{};  // among all sums
+};
+WantedSum add_if(bool wanted, BroadcastSums& sums, const at::Tensor& of) {
+  if (!wanted) return {};
+  const size_t index = sums.size();
+  return {sums.add(of), index};
+}
+
 template <class T>
 gpu::FlowEndBars<T> end_bars_of(const FlowBox& box, const End& end) {
   const bool is_inflow = box.boundary(end.axis) == FlowBoundary::kOpen;
@@ -81,14 +92,11 @@ std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation
   std::vector<at::Tensor> found(given.size() + 1);
   std::vector<bool> wanted(found.size());
   for (size_t i = 0; i < found.size(); ++i) wanted[i] = needed[i] && (i == 0 || given[i - 1].defined());
-  const bool wants_nu = wanted[place_of(Tensor::kNu)], wants_force = wanted[place_of(Tensor::kForce)];
   if (wanted[kState]) found[kState] = by_channels(like, box);
   const auto ends = ends_of(box, like, wanted);
   BroadcastSums sums(like);
-  const auto nothing = gpu::BroadcastSum{};
-  const auto of_nu = wants_nu ? sums.add(equation.nu) : nothing;
-  const auto force = wants_force ? sums.add(equation.force) : nothing;
-  const size_t nu_sum = 0, force_sum = wants_nu ? 1 : 0;  // in the order of add()
+  const auto nu = add_if(wanted[place_of(Tensor::kNu)], sums, equation.nu);
+  const auto force = add_if(wanted[place_of(Tensor::kForce)], sums, equation.force);
   int64_t count = sums.count() + (wanted[kState] ? found[kState].numel() : 0);
   for (const auto& end : ends) count += end.bar.numel();
   if (count == 0) return found;
@@ -99,17 +107,17 @@ std::optional<std::vector<at::Tensor>> explicit_vjp(const FlowEquation& equation
                         .of_state = static_cast<int>(wanted[kState] ? found[kState].numel() : 0),
                         .ends = static_cast<int>(ends.size()),
                         .end = {},
-                        .force = force,
-                        .of_nu = of_nu,
+                        .force = force.terms,
+                        .of_nu = nu.terms,
                         .nu = viscosity_bars_of<T>(box, part),
-                        .force_out = wants_force ? sums.memory(force_sum) : nullptr,
-                        .nu_out = wants_nu ? sums.memory(nu_sum) : nullptr};
+                        .force_out = force.index ? sums.memory(*force.index) : nullptr,
+                        .nu_out = nu.index ? sums.memory(*nu.index) : nullptr};
     for (size_t k = 0; k < ends.size(); ++k) of.end[k] = end_bars_of<T>(box, ends[k]);
     return of;
   });
   if (!launched) return std::nullopt;
-  if (wants_nu) found[place_of(Tensor::kNu)] = sums.result(nu_sum);
-  if (wants_force) found[place_of(Tensor::kForce)] = sums.result(force_sum);
+  if (nu.index) found[place_of(Tensor::kNu)] = sums.result(*nu.index);
+  if (force.index) found[place_of(Tensor::kForce)] = sums.result(*force.index);
   for (const auto& end : ends) found[end.place] = at::sum_to(end.bar, given[end.place - 1].sizes());
   return found;
 }

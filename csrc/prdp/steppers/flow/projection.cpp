@@ -48,7 +48,7 @@ at::Tensor flush_subnormals(const at::Tensor& b) {
       b.scalar_type() == at::kFloat ? std::numeric_limits<float>::min() : std::numeric_limits<double>::min();
   const auto rows = largest_magnitude(b) < normal;
   if (b.is_cpu() && !at::isTensorSubclassLike(b) && !rows.any().item<bool>()) return b;
-  return b.masked_fill(per_sample(rows, b), 0.0);
+  return cleared(b, rows);
 }
 
 at::Tensor masked(const at::Tensor& t, const at::Tensor& mask) { return mask.defined() ? t * mask : t; }
@@ -137,11 +137,9 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
                        how,
                        /*reverse=*/true};
     if (const auto found = project_by_kernels(box, by, options, info)) return {found->u, found->on_free_faces};
-    const auto cleared = [&](const at::Tensor& t) {
-      return t.defined() && refused.defined() ? t.masked_fill(per_sample(refused.ne(0), t), 0.0) : t;
-    };
-    cotangent = cleared(cotangent);
-    potential_bar = cleared(potential_bar);
+    const auto to_clear = refused.defined() ? refused.ne(0) : at::Tensor();
+    cotangent = cleared(cotangent, to_clear);
+    potential_bar = cleared(potential_bar, to_clear);
   }
   auto phi_bar = flow_divergence(box, masked(cotangent, fields.free));
   if (potential_bar.defined()) phi_bar = phi_bar + masked(potential_bar, fields.cells);

@@ -1,5 +1,6 @@
 #include "prdp/steppers/flow/step.h"
 
+#include "prdp/operators/tensors.h"
 #include "prdp/steppers/flow/balance.h"
 #include "prdp/steppers/flow/diffusion.h"
 #include "prdp/steppers/flow/explicit_part.h"

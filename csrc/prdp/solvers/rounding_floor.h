@@ -1,0 +1,84 @@
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+#include "prdp/solvers/method_properties.h"
+#include "prdp/solvers/sample_state.h"
+#include "prdp/solvers/space.h"
+
+/// When a residual is no more than rounding, so that its sample gets no better.
+namespace prdp::detail {
+
+/// The floor ε ‖A‖ ‖u‖ of each sample: about what the rounding of a product with u leaves.
+template <class Space, class Method>
+auto rounding_floors(Space& space, const Method& method) {
+  const auto norm_a = space.operator_norm();
+  auto floors = space.values_of(space.solution2(method.x));
+  for (size_t i = 0; i < floors.size(); ++i) floors[i] = space.epsilon() * norm_a[i] * std::sqrt(floors[i]);
+  return floors;
+}
+
+/// How many floors a residual may be to count as rounding: 1; 8 where rtol lies below the floor, or below 8 floors for
+/// direct methods, which reach no lower; 100 where a space is exhausted.
+template <class Method>
+double slack_of_floor(const SampleState& s, double rtol, double floor) {
+  if (s.status == SolveStatus::kBreakdown) return 100.0;
+  return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
+}
+
+/// The floors of the `doubtful` samples whose residual is at most slack_of_floor() of them; zero for the others. There
+/// a floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10, as u is garbage then. In float64 no floor above
+/// 1e-5 ‖b‖ is taken for rounding: u is that of a singular system, which a null vector that nobody named has made
+/// large.
+template <class Space, class Method, class Predicate>
+auto floors_of_suspects(Space& space, const Method& method, const typename Space::States& states, double rtol,
+                        const Predicate& doubtful) {
+  const auto all_floors = rounding_floors(space, method);
+  const double largest_floor = space.epsilon() < 1e-10 ? 1e-5 : 0.25;
+  auto floors = space.map(states, [](const SampleState&) { return 0.0; });
+  for (size_t i = 0; i < states.size(); ++i) {
+    const auto& s = states[i];
+    const double floor = all_floors[i], b = std::sqrt(s.b2), residual = std::sqrt(s.residual2);
+    const bool says_something = floor <= largest_floor * b && residual <= 0.1 * b;
+    if (doubtful(s) && says_something && residual <= slack_of_floor<Method>(s, rtol, floor) * floor) floors[i] = floor;
+  }
+  return floors;
+}
+
+// What a product may round, in estimates of ε ‖|A| |u|‖: by the first estimate, and by the largest of several.
+inline constexpr double kRoundingsOfProduct = 64.0, kFewRoundings = 4.0;
+inline constexpr int64_t kManyEstimates = 8;  // at most kSignPatterns
+
+/// Whether a suspect's residual is rounding, by the p-th estimate of ε ‖|A| |u|‖. The first allows slack. As the
+/// largest of several estimates is less strict, the others allow none, and a few roundings.
+template <class Method>
+bool residual_is_rounding(const SampleState& s, double rtol, double floor, double rounding, int64_t p) {
+  const double residual = std::sqrt(s.residual2);
+  if (p == 0) return residual <= slack_of_floor<Method>(s, rtol, floor) * (kRoundingsOfProduct * rounding);
+  return residual <= floor && residual <= kFewRoundings * rounding;
+}
+
+/// Stops those of the `doubtful` samples whose residual is rounding: near the floor ε ‖A‖ ‖u‖, as above. As the floor
+/// overstates the rounding where columns of A differ in size, the residual must also be of the order of ε ‖|A| |u|‖,
+/// what a product rounds, by an estimate from below. It misses the strongest coupling of two unknowns every second
+/// time: more `estimates` find it.
+template <class Space, class Method, class Predicate>
+PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
+                                          double rtol, const Predicate& doubtful, int64_t estimates = 1) {
+  if (std::none_of(states.begin(), states.end(), doubtful)) return;
+  auto suspected = floors_of_suspects(space, method, states, rtol, doubtful);  // 0: not suspected
+  for (int64_t p = 0; p < estimates; ++p) {
+    if (std::none_of(suspected.begin(), suspected.end(), [](double floor) { return floor > 0.0; })) return;
+    const auto componentwise_scale2 = space.values_of(space.componentwise_scale2(method.x, p));
+    for (size_t i = 0; i < states.size(); ++i) {
+      auto& s = states[i];
+      const double floor = suspected[i], rounding = space.epsilon() * std::sqrt(componentwise_scale2[i]);
+      if (!(floor > 0.0) || !residual_is_rounding<Method>(s, rtol, floor, rounding, p)) continue;
+      s.stop(SolveStatus::kStagnated);
+      s.floor2 = floor * floor;
+      suspected[i] = 0.0;
+    }
+  }
+}
+
+}  // namespace prdp::detail
