@@ -11,7 +11,7 @@ import torch
 from helpers import dense_burgers, dense_navier_stokes
 
 import prdp_torch as prdp
-from benchmarks import measure, ours, problems
+from benchmarks import measure, ours, problems, updates
 from benchmarks.peers import stencils, torch_eager
 
 ROOT = Path(__file__).parents[2]
@@ -136,6 +136,13 @@ def test_all_suites_run_and_leave_a_page(tmp_path):
     peaks = {(p["case"], p["mode"]): p["bytes"] for p in json.loads((tmp_path / "memory.json").read_text())["memory"]}
     for case in ("heat_3d", "heat_3d_chebyshev", "navier_stokes"):
         assert 0 < 2 * peaks[case, "unrolled"] < peaks[case, "unrolled, recorded by autograd"]
+
+
+def test_an_update_of_a_scene_is_timed_with_its_solves_and_without():
+    for name in ("heat_1d", "kolmogorov"):  # an emulator, a corrector
+        (record,) = updates.run(torch.device("cpu"), [name], rounds=1)
+        assert record["scene"] == name and record["ratio"] == record["seconds"] / record["network"]
+        assert record["seconds"] > record["network"] > 0 and 0 < record["residual"] < 1
 
 
 def test_an_unknown_suite_is_refused():
