@@ -1,5 +1,5 @@
-"""Streams, threads and devices of CUDA, as `make cuda` runs them. Without a GPU the CPU takes its place: then these tests
-are tried themselves, and CUDA is not."""
+"""Streams, threads and devices of CUDA, as `make cuda` runs them. Without a GPU the CPU takes its place: then these
+tests are tried themselves, and CUDA is not."""
 
 import contextlib
 import threading

@@ -23,8 +23,8 @@ namespace prdp {
 template <class Space, class X>
 using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
 
-/// Where column j of a Hessenberg matrix begins, which has j + 2 numbers. The columns lie one behind the other: on a GPU,
-/// each thread has a copy.
+/// Where column j of a Hessenberg matrix begins, which has j + 2 numbers. The columns lie one behind the other: on a
+/// GPU, each thread has a copy.
 constexpr int64_t hessenberg_column(int64_t j) { return j * (j + 3) / 2; }
 
 /// Ten operations that all methods are made of, and where their vectors come from.
