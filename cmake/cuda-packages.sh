@@ -11,7 +11,7 @@ missing=""
 want() { # want PACKAGE
   missing="$missing $(grep "^$1==" requirements.txt)"
 }
-for module in numpy pytest hypothesis; do
+for module in numpy matplotlib jinja2 rich typer pytest hypothesis; do
   "$python" -c "import $module" 2>/dev/null || want "$module"
 done
 PATH=$2/bin:$(dirname "$(command -v "$1")"):$PATH

@@ -2,9 +2,11 @@
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar
 
 import torch
+
+from prdp_torch import torch_private
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,7 +31,7 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
 def between_graphs(call: Callable[P, T]) -> Callable[P, T]:
     """What torch.compile calls as it is, with a break of the graph; with fullgraph=True the reason is said."""
     reason = f"{call.__qualname__} of prdp_torch is called between graphs, not traced: compile without fullgraph=True"
-    return cast(Callable[P, T], torch.compiler.disable(call, reason=reason))
+    return torch_private.disabled_once_imported(call, reason)
 
 
 def not_in_graphs(call: Callable[P, T]) -> Callable[P, T]:

@@ -1,12 +1,13 @@
 """Kernels of a GPU: compiled when they are first needed, or before."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from prdp_torch import _C
+from prdp_torch.torch_private import leaves_of
 
 
 def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = True) -> list[str]:
@@ -31,23 +32,9 @@ def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = Tru
     with torch.enable_grad() if backward else torch.no_grad():
         found = step(state)
         results = [u for u in ([found] if isinstance(found, Tensor) else found) if u.requires_grad]
-        parameters = [leaf for leaf in leaves_of(results) if leaf is not state]
+        parameters = list({leaf for u in results for leaf in leaves_of(u)} - {state})
         for wanted in ([state], parameters, [state, *parameters]):  # kernels differ by what a gradient is asked of
             if results and wanted:
                 ones = [torch.ones_like(u) for u in results]
                 torch.autograd.grad(results, wanted, ones, retain_graph=True, allow_unused=True)
     return [name for name in _C.kernels_made() if name not in before]
-
-
-def leaves_of(results: list[Tensor]) -> Iterator[Tensor]:
-    """The tensors that a backward pass from these would leave a gradient in."""
-    seen: set[Any] = set()
-    nodes: list[Any] = [u.grad_fn for u in results]
-    while nodes:
-        node = nodes.pop()
-        if node is None or node in seen:
-            continue
-        seen.add(node)
-        if hasattr(node, "variable"):  # torch's AccumulateGrad
-            yield node.variable
-        nodes += [below for below, _ in node.next_functions]

@@ -3,8 +3,10 @@
 Where a release of torch changes one of them, `tests/python/test_torch_private.py` fails with its name.
 """
 
+import functools
+import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -49,15 +51,42 @@ def number_as_graph_input(module: torch.nn.Module, name: str) -> Any:
     return number
 
 
-@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def disabled_once_imported(call: F, reason: str) -> F:
+    """`torch.compiler.disable(call, reason=reason)`, which imports the compiler: that takes as long as the rest of
+    torch, so it waits for the first call in a process that has imported it. Until then nothing is compiled."""
+    disabled: list[Callable[..., Any]] = []
+
+    @functools.wraps(call)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        if "torch._dynamo" not in sys.modules:
+            return call(*args, **kwargs)
+        if not disabled:
+            disabled.append(cast(F, torch.compiler.disable(call, reason=reason)))
+        return disabled[0](*args, **kwargs)
+
+    called._torchdynamo_disable = True  # type: ignore[attr-defined]
+    called._torchdynamo_disable_msg = reason  # type: ignore[attr-defined]
+    return cast(F, called)
+
+
+def _called_while_tracing(function: F) -> F:
+    """Called while torch.compile traces, not by what it makes. `torch.compiler.assume_constant_result` is this, but
+    imports the compiler, which takes as long as the rest of torch."""
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
+
+
+@_called_while_tracing
 def _list_as_dynamic(name: str) -> str:
-    """Called while torch.compile traces, not by what it makes."""
     listed: str = torch.compiler.config.dynamic_sources
     torch.compiler.config.dynamic_sources = f"{listed},.*\\b{name}\\b"
     return listed
 
 
-@torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
+@_called_while_tracing
 def _list_as_before(listed: str) -> None:
     torch.compiler.config.dynamic_sources = listed
 

@@ -4,14 +4,14 @@ import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import jinja2
-from matplotlib.figure import Figure
-
-from prdp_torch.experiments import _C, charts, records, trajectory_charts
+from prdp_torch.experiments import _C, records
 from prdp_torch.experiments.compare import Entry, Row, verdict
 from prdp_torch.experiments.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Column(NamedTuple):
@@ -161,7 +161,7 @@ def _savings(base: Entry, entry: Entry) -> str:
     return f"{text}; {entry['seconds']:.3g} s, where converged solves take {base['seconds']:.3g} s"
 
 
-def _svg(figure: Figure) -> str:
+def _svg(figure: "Figure") -> str:
     image = io.BytesIO()
     figure.savefig(image, format="svg")
     return base64.b64encode(image.getvalue()).decode()
@@ -170,6 +170,10 @@ def _svg(figure: Figure) -> str:
 def write(scene: _C.Scene, rows: list[Row], table: list[Entry], shown: Trajectories | None, folder: Path) -> None:
     """`report.html`, one self-contained file with table, pictures and the scene; each chart also as PNG, and
     `trajectories.gif` for fields in 2D. shown: from `trajectories.collect`, or None."""
+    import jinja2  # with matplotlib half a second, which other commands need not wait for
+
+    from prdp_torch.experiments import charts, trajectory_charts
+
     drawn = charts.all_charts(scene, rows, table)
     learned = trajectory_charts.pictures(scene, shown) if shown else []
     for name, figure, _ in [*drawn, *learned]:

@@ -83,8 +83,8 @@ def test_modules_for_trainings_come_with_the_package_when_they_are_used():
         "print(json.dumps([before, 'heat_1d' in prdp.experiments.scenes.available(), callable(prdp.load_trained),"
         " 'experiments' in dir(prdp)]))"
     )
-    lazy = ("prdp_torch.experiments", "torch.utils.tensorboard", "matplotlib")
+    lazy = ("prdp_torch.experiments", "torch.utils.tensorboard", "matplotlib", "torch._dynamo")
     done = subprocess.run([sys.executable, "-c", code, *lazy], capture_output=True, text=True)
-    assert json.loads(done.stdout) == [[False] * 3, True, True, True], done.stderr
+    assert json.loads(done.stdout) == [[False] * 4, True, True, True], done.stderr
     with pytest.raises(AttributeError, match="module 'prdp_torch' has no attribute 'nothing'"):
         prdp.nothing  # noqa: B018
