@@ -58,9 +58,9 @@ class Solver:
     if not TYPE_CHECKING:
 
         def __setattr__(self, name: str, value: object) -> None:
-            if name not in self.__dataclass_fields__ and type(self).__module__ == __name__:  # it would have no effect
-                allowed = ", ".join(f.name for f in fields(self) if f.init)
-                raise AttributeError(f"{type(self).__name__}: no setting '{name}'; allowed: {allowed}")
+            settings = [f.name for f in fields(self) if f.init]
+            if name not in settings and type(self).__module__ == __name__:  # it would have no effect
+                raise AttributeError(f"{type(self).__name__}: no setting '{name}'; allowed: {', '.join(settings)}")
             object.__setattr__(self, name, value)
 
 
@@ -251,7 +251,7 @@ class Multigrid(Solver):
         self.smoothing = _check.whole("Multigrid", "smoothing", self.smoothing)
         if self.smoothing < 1:
             raise ValueError(f"Multigrid: smoothing must be >= 1, got {self.smoothing}")
-        self.preconditioner = self  # as a method, its cycles are M⁻¹
+        vars(self)["preconditioner"] = self  # as a method, its cycles are M⁻¹
         super().__post_init__()
 
 
