@@ -34,6 +34,22 @@ def run(*arguments):
     return process.returncode, errors
 
 
+@pytest.fixture(scope="module")
+def left_alone(tmp_path_factory):
+    """The curves of a training that nobody kills, by trainer, scene and intervals: each is run once."""
+    found = {}
+
+    def curves_of(trainer, scene, intervals):
+        key = (trainer, Path(scene).read_text(), intervals)
+        if key not in found:
+            out = tmp_path_factory.mktemp("alone")
+            assert run(trainer, scene, out, "--intervals", intervals)[0] == 0
+            found[key] = json.loads((out / "prdp/seed_0.json").read_text())["curves"]
+        return found[key]
+
+    return curves_of
+
+
 def stop(process, checkpoint, signal):
     """Send the signal once a few checkpoints were written; the exit status."""
     seen = set()
@@ -58,16 +74,15 @@ def seconds_in(trainer, checkpoint):
     [
         ("python", "emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
         ("cpp", "emulator", 150, [SIGKILL, SIGTERM, SIGINT]),
-        ("cpp", "parameters", 500, [SIGKILL]),
+        ("cpp", "parameters", 300, [SIGKILL]),
         ("python", "corrector", 40, [SIGKILL]),
         ("cpp", "corrector", 40, [SIGKILL]),
         ("cpp", "field", 150, [SIGKILL]),
     ],
 )
-def test_a_killed_training_goes_on_bit_for_bit(tmp_path, trainer, task, intervals, signals):
+def test_a_killed_training_goes_on_bit_for_bit(tmp_path, left_alone, trainer, task, intervals, signals):
     scene = scene_of(task, tmp_path)
-    assert run(trainer, scene, tmp_path / "alone", "--intervals", intervals)[0] == 0
-    alone = json.loads((tmp_path / "alone/prdp/seed_0.json").read_text())["curves"]
+    alone = left_alone(trainer, scene, intervals)
     assert len(set(alone["max_iter"])) > 1  # the controller has something to remember
 
     record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
@@ -115,10 +130,10 @@ def test_a_checkpoint_of_other_settings_is_not_gone_on_from_in_cpp(tmp_path):
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp_path, trainer):
+def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp_path, left_alone, trainer):
     scene = scene_of("parameters", tmp_path)
     arguments = ("--intervals", 300)
-    assert run(trainer, scene, tmp_path / "alone", *arguments)[0] == 0
+    alone = left_alone(trainer, scene, 300)
     record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
     stop(start(trainer, scene, tmp_path / "killed", *arguments), checkpoint, SIGKILL)
     damaged = checkpoint.read_bytes()[:-20]
@@ -128,7 +143,7 @@ def test_where_the_last_checkpoint_is_damaged_the_one_before_is_gone_on_from(tmp
     assert status == 0
     assert f"checkpoint: '{checkpoint}' is damaged or of another version: its content is not that" in errors
     assert errors.count("; the training goes on from the one before\n") == 1
-    curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
+    curves = json.loads(record.read_text())["curves"]
     assert without_seconds(curves) == without_seconds(alone)
     assert [path.name for path in record.parent.iterdir()] == ["seed_0.json"]
 
@@ -146,10 +161,12 @@ def without_a_part(trainer, content):
 @pytest.mark.parametrize(
     "trainer, change", [("cpp", lambda *_: b"no state at all"), ("cpp", without_a_part), ("python", without_a_part)]
 )
-def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_from(tmp_path, trainer, change):
+def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_from(
+    tmp_path, left_alone, trainer, change
+):
     scene = scene_of("parameters", tmp_path)
     arguments = ("--intervals", 300)
-    assert run(trainer, scene, tmp_path / "alone", *arguments)[0] == 0
+    alone = left_alone(trainer, scene, 300)
     record, checkpoint = (tmp_path / "killed/prdp" / f"seed_0.{kind}" for kind in ("json", "checkpoint"))
     stop(start(trainer, scene, tmp_path / "killed", *arguments), checkpoint, SIGKILL)
     content = checkpoint.read_bytes().split(b"\n", 2)[2]
@@ -159,7 +176,7 @@ def test_where_the_last_checkpoint_was_tampered_with_the_one_before_is_gone_on_f
     words = {b"no state at all": "expected named tensors"}.get(change(trainer, content), "there is no tensor 'history_")
     assert f"checkpoint: '{checkpoint}' is damaged or of another version: {words}" in errors
     assert errors.count("; the training goes on from the one before\n") == 1
-    curves, alone = (json.loads(path.read_text())["curves"] for path in (record, tmp_path / "alone/prdp/seed_0.json"))
+    curves = json.loads(record.read_text())["curves"]
     assert without_seconds(curves) == without_seconds(alone)
 
 
