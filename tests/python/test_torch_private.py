@@ -65,6 +65,22 @@ def test_private_names_are_in_one_file_and_all_of_them_are_tested():
     assert used == {*NAMES}
 
 
+def test_torch_marks_what_it_does_not_trace_as_before():
+    """The marks that `disabled_once_imported` and `_called_while_tracing` set before the compiler is imported."""
+
+    def call():
+        pass
+
+    marks = vars(torch_private.disabled_once_imported(call, "for a reason"))
+    of_torch = vars(torch.compiler.disable(call, reason="for a reason"))
+    assert {name: of_torch[name] for name in marks if "dynamo" in name} == {
+        name: value for name, value in marks.items() if "dynamo" in name
+    }
+    assert len([name for name in marks if "dynamo" in name]) == 2
+    of_torch = vars(torch.compiler.assume_constant_result(call))
+    assert vars(torch_private._called_while_tracing(lambda: None)).items() <= of_torch.items()
+
+
 def test_transforms_are_active():
     seen = []
 
