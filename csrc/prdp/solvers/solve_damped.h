@@ -19,8 +19,8 @@ T hypotenuse(T a, T b) {
   return larger * std::sqrt(1 + ratio * ratio);
 }
 
-/// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of a Hessenberg matrix r: the rows of
-/// τ I are rotated into R, one by one.
+/// y = argmin ‖g - R y‖² + τ² ‖y‖² for the upper triangle R in the first n columns of a Hessenberg matrix r: the rows
+/// of τ I are rotated into R, one by one.
 template <class T>
 void solve_damped(const T* r, const T* g, int64_t n, T tau, T* y, T* work) {
   T *a = work, *rhs = a + n * n, *row = rhs + n;
