@@ -15,6 +15,11 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, distributed
 
+if distributed.is_available():
+    # Its functions have the default group of the moment for their default, and so keep it for good where they are first
+    # imported after it: its threads then outlive Python, and may abort the process.
+    import torch.distributed.nn.functional
+
 T = TypeVar("T")
 
 

@@ -1,6 +1,6 @@
 """Kernels of a GPU: compiled when they are first needed, or before."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -30,11 +30,21 @@ def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = Tru
     before = set(_C.kernels_made())
     state = example.detach().clone().requires_grad_(backward)
     with torch.enable_grad() if backward else torch.no_grad():
-        found = step(state)
-        results = [u for u in ([found] if isinstance(found, Tensor) else found) if u.requires_grad]
+        results = [u for u in tensors_in(step(state)) if backward and u.requires_grad]
         parameters = list({leaf for u in results for leaf in leaves_of(u)} - {state})
-        for wanted in ([state], parameters, [state, *parameters]):  # kernels differ by what a gradient is asked of
-            if results and wanted:
-                ones = [torch.ones_like(u) for u in results]
-                torch.autograd.grad(results, wanted, ones, retain_graph=True, allow_unused=True)
+        # Kernels differ by what a gradient is asked of.
+        passes = [[state], parameters, [state, *parameters]] if parameters else [[state]]
+        for wanted in passes if results else []:
+            ones = [torch.ones_like(u) for u in results]
+            more = wanted is not passes[-1]
+            torch.autograd.grad(results, wanted, ones, retain_graph=more, allow_unused=True)
     return [name for name in _C.kernels_made() if name not in before]
+
+
+def tensors_in(found: Any) -> Iterator[Tensor]:
+    """The tensors of what a step returns: one, or several in tuples, lists and dicts, among whatever else."""
+    if isinstance(found, Tensor):
+        yield found
+    elif isinstance(found, tuple | list | dict):
+        for part in found.values() if isinstance(found, dict) else found:
+            yield from tensors_in(part)

@@ -54,6 +54,13 @@ def number_as_graph_input(module: torch.nn.Module, name: str) -> Any:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+def _called_while_tracing(function: F) -> F:
+    """Called while torch.compile traces, not by what it makes. `torch.compiler.assume_constant_result` is this, but
+    imports the compiler, which takes as long as the rest of torch."""
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
+
+
 def disabled_once_imported(call: F, reason: str) -> F:
     """`torch.compiler.disable(call, reason=reason)`, which imports the compiler: that takes as long as the rest of
     torch, so it waits for the first call in a process that has imported it. Until then nothing is compiled."""
@@ -61,6 +68,8 @@ def disabled_once_imported(call: F, reason: str) -> F:
 
     @functools.wraps(call)
     def called(*args: Any, **kwargs: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():  # from the first line on, as where a module is compiled
+            torch._dynamo.graph_break(msg=reason)
         if "torch._dynamo" not in sys.modules:
             return call(*args, **kwargs)
         if not disabled:
@@ -70,13 +79,6 @@ def disabled_once_imported(call: F, reason: str) -> F:
     called._torchdynamo_disable = True  # type: ignore[attr-defined]
     called._torchdynamo_disable_msg = reason  # type: ignore[attr-defined]
     return cast(F, called)
-
-
-def _called_while_tracing(function: F) -> F:
-    """Called while torch.compile traces, not by what it makes. `torch.compiler.assume_constant_result` is this, but
-    imports the compiler, which takes as long as the rest of torch."""
-    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
-    return function
 
 
 @_called_while_tracing

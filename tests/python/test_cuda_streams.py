@@ -77,15 +77,18 @@ def test_products_of_dense_matrices_take_no_tf32():
     n = 64
     a = torch.eye(n) * 4 + noise(n, n).float() / n
     b = noise(5, n, seed=1).float()
+    matrix, solver = a.to(DEVICES[0]), prdp.GMRES(max_iter=20, rtol=1e-6)
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:
-        u, info = prdp.linear_solve(a.to(DEVICES[0]), b.to(DEVICES[0]), prdp.GMRES(20, 1e-6))
-        product = operators.Matrix(a.to(DEVICES[0])).apply(u)
+        u, info = prdp.linear_solve(matrix, b.to(DEVICES[0]), solver)
+        of_function, _ = prdp.linear_solve(operators.Function(lambda v: v @ matrix.mT), b.to(DEVICES[0]), solver)
+        product = operators.Matrix(matrix).apply(u)
     finally:
         torch.set_float32_matmul_precision(before)
     assert info.status.eq(int(prdp.SolveStatus.CONVERGED)).all()
-    assert (a.double() @ u.cpu().double().mT - b.double().mT).norm() <= 2e-6 * b.norm()
+    for solution in (u, of_function):
+        assert (a.double() @ solution.cpu().double().mT - b.double().mT).norm() <= 2e-6 * b.norm()
     torch.testing.assert_close(product.cpu().double(), u.cpu().double() @ a.double().mT, rtol=1e-6, atol=1e-6)
 
 

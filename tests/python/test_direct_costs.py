@@ -132,8 +132,10 @@ def test_a_dense_matrix_of_a_grid_is_not_made_in_silence(capfd):
         ):
             kappa = device.send(random(1, size, size).exp())
             torch.set_warn_always(True)
-            prdp.linear_solve(operators.Diffusion(kappa, 1.0), device.send(random(1, 1, size, size)), prdp.Direct())
-            torch.set_warn_always(False)
+            try:
+                prdp.linear_solve(operators.Diffusion(kappa, 1.0), device.send(random(1, 1, size, size)), prdp.Direct())
+            finally:
+                torch.set_warn_always(False)
             said = capfd.readouterr().err  # where warnings go while a mode of torch is at work
             assert re.search(words, said) if words else not said
 

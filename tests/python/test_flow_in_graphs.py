@@ -1,5 +1,8 @@
 """What `Flow` says to torch.compile and torch.export, whose graphs cannot hold its steps."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -33,6 +36,20 @@ def test_a_compiled_function_calls_it_between_graphs(name):
     words = f"Flow.{name} of prdp_torch is called between graphs, not traced: compile without fullgraph=True"
     with pytest.raises(torch._dynamo.exc.Unsupported, match=words):
         torch.compile(call, backend="eager", fullgraph=True)(u)
+
+
+COMPILED_FIRST = """
+import torch, prdp_torch as prdp
+try:
+    torch.compile(prdp.Flow((8, 6), 0.1, 0.01), backend="eager", fullgraph=True)(torch.zeros(2, 2, 8, 6))
+except torch._dynamo.exc.Unsupported as error:
+    print(error)
+"""
+
+
+def test_a_compiled_flow_says_so_in_a_process_that_called_none_before():
+    done = subprocess.run([sys.executable, "-c", COMPILED_FIRST], capture_output=True, text=True, check=True)
+    assert "Flow.forward of prdp_torch is called between graphs, not traced" in done.stdout
 
 
 class Wrapped(torch.nn.Module):

@@ -249,3 +249,20 @@ def test_a_sample_of_more_points_than_the_blocks_of_the_device_usually_take(mult
 def test_a_sample_that_no_kernel_holds_is_named():
     said = Fibers.library().prdp_why_too_large(1 << 31).decode()
     assert said == "a sample of 2147483648 unknowns is too large for a kernel"
+
+
+@pytest.mark.parametrize("backward", [True, False])
+def test_a_warm_up_takes_whatever_a_step_returns(backward):
+    n = 12 + backward  # a kernel that was not made before
+    a, layer = prdp.operators.Heat((n,), 1e-2, 1.0), torch.nn.Linear(n, n, dtype=torch.float64)
+    state = torch.randn(2, 1, n, dtype=torch.float64)
+    steps = {
+        "a solve": lambda u: prdp.linear_solve(a, u, prdp.CG(max_iter=7)),
+        "nothing": lambda u: None,
+        "a dict": lambda u: {"u": [layer(u), (u,)], "word": "x"},
+        "a constant": lambda u: torch.ones(2),
+    }
+    with Fibers():
+        made = {name: prdp.warm_up(step, state, backward) for name, step in steps.items()}
+    assert [len(names) for names in made.values()] == [1, 0, 0, 0]
+    assert layer.weight.grad is None

@@ -40,7 +40,8 @@ def by_hand(stepper, u):
     b, last = stepper.rhs(u), u
     for _ in range(stepper.equation.picard_steps if isinstance(stepper, prdp.steppers.EquationStepper) else 1):
         solver = {"cg": prdp.CG, "jacobi": prdp.Jacobi, "gmres": prdp.GMRES}[stepper.method](stepper.max_iter)
-        solver.restart = stepper.restart
+        if isinstance(solver, prdp.GMRES):
+            solver.restart = stepper.restart
         options = {"backward": stepper.backward, "on_failure": "return"}
         last, _ = prdp.linear_solve(stepper.operator(last), b, solver, x0=last, **options)
     return last

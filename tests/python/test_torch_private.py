@@ -17,6 +17,7 @@ NAMES = [
     "torch._C._are_functorch_transforms_active",
     "torch._C._functorch.get_unwrapped",
     "torch._C._len_torch_dispatch_stack",
+    "torch._dynamo.graph_break",
     "torch._C._functorch.is_functorch_wrapped_tensor",
     "torch._C._functorch.maybe_get_bdim",
     "torch.nn.Module._apply",

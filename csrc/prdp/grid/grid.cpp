@@ -1,5 +1,7 @@
 #include "prdp/grid/grid.h"
 
+#include <ATen/Context.h>
+
 #include <cmath>
 #include <numbers>
 
@@ -112,6 +114,7 @@ at::Tensor laplacian_eigenvalues(const Grid& grid, const at::TensorOptions& opti
 }
 
 at::Tensor sine_transform(const at::Tensor& v, const Grid& grid) {
+  const at::NoTF32Guard full_precision;
   auto w = v;
   for (int64_t d = 0; d < grid.dim(); ++d) {
     const int64_t axis = tensor_axis(v, grid, d);

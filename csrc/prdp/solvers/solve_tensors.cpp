@@ -1,3 +1,4 @@
+#include <ATen/Context.h>
 #include <ATen/core/grad_mode.h>
 
 #include <cstdlib>
@@ -70,6 +71,7 @@ std::vector<SampleOutcome> outcomes_of(std::vector<SampleState>& states, const P
 
 SolveResult solve_with_tensors(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   const at::NoGradGuard no_grad;
+  const at::NoTF32Guard full_precision;  // residuals below 1e-3 would be rounding
   if (b.is_cpu()) keep_top_of_heap();
   const auto& solver = request.solver;
   const auto batch = prepare_batch(a, b, request);

@@ -87,7 +87,6 @@ at::Tensor TensorGmres::recompute_residual() {
 }
 
 void TensorGmres::extend_basis() {
-  const at::NoTF32Guard full_precision;
   const auto& b = space_.b();
   const int64_t batch = b.size(0);
   v_ = at::empty({m_, batch, space_.unknowns()}, b.options());  // a Function may keep what it was given before

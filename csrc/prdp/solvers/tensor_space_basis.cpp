@@ -1,3 +1,5 @@
+#include <ATen/Context.h>
+
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/batch_loops.h"
 #include "prdp/solvers/tensor_space.h"
@@ -38,6 +40,7 @@ void TensorSpace::damp(const Scalar* R, const Scalar* g, int64_t n, const Scalar
   // matrix has full rank.
   const auto wanted = keep.detach().eq(0);
   if (!wanted.any().item<bool>()) return;
+  const at::NoTF32Guard full_precision;
   const int64_t batch = b_.size(0);
   auto stacked = at::zeros({batch, 2 * n, n}, b_.options());
   auto rhs = at::zeros({batch, 2 * n, 1}, b_.options());

@@ -192,14 +192,14 @@ class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, pe
       const G at(point);
       (entry<Offsets>(at, point, 0, k++, [&](T a, int) { one(Offsets(), a); }), ...);
     } else {
-      (one(Offsets(), coefficients_[k++ * G::kPoints + point]), ...);
+      (one(Offsets(), coefficients_[kOfOffset * k++ + point]), ...);
     }
   }
   /// Of all that stands there, also of what leads out of the grid.
   T largest_in_row(int i) const {
     T most = 0;
     for (int k = 0; k < static_cast<int>(sizeof...(Offsets)); ++k)
-      most = larger_or_nan(most, std::abs(coefficients_[k * G::kPoints + i % G::kPoints]));
+      most = larger_or_nan(most, std::abs(coefficients_[kOfOffset * k + i % G::kPoints]));
     return most;
   }
   /// Of the neighbours that are inside the grid.
@@ -212,6 +212,8 @@ class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, pe
   }
 
  private:
+  static constexpr int64_t kOfOffset = G::kPoints;  // coefficients; those of all offsets may be more than an int counts
+
   template <class O, class F>
   void entry(const G& at, int point, int channel, int k, const F& f) const {
     constexpr int sign = kTransposed ? -1 : 1;
@@ -220,7 +222,7 @@ class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, pe
     const int x = moved<G::kX, sign * O::kX, periodic_x>(at.x);
     if ((z | y | x) < 0) return;
     const int there = (z * G::kY + y) * G::kX + x;
-    f(coefficients_[k * G::kPoints + (kTransposed ? there : point)], channel + there);
+    f(coefficients_[kOfOffset * k + (kTransposed ? there : point)], channel + there);
   }
 
   const T* coefficients_;
