@@ -83,6 +83,6 @@ def test_the_loops_are_faster_than_plain_tensors(case, ratios):
 
 
 def test_a_product_of_a_stencil_takes_no_longer_than_a_few_iterations():
-    """One on the processor where it was first measured, 1.9 to 2.5 on an EPYC of 2026-11-29. Three, where the first was,
+    """One where it was first measured, 1.9 to 2.5 on an EPYC of 2026-11-29. It took three, where it was first measured,
     before it read the coefficients where they lie."""
     assert in_one_thread("t.product_over_iteration()") < 2.75
