@@ -34,8 +34,8 @@ def warm_up(step: Callable[[Tensor], Any], example: Tensor, backward: bool = Tru
         parameters = list({leaf for u in results for leaf in leaves_of(u)} - {state})
         # Kernels differ by what a gradient is asked of.
         passes = [[state], parameters, [state, *parameters]] if parameters else [[state]]
+        ones = [torch.ones_like(u) for u in results]
         for wanted in passes if results else []:
-            ones = [torch.ones_like(u) for u in results]
             more = wanted is not passes[-1]
             torch.autograd.grad(results, wanted, ones, retain_graph=more, allow_unused=True)
     return [name for name in _C.kernels_made() if name not in before]

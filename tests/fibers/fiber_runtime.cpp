@@ -34,6 +34,7 @@ struct Settings {
   int left_out = 0;  // the line of the barrier that is left out; 0: none
   bool poisons = true;  // memory of a block
   bool captures = false;  // a graph, on all streams
+  bool refuses = false;  // every kernel
   bool from_ptx = false;  // the fibers run what NVRTC makes of the text
 };
 Settings settings;
@@ -137,6 +138,7 @@ class FiberRuntime final : public prdp::gpu::Runtime {
   std::shared_ptr<const prdp::gpu::Kernel> kernel(c10::Device, const KernelSource& source) override {
     const std::lock_guard lock(mutex_);
     if (std::ranges::find(asked_for, source.text, &KernelSource::text) == asked_for.end()) asked_for.push_back(source);
+    if (settings.refuses) throw Unavailable("the device has no room for a block of this kernel");
     auto& kernel = kernels_[{source.text, settings.from_ptx}];
     if (!kernel) kernel = std::make_shared<FiberKernel>(source);
     return kernel;
@@ -182,10 +184,18 @@ void register_cuda() {
 extern "C" void prdp_fibers_begin(int64_t block_memory, int64_t cells_of_block, int64_t threads, int order,
                                   int left_out, bool poisons, bool captures, int64_t most_blocks, bool from_ptx) {
   static auto* runtime = new FiberRuntime;
-  settings = {{block_memory, cells_of_block, threads, most_blocks}, order, left_out, poisons, captures, from_ptx};
+  settings = {.limits = {block_memory, cells_of_block, threads, most_blocks},
+              .order = order,
+              .left_out = left_out,
+              .poisons = poisons,
+              .captures = captures,
+              .refuses = false,
+              .from_ptx = from_ptx};
   asked_for.clear();
   prdp::gpu::set_runtime(c10::DeviceType::CPU, runtime);
 }
+/// Until they begin again, none can be made.
+extern "C" void prdp_fibers_refuse() { settings.refuses = true; }
 /// How many kernels were asked for since then.
 extern "C" int64_t prdp_fibers_kernels() { return std::ssize(asked_for); }
 extern "C" const char* prdp_text_of(int64_t kernel) { return asked_for.at(static_cast<size_t>(kernel)).text.c_str(); }

@@ -196,13 +196,17 @@ def ask(tmp_path):
     return build_and_ask
 
 
+# A torch with CUDA has loaded its own driver, and has its own guard of the device.
+with_a_driver_of_our_own = pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
+
+
 def test_a_driver_that_refuses_is_quoted(ask):
     said = "the driver does not start: CUDA driver version is insufficient for CUDA runtime version (35)"
     assert said in ask(["prdp_why_no_cuda"])
     assert "cuLaunchCooperativeKernel" in ask(["prdp_why_no_cuda"], "-DWITHOUT_NEWER")
 
 
-@pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
+@with_a_driver_of_our_own
 def test_a_driver_that_captures_and_a_device_without_room(ask, cache):
     assert TRIVIAL.compile(90)[1] == ""  # and is kept: NVRTC does not work beside a driver like this one
     why = ["prdp_why_no_kernel_of_cuda", TRIVIAL.text]
@@ -212,7 +216,7 @@ def test_a_driver_that_captures_and_a_device_without_room(ask, cache):
     assert "a kernel is to be compiled while a CUDA graph is captured; call prdp.warm_up() before" in said
 
 
-@pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
+@with_a_driver_of_our_own
 def test_a_kernel_that_did_not_load_for_want_of_memory_is_tried_again(ask, cache):
     assert TRIVIAL.compile(90)[1] == ""
     why = ["prdp_why_no_kernel_of_cuda", TRIVIAL.text]
@@ -220,7 +224,7 @@ def test_a_kernel_that_did_not_load_for_want_of_memory_is_tried_again(ask, cache
     assert ask([*why, 2], "-DWORKS", SHORT="1") == ""
 
 
-@pytest.mark.skipif(torch.version.cuda is not None, reason="the device is torch's own")
+@with_a_driver_of_our_own
 @pytest.mark.parametrize("device", [0, 1])
 def test_a_launch_from_a_thread_without_a_context(ask, cache, device):
     """Teams of several blocks wait for each other, so theirs is cooperative."""
@@ -230,6 +234,23 @@ def test_a_launch_from_a_thread_without_a_context(ask, cache, device):
             f"{how} blocks of 64 threads with 60000 bytes in context {1 + device} on stream {100 * device + 7}, "
             "argument 42"
         )
+
+
+def test_a_solve_whose_kernel_cannot_be_made_is_done_by_tensor_operations():
+    a, b = OPERATORS["heat 2D"](F32), right_hand_sides("heat 2D", F32)
+    expected, report = solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+    no_room = "the device has no room for a block of this kernel"
+    with Fibers() as fibers, warnings.catch_warnings(record=True) as said:
+        fibers.library().prdp_fibers_refuse()
+        warnings.simplefilter("always")
+        with pytest.raises(RuntimeError, match=f"PRDP_GPU=required: {no_room}"):
+            prdp.linear_solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+        os.environ["PRDP_GPU"] = "auto"
+        for _ in range(2):
+            u, info = prdp.linear_solve(a, b, prdp.CG(max_iter=60, rtol=1e-5))
+    assert [no_room in str(warning.message) for warning in said] == [True]
+    assert info.way != "kernel" and torch.equal(info.status, report.status)
+    torch.testing.assert_close(u, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("multigrid", [False, True])
