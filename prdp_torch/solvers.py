@@ -165,8 +165,8 @@ class CG(Solver):
 
     `preconditioner="diagonal"` divides by the diagonal. Where the diagonal varies much, as with a diffusivity that
     varies in space, this saves most of the iterations. If the diagonal is constant, it saves none. A zero on the
-    diagonal is refused (ZERO_DIAGONAL). A preconditioner of your own must be symmetric and definite; where it is not,
-    a sample ends with BREAKDOWN.
+    diagonal is refused (ZERO_DIAGONAL). A preconditioner of your own must be symmetric and definite. Where it is not
+    definite, a sample ends with BREAKDOWN; where it is not symmetric, rtol is not reached, and a warning says so.
 
     Source: Hestenes and Stiefel 1952.
     """
@@ -190,8 +190,8 @@ class MINRES(Solver):
     """The minimal residual for symmetric operators, definite or not, as a Helmholtz equation or a saddle point.
 
     An iteration has one product with A, and memory does not grow with their number, as it does in a cycle of `GMRES`.
-    Where A is definite, `CG` takes less work per iteration. A preconditioner must be positive definite, else a sample
-    ends with BREAKDOWN; the built-in ones are where A is, so not of `Poisson`, whose A is negative definite.
+    Where A is definite, `CG` takes less work per iteration. A preconditioner must be symmetric, and positive definite,
+    else a sample ends with BREAKDOWN. The built-in ones are where A is: not of `Poisson`, whose A is negative definite.
 
     Source: Paige and Saunders 1975.
     """

@@ -119,8 +119,9 @@ class Diffusion(Operator):
             values: u on the sides that are "zero", and u_ext of those that are "robin", where -κ ∂u/∂n is then
                 h (u - u_ext).
             fluxes: what flows in, κ ∂u/∂n with the normal n pointing outwards, on the sides that are "flux".
-                Each is one for all sides, or a pair (low, high) for each axis; a number, or a tensor that broadcasts
-                to (batch or 1, *side), where side is shape without the axis. In a pair, None is 0.
+                Each is a pair (low, high) for each axis, or one that stands on all sides that take it; a number, or a
+                tensor that broadcasts to (batch or 1, *side), where side is shape without the axis. In a pair, None is
+                0.
 
         Raises:
             ValueError: a value that is not 0 stands at a side that takes none.
@@ -162,7 +163,7 @@ class Diffusion(Operator):
             of_axes = isinstance(given, (tuple, list)) and len(given) == dim
             if not of_axes or any(not isinstance(pair, (tuple, list)) or len(pair) != 2 for pair in given):
                 raise ValueError(
-                    f"Diffusion: {name} must be one for all sides or a pair (low, high) for each of {dim} axes, got "
+                    f"Diffusion: {name} must be a number, a tensor, or a pair (low, high) for each of {dim} axes, got "
                     f"{given!r:.80}"
                 )
             pairs = [[0.0 if value is None else value for value in pair] for pair in given]

@@ -3,6 +3,7 @@
 import signal
 
 import pytest
+import torch
 from hypothesis import settings
 
 # The same cases in every run; `pytest --hypothesis-profile default` draws new ones.
@@ -20,3 +21,11 @@ def data_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PRDP_CACHE", str(tmp_path_factory.mktemp("data")))
         yield
+
+
+@pytest.fixture
+def always():
+    """A warning that is said once in a process is said each time."""
+    torch.set_warn_always(True)
+    yield
+    torch.set_warn_always(False)

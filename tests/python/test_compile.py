@@ -131,3 +131,14 @@ def test_operators_of_numbers_are_made_inside_a_graph():
     b = field((8,), batch=2)
     compiled = torch.compile(solve, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(b), solve(b), rtol=0.0, atol=0.0)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace")
+def test_torch_export_records_a_step_and_torch_jit_trace_says_that_it_cannot():
+    step, u = prdp.Heat((8,), 0.3, 0.1, prdp.CG(20)), field((8,))
+    exported = torch.export.export(torch.nn.Sequential(step), (u,)).module()
+    torch.testing.assert_close(exported(u), step(u), rtol=0.0, atol=0.0)
+    heat = operators.Heat((8,), 0.3, 0.1)
+    for run in (step, lambda b: prdp.linear_solve(heat, b, prdp.CG(20))[0]):
+        with pytest.raises(TypeError, match="trace cannot record a solve of prdp_torch"):
+            torch.jit.trace(run, u)

@@ -67,6 +67,14 @@ def test_rolling_decisions_equal_the_published_code(sequence):
         assert checkpoint == pytest.approx(G["seq_checkpoint"][sequence][epoch], rel=1e-10)
 
 
+@given(st.lists(st.floats(0, 1e6), min_size=2, max_size=60))
+def test_a_window_of_one_does_not_smooth(metrics):
+    controller = prdp.PRDPController(window=1)
+    for metric in metrics:
+        controller.step(metric)
+    assert [record.smoothed for record in controller.history] == metrics
+
+
 def test_f02_a_constant_metric_refines_once():
     failures = golden("failures")
     controller = prdp.PRDPController()

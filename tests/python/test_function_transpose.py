@@ -23,14 +23,6 @@ def gradient(a, solver, inputs=None, dtype=torch.float64, n=12, seed=1, on_failu
     return torch.autograd.grad((u * weights).sum(), b if inputs is None else inputs)[0]
 
 
-@pytest.fixture
-def always():
-    """A warning that is said once is said in each of these tests."""
-    torch.set_warn_always(True)
-    yield
-    torch.set_warn_always(False)
-
-
 @pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("wrong", ["symmetric", "transpose", "captured", "tensors alone"])
 def test_a_wrong_transpose_is_said(wrong):

@@ -165,3 +165,28 @@ def test_minres_with_the_diagonal_of_a_negative_definite_operator_names_a_way():
     solver = prdp.MINRES(20, preconditioner="diagonal")
     with pytest.raises(torch.linalg.LinAlgError, match="take MINRES without it, or CG where A is negative definite"):
         prdp.linear_solve(operators.Poisson((8,)), torch.randn(1, 1, 8, dtype=torch.float64), solver)
+
+
+NOT_SYMMETRIC = r"not symmetric \(‖M⁻¹v - M⁻ᵀv‖ is [\d.]+ ‖M⁻¹v‖ for a v of no structure\); take GMRES"
+NOT_LINEAR = r"not linear: M⁻¹\(-2 v\) is not -2 M⁻¹ v"
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("claims_symmetry", [False, True])
+@pytest.mark.parametrize(
+    "solver, apply, said",
+    [
+        (prdp.CG(400, 1e-12), lambda r: r + 0.3 * r.roll(1, -1), NOT_SYMMETRIC),
+        (prdp.MINRES(400, 1e-12), lambda r: r + 0.3 * r.roll(1, -1), NOT_SYMMETRIC),
+        (prdp.GMRES(400, 1e-12), lambda r: r + r.tanh(), NOT_LINEAR),
+    ],
+)
+def test_a_preconditioner_that_does_not_suit_the_method_is_named_where_rtol_is_not_reached(
+    solver, apply, said, claims_symmetry
+):
+    kappa, b = 0.2 + 5 * field((16, 16)).abs()[:, 0], field((16, 16))
+    inverse = operators.Function(apply, symmetric=claims_symmetry)
+    solver = dataclasses.replace(solver, preconditioner=inverse)
+    with pytest.warns(UserWarning, match=f"did not reach rtol = 1e-12: .* its preconditioner is {said}"):
+        _, info = prdp.linear_solve(operators.Diffusion(kappa, 0.5), b, solver, backward="none")
+    assert not info.solved.all()

@@ -214,9 +214,20 @@ OperatorSpec csr_matrix(const at::Tensor& crow, const at::Tensor& col, const at:
   return a;
 }
 
+namespace {
+/// torch.jit.trace has no way to write down the options of a solve, and would fail without saying of what.
+void refuse_trace(const c10::OperatorHandle&, torch::jit::Stack*) {
+  TORCH_CHECK_TYPE(false, "torch.jit.trace cannot record a solve of prdp_torch; take torch.export or torch.compile");
+}
+}  // namespace
+
 TORCH_LIBRARY_FRAGMENT(prdp, m) { m.def(kSchema, {at::Tag::pt2_compliant_tag}); }
 TORCH_LIBRARY_IMPL(prdp, CompositeExplicitAutograd, m) { m.impl("linear_solve", static_cast<Signature*>(solve_op)); }
 TORCH_LIBRARY_IMPL(prdp, Meta, m) { m.impl("linear_solve", static_cast<Signature*>(fake_op)); }
 TORCH_LIBRARY_IMPL(prdp, Autograd, m) { m.impl("linear_solve", static_cast<Signature*>(autograd_op)); }
+TORCH_LIBRARY_IMPL(prdp, Tracer, m) {
+  for (const char* op : {"linear_solve", "step", "rollout"})
+    m.impl(op, torch::CppFunction::makeFromBoxedFunction<&refuse_trace>());
+}
 
 }  // namespace prdp

@@ -52,8 +52,7 @@ bool PRDPController::step(double metric, const Solves& solves) {
   check_metric(metric);
   const double alpha = 2.0 / (static_cast<double>(settings_.window) + 1.0);
   const auto& history = state_.history;
-  const double smoothed =
-      history.empty() ? metric : history.back().smoothed + alpha * (metric - history.back().smoothed);
+  const double smoothed = history.empty() ? metric : std::lerp(history.back().smoothed, metric, alpha);
   state_.history.push_back({metric, smoothed, state_.max_iter, false, solves.error, solves.residual});
 
   const int64_t limit = settings_.maximum.value_or(std::numeric_limits<int64_t>::max());

@@ -6,7 +6,8 @@ namespace prdp {
 
 void check_matrix_vector(const at::Tensor& b, const at::Tensor& values, int64_t n, bool batched) {
   TORCH_CHECK_VALUE(b.dim() == 2 && b.size(1) == n, "linear_solve: a matrix of ", n, " rows needs b of shape (", n,
-                    ",) or (batch, ", n, "), got ", b.sizes());
+                    ",) or (batch, ", n, "), got ", b.sizes(),
+                    b.dim() > 2 ? "; flatten b, or make the product a Function" : "");
   TORCH_CHECK_VALUE(!batched || b.size(0) == values.size(0), "linear_solve: A holds ", values.size(0),
                     " matrices, b holds ", b.size(0), " right-hand sides");
   TORCH_CHECK_TYPE(b.scalar_type() == at::kFloat || b.scalar_type() == at::kDouble,

@@ -4,17 +4,15 @@
 
 #include <algorithm>
 #include <cmath>
-#include <iomanip>
-#include <limits>
 #include <sstream>
 
 #include "prdp/error_text.h"
 #include "prdp/kernels/kernel.h"
 #include "prdp/operators/kinds.h"
-#include "prdp/operators/probes.h"
 #include "prdp/operators/singular_operator.h"
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/methods.h"
+#include "prdp/solvers/unfit.h"
 #include "prdp/solvers/unnamed_null_space.h"
 
 namespace prdp {
@@ -32,29 +30,10 @@ std::string name_of(const Solver& solver) {
   return text.str();
 }
 
-std::string number(double x) {
-  std::ostringstream text;
-  text << std::setprecision(3) << x;
-  return text.str();
-}
-
 double norm_of(const at::Tensor& v) { return v.to(at::kDouble).norm().item<double>(); }
 
 double value_of_sample(const at::Tensor& t, int64_t sample) {
   return (t.dim() == 0 || t.size(0) == 1 ? t.reshape({-1})[0] : t.reshape({-1})[sample]).to(at::kDouble).item<double>();
-}
-
-/// How far A is from symmetric, for vectors without structure of this sample: ‖A v - Aᵀ v‖ / ‖A v‖, and, as the
-/// transpose of a function may be claimed to be A itself, |⟨A v, w⟩ - ⟨v, A w⟩| / (‖A v‖ ‖w‖). NaN for a function
-/// without a transpose.
-double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
-  const auto v = unstructured_like(b), w = v.flatten(1).roll(1, 1).view_as(v);
-  const auto of = [&](const at::Tensor& t) { return t.select(0, sample).flatten().to(at::kDouble); };
-  const auto product = of(a.apply(v)), other = of(a.apply_transpose(v));
-  const double claimed = (product.dot(of(w)) - of(v).dot(of(a.apply(w)))).item<double>();
-  return std::max(norm_of(product - other) / norm_of(product), std::abs(claimed) / (norm_of(product) * norm_of(of(w))));
-} catch (const std::exception&) {  // it has nothing to add to a message
-  return std::numeric_limits<double>::quiet_NaN();
 }
 
 /// Whether the product with a vector of ones is finite, for this sample.
@@ -95,13 +74,6 @@ std::string badly_scaled(const Solver& solver, const Operator& a, const at::Tens
 bool row_sums_are_rounding(const Operator& a, const at::Tensor& b, int64_t sample) {
   const double row_sum = a.apply(at::ones_like(b)).select(0, sample).abs().max().item<double>();
   return row_sum > 0.0 && row_sum <= 64.0 * epsilon_of(b) * value_of_sample(a.norm(), sample);
-}
-
-/// Where A is not symmetric: that, in words. Else empty.
-std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample) {
-  const double share = asymmetry(a, b, sample);
-  if (!(share > 100.0 * epsilon_of(b))) return {};
-  return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
 }
 
 /// Why a method for symmetric definite operators fails on this one.
@@ -188,8 +160,9 @@ bool has_wide_kappa(const SolveRole& role, const Operator& a, const at::Tensor& 
 }
 
 /// Why the residual fell no further, far above what was asked for.
-std::string stagnated(const SolveRole& role, const at::Tensor& b) {
+std::string stagnated(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto& solver = role.solver;
+  if (auto found = unfit(role, a, b, sample); !found.empty()) return found;
   const bool single = b.scalar_type() == at::kFloat;
   if (single && role.a.kind.starts_with("diffusion") && solver.method == Method::kConjugateGradient)
     return "the residual falls no further in float32; where κ jumps, u may be right all the same: solve it once with "
@@ -210,9 +183,7 @@ std::string stagnated(const SolveRole& role, const at::Tensor& b) {
 /// Why max_iter left a large residual.
 std::string stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
   const auto& solver = role.solver;
-  const auto made_for = traits(solver.method).made_for;
-  if (made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric)
-    if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+  if (auto found = unfit(role, a, b, sample); !found.empty()) return found;
   const bool holds_weakly = role.a.kind.starts_with("diffusion") && b.scalar_type() == at::kFloat;
   if (solver.preconditioner.is_multigrid() && holds_weakly && solver.method != Method::kConjugateGradient)
     return "in float32 its coarse grids may lose what keeps A from being singular; take CG with multigrid, Direct or "
@@ -292,7 +263,7 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
         if (const auto refused = a.refusal(sample); !refused.empty())
           return refused + "; what a network predicts should end in exp or softplus";
         return "A is made of a NaN or Inf; look at the state, the weights or the file that it comes from";
-      case SolveStatus::kStagnated: return stagnated(role, b);
+      case SolveStatus::kStagnated: return stagnated(role, a, b, sample);
       case SolveStatus::kMaxIter: return stopped(role, a, b, sample);
       default: return "it did not reach its tolerance; raise max_iter or rtol";
     }

@@ -10,6 +10,7 @@
 #include "prdp/operators/tensors.h"
 #include "prdp/solvers/failure_messages.h"
 #include "prdp/solvers/raise_or_warn.h"
+#include "prdp/solvers/unfit.h"
 
 namespace prdp {
 
@@ -87,18 +88,19 @@ std::string key_of(const SolveRole& role) {
 /// Residuals above this are reported.
 double warning_threshold(double rtol) { return std::max(10.0 * rtol, 0.01); }
 
-/// Warns of samples whose residual stopped far above what was asked for. That is no failure: the residual may be all
-/// that rounding leaves of a u that is good enough, but nobody else would say that it may not be.
-void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+/// Warns of samples whose residual stopped far above what was asked for, and returns whether there are any. That is no
+/// failure: the residual may be all that rounding leaves of a u that is good enough, but nobody else would say that it
+/// may not be.
+bool warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
                         const std::vector<int64_t>& stagnated) {
-  if (stagnated.empty()) return;
+  if (stagnated.empty()) return false;
   // Where the two are equal, u consists of the least numbers of its dtype, and the residual of their rounding.
   const auto residuals = info.residual.masked_fill(info.residual.eq(info.floor), 0.0).to(at::kCPU, at::kDouble);
   const auto* residual = residuals.const_data_ptr<double>();
   const double bound = warning_threshold(role.solver.rtol);
   const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
   const int64_t worst = *std::max_element(stagnated.begin(), stagnated.end(), worse);
-  if (!(residual[worst] > bound)) return;
+  if (!(residual[worst] > bound)) return false;
   const auto many = std::count_if(stagnated.begin(), stagnated.end(), [&](int64_t i) { return residual[i] > bound; });
   warn_once(key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
@@ -106,6 +108,7 @@ void warn_of_stagnation(const SolveRole& role, const Operator& a, const at::Tens
          << " at relative residual " << residual[worst] << " after " << info.iterations[worst].item<int64_t>()
          << " iterations, " << diagnosis(role, a, b, SolveStatus::kStagnated, worst);
   });
+  return true;
 }
 
 /// Warns where zeros take the place of gradients that a NaN or Inf in the cotangent has spoilt: a loss scaler waits for
@@ -134,8 +137,8 @@ bool later_iterations_were_worse(const Solver& solver, SolveStatus status, int64
 }
 
 /// Warns of those that max_iter left with a residual above ‖b‖. That is no failure, as an error may fall where its
-/// residual grows, but whoever asked for a tolerance did not mean it.
-void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& b, const std::vector<int64_t>& status,
+/// residual grows, but whoever asked for a tolerance did not mean it. Returns whether there are any.
+bool warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& b, const std::vector<int64_t>& status,
                     const std::vector<double>& residual) {
   const auto has_grown = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kMaxIter && residual[i] > 1.0;
@@ -146,18 +149,41 @@ void warn_of_growth(const SolveRole& role, const Operator& a, const at::Tensor& 
     ++many;
     if (worst < 0 || residual[i] > residual[worst]) worst = i;
   }
-  if (many == 0) return;
+  if (many == 0) return false;
   warn_once("grown: " + key_of(role), residual[worst], [&](std::ostream& text) {
     text << name_of(role) << ": " << many << " of " << b.size(0)
          << " samples stopped at max_iter = " << role.solver.max_iter << ", with a residual above ‖b‖: sample " << worst
          << " at " << residual[worst] << ", where rtol = " << role.solver.rtol << " was asked for, "
          << diagnosis(role, a, b, SolveStatus::kMaxIter, worst) << "; or rtol=0 if this is meant";
   });
+  return true;
 }
 
-/// Warns of samples that max_iter stopped, where a tolerance was asked for.
-void warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info) {
+/// Warns where many products did not lead to rtol, though no residual grew, as A or a preconditioner of one's own is
+/// not what the method is made for. Below so many, the products that tell would cost too much beside the solve.
+void warn_of_unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info,
+                   const std::vector<int64_t>& unsolved) {
+  constexpr int64_t many = 100;
   if (!(role.solver.rtol > 0.0)) return;
+  const auto residual = to_host<double>(info.residual, b.size(0)), floor = to_host<double>(info.floor, b.size(0));
+  const auto products = to_host<int64_t>(info.operator_applications, b.size(0));
+  const auto worse = [&](int64_t i, int64_t j) { return residual[i] < residual[j]; };
+  const int64_t worst = *std::max_element(unsolved.begin(), unsolved.end(), worse);
+  const double bound = std::max(10.0 * role.solver.rtol, 10.0 * floor[worst]);
+  if (products[worst] < many || !(residual[worst] > bound)) return;
+  if (unfit(role, a, b, worst).empty()) return;
+  warn_once("unfit: " + key_of(role), residual[worst], [&](std::ostream& text) {
+    text << name_of(role) << ": " << unsolved.size() << " of " << b.size(0)
+         << " samples did not reach rtol = " << role.solver.rtol << ": sample " << worst << " is at relative residual "
+         << residual[worst] << " after " << products[worst] << " products with A, "
+         << diagnosis(role, a, b, SolveStatus::kMaxIter, worst);
+  });
+}
+
+/// Warns of samples that max_iter stopped, where a tolerance was asked for. Returns whether there are any that are far
+/// from it.
+bool warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor& b, const SolveInfo& info) {
+  if (!(role.solver.rtol > 0.0)) return false;
   const auto iterations = to_host<int64_t>(info.iterations, b.size(0)),
              status = to_host<int64_t>(info.status, b.size(0));
   const auto residual = to_host<double>(info.residual, b.size(0));
@@ -175,6 +201,7 @@ void warn_of_stopped(const SolveRole& role, const Operator& a, const at::Tensor&
          << " at relative residual " << residual[first] << ", as the last of " << role.solver.max_iter
          << " iterates was worse, " << diagnosis(role, a, b, SolveStatus::kMaxIter, first);
   });
+  return true;
 }
 
 }  // namespace
@@ -194,17 +221,18 @@ void report_failures(const SolveRole& role, const Operator& a, const at::Tensor&
   const int64_t batch = info.status.size(0);
   const auto on_host = info.status.to(at::kCPU);
   const auto* status = on_host.const_data_ptr<int64_t>();
-  std::vector<int64_t> failed, stagnated;
-  bool any_open = false;
+  std::vector<int64_t> failed, stagnated, unsolved;
   for (int64_t i = 0; i < batch; ++i) {
     const auto what = static_cast<SolveStatus>(status[i]);
     if (is_failure(what)) failed.push_back(i);
-    any_open = any_open || what == SolveStatus::kMaxIter;
     if (what == SolveStatus::kStagnated) stagnated.push_back(i);
+    if (what == SolveStatus::kStagnated || what == SolveStatus::kMaxIter) unsolved.push_back(i);
   }
   if (failed.empty()) {
-    if (any_open) warn_of_stopped(role, a, b, info);
-    return warn_of_stagnation(role, a, b, info, stagnated);
+    const bool have_stopped = unsolved.size() > stagnated.size() && warn_of_stopped(role, a, b, info);
+    const bool have_stagnated = warn_of_stagnation(role, a, b, info, stagnated);
+    if (!have_stopped && !have_stagnated && !unsolved.empty()) warn_of_unfit(role, a, b, info, unsolved);
+    return;
   }
   const auto is_of_a = [&](int64_t i) {
     return static_cast<SolveStatus>(status[i]) == SolveStatus::kNonfiniteOperator;

@@ -1,0 +1,81 @@
+#include "prdp/solvers/unfit.h"
+
+#include <ATen/core/grad_mode.h>
+
+#include <algorithm>
+#include <cmath>
+#include <iomanip>
+#include <limits>
+#include <sstream>
+
+#include "prdp/operators/probes.h"
+#include "prdp/operators/tensors.h"
+#include "prdp/solvers/methods.h"
+
+namespace prdp {
+
+namespace {
+
+/// One sample of a batch of vectors.
+at::Tensor row(const at::Tensor& v, int64_t sample) { return v.select(0, sample).flatten().to(at::kDouble); }
+
+double norm_of(const at::Tensor& v) { return v.norm().item<double>(); }
+
+/// How far A is from symmetric, for vectors without structure of this sample: ‖A v - Aᵀ v‖ / ‖A v‖, and, as the
+/// transpose of a function may be claimed to be A itself, |⟨A v, w⟩ - ⟨v, A w⟩| / (‖A v‖ ‖w‖). NaN for a function
+/// without a transpose.
+double asymmetry(const Operator& a, const at::Tensor& b, int64_t sample) try {
+  const auto v = unstructured_like(b), w = v.flatten(1).roll(1, 1).view_as(v);
+  const auto product = row(a.apply(v), sample), other = row(a.apply_transpose(v), sample);
+  const double claimed = (product.dot(row(w, sample)) - row(v, sample).dot(row(a.apply(w), sample))).item<double>();
+  return std::max(norm_of(product - other) / norm_of(product),
+                  std::abs(claimed) / (norm_of(product) * norm_of(row(w, sample))));
+} catch (const std::exception&) {  // it has nothing to add to a message
+  return std::numeric_limits<double>::quiet_NaN();
+}
+
+/// How far M⁻¹ (-2 v) is from -2 M⁻¹ v, beside the latter.
+double nonlinearity(const Operator& m, const at::Tensor& b, int64_t sample) {
+  const auto v = unstructured_like(b);
+  const auto doubled = -2.0 * row(m.apply(v), sample);
+  return norm_of(row(m.apply(-2.0 * v), sample) - doubled) / norm_of(doubled);
+}
+
+bool needs_symmetry(Method method) {
+  const auto made_for = traits(method).made_for;
+  return made_for == MadeFor::kDefinite || made_for == MadeFor::kSymmetric;
+}
+
+}  // namespace
+
+std::string number(double x) {
+  std::ostringstream text;
+  text << std::setprecision(3) << x;
+  return text.str();
+}
+
+std::string asymmetric(const Operator& a, const at::Tensor& b, int64_t sample) {
+  const double share = asymmetry(a, b, sample);
+  if (!(share > 100.0 * epsilon_of(b))) return {};
+  return "A is not symmetric (‖A v - Aᵀ v‖ is " + number(share) + " ‖A v‖ for a v of no structure); take GMRES";
+}
+
+std::string unfit(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  const at::NoGradGuard no_grad;
+  const auto& solver = role.solver;
+  const bool symmetric = needs_symmetry(solver.method);
+  if (symmetric)
+    if (auto found = asymmetric(a, b, sample); !found.empty()) return found;
+  if (!solver.preconditioner.is_operator()) return {};
+  const auto m = make_operator(solver.preconditioner.spec());
+  // One made of differences is linear but for their rounding.
+  if (nonlinearity(*m, b, sample) > 32.0 * std::sqrt(epsilon_of(b)))
+    return "its preconditioner is not linear: M⁻¹(-2 v) is not -2 M⁻¹ v; a network is linear without biases and "
+           "activations";
+  const double share = symmetric ? asymmetry(*m, b, sample) : 0.0;
+  if (!(share > 32.0 * std::sqrt(epsilon_of(b)))) return {};
+  return "its preconditioner is not symmetric (‖M⁻¹v - M⁻ᵀv‖ is " + number(share) +
+         " ‖M⁻¹v‖ for a v of no structure); take GMRES";
+}
+
+}  // namespace prdp
