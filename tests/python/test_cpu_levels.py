@@ -2,8 +2,10 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,3 +96,15 @@ def test_an_unknown_level_is_named_with_those_that_exist():
     done = at_level("x86-64-v9")
     assert done.returncode != 0
     assert "PRDP_CPU_LEVEL: this processor has no level 'x86-64-v9'; allowed: baseline" in done.stderr.decode()
+
+
+def test_no_code_for_one_processor_can_take_the_place_of_anothers():
+    """What the linker may share between objects, as templates, has the name of the level in it."""
+    objects = list(Path(__file__).parents[2].glob("build/**/prdp_loops_*.dir/**/*.o"))
+    assert objects
+    for path in objects:
+        level = re.search(r"prdp_loops_(\w+)\.dir", str(path))[1]
+        listed = subprocess.run(["nm", "-C", str(path)], capture_output=True, text=True, check=True).stdout
+        shared = [line for line in listed.splitlines() if re.match(r"[0-9a-f]* *[uvVwW] ", line)]
+        own = (f"Eigen_{level}::", "DW.ref.")  # the latter points to functions of the runtime
+        assert not [line for line in shared if not any(name in line for name in own)], path

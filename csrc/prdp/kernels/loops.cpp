@@ -1,7 +1,12 @@
 // Compiled once per instruction set, with PRDP_LEVEL naming it. Everything but the two tables has
-// internal linkage, and nothing of the standard library is instantiated: no code for one processor can
-// be linked in the place of another's.
+// internal linkage, nothing of the standard library is instantiated, and Eigen has a name of its own: no
+// code for one processor can be linked in the place of another's.
+#define PRDP_JOIN_(a, b) a##b
+#define PRDP_JOIN(a, b) PRDP_JOIN_(a, b)
+#define Eigen PRDP_JOIN(Eigen_, PRDP_LEVEL)
+
 #include "prdp/kernels/dense_loops.h"
+#include "prdp/kernels/factor_lu.h"
 #include "prdp/kernels/flow_loops.h"
 #include "prdp/kernels/laplacian_loops.h"
 #include "prdp/kernels/multigrid_loops.h"
@@ -49,14 +54,13 @@ constexpr Loops<T> table(const char* level) {
           add_merged<T>,
           galerkin_product<T>,
           multiply<T>,
+          factor_lu,
           advect_row<T>,
           advect_row_back<T>};
 }
 
 }  // namespace
 
-#define PRDP_JOIN_(a, b) a##b
-#define PRDP_JOIN(a, b) PRDP_JOIN_(a, b)
 extern const Loops<float> PRDP_JOIN(float_loops_, PRDP_LEVEL);
 extern const Loops<double> PRDP_JOIN(double_loops_, PRDP_LEVEL);
 const Loops<float> PRDP_JOIN(float_loops_, PRDP_LEVEL) = table<float>(PRDP_LEVEL_NAME);

@@ -17,7 +17,7 @@ using Values = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 /// and columns may only differ much in size: they are scaled, and factored again.
 class DenseLU {
  public:
-  explicit DenseLU(const Eigen::MatrixXd& m) {
+  explicit DenseLU(const Eigen::MatrixXd& m) : rows_(m.rows()) {
     factor(m);
     if (is_regular_) return;
     const auto scales = equilibrate(m.rows(), [&](const auto& body) {
@@ -40,18 +40,31 @@ class DenseLU {
 
  private:
   /// A pivot is rounding beside its own column: how large the others are does not matter.
-  void factor(const Eigen::MatrixXd& m) {
-    lu_.compute(m);
+  void factor(Eigen::MatrixXd m) {
     const double rounding = std::numeric_limits<double>::epsilon() * static_cast<double>(m.rows());
-    const Eigen::ArrayXd pivots = lu_.matrixLU().diagonal().cwiseAbs();
-    is_regular_ = (pivots > rounding * m.cwiseAbs().colwise().sum().transpose().array()).all();
+    const Eigen::ArrayXd sizes = m.cwiseAbs().colwise().sum();
+    lu_ = std::move(m);
+    loops<double>().factor_lu(lu_.data(), lu_.rows(), rows_.data());
+    is_regular_ = (lu_.diagonal().cwiseAbs().array() > rounding * sizes).all();
   }
   Eigen::VectorXd solve_factors(const Eigen::VectorXd& b, bool transposed) const {
-    if (transposed) return lu_.transpose().solve(b);
-    return lu_.solve(b);
+    const auto lower = lu_.triangularView<Eigen::UnitLower>();
+    const auto upper = lu_.triangularView<Eigen::Upper>();
+    Eigen::VectorXd x = transposed ? b : b(rows_);
+    if (!transposed) {
+      lower.solveInPlace(x);
+      upper.solveInPlace(x);
+      return x;
+    }
+    upper.transpose().solveInPlace(x);
+    lower.transpose().solveInPlace(x);
+    Eigen::VectorXd y(x.size());
+    y(rows_) = x;
+    return y;
   }
 
-  Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
+  Eigen::MatrixXd lu_;
+  std::vector<int64_t> rows_;  // of P
   std::optional<Equilibration> scales_;
   bool is_regular_ = false;
 };
