@@ -21,8 +21,9 @@ def forgets_if_it_raises(step: Callable[P, T]) -> Callable[P, T]:
             return step(*args, **kwargs)
         try:
             return step(*args, **kwargs)
-        except BaseException:
-            vars(args[0])["info"] = None
+        except BaseException as error:
+            if not torch_private.is_end_of_recomputation(error):
+                vars(args[0])["info"] = None
             raise
 
     return call

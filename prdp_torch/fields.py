@@ -44,7 +44,7 @@ def project(u: Tensor, length: Length = 1.0) -> Tensor:
     # Eigenvalues of D G, the five-point Laplacian.
     symbol = -((2 * ny / ly * torch.sin(math.pi / ny * ky)[:, None]) ** 2)
     symbol = symbol - (2 * nx / lx * torch.sin(math.pi / nx * kx)) ** 2
-    symbol[0, 0] = 1.0  # the mean of φ, which G does not see
+    symbol = symbol.masked_fill(symbol == 0, 1.0)  # of the mean of φ, which G does not see
     phi = torch.fft.irfft2(torch.fft.rfft2(divergence(u, length)) / symbol, s=(ny, nx))
     return torch.cat([u1 - _backward(phi, _X, lx), u2 - _backward(phi, _Y, ly), u[:, 2:]], dim=1)
 
@@ -70,6 +70,10 @@ def rollout(stepper: Callable[[Tensor], Tensor], u: Tensor, steps: int) -> Tenso
     states = [_check.dense("rollout", "u", u)]
     for _ in range(steps):
         states.append(stepper(states[-1]))
+        if states[-1].shape != u.shape:
+            raise ValueError(
+                f"rollout: the step must keep the shape of its input, {tuple(u.shape)}, got {tuple(states[-1].shape)}"
+            )
     return torch.stack(states, dim=1)
 
 

@@ -27,6 +27,13 @@ def modes_are_active() -> bool:
     return not torch.compiler.is_compiling() and bool(torch._C._len_torch_dispatch_stack())
 
 
+def is_end_of_recomputation(error: BaseException) -> bool:
+    """Whether this is how `torch.utils.checkpoint` leaves what it runs again, once it has what it needs."""
+    import torch.utils.checkpoint
+
+    return isinstance(error, torch.utils.checkpoint._StopRecomputationError)
+
+
 def unwrapped(t: Tensor) -> Tensor:
     """A tensor without the wrappers of the transforms that run; the axes that are mapped come first. Reports of solves
     outlive the transforms, and torch.func has no public way to take a wrapper off."""

@@ -131,8 +131,10 @@ def load_random(saved: _C.Saved, device: torch.device) -> None:
 
 
 def make_optimiser(scene: _C.Scene, parameters: Iterable[Tensor]) -> torch.optim.Adam:
-    """Adam as the scenes use it; in one kernel where torch has one."""
-    return torch.optim.Adam(parameters, lr=scene.learning_rate(0), fused=scene.device.type in ("cpu", "cuda"))
+    """Adam as the scenes use it; in one kernel where torch has one, which takes no complex numbers."""
+    trained = list(parameters)
+    fused = scene.device.type in ("cpu", "cuda") and not any(p.is_complex() for p in trained)
+    return torch.optim.Adam(trained, lr=scene.learning_rate(0), fused=fused)
 
 
 def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

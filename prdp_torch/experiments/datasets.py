@@ -126,6 +126,10 @@ def evaluating(network: object) -> Iterator[None]:
             module.training = mode
 
 
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
 def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     """Raise TypeError or ValueError unless the network takes states of the scene to states, and can be trained."""
     if not isinstance(network, torch.nn.Module):
@@ -133,12 +137,14 @@ def check_network(scene: _C.Scene, network: object, states: Tensor) -> None:
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if not trained:
         raise ValueError("train: network has no parameters that require a gradient")
-    other = {str(p.dtype).removeprefix("torch.") for p in trained if p.dtype != scene.dtype}
+    wanted = {False: scene.dtype, True: scene.dtype.to_complex()}
+    other = {p.dtype for p in trained if p.dtype != wanted[p.is_complex()]}
     if other:
-        wanted = str(scene.dtype)
+        has_complex = any(dtype.is_complex for dtype in other)
         raise ValueError(
-            f"train: the scene computes in {wanted.removeprefix('torch.')}, but network has parameters in "
-            f"{', '.join(sorted(other))}; call network.to({wanted})"
+            f"train: the scene computes in {_name(scene.dtype)}, but network has parameters in "
+            f"{', '.join(sorted(map(_name, other)))}; "
+            + (f"make its complex ones {_name(wanted[True])}" if has_complex else f"call network.to({scene.dtype})")
         )
     try:
         with evaluating(network), torch.random.fork_rng(devices=[]):

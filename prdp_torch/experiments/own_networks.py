@@ -20,7 +20,7 @@ def make(scene: _C.Scene, seed: int) -> torch.nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            return cls().to(scene.dtype)
+            return _in_dtype(cls(), scene.dtype)
         except Exception as error:
             raise _refused(scene, f"{cls.__name__}() raised {type(error).__name__}: {error}") from error
 
@@ -34,6 +34,16 @@ def warn_if_changed(scene: _C.Scene, known: str | None) -> None:
     """Warn if the source of the class is not that of the training."""
     if fingerprint(scene) != known:
         warnings.warn(f"network: '{_source(scene)}' has changed since the training", stacklevel=3)
+
+
+def _in_dtype(network: torch.nn.Module, dtype: torch.dtype) -> torch.nn.Module:
+    """Its real numbers in this dtype, its complex ones in the complex dtype of the same precision, which
+    `network.to(dtype)` would make real."""
+    network = network.double() if dtype == torch.float64 else network.float()
+    for t in (*network.parameters(), *network.buffers()):
+        if t.is_complex():
+            t.data = t.data.to(dtype.to_complex())
+    return network
 
 
 def _class_of(scene: _C.Scene) -> type[torch.nn.Module]:

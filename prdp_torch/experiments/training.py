@@ -142,6 +142,8 @@ def train(
     if data_parallel.count() > 1 and not scene.trains_network:
         raise ValueError(f"train: several processes share the batches of a network; the task '{scene.task}' has none")
     scene = placed(scene, device)
+    if not isinstance(callbacks, Iterable):
+        raise TypeError(f"train: callbacks must be a list of functions, got {callbacks!r}")
     callbacks = list(callbacks)
     for callback in callbacks:
         if not callable(callback):

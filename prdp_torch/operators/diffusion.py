@@ -37,8 +37,8 @@ class Diffusion(Operator):
             (batch, 1) in 1D, (batch, 1, 1) in 2D. With 1/dt, A is a step of ∂u/∂t = ∇·(κ ∇u) by implicit Euler, with
             b = u/dt. In float32 products are made of fluxes: for `CG` and `Direct` a small shift, weak sides and jumps
             of κ are not lost in the rounding of a diagonal, though the residual may end at ε max κ Σ 2/dx² |u|, with a
-            warning. `MINRES` and `GMRES`, which go by the residual, and the coarse grids of multigrid do lose what
-            holds u by less than that.
+            warning. `Direct` ends with BREAKDOWN where κ/dx² is 1e13 times as large as what holds u. `MINRES` and
+            `GMRES`, which go by the residual, and the coarse grids of multigrid do lose what holds u by less than that.
         boundary: "zero" (u = 0 on the side, half a cell from the nearest centre), "flux" (none passes), "periodic", or
             ("robin", h) with h >= 0 (what flows out, -κ ∂u/∂n with the normal n pointing outwards, is h u on the side):
             one for all sides, one for each axis, or a pair (low, high) for each axis. h is a number, or a tensor
@@ -77,6 +77,8 @@ class Diffusion(Operator):
                 f"in shape, got {tuple(kappa.shape)}"
             )
         self.per_axis, shape = per_axis, kappa.shape[-dim:]
+        if 0 in shape:
+            raise ValueError(f"Diffusion: every extent of shape must be >= 1, got {tuple(shape)}")
         if per_axis:
             self.kind = "diffusion_per_axis"
         if faces not in ("harmonic", "arithmetic"):
@@ -148,8 +150,8 @@ class Diffusion(Operator):
                         f"Diffusion: the {ENDS[end]} side of axis {axis} holds {len(added)} samples, the sides before "
                         f"it {len(b)}"
                     )
-                place = torch.zeros(self.shape[axis], dtype=b.dtype, device=b.device)
-                place[-end] = 1.0
+                cells = torch.arange(self.shape[axis], device=b.device)
+                place = (cells == end * (self.shape[axis] - 1)).to(b.dtype)  # torch.func.linearize loses what is set
                 b = b + added.unsqueeze(axis + 1) * place.view(-1, *(1,) * (len(self.shape) - axis - 1))
         return b.unsqueeze(1)
 

@@ -37,8 +37,9 @@ class Function(Operator):
             axes, they have that of b without its batch axis.
 
     `Direct` multiplies A with unit vectors, so it is for small systems. Call `prdp.check_operator` once to compare
-    the functions with each other. On the CPU, the first solve refuses a product that is not linear, and the backward
-    pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A `Function` cannot be created inside `torch.compile`.
+    the functions with each other. On the CPU, the first solve refuses a product that is far from linear or mixes
+    samples, and the backward pass warns where ⟨λ, A u⟩ and ⟨Aᵀ λ, u⟩ differ. A `Function` cannot be created inside
+    `torch.compile`.
     """
 
     kind = "function"

@@ -89,6 +89,8 @@ def test_a_callback_is_not_told_of_an_interval_that_was_lost():
 def test_what_is_no_callback_is_refused_before_any_work():
     with pytest.raises(TypeError, match="train: callbacks must be functions of an Interval, got 3"):
         train(short(), Refinement.constant(3), callbacks=[3])
+    with pytest.raises(TypeError, match="train: callbacks must be a list of functions, got <built-in function print>"):
+        train(short(), Refinement.constant(3), callbacks=print)
 
 
 # ---- TensorBoard

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import field
 from test_diffusion import F64, rand
 
 import prdp_torch as prdp
@@ -155,3 +156,34 @@ def test_a_rise_above_the_values_at_the_sides(shape, boundary):
 def test_values_that_do_not_fit_the_sides_are_named(values, words):
     with pytest.raises(ValueError, match=words):
         Diffusion(torch.ones(1, 4, 5)).boundary_rhs(values=values)
+
+
+@pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")  # by torch.func.linearize
+def test_boundary_rhs_is_linearised():
+    """torch.func.linearize loses what a function sets in a tensor of its own."""
+    boundary = ["zero", (("robin", 0.3), "flux")]
+
+    def made(kappa, value, flux):
+        a = Diffusion(kappa, 1.0, boundary)
+        return a.boundary_rhs(values=[(value, 2.0), (value, 0.0)], fluxes=[(0.0, 0.0), (0.0, flux)])
+
+    given = (0.5 + field((4, 5))[:, 0].abs(), torch.tensor(1.5, dtype=F64), torch.tensor(-0.7, dtype=F64))
+    tangents = (field((4, 5), seed=1)[:, 0], torch.tensor(0.3, dtype=F64), torch.tensor(2.0, dtype=F64))
+    b, linear = torch.func.linearize(made, *given)
+    torch.testing.assert_close(b, made(*given))
+    torch.testing.assert_close(linear(*tangents), torch.func.jvp(made, given, tangents)[1])
+
+
+def test_a_box_without_cells_is_refused():
+    for shape in ((8, 0), (0, 8), (0,)):
+        with pytest.raises(ValueError, match=r"Diffusion: every extent of shape must be >= 1, got \("):
+            Diffusion(torch.ones(1, *shape))
+
+
+def test_what_a_constant_null_space_forbids_is_called_the_mean():
+    insulated, b = Diffusion(torch.ones(1, 6, 5, dtype=F64), 0.0, "flux"), 1.0 + field((6, 5))
+    with pytest.raises(torch.linalg.LinAlgError, match="maps the constant to zero; take the mean off b"):
+        prdp.linear_solve(insulated, b, prdp.CG(50))
+    with pytest.raises(torch.linalg.LinAlgError, match="the cotangent lies outside .*mean off the u that the loss"):
+        v = (b - b.mean((-2, -1), keepdim=True)).requires_grad_()
+        prdp.linear_solve(insulated, v, prdp.CG(50))[0].sum().backward()

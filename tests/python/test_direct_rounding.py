@@ -5,6 +5,7 @@ import torch
 from stand_in_device import StandIn
 
 import prdp_torch as prdp
+from prdp_torch import operators
 from prdp_torch.operators import Matrix
 
 F64 = torch.float64
@@ -110,3 +111,26 @@ def test_a_function_with_rows_of_other_sizes_is_solved(dtype):
     )  # fmt: skip
     expected = torch.linalg.solve(a, b.T).T
     assert ((u - expected).norm(dim=1) < 300 * torch.finfo(dtype).eps * expected.norm(dim=1)).all(), info
+
+
+@pytest.mark.filterwarnings("ignore:.* STAGNATED far above rtol", "ignore:.* with a residual above")
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("shape", [(40,), (16, 12), (6, 7, 8)])
+@pytest.mark.parametrize("held_by", ["shift", "side"])
+def test_a_diffusion_that_loses_what_holds_u_in_its_factors_is_refused(dtype, shape, held_by):
+    """Insulated but for a shift, or for one weak side: the mean of u follows from that of b."""
+    refused = []
+    for power in range(3, 16):
+        kappa = torch.full((1, *shape), 10.0**power, dtype=dtype)
+        kappa[..., shape[-1] // 2 :] *= 1e3
+        b = torch.ones(1, 1, *shape, dtype=dtype)
+        b[..., 0] = 2.0
+        sides = "flux" if held_by == "shift" else [*["flux"] * (len(shape) - 1), (("robin", 1.0), "flux")]
+        a = operators.Diffusion(kappa, 1.0 if held_by == "shift" else 0.0, sides)
+        u, info = prdp.linear_solve(a, b, prdp.Direct(), on_failure="return", backward="none")
+        refused.append(bool(info.failed))
+        out = u.double().mean() if held_by == "shift" else u.double()[..., 0].mean()  # of cells at the side, κ >> h dx
+        assert refused[-1] or not info.solved or abs(out / b.double().mean() - 1) < 3e-3, (power, out)
+    assert refused == sorted(refused) and refused[-1] and not refused[2]
+    with pytest.raises(torch.linalg.LinAlgError, match=r"Direct on Diffusion: (what holds u, a shift|A is singular)"):
+        prdp.linear_solve(a, b, prdp.Direct())

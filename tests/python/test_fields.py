@@ -96,6 +96,8 @@ def test_rollout_stacks_the_states_and_differentiates():
         (lambda: fields.downsample([0.0]), TypeError, "downsample: u must be a torch tensor, got list"),
         (lambda: fields.rollout(math.sin, field((4,)), -1), ValueError, "rollout: steps must be >= 0, got -1"),
         (lambda: fields.rollout(math.sin, field((4,)), 1.5), TypeError, "rollout: steps must be a whole number"),
+        (lambda: fields.rollout(lambda u: u[..., 1:], field((4,)), 2), ValueError,
+         r"rollout: the step must keep the shape of its input, \(2, 1, 4\), got \(2, 1, 3\)"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused_in_words(call, error, message):

@@ -328,6 +328,17 @@ def test_a_product_that_is_not_linear_is_refused():
                 prdp.linear_solve(operators.Function(product), b, prdp.GMRES(9))
 
 
+def test_a_product_that_mixes_samples_is_refused():
+    b = right_hand_side()
+    assert len(b) > 1
+    mixing = [lambda v: 3 * v + v.mean(0, keepdim=True), lambda v: 3 * v + 0.1 * v.roll(1, 0)]
+    for product in mixing:
+        for _ in range(2):  # nor does it pass the second time
+            with pytest.raises(ValueError, match=r"matvec must keep samples apart, but matvec\(v\) of sample \d"):
+                prdp.linear_solve(operators.Function(product), b, prdp.GMRES(9))
+    assert prdp.linear_solve(operators.Function(mixing[0]), b[:1], prdp.GMRES(9))[1].solved.all()  # alone
+
+
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
 def test_a_derivative_by_differences_is_linear_enough_whatever_the_size_of_b(scale):
     u0 = torch.linspace(1, 2, 4, dtype=torch.float64)

@@ -145,6 +145,17 @@ def test_checkpointing_recomputes_the_solve():
     assert torch.equal(u.grad, v.grad)
 
 
+@pytest.mark.parametrize("use_reentrant", [False, True])
+def test_checkpointing_leaves_the_report_to_controllers(use_reentrant):
+    """torch ends what it runs again by an exception of its own."""
+    heat = prdp.Heat((20,), 1e-2, 1.0, solver=prdp.CG(30))
+    checkpoint(heat, field((20,)).requires_grad_(), use_reentrant=use_reentrant).sum().backward()
+    assert heat.converged and heat.info.solved.all() and heat.adjoint_info.solved.all()
+    with pytest.raises(ValueError):
+        heat(field((19,)))
+    assert heat.info is None
+
+
 def test_fake_tensors_know_the_shapes():
     with torch._subclasses.FakeTensorMode():
         b = torch.empty(7, 1, 4, 5)

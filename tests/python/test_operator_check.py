@@ -157,3 +157,15 @@ def test_minres_takes_what_is_indefinite_and_cg_what_is_negative():
     indefinite = operators.Function(lambda v: v * torch.linspace(-1, 1, N))
     assert prdp.check_operator(indefinite, EXAMPLE, prdp.MINRES(3))
     assert prdp.check_operator(operators.Function(lambda v: -v), EXAMPLE, prdp.CG(3))
+
+
+def test_one_eigenvalue_of_the_other_sign_is_found_among_many():
+    for n, smallest in ((30, -1e-6), (200, -1e-3), (900, -0.1)):
+        q, _ = torch.linalg.qr(torch.randn(n, n, dtype=torch.float64, generator=torch.Generator().manual_seed(n)))
+        for sign in (1.0, -1.0):
+            eigenvalues = torch.linspace(1, 50, n, dtype=torch.float64).index_fill(0, torch.tensor(n // 2), smallest)
+            a = sign * (q * eigenvalues) @ q.mT
+            with pytest.raises(ValueError, match="CG needs a definite A"):
+                prdp.check_operator((a + a.mT) / 2, torch.ones(2, n, dtype=torch.float64), prdp.CG(3))
+            regular = sign * (q * eigenvalues.abs()) @ q.mT
+            assert prdp.check_operator((regular + regular.mT) / 2, torch.ones(2, n, dtype=torch.float64), prdp.CG(3))

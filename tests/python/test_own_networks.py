@@ -30,6 +30,15 @@ class Net(torch.nn.Module):
         return self.layer(self.norm(u)).minimum(self.mask)
 
 
+class Fourier(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.exp(1j * torch.rand(1, 1, 16)))
+
+    def forward(self, u):
+        return torch.fft.irfft(torch.einsum("bci,oci->boi", torch.fft.rfft(u), self.weight), n=u.shape[-1])
+
+
 class Wide(torch.nn.Module):
     def __init__(self, width):
         super().__init__()
@@ -71,6 +80,26 @@ def test_an_own_network_is_trained_and_found_again(tmp_path, module):
     with torch.no_grad():
         states = emulator.rollout(data.valid_start, 2)
     assert float(_C.normalised_mse(states[:, -1], data.valid_end)) == pytest.approx(curves["metric"][-1], rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_complex_weights_stay_complex_and_go_on_bit_for_bit(tmp_path, module, dtype):
+    path = Path(scene_with(tmp_path, f"{module}:Fourier"))
+    path.write_text(path.read_text().replace("float32", str(dtype).removeprefix("torch.")))
+    scene = scenes.load(path)
+    curves = trained(scene, tmp_path / "run")
+
+    def stop(event):
+        if event.number == 1:
+            raise KeyboardInterrupt
+
+    scene.training.intervals = 3
+    prdp_controller, environment = Refinement.prdp(scene), records.environment()
+    with pytest.raises(KeyboardInterrupt):
+        compare.run_one(scene, "prdp", prdp_controller, 0, tmp_path / "stopped", environment, callbacks=[stop])
+    assert trained(scene, tmp_path / "stopped", resume=True)["metric"] == curves["metric"]
+    weights = [prdp.load_trained(tmp_path / name).network.weight for name in ("run", "stopped")]
+    assert weights[0].dtype == dtype.to_complex() and torch.equal(*weights) and weights[0].imag.any()
 
 
 def test_the_seed_sets_its_weights(tmp_path, module):

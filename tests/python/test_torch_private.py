@@ -25,6 +25,7 @@ NAMES = [
     "torch.nn.modules.module._global_backward_pre_hooks",
     "torch.nn.modules.module._global_forward_hooks",
     "torch.nn.modules.module._global_forward_pre_hooks",
+    "torch.utils.checkpoint._StopRecomputationError",
 ]
 
 

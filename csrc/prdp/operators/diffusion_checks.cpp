@@ -1,6 +1,7 @@
 #include <ATen/EmptyTensor.h>
 #include <ATen/TensorSubclassLikeUtils.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "prdp/operators/diffusion_operator.h"
@@ -63,6 +64,8 @@ DiffusionOperator::DiffusionOperator(const OperatorSpec& spec)
                         kappa.sym_sizes().slice(1) == c10::SymIntArrayRef(c10::fromIntArrayRefSlow(of_sample)),
                     "Diffusion: kappa must have shape (batch or 1, ", per_axis_ ? "axes, " : "", "*shape), got ",
                     kappa.sym_sizes());
+  TORCH_CHECK_VALUE(std::all_of(shape_.begin(), shape_.end(), [](int64_t n) { return n >= 1; }),
+                    "Diffusion: every extent of shape must be >= 1, got ", at::IntArrayRef(shape_));
   TORCH_CHECK_TYPE(kappa.scalar_type() == at::kFloat || kappa.scalar_type() == at::kDouble,
                    "Diffusion: kappa must be float32 or float64, got ", kappa.scalar_type());
   TORCH_CHECK_VALUE(

@@ -40,6 +40,19 @@ void check_multiples(const Operator& a, const at::Tensor& b) {
                     in_language("torch.func.jvp", "forward-mode autograd"), " makes it");
 }
 
+/// Raises ValueError where A v of some sample changes with the v of the first one.
+void check_samples_are_apart(const Operator& a, const at::Tensor& b) {
+  if (b.size(0) < 2) return;
+  auto v = scale_finite_samples(b, b.abs().flatten(1).amax(1)).v.clone();
+  const auto rest = [&] { return a.apply(v).slice(0, 1).flatten(1); };
+  const auto before = rest();
+  v[0] = v[0].flip(-1) - 2.0 * v[0];
+  // Products by differences are rounding of the whole batch apart.
+  const auto changed = (rest() - before).norm(2, 1).gt(0.01 * before.norm(2, 1)).nonzero();
+  TORCH_CHECK_VALUE(changed.numel() == 0, "Function: ", product_name(), " must keep samples apart, but ",
+                    product_name(), "(v) of sample ", changed[0].item<int64_t>() + 1, " depends on the v of sample 0");
+}
+
 }  // namespace
 
 const char* product_name() { return in_language("matvec", "apply"); }
@@ -93,7 +106,10 @@ void refuse_nonlinear_product(const OperatorSpec& a, const at::Tensor& b) {
     TORCH_CHECK_VALUE(at_zero == 0.0 || at_zero <= rounding || !std::isfinite(rounding), "Function: ", product_name(),
                       " must be linear, but ", product_name(), "(0) holds ±", at_zero,
                       "; constants, such as values on the boundary, belong to b");
-    if (solves == 1) check_multiples(*of, v);
+    if (solves == 1) {
+      check_multiples(*of, v);
+      check_samples_are_apart(*of, v);
+    }
   }
   ++code->solves;
 }

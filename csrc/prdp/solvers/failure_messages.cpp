@@ -152,11 +152,18 @@ std::string breakdown(const Solver& solver, const Operator& a, const at::Tensor&
          "take a b without that part, or add a multiple of the identity to A";
 }
 
-/// Whether a diffusion has rows that differ too much for `Direct`, see Kernel::has_definite_factors().
-bool has_wide_kappa(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
-  if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return false;
-  const auto diagonal = a.diagonal().expand_as(b).select(0, sample).abs();
-  return (diagonal.max() / diagonal.min()).item<double>() >= kernels::kWidestRowsOfFactors;
+/// Why the factors of a diffusion lose what `Direct` needs of it, see kernels::kWidestRowsOfFactors. Else empty.
+std::string lost_in_factors(const SolveRole& role, const Operator& a, const at::Tensor& b, int64_t sample) {
+  if (!traits(role.solver.method).is_direct || !role.a.kind.starts_with("diffusion")) return {};
+  const auto of = [&](const at::Tensor& t) { return t.expand_as(b).select(0, sample).to(at::kDouble).abs(); };
+  const auto diagonal = of(a.diagonal()), row_sums = of(a.apply(at::ones_like(b)));
+  if ((diagonal.max() / diagonal.min()).item<double>() >= kernels::kWidestRowsOfFactors)
+    return "κ differs by more than a factor of 1e13, beyond what factors in float64 hold; bring its largest and its "
+           "smallest value nearer to each other";
+  if ((diagonal.sum() / row_sums.sum()).item<double>() >= kernels::kWidestRowsOfFactors)
+    return "what holds u, a shift or the sides, is 1e13 times smaller than κ/dx², beyond what factors in float64 hold; "
+           "make κ smaller or the shift larger";
+  return {};
 }
 
 /// Why the residual fell no further, far above what was asked for.
@@ -221,10 +228,17 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
     return std::string(role.adjoint ? "the cotangent" : "b") + " has a constant part, which " +
            (role.adjoint ? "Aᵀ" : "A") + " cannot reach, as " + (role.adjoint ? "A" : "Aᵀ") +
            " maps the constant to zero; " + (role.adjoint ? "" : "take the mean off b, and ") + name_the_null_space();
-  const auto outside = norm_of((b - a.project(b)).select(0, sample)) / norm_of(b.select(0, sample));
-  const auto share = number(100.0 * outside) + " % of ";
-  if (!operator_kind(role.a.kind).has_pressure)
-    return share + "b lies outside the range of A; take a b without that part";
+  const auto outside = (b - a.project(b)).select(0, sample);
+  const auto share = number(100.0 * norm_of(outside) / norm_of(b.select(0, sample))) + " % of ";
+  if (!operator_kind(role.a.kind).has_pressure) {
+    const auto fields = outside.dim() > 1 ? outside.flatten(1) : outside.unsqueeze(0);
+    const bool is_constant =
+        norm_of(fields - fields.mean(1, /*keepdim=*/true)) <= std::sqrt(epsilon_of(b)) * norm_of(outside);
+    return share + (role.adjoint ? "the cotangent" : "b") + " lies outside the range of " +
+           (role.adjoint ? "Aᵀ" : "A") +
+           (is_constant ? ", which maps the constant to zero; take the mean off " : "; take that part off ") +
+           (role.adjoint ? "the u that the loss is made of" : "b");
+  }
   if (role.adjoint)
     return share +
            "the cotangent is the mean of its pressure, which the step leaves free; take the mean off the "
@@ -241,9 +255,8 @@ std::string diagnosis(const SolveRole& role, const Operator& a, const at::Tensor
     if ((status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown) &&
         has_undeclared_constant_null_space(role, a, b, sample))
       return "A maps the constant to zero, so it is singular; " + name_the_null_space();
-    if (status == SolveStatus::kBreakdown && has_wide_kappa(role, a, b, sample))
-      return "κ differs by more than a factor of 1e13, beyond what factors in float64 hold; bring its largest and its "
-             "smallest value nearer to each other";
+    if (status == SolveStatus::kBreakdown)
+      if (auto lost = lost_in_factors(role, a, b, sample); !lost.empty()) return lost;
     if (status == SolveStatus::kDiverged || status == SolveStatus::kBreakdown || status == SolveStatus::kStagnated)
       if (auto scales = badly_scaled(role.solver, a, b, sample); !scales.empty()) return scales;
     switch (status) {
