@@ -52,7 +52,7 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   // Coarse grids come first into the memory of the block, then the vectors of the finest one.
   const CycleMemory cycle = by_multigrid ? memory_of_cycle(b) : CycleMemory{};
   const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;
-  const int64_t cycle_in_block = cycle.usual <= of_block ? cycle.usual : 0;
+  const int64_t cycle_in_block = cycle.if_all_axes <= of_block ? cycle.if_all_axes : 0;
   const int64_t in_block = std::min(vectors, (of_block - cycle_in_block) / unknowns);
 
   std::ostringstream text;
@@ -64,7 +64,8 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
         int64_t{divides_by_diagonal(solver)}, bytes_of_arrays(solver.method, restart, number), restart})
     text << n << ", ";
   if (by_multigrid)
-    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
+    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.at_most
+         << ">";
   else text << "NoCycleSetting";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
        << "using Arguments = SolveArguments<S::T>;\n"
@@ -72,7 +73,7 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
           "  PRDP_BLOCK_MEMORY(memory);\n"
           "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
   return {{text.str(), threads, (in_block * unknowns + cycle_in_block) * number, blocks},
-          (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.most};
+          (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.at_most};
 }
 
 }  // namespace prdp::gpu
