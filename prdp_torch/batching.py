@@ -41,7 +41,8 @@ def _linear_solve(
     inverse: list[Tensor],
 ) -> tuple[Any, Any]:
     size, op = info.batch_size, torch.ops.prdp.linear_solve
-    samples = b.shape[0 if in_dims[0] is None else int(in_dims[0] == 0)]
+    dim_of_b, dims_of_tensors, *_, dim_of_x0, _, _, _, dims_of_inverse = in_dims
+    samples = b.shape[0 if dim_of_b is None else int(dim_of_b == 0)]
 
     def entries(t: Tensor | None, dim: int | None) -> Tensor | None:  # the mapped axis in front
         return t if t is None else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
@@ -49,8 +50,8 @@ def _linear_solve(
     def solved(b: Tensor, tensors: list[Tensor], x0: Tensor | None, inverse: list[Tensor]) -> Any:
         return op(b, tensors, kind, shape, parameters, transposed, x0, names, counts, numbers, inverse)
 
-    of_b, of_x0 = cast(Tensor, entries(b, in_dims[0])), entries(x0, in_dims[6])  # the places among the arguments
-    mapped = [dim is not None for dim in in_dims[1]]
+    of_b, of_x0 = cast(Tensor, entries(b, dim_of_b)), entries(x0, dim_of_x0)
+    mapped = [dim is not None for dim in dims_of_tensors]
     own = _of_samples(tensors, kind, len(shape), samples)
     if not any(mapped) and any(own) and not inverse and 0 < samples <= size:
         found = []
@@ -58,9 +59,9 @@ def _linear_solve(
             of_one = [t[s : s + 1] if is_own else t for t, is_own in zip(tensors, own, strict=True)]
             found.append(solved(of_b[:, s], of_one, None if of_x0 is None else of_x0[:, s], inverse))
         return [torch.stack(parts, 1) for parts in zip(*found, strict=True)], [0] * len(found[0])
-    folded = _fold(tensors, in_dims[1], kind, len(shape), size, samples)
+    folded = _fold(tensors, dims_of_tensors, kind, len(shape), size, samples)
     # A preconditioner, whose kind is the last of the names and whose shape is behind the counts.
-    folded_inverse = _fold(inverse, in_dims[10], names[-1], len(counts) - _COUNTS, size, samples) if inverse else []
+    folded_inverse = _fold(inverse, dims_of_inverse, names[-1], len(counts) - _COUNTS, size, samples) if inverse else []
     if folded is None or folded_inverse is None:
         arguments = b, tensors, kind, shape, parameters, transposed, x0, names, counts, numbers, inverse
         return _one_by_one(op, info, in_dims, arguments)

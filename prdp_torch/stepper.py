@@ -168,7 +168,7 @@ class Stepper(HasSettings):
         compiling = torch.compiler.is_compiling()
         if kept is None:
             info = None
-        else:  # without a solve, that of another one would be told
+        else:  # if nothing was solved, way_of_last_solve() would describe an earlier solve
             info = SolveInfo(*kept, log, "" if compiling or not kept[0].numel() else _C.way_of_last_solve())
         if compiling:
             self.info = info

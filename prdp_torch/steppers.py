@@ -58,6 +58,7 @@ class EquationStepper(HoldsTensors, Stepper):
         extents = _check.shape(who, shape)
         self._length = _kept_length(length)
         parameters = _check.lengths(who, length, len(extents))
+        self._number: tuple[float, Tensor] | None = None  # nu as a number, and as the tensor that the library takes
         if nu_and_dt is not None:
             nu, dt = nu_and_dt
             self._hold("nu", self._checked_nu(nu))
@@ -81,11 +82,11 @@ class EquationStepper(HoldsTensors, Stepper):
 
     @length.setter
     def length(self, length: Length) -> None:
-        dt = self.equation.parameters[: self._others]
+        dt = self.equation.parameters[: self._parameters_before_lengths]
         self._change(parameters=dt + _check.lengths(type(self).__name__, length, len(self.equation.shape)))
         self._length = _kept_length(length)
 
-    _others: ClassVar[int] = 0  # parameters of the equation before its lengths
+    _parameters_before_lengths: ClassVar[int] = 0  # of the equation
 
     def _change(self, **changed: Any) -> None:
         """Take another equation in one piece, once it is checked: other threads, and copies, have the one before."""
@@ -98,11 +99,11 @@ class EquationStepper(HoldsTensors, Stepper):
         def __setattr__(self, name: str, value: object) -> None:
             if name == "nu" and "equation" in vars(self) and not torch.compiler.is_compiling():
                 self._set("nu", self._checked_nu(value))
+                self._number = None
             else:
                 super().__setattr__(name, value)
 
     def _checked_nu(self, nu: Number) -> Number:
-        self._number: tuple[float, Tensor] | None = None  # nu as a number, and as the tensor that the library takes
         return nu if isinstance(nu, torch.Tensor) else _check.real(type(self).__name__, "nu", nu)
 
     def _refuse_own_system(self) -> None:
@@ -183,7 +184,7 @@ class EquationStepper(HoldsTensors, Stepper):
 class TimeStepper(EquationStepper):
     """The base of those that make a step of dt."""
 
-    _others = 1
+    _parameters_before_lengths = 1
 
     @property
     def dt(self) -> float:

@@ -167,7 +167,7 @@ SolveResult linear_solve_unrecorded(const OperatorSpec& spec, const at::Tensor& 
                                     const at::Tensor& x0) {
   const auto a = checked_operator(spec, b, options, x0);
   const auto checks = checks_of(options.on_failure);
-  a->check_parameters(gpu::takes(b, options.solver) ? Checks::kHost : checks);
+  a->check_parameters(gpu::may_run_kernel(b, options.solver) ? Checks::kHost : checks);
   if (!spec.transposed) {  // an adjoint solve follows one
     a->check_null_spaces(b);
     if (is_function(spec)) refuse_nonlinear_product(spec, b);

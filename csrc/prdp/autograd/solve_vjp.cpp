@@ -91,7 +91,7 @@ SolveVjp implicit_vjp(const at::Tensor& cotangent, const at::Tensor& u, const Op
   };
   std::vector<at::Tensor> products;
   // An overflow of ḡ must stay with its sample.
-  if (!waits_for_report(o) && gpu::takes(cotangent, o.solver) && !in_torch_func()) {
+  if (!waits_for_report(o) && gpu::may_run_kernel(cotangent, o.solver) && !in_torch_func()) {
     leave_out_overflow_on_device(lambda, u, found.info.status);
     if (needed[0]) found.gradients[0] = lambda;
     if (o.adjoint_log != 0) adjoint_log::write(o.adjoint_log, found.info);

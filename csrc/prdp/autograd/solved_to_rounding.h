@@ -12,8 +12,8 @@ inline constexpr double kRoundings = 8.0;
 /// Solves again, for a u that is not kept.
 using MakeSolution = std::function<at::Tensor()>;
 
-/// The samples that were solved to rounding, but those whose iterations are smooth there: all of a polynomial
-/// up to max_iter, and as many of CG as there are unknowns, where none before the last sufficed.
+/// The samples solved to rounding. Left out are those whose iterations still have a smooth derivative there: polynomial
+/// methods that ran all max_iter iterations, and CG or MINRES that needed as many iterations as there are unknowns.
 Rows solved_to_rounding(const Operator& a, const Solved& solved, const Solver& solver, const MakeSolution& make_u);
 
 }  // namespace prdp

@@ -42,21 +42,18 @@ class SampleVjps {
   SolveVjp run() {
     if (needs_gradient_of_a_ && options_.solver.preconditioner.is_multigrid()) warn_of_constant_cycles();
     classify();
-    found_ = differentiate(accepted_);
+    found_ = differentiate(has_finite_cotangent_);
     retry_implicitly();
     if (zero_grad_) leave_out_failed_adjoints();
-    auto& gradients = found_.gradients;
-    if (!needed_[0]) gradients[0] = at::Tensor();
-    for (size_t i = 0; i < needed_.size(); ++i)
-      if (needed_[i] && !gradients[i].defined())
-        gradients[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
-    return {std::move(gradients), report()};
+    fill_missing();
+    return {std::move(found_.gradients), report()};
   }
 
  private:
   struct Differentiated {
     std::vector<at::Tensor> gradients;    // summed over samples
     std::vector<SampleOutcome> outcomes;  // of each sample
+    Rows finite;                          // the samples whose gradient is
   };
 
   const at::Tensor& cotangent_;
@@ -81,8 +78,8 @@ class SampleVjps {
   const double judged_rtol_ =
       options_.adjoint_rtol.value_or(options_.solver.rtol);  // by which adjoint solves are judged
   std::vector<Derivative> derivatives_{};
-  Rows accepted_ = finite_rows(cotangent_);  // whose cotangent and, once differentiated, gradient are finite
-  at::Tensor finite_cotangent_ = only(cotangent_, accepted_);  // the cotangent of samples that are not refused
+  const Rows has_finite_cotangent_ = finite_rows(cotangent_);  // the others are refused
+  const at::Tensor finite_cotangent_ = only(cotangent_, has_finite_cotangent_);
   Differentiated found_{};
   at::Tensor u_{};
 
@@ -106,15 +103,15 @@ class SampleVjps {
   void classify() {
     const auto exact = solved_to_rounding(*a_, solved_, options_.solver, [&] { return solution(); });
     for (int64_t i = 0; i < batch_; ++i)
-      derivatives_.push_back(!accepted_[i]        ? Derivative::kRefused
-                             : exact[i]           ? Derivative::kOfSolution
-                             : !has_derivative(i) ? Derivative::kNone
-                                                  : Derivative::kOfIterations);
+      derivatives_.push_back(!has_finite_cotangent_[i] ? Derivative::kRefused
+                             : exact[i]                ? Derivative::kOfSolution
+                             : !has_derivative(i)      ? Derivative::kNone
+                                                       : Derivative::kOfIterations);
   }
 
-  /// Sums the gradients of these samples; those whose gradient is not finite leave `rows`. finite_sum() may ask for
-  /// fewer samples in between, and last for those that stay, so that the outcomes end as theirs.
-  Differentiated differentiate(Rows& rows) {
+  /// Sums the gradients of these samples, without those that are not finite. finite_sum() may ask for fewer samples in
+  /// between, and last for those that stay, so that the outcomes end as theirs.
+  Differentiated differentiate(Rows rows) {
     std::vector<SampleOutcome> outcomes(batch_);
     auto gradients = finite_sum(rows, [&](const Rows& some) {
       auto [sum, applications] = vjp_of_iterations(some);
@@ -126,7 +123,7 @@ class SampleVjps {
       if (any(solved)) add_adjoint_solves(solved, sum, outcomes);
       return sum;
     });
-    return {std::move(gradients), std::move(outcomes)};
+    return {std::move(gradients), std::move(outcomes), std::move(rows)};
   }
 
   UnrolledVjp vjp_of_iterations(const Rows& rows) const {
@@ -178,7 +175,7 @@ class SampleVjps {
     if (!may_mislead_ || !found_.gradients[0].defined()) return;
     auto rows = solved_samples(solved_);
     for (int64_t i = 0; i < batch_; ++i)
-      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && accepted_[i];
+      rows[i] = rows[i] && derivatives_[i] == Derivative::kOfIterations && found_.finite[i];
     if (!any(rows)) return;
     const auto allowed = allowed_disagreement(solved_, options_.solver);
     auto misleading = misleading_b_bar(*a_, finite_cotangent_, found_.gradients[0], rows, allowed);
@@ -193,33 +190,42 @@ class SampleVjps {
     if (!any(misleading)) return;
     for (int64_t i = 0; i < batch_; ++i)
       if (misleading[i]) derivatives_[i] = Derivative::kOfSolution;
-    found_ = differentiate(accepted_);
+    found_ = differentiate(found_.finite);
   }
 
   /// Those of the iterations of these samples alone; undefined where none ran.
   std::vector<at::Tensor> gradients_of(const Rows& rows) const {
     for (int64_t i = 0; i < batch_; ++i)
-      if (!rows[i] && accepted_[i] && derivatives_[i] != Derivative::kNone) return vjp_of_iterations(rows).gradients;
+      if (!rows[i] && found_.finite[i] && derivatives_[i] != Derivative::kNone)
+        return vjp_of_iterations(rows).gradients;
     return found_.gradients;  // no other sample contributes
   }
 
   void leave_out_failed_adjoints() {
-    auto good = accepted_;
-    for (int64_t i = 0; i < batch_; ++i) good[i] = accepted_[i] && !adjoint_failed(i);
-    if (good != accepted_) found_.gradients = differentiate(good).gradients;  // the failed stay in the report
+    auto good = found_.finite;
+    for (int64_t i = 0; i < batch_; ++i) good[i] = found_.finite[i] && !adjoint_failed(i);
+    if (good != found_.finite) found_.gradients = differentiate(good).gradients;  // the failed stay in the report
   }
   bool adjoint_failed(int64_t i) const {
     return derivatives_[i] == Derivative::kOfSolution && is_failure(found_.outcomes[i].status);
   }
 
+  void fill_missing() {
+    auto& gradients = found_.gradients;
+    if (!needed_[0]) gradients[0] = at::Tensor();
+    for (size_t i = 0; i < needed_.size(); ++i)
+      if (needed_[i] && !gradients[i].defined())
+        gradients[i] = i == 0 ? only(cotangent_, Rows(batch_, false)) : at::zeros_like(spec_.tensors[i - 1]);
+  }
+
   SolveInfo report() {
     for (int64_t i = 0; i < batch_; ++i)
-      if (!accepted_[i])
+      if (!found_.finite[i])
         found_.outcomes[i] = zero_instead(derivatives_[i] == Derivative::kRefused ? SolveStatus::kNonfiniteInput
                                                                                   : SolveStatus::kOverflow);
     auto failures = found_.outcomes;  // the forward solve has reported its own
     for (int64_t i = 0; i < batch_; ++i)
-      if (accepted_[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
+      if (found_.finite[i] && !adjoint_failed(i)) failures[i].status = SolveStatus::kConverged;
     auto info = info_of(found_.outcomes, solved_.b.scalar_type());
     if (options_.adjoint_log != 0) adjoint_log::write(options_.adjoint_log, info);
     report_failures({spec_, options_.solver, /*adjoint=*/true}, *a_, cotangent_,

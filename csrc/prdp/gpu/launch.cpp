@@ -53,7 +53,7 @@ SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int
     const auto team = team_size(points, runtime->limits(device));
     const auto sizes = c10::str("<", team.blocks, ", ", team.threads, ">");
     SampleLoop loop{kernel_of(*runtime, device, body, "EachSample", sizes, team)};
-    loop.teams = std::min(batch, team.blocks > 1 ? loop.kernel->teams() : 4 * loop.kernel->teams());
+    loop.teams = loop.kernel->teams_for(batch, team.blocks);
     loop.memory = {team.blocks, loop.teams, at::TensorOptions().device(device)};
     return loop;
   });

@@ -24,7 +24,7 @@ struct SampleLoop {
 SampleLoop sample_loop(c10::Device device, const Body& body, int64_t points, int64_t batch);
 bool launch_samples(const SampleLoop& loop, const void* arguments);
 
-/// Each returns false, after fall_back(), where there is no kernel.
+/// Each returns false where there is no kernel: the device has no runtime, or fall_back() said why.
 template <class Of>
 bool each_point(c10::Device device, const Body& body, const Of& of, int64_t count) {
   const EachPoint<Of> arguments{of, static_cast<int>(count)};

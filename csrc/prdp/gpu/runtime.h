@@ -1,6 +1,7 @@
 #pragma once
 #include <ATen/ATen.h>
 
+#include <algorithm>
 #include <atomic>
 #include <memory>
 #include <stdexcept>
@@ -42,11 +43,15 @@ enum class Trust { kUnknown, kGood, kNone };
 class Kernel {
  public:
   mutable std::atomic<Trust> trust = Trust::kUnknown;
-  mutable std::atomic<int> looks = 0;  // at its results
+  mutable std::atomic<int> checks = 0;  // of its results
 
   virtual ~Kernel() = default;
   /// Teams that can be at work at the same time.
   virtual int64_t teams() const = 0;
+  /// Teams for a batch. Those of several blocks meet, so all must be at work at once. Single blocks may queue.
+  int64_t teams_for(int64_t batch, int64_t blocks_of_team) const {
+    return std::min(batch, blocks_of_team > 1 ? teams() : 4 * teams());
+  }
   /// On the device's current stream. `arguments` are what its text calls Arguments.
   virtual void launch(int64_t teams, const void* arguments) const = 0;
 };

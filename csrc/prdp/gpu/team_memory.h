@@ -6,14 +6,15 @@
 
 namespace prdp::gpu {
 
-/// What the teams of a launch work in, in one tensor: where the blocks of a team meet and where they add up, if it has
-/// several; and then what the kernel itself needs.
+/// Global memory of a launch, in one tensor: barrier counters and partial sums, if a team has several blocks; then the
+/// kernel's own workspace.
 class TeamMemory {
  public:
   TeamMemory() = default;
   /// `own`: bytes of the kernel.
   TeamMemory(int64_t blocks, int64_t teams, const at::TensorOptions& options, int64_t own = 0)
-      : arrived_(blocks > 1 ? kArrivedOfTeam * teams : 0), parts_(blocks > 1 ? kPartsOfBlock * blocks * teams : 0) {
+      : arrived_(blocks > 1 ? kArrivedOfTeam * int64_t{sizeof(unsigned)} * teams : 0),
+        parts_(blocks > 1 ? kPartsOfBlock * int64_t{sizeof(double)} * blocks * teams : 0) {
     if (arrived_ + own == 0) return;
     memory_ = at::empty({arrived_ + parts_ + own}, options.dtype(at::kByte));
     if (arrived_ > 0) part_of(memory_, 0, arrived_, at::kByte).zero_();
@@ -25,15 +26,13 @@ class TeamMemory {
     arguments.arrived = place<unsigned>(0);
     arguments.parts = place<double>(arrived_);
   }
-  /// What the kernel itself needs.
+  /// The kernel's own workspace.
   template <class T>
   T* own() const {
     return memory_.defined() ? place<T>(arrived_ + parts_) : nullptr;
   }
 
  private:
-  static constexpr int64_t kArrivedOfTeam = 32 * 4, kPartsOfBlock = 2 * kMostAtOnce * 8;  // bytes
-
   template <class T>
   T* place(int64_t byte) const {
     return reinterpret_cast<T*>(static_cast<char*>(memory_.mutable_data_ptr()) + byte);

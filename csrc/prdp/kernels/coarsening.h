@@ -43,9 +43,9 @@ bool may_need_one_point(const Shape& shape, int dim) {
 }
 
 /// The axes along which to coarsen: those of more than four points whose coupling is at least a quarter of the
-/// strongest one. But where the points of a short axis are coupled so much more than those of a longer one, and nothing
-/// holds their constant, such as a value on the boundary, what is constant along the short axis is neither smoothed nor
-/// coarsened: that axis is coarsened as well, down to one point. `net` and `rows` are needed if may_need_one_point().
+/// strongest one. Exception: a short axis whose coupling is four times that of a long one, with nothing such as a
+/// boundary value to fix its constant. A vector that is constant along it is neither smoothed nor coarsened, so this
+/// axis is coarsened too, to one point. `net` and `rows` are needed if may_need_one_point().
 template <class Shape>
 Axes axes_to_coarsen(const Shape& shape, int dim, const Couplings& couplings) {
   constexpr double weak = 0.25, held = 3.0 / 16.0;
@@ -127,5 +127,24 @@ struct WeightsOfPoint {
     right = whole > T(0) ? after / whole : T(0);
   }
 };
+
+/// How many parts of at least two points there are that nothing couples to each other, where bit j of of_row[i] says
+/// whether there is an entry (i, j), and bit i of of_column[j] too. For the coarsest grid, which has n <= 64 points.
+inline int count_parts(int n, const uint64_t* of_row, const uint64_t* of_column) {
+  uint64_t seen = 0;
+  int parts = 0;
+  for (int first = 0; first < n; ++first) {
+    if (seen >> first & 1) continue;
+    uint64_t part = uint64_t{1} << first, before = 0;
+    while (part != before) {
+      before = part;
+      for (int i = first; i < n; ++i)
+        if (part >> i & 1) part |= of_row[i] | of_column[i];
+    }
+    seen |= part;
+    parts += (part & (part - 1)) != 0;
+  }
+  return parts;
+}
 
 }  // namespace prdp::kernels

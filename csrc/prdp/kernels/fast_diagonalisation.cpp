@@ -38,9 +38,9 @@ class Reader {
   bool agrees_with(const SumOverAxes& sum) const {
     for (int64_t r = 0; r < a_.rows(); ++r) {
       const int64_t z = r / n_[1], y = r % n_[1];
-      if (!a_.has_row_sums() && !is_middle_row(r, 0, sum[0](z, z) + sum[1](y, y))) return false;
+      if (!a_.has_row_sums() && !matches_middle_row(r, 0, sum[0](z, z) + sum[1](y, y))) return false;
       for (const int64_t step : {-1, 1}) {
-        if (!is_middle_row(r, place_of(2, step), 0.0)) return false;
+        if (!matches_middle_row(r, place_of(2, step), 0.0)) return false;
         if (!is_constant(r, sum[1], 1, y, step) || !is_constant(r, sum[0], 0, z, step)) return false;
       }
     }
@@ -92,17 +92,17 @@ class Reader {
     if (axis == 2) return a_.row_sum(middle_row(), i);
     return a_.row_sum(row_of(axis, i), middle(2)) - a_.row_sum(middle_row(), middle(2));
   }
-  /// How much a coefficient may differ from this one: where the row sums are stored it does not enter a diagonal,
-  /// beside whose rounding it would have to count.
+  /// How far a coefficient may be from this one: relative to itself where row sums are stored, else to ‖A‖, as it then
+  /// adds to a diagonal.
   double slack_of(double coefficient) const {
     return a_.has_row_sums() ? 16.0 * std::numeric_limits<T>::epsilon() * std::abs(coefficient) : slack_;
   }
-  /// Whether coefficient k of row r is that of the middle row, and `more`.
-  bool is_middle_row(int64_t r, int64_t k, double more) const {
+  /// Whether coefficient k of row r is that of the middle row plus `shift`.
+  bool matches_middle_row(int64_t r, int64_t k, double shift) const {
     const int64_t last = n_[2] - 1, middle = middle_row();
     for (const int64_t end : {int64_t{0}, last}) {
       const double expected = a_.value(middle, k, end);
-      if (!(std::abs(a_.value(r, k, end) - expected - more) <= slack_of(expected))) return false;
+      if (!(std::abs(a_.value(r, k, end) - expected - shift) <= slack_of(expected))) return false;
     }
     const T *row = a_.coefficient(r, k), *of_middle = a_.coefficient(middle, k);
     if (a_.has_row_sums()) {
@@ -111,7 +111,7 @@ class Reader {
       return true;
     }
     return all_within(1, last, slack_,
-                      [&, added = static_cast<T>(more)](int64_t i) { return row[i] - of_middle[i] - added; });
+                      [&, added = static_cast<T>(shift)](int64_t i) { return row[i] - of_middle[i] - added; });
   }
   /// Whether the coefficient of the neighbour along another axis than x is the same at all points of a row.
   bool is_constant(int64_t r, const Eigen::MatrixXd& matrix, int axis, int64_t i, int64_t step) const {

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 
+#include "prdp/kernels/coarsening.h"
 #include "prdp/kernels/galerkin.h"
 #include "prdp/kernels/given_stencil.h"
 
@@ -83,23 +84,16 @@ bool all_finite(const StencilFields<T>& a) {
 
 using Eigen::MatrixXd;
 
-/// How many parts of at least two points there are that nothing couples to each other.
-int64_t count_parts(const MatrixXd& m) {
-  std::vector<char> seen(m.rows());
-  int64_t parts = 0;
-  for (Eigen::Index first = 0; first < m.rows(); ++first) {
-    if (seen[first]) continue;
-    std::vector<Eigen::Index> part{first};
-    seen[first] = true;
-    for (size_t k = 0; k < part.size(); ++k)
-      for (Eigen::Index j = 0; j < m.cols(); ++j)
-        if (!seen[j] && (m(part[k], j) != 0.0 || m(j, part[k]) != 0.0)) {
-          seen[j] = true;
-          part.push_back(j);
-        }
-    parts += part.size() > 1;
-  }
-  return parts;
+int count_parts(const MatrixXd& m) {
+  const int n = static_cast<int>(m.rows());
+  std::vector<uint64_t> of_row(n), of_column(n);
+  for (int i = 0; i < n; ++i)
+    for (int j = 0; j < n; ++j) {
+      const uint64_t is_entry = m(i, j) != 0.0;
+      of_row[i] |= is_entry << j;
+      of_column[j] |= is_entry << i;
+    }
+  return kernels::count_parts(n, of_row.data(), of_column.data());
 }
 
 /// The inverse without what is tiny.

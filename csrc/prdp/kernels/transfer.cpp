@@ -125,19 +125,17 @@ void Transfer<T>::restrict_along_x(const T* fine, const T* left, const T* right,
 template <class T>
 template <class Row, class Weight>
 void Transfer<T>::restrict_row(int64_t j, const Row& row, const Compressed& w, const Weight& weight, T* coarse) const {
-  const int64_t n = fine_.shape[axis_], here = 2 * j + first_coarse_, before = here - 1, after = here + 1;
-  const bool wraps = before < 0 && periodic_ && n % 2 == 0;
-  const T *row_before = zeros_.data(), *weight_before = row_before;
-  const T *row_after = row_before, *weight_after = row_before;
-  if (before >= 0 || wraps) {
-    row_before = row(wraps ? n - 1 : before);
-    weight_before = weight(w.right, wraps ? between() - 1 : before / 2);
-  }
-  if (after < n) {
-    row_after = row(after);
-    weight_after = weight(w.left, after / 2);
-  }
-  loops<T>().restrict_row(row(here), row_before, weight_before, row_after, weight_after, coarse, fine_.shape[2]);
+  struct Beside {
+    const T *row, *weight;
+  };
+  const Beside none{zeros_.data(), zeros_.data()};
+  const int64_t n = fine_.shape[axis_], here = 2 * j + first_coarse_;
+  const bool wraps = here == 0 && periodic_ && n % 2 == 0;
+  const auto before = wraps      ? Beside{row(n - 1), weight(w.right, between() - 1)}
+                      : here > 0 ? Beside{row(here - 1), weight(w.right, (here - 1) / 2)}
+                                 : none;
+  const auto after = here + 1 < n ? Beside{row(here + 1), weight(w.left, (here + 1) / 2)} : none;
+  loops<T>().restrict_row(row(here), before.row, before.weight, after.row, after.weight, coarse, fine_.shape[2]);
 }
 
 template <class T>

@@ -55,16 +55,17 @@ at::Tensor CyclicReduction::reduce(const at::Tensor& b) const {
   // diagonal.
   auto rows = at::cat({lower_.unsqueeze(1), upper_.unsqueeze(1), column_.unsqueeze(1), b.narrow(-1, 0, m)}, 1) /
               pivot_.unsqueeze(1);
+  constexpr int64_t kBefore = 0, kBehind = 1, kSides = 2;
+  const auto part = [](const at::Tensor& t, int64_t row) { return t.narrow(1, row, 1); };
+  const auto sides = [](const at::Tensor& t) { return t.narrow(1, kSides, t.size(1) - kSides); };
   for (int64_t step = 1; step < m; step *= 2) {
-    const auto before = rows.narrow(1, 0, 1) * padded(rows.narrow(2, 0, m - step), step, 0);
-    const auto behind = rows.narrow(1, 1, 1) * padded(rows.narrow(2, step, m - step), 0, step);
-    const auto beside = [&](const at::Tensor& t, int64_t row) { return t.narrow(1, row, 1); };
-    const auto diagonal = 1.0 - beside(before, 1) - beside(behind, 0);
-    const auto sides = rows.size(1) - 2;
-    const auto left = rows.narrow(1, 2, sides) - before.narrow(1, 2, sides) - behind.narrow(1, 2, sides);
-    rows = at::cat({-beside(before, 0), -beside(behind, 1), left}, 1) / diagonal;
+    const auto before = part(rows, kBefore) * padded(rows.narrow(2, 0, m - step), step, 0);
+    const auto behind = part(rows, kBehind) * padded(rows.narrow(2, step, m - step), 0, step);
+    const auto diagonal = 1.0 - part(before, kBehind) - part(behind, kBefore);
+    const auto left = sides(rows) - sides(before) - sides(behind);
+    rows = at::cat({-part(before, kBefore), -part(behind, kBehind), left}, 1) / diagonal;
   }
-  return rows.narrow(1, 2, rows.size(1) - 2);
+  return sides(rows);
 }
 
 at::Tensor CyclicReduction::solve(const at::Tensor& b) const {

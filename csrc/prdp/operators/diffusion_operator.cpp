@@ -21,16 +21,8 @@ at::Tensor above(const at::Tensor& t, int64_t axis) { return t.narrow(axis, 1, t
 at::Tensor first(const at::Tensor& t, int64_t axis) { return t.narrow(axis, 0, 1); }
 at::Tensor last(const at::Tensor& t, int64_t axis) { return t.narrow(axis, t.size(axis) - 1, 1); }
 
-/// t with so many zeros before and behind it along an axis.
-at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int64_t behind) {
-  std::vector<int64_t> pad(2 * (t.dim() - axis), 0);
-  pad[pad.size() - 2] = before;
-  pad[pad.size() - 1] = behind;
-  return at::constant_pad_nd(t, pad);
-}
-
 /// a and b behind each other, where either may be the same for all samples.
-at::Tensor joined(const at::Tensor& a, const at::Tensor& b, int64_t axis) {
+at::Tensor joined_along(const at::Tensor& a, const at::Tensor& b, int64_t axis) {
   if (a.sym_size(0) == b.sym_size(0)) return at::cat({a, b}, axis);
   const auto grown = [batch = a.size(0) == 1 ? b.size(0) : a.size(0)](const at::Tensor& t) {
     auto sizes = t.sizes().vec();
@@ -87,7 +79,7 @@ std::array<at::Tensor, 2> DiffusionOperator::faces(int64_t axis, double factor) 
   const auto around = wraps_around(axis) ? mean(first(averaged, d), last(averaged, d)) : at::Tensor();
   const auto low = around.defined() ? around : outer(0);
   const auto high = around.defined() ? around : outer(1);
-  return {joined(low, inner, d), joined(inner, high, d)};
+  return {joined_along(low, inner, d), joined_along(inner, high, d)};
 }
 
 at::Tensor DiffusionOperator::apply(const at::Tensor& v) const {
@@ -195,11 +187,7 @@ std::unique_ptr<Operator> DiffusionOperator::select(const at::Tensor& index) con
   return chosen;
 }
 
-std::vector<int64_t> DiffusionOperator::vector_shape() const {
-  std::vector<int64_t> shape{1};
-  shape.insert(shape.end(), shape_.begin(), shape_.end());
-  return shape;
-}
+std::vector<int64_t> DiffusionOperator::vector_shape() const { return with_channels(1, shape_); }
 
 std::shared_ptr<const kernels::Kernels> DiffusionOperator::kernels(const at::Tensor& b, bool /*transposed*/) const {
   const at::NoGradGuard no_grad;

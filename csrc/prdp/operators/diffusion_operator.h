@@ -73,7 +73,7 @@ class DiffusionOperator final : public Operator {
   /// The product rule in one launch on a GPU; nothing where there is no kernel.
   std::vector<at::Tensor> product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const;
   template <class T>
-  std::vector<at::Tensor> products_of(const at::Tensor& lambda, const at::Tensor& u) const;
+  std::vector<at::Tensor> launch_product_rule(const at::Tensor& lambda, const at::Tensor& u) const;
   int64_t dim() const { return static_cast<int64_t>(shape_.size()); }
   /// Whether the first and the last cell of an axis are neighbours; a single cell is none of itself.
   bool wraps_around(int64_t axis) const { return sides_[axis][0] == Side::kPeriodic && shape_[axis] > 1; }

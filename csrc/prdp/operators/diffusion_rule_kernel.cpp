@@ -28,43 +28,43 @@ struct RobinSide {
 }  // namespace
 
 template <class T>
-std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda, const at::Tensor& u) const {
+std::vector<at::Tensor> DiffusionOperator::launch_product_rule(const at::Tensor& lambda, const at::Tensor& u) const {
   const auto kappa = kappa_.detach().contiguous(), l = lambda.contiguous(), v = u.contiguous();
-  const auto of_kappa = at::empty_like(kappa);
-  gpu::DiffusionProductRule<T> of{};
-  of.pair = pair_of<T>(l, v, kappa.size(0));
-  of.batch = static_cast<int>(l.size(0));
-  of.harmonic = mean_ == FaceMean::kHarmonic;
-  of.kappa = kappa.const_data_ptr<T>();
-  of.of_kappa = of_kappa.mutable_data_ptr<T>();
+  const auto kappa_bar = at::empty_like(kappa);
+  gpu::DiffusionProductRule<T> rule{};
+  rule.pair = pair_of<T>(l, v, kappa.size(0));
+  rule.batch = static_cast<int>(l.size(0));
+  rule.harmonic = mean_ == FaceMean::kHarmonic;
+  rule.kappa = kappa.const_data_ptr<T>();
+  rule.kappa_out = kappa_bar.mutable_data_ptr<T>();
   for (int64_t axis = 0; axis < 3; ++axis) {
     const int64_t d = axis - axis_of_kernel(0, dim());
-    of.n[axis] = d < 0 ? 1 : static_cast<int>(shape_[d]);
-    of.inverse_width[axis] = d < 0 ? 0.0 : inverse_width(d);
+    rule.n[axis] = d < 0 ? 1 : static_cast<int>(shape_[d]);
+    rule.inverse_width[axis] = d < 0 ? 0.0 : inverse_width(d);
     for (int64_t end = 0; end < 2; ++end)
-      of.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
+      rule.sides[2 * axis + end] = static_cast<int>(d < 0 ? Side::kFlux : sides_[d][end]);
   }
   BroadcastSums sums(l);
   const size_t shift_sum = sums.size();
-  of.sums[0] = sums.add(shift_);
+  rule.sums[0] = sums.add(shift_);
   std::vector<RobinSide> robin_sides;
   for (int64_t axis = 0; axis < dim(); ++axis)
     for (size_t end = 0; end < 2; ++end) {
       if (sides_[axis][end] != Side::kRobin) continue;
       const int64_t number = 2 * axis_of_kernel(axis, dim()) + static_cast<int64_t>(end);
       robin_sides.push_back({axis, number, sums.size(), robin(axis, end).detach().contiguous()});
-      of.robin[number] = side_field<T>(robin_sides.back().h);
-      of.sums[1 + number] = sums.add(robin(axis, end), axis);
+      rule.robin[number] = side_field<T>(robin_sides.back().h);
+      rule.sums[1 + number] = sums.add(robin(axis, end), axis);
     }
-  of.of_sums[0] = sums.memory(shift_sum);
-  for (const auto& side : robin_sides) of.of_sums[1 + side.number] = sums.memory(side.sum);
-  const int64_t count = of_kappa.numel() + sums.count();
+  rule.sums_out[0] = sums.memory(shift_sum);
+  for (const auto& side : robin_sides) rule.sums_out[1 + side.number] = sums.memory(side.sum);
+  const int64_t count = kappa_bar.numel() + sums.count();
   if (!gpu::each_point(l.device(),
-                       product_rule_body<T>("DiffusionProductRule", "prdp/gpu/device/diffusion_product_rule.h"), of,
+                       product_rule_body<T>("DiffusionProductRule", "prdp/gpu/device/diffusion_product_rule.h"), rule,
                        count))
     return {};
   const auto of_shift = sums.result(shift_sum);
-  std::vector<at::Tensor> found{of_kappa.squeeze(1), shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
+  std::vector<at::Tensor> found{kappa_bar.squeeze(1), shift_.dim() == 0 ? of_shift : of_shift.squeeze(1)};
   for (const auto& side : robin_sides) {
     const auto bar = sums.result(side.sum);
     found.push_back(bar.dim() == 0 ? bar : bar.squeeze(2 + side.axis).squeeze(1));
@@ -74,7 +74,7 @@ std::vector<at::Tensor> DiffusionOperator::products_of(const at::Tensor& lambda,
 
 std::vector<at::Tensor> DiffusionOperator::product_rule_by_kernel(const at::Tensor& lambda, const at::Tensor& u) const {
   if (per_axis_ || !has_product_rule_kernel(lambda, u)) return {};
-  return u.scalar_type() == at::kFloat ? products_of<float>(lambda, u) : products_of<double>(lambda, u);
+  return u.scalar_type() == at::kFloat ? launch_product_rule<float>(lambda, u) : launch_product_rule<double>(lambda, u);
 }
 
 }  // namespace prdp

@@ -14,6 +14,7 @@
 #include "prdp/operators/product_rule_kernels.h"
 #include "prdp/operators/separable_inverse.h"
 #include "prdp/operators/sums_in_order.h"
+#include "prdp/operators/tensors.h"
 
 namespace prdp {
 
@@ -80,11 +81,7 @@ at::Tensor LaplacianOperator::jacobi_radius() const {
   return 1.0 - symbol(slowest) / diagonal();
 }
 
-std::vector<int64_t> LaplacianOperator::vector_shape() const {
-  std::vector<int64_t> shape{1};
-  shape.insert(shape.end(), grid_.shape().begin(), grid_.shape().end());
-  return shape;
-}
+std::vector<int64_t> LaplacianOperator::vector_shape() const { return with_channels(1, grid_.shape()); }
 
 std::shared_ptr<const kernels::Kernels> LaplacianOperator::kernels(const at::Tensor& b, bool) const {
   const auto [alpha, beta] = coefficients();

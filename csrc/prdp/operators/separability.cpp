@@ -97,7 +97,7 @@ void Separability::take_apart(const std::vector<at::Tensor>& lines) {
   for (const auto& line : lines)
     lines_.push_back(next(line.size(1) * line.size(2)).unflatten(1, {line.size(1), line.size(2)}));
   for (int64_t axis = 0; axis < dim(); ++axis) ends_.push_back(next(2));
-  sizes_ = next(5);
+  sizes_ = next(host_.size(1) - column);
 }
 
 Separability::Sizes Separability::sizes(int64_t s) const {

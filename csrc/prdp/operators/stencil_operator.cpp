@@ -147,11 +147,9 @@ at::Tensor StencilOperator::shifted(const at::Tensor& t, const kernels::Offset& 
       moved = at::roll(moved, -cells, d);
       continue;
     }
-    const int64_t kept = std::max<int64_t>(n - std::abs(cells), 0);
-    std::vector<int64_t> pad(2 * (t.dim() - d), 0);
-    pad[pad.size() - 2] = cells < 0 ? n - kept : 0;
-    pad[pad.size() - 1] = cells > 0 ? n - kept : 0;
-    moved = at::constant_pad_nd(moved.narrow(d, cells > 0 ? n - kept : 0, kept), pad);
+    const int64_t kept = std::max<int64_t>(n - std::abs(cells), 0), before = cells < 0 ? n - kept : 0;
+    const int64_t behind = cells > 0 ? n - kept : 0;
+    moved = padded(moved.narrow(d, behind, kept), d, before, behind);
   }
   return moved;
 }

@@ -79,6 +79,21 @@ inline ScaledSamples scale_finite_samples(const at::Tensor& v, const at::Tensor&
   return scale_samples(v, magnitude, magnitude.isfinite().logical_and(magnitude.gt(0)));
 }
 
+/// t with so many zeros before and behind it along an axis.
+inline at::Tensor padded(const at::Tensor& t, int64_t axis, int64_t before, int64_t behind) {
+  std::vector<int64_t> pad(2 * (t.dim() - axis), 0);
+  pad[pad.size() - 2] = before;
+  pad[pad.size() - 1] = behind;
+  return at::constant_pad_nd(t, pad);
+}
+
+/// (channels, *shape)
+inline std::vector<int64_t> with_channels(int64_t channels, at::IntArrayRef shape) {
+  std::vector<int64_t> sizes{channels};
+  sizes.insert(sizes.end(), shape.begin(), shape.end());
+  return sizes;
+}
+
 /// sum += term; an undefined tensor is a zero of any shape.
 inline void add_to(at::Tensor& sum, const at::Tensor& term) {
   if (term.defined()) sum = sum.defined() ? sum + term : term;

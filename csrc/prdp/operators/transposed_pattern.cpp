@@ -11,20 +11,20 @@ namespace prdp {
 
 namespace {
 
-/// Some indices, as they were.
-class Indices {
+/// Tells whether indices are the same as before, unchanged since.
+class IndexFingerprint {
  public:
-  explicit Indices(const at::Tensor& t)
+  explicit IndexFingerprint(const at::Tensor& t)
       : storage_(t.storage().getWeakStorageImpl()),
         data_(t.const_data_ptr()),
         sizes_(t.sizes().vec()),
         strides_(t.strides().vec()),
         version_(t._version()) {}
-  bool are(const at::Tensor& t) const {
-    return !are_gone() && data_ == t.const_data_ptr() && sizes_ == t.sizes() && strides_ == t.strides() &&
+  bool matches(const at::Tensor& t) const {
+    return !expired() && data_ == t.const_data_ptr() && sizes_ == t.sizes() && strides_ == t.strides() &&
            version_ == t._version();
   }
-  bool are_gone() const { return storage_.expired(); }
+  bool expired() const { return storage_.expired(); }
 
  private:
   c10::weak_intrusive_ptr<c10::StorageImpl> storage_;
@@ -34,7 +34,7 @@ class Indices {
 };
 
 struct Kept {
-  Indices crow, col;
+  IndexFingerprint crow, col;
   c10::Stream stream;
   TransposedPattern pattern;
 };
@@ -68,13 +68,14 @@ TransposedPattern transposed(const Pattern& p, bool may_keep) {
   const auto stream = c10::impl::VirtualGuardImpl(p.col.device().type()).getStream(p.col.device());
   const std::lock_guard lock(mutex);
   auto& kept = kept_patterns();
-  std::erase_if(kept, [](const Kept& k) { return k.crow.are_gone() || k.col.are_gone(); });
+  std::erase_if(kept, [](const Kept& k) { return k.crow.expired() || k.col.expired(); });
   const auto is_it = [&](const Kept& k) {
-    return k.stream == stream && k.crow.are(p.given_crow) && k.col.are(p.given_col);
+    return k.stream == stream && k.crow.matches(p.given_crow) && k.col.matches(p.given_col);
   };
   if (const auto found = std::find_if(kept.begin(), kept.end(), is_it); found != kept.end()) return found->pattern;
   if (kept.size() == kMostKept) kept.pop_front();
-  return kept.emplace_back(Indices(p.given_crow), Indices(p.given_col), stream, make(p.crow, p.col)).pattern;
+  return kept.emplace_back(IndexFingerprint(p.given_crow), IndexFingerprint(p.given_col), stream, make(p.crow, p.col))
+      .pattern;
 }
 
 }  // namespace prdp

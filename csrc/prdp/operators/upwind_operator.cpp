@@ -1,5 +1,7 @@
 #include "prdp/operators/upwind_operator.h"
 
+#include "prdp/operators/tensors.h"
+
 namespace prdp {
 
 UpwindOperator::UpwindOperator(const char* owner, const OperatorSpec& spec, int64_t channels)
@@ -18,11 +20,7 @@ void UpwindOperator::check_vector(const at::Tensor& b) const {
                     " but the vector is on ", b.device());
 }
 
-std::vector<int64_t> UpwindOperator::vector_shape() const {
-  std::vector<int64_t> shape{channels_};
-  shape.insert(shape.end(), grid_.shape().begin(), grid_.shape().end());
-  return shape;
-}
+std::vector<int64_t> UpwindOperator::vector_shape() const { return with_channels(channels_, grid_.shape()); }
 
 std::vector<int64_t> UpwindOperator::first_nonfinite(int64_t sample) const {
   return first_true(nonfinite(winds_.select(0, winds_.size(0) == 1 ? 0 : sample)));

@@ -36,42 +36,42 @@ class BiCGStabMethod {
     for (auto* vector : {&x, &p_, &v_}) space_.fill_zero(*vector);
     space_.copy(space_.b(), r_);
     space_.copy(space_.b(), hat_);
-    rr_ = hh_ = ss_ = st_ = tt_ = space_.b2();
-    inverse_hv_ = zero_ = rr_ * 0;
+    r2_ = hat2_ = s2_ = st_ = t2_ = space_.b2();
+    inverse_hv_ = zero_ = r2_ * 0;
   }
   void step() {
     Scalar rho = rho_or_anew();
-    const Scalar over_omega = space_.guarded_quotient(tt_, st_, ss_, tt_);
+    const Scalar over_omega = space_.guarded_quotient(t2_, st_, s2_, t2_);
     space_.xpby(v_, -over_omega, p_);
     space_.xpby(r_, -(rho * inverse_hv_), p_);
-    auto [hv, vv] = space_.apply_along(preconditioned(p_), hat_, v_);
-    const Scalar starts_anew = space_.breaks_down(hv, hh_, vv, inverse_hv_);
+    auto [hv, v2] = space_.apply_along(preconditioned(p_), hat_, v_);
+    const Scalar starts_anew = space_.breaks_down(hv, hat2_, v2, inverse_hv_);
     space_.restore(starts_anew, zero_, rho);
-    space_.restore(starts_anew, zero_, hh_);
-    space_.restore(starts_anew, vv, hv);  // a number to divide by, which ρ = 0 takes out again
+    space_.restore(starts_anew, zero_, hat2_);
+    space_.restore(starts_anew, v2, hv);  // a number to divide by, which ρ = 0 takes out again
     // r·r, which is never zero while there is something to do, is the size that a quotient is judged by; ρ may be zero.
-    inverse_hv_ = space_.ratio(space_.guarded_quotient(rr_, hv, hh_, vv), rr_);
+    inverse_hv_ = space_.ratio(space_.guarded_quotient(r2_, hv, hat2_, v2), r2_);
     const auto moves = [&](const Scalar& length) { return space_.unless_zero(length, over_omega, inverse_hv_); };
-    ss_ = space_.update_iterate_and_residual(moves(rho * inverse_hv_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
-    const auto [st, tt] = apply_to(r_, t_);
+    s2_ = space_.update_iterate_and_residual(moves(rho * inverse_hv_), space_.is_preconditioned() ? z_ : p_, v_, x, r_);
+    const auto [st, t2] = apply_to(r_, t_);
     st_ = st;
-    tt_ = tt;
-    rr_ = space_.update_iterate_and_residual(moves(space_.ratio(st, tt)), space_.is_preconditioned() ? z_ : r_, t_, x,
+    t2_ = t2;
+    r2_ = space_.update_iterate_and_residual(moves(space_.ratio(st, t2)), space_.is_preconditioned() ? z_ : r_, t_, x,
                                              r_);
     start_anew_where(starts_anew);
   }
-  auto residual2() const { return rr_; }
+  auto residual2() const { return r2_; }
   /// From the true residual it starts anew.
   auto recompute_residual() {
-    rr_ = space_.residual(x, r_);
+    r2_ = space_.residual(x, r_);
     space_.copy(r_, hat_);
-    for (auto* square : {&hh_, &ss_, &st_, &tt_}) space_.assign(rr_, *square);
-    space_.assign(rr_ * 0, inverse_hv_);
-    return rr_;
+    for (auto* square : {&hat2_, &s2_, &st_, &t2_}) space_.assign(r2_, *square);
+    space_.assign(r2_ * 0, inverse_hv_);
+    return r2_;
   }
 
   /// What the next iteration starts from, beside x; resume() once it has been put back.
-  auto iteration_state() { return std::tie(r_, hat_, p_, v_, rr_, hh_, ss_, st_, tt_, inverse_hv_); }
+  auto iteration_state() { return std::tie(r_, hat_, p_, v_, r2_, hat2_, s2_, st_, t2_, inverse_hv_); }
   void resume(int64_t) {}
 
   typename Space::Vector x;
@@ -80,15 +80,15 @@ class BiCGStabMethod {
   /// ρ = r̂·r; where that is rounding, it starts anew with ρ = r·r.
   Scalar rho_or_anew() {
     Scalar rho = space_.dot(hat_, r_);
-    const Scalar lost = space_.is_rounding(rho, hh_, rr_, 200 * space_.epsilon());
+    const Scalar lost = space_.is_rounding(rho, hat2_, r2_, 200 * space_.epsilon());
     start_anew_where(lost);
-    space_.restore(lost, rr_, rho);
+    space_.restore(lost, r2_, rho);
     return rho;
   }
   /// r̂ = r, and β = 0 in the next iteration, so that p = r.
   void start_anew_where(const Scalar& mask) {
     space_.restore(mask, r_, hat_);
-    space_.restore(mask, rr_, hh_);
+    space_.restore(mask, r2_, hat2_);
     space_.restore(mask, zero_, inverse_hv_);
   }
   /// out = A v, or A M⁻¹ v with M⁻¹ v in z_; returns v·out and ‖out‖².
@@ -105,8 +105,14 @@ class BiCGStabMethod {
   }
 
   Space& space_;
-  typename Space::Vector r_, hat_, p_, v_, t_, z_;  // r, and s between; r̂; A p; A s; M⁻¹ p, or of s
-  Scalar rr_{}, hh_{}, ss_{}, st_{}, tt_{}, inverse_hv_{};  // r·r, r̂·r̂, s·s, s·t, t·t, 1/(r̂·v)
+  typename Space::Vector r_;  // r, and s between
+  typename Space::Vector hat_;  // r̂
+  typename Space::Vector p_;
+  typename Space::Vector v_;  // A p
+  typename Space::Vector t_;  // A s
+  typename Space::Vector z_;  // M⁻¹ p, or M⁻¹ s
+  Scalar r2_{}, hat2_{}, s2_{}, st_{}, t2_{};  // r·r, r̂·r̂, s·s, s·t, t·t
+  Scalar inverse_hv_{};  // 1/(r̂·v)
   Scalar zero_{};
 };
 

@@ -46,7 +46,7 @@ class CorrectionMethod {
 };
 
 struct VCycle {
-  static void apply(auto& space, auto& r, auto& d) { space.correct(r, d); }
+  static void apply(auto& space, auto& r, auto& d) { space.apply_cycle(r, d); }
 };
 template <VectorSpace Space>
 struct MultigridMethod : CorrectionMethod<Space, VCycle> {

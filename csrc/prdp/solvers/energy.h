@@ -7,26 +7,27 @@
 /// Whether an iterate whose residual is above ‖b‖ is what a method for definite operators is made for.
 namespace prdp::detail {
 
-/// What energy_falls() is told by: products of x; b; r, its residual; A r; and ‖A‖ ‖x‖².
-struct Energies {
-  double xb, xr, rb, rr, bb, x_ar, r_ar, xx, ar2, largest;
+/// What energy_falls() is told by: inner products of x, b and the residual r; and ‖A‖ ‖x‖².
+struct InnerProducts {
+  double x_b, x_r, r_b, r_r, b_b, x_Ar, r_Ar, x_x, Ar_Ar, norm_A_x_x;
 };
 
 /// Whether the iterates of a method for definite operators do what they are made for: A is symmetric, judged by x·A r
 /// and r·A x; it is definite on the plane of x and r; and x is nearer to the solution than zero in the norm of A, which
 /// is (x·b)² > (x·r)² for a definite A of either sign. Where the two agree up to rounding, or x·A x is the rounding of
 /// A x, x lies almost in the null space of A, and says nothing, unless A has none for sure.
-inline bool energy_falls(const Energies& e, double epsilon, bool surely_definite) {
+inline bool energy_falls(const InnerProducts& e, double epsilon, bool surely_definite) {
   constexpr double roundings = 2e3;  // of a product of vectors, with much to spare
-  const auto positive = [](double v) { return std::max(v, 0.0); };
+  const auto clamped = [](double v) { return std::max(v, 0.0); };
   const double scale =
-      std::sqrt(e.rr) * std::sqrt(positive(e.bb - 2 * e.rb + e.rr)) + std::sqrt(e.xx) * std::sqrt(e.ar2);
-  const double energy = e.xb - e.xr, across = positive(std::abs(e.x_ar) - roundings * epsilon * scale);
-  const bool symmetric = std::abs(e.rb - e.rr - e.x_ar) <= roundings * epsilon * scale;
-  const bool nearer = e.xb * e.xb > e.xr * e.xr;
-  const double rounding = std::max(roundings * std::abs(e.xb), surely_definite ? 0.0 : e.largest);
-  const bool not_rounding = std::abs(energy) > epsilon * rounding;
-  const bool definite = e.r_ar * energy > across * across;
+      std::sqrt(e.r_r) * std::sqrt(clamped(e.b_b - 2 * e.r_b + e.r_r)) + std::sqrt(e.x_x) * std::sqrt(e.Ar_Ar);
+  const double x_Ax = e.x_b - e.x_r;  // A x = b - r
+  const double coupling = clamped(std::abs(e.x_Ar) - roundings * epsilon * scale);  // |x·A r| beyond rounding
+  const bool symmetric = std::abs(e.r_b - e.r_r - e.x_Ar) <= roundings * epsilon * scale;
+  const bool nearer = e.x_b * e.x_b > e.x_r * e.x_r;
+  const double rounding = std::max(roundings * std::abs(e.x_b), surely_definite ? 0.0 : e.norm_A_x_x);
+  const bool not_rounding = std::abs(x_Ax) > epsilon * rounding;
+  const bool definite = e.r_Ar * x_Ax > coupling * coupling;
   return symmetric && definite && nearer && not_rounding;
 }
 
@@ -46,9 +47,9 @@ void accept_by_energy(Space& space, Method& method, typename Space::States& stat
   auto ar = space.scratch();
   space.apply(r, ar);
   const auto values_of = [&](const auto& v, const auto& w) { return space.values_of(space.dot(v, w)); };
-  const auto xb = values_of(x, b), xr = values_of(x, r), rb = values_of(r, b), rr = values_of(r, r),
-             bb = values_of(b, b);
-  const auto x_ar = values_of(x, ar), r_ar = values_of(r, ar), xx = values_of(x, x), ar2 = values_of(ar, ar);
+  const auto x_b = values_of(x, b), x_r = values_of(x, r), r_b = values_of(r, b), r_r = values_of(r, r),
+             b_b = values_of(b, b);
+  const auto x_Ar = values_of(x, ar), r_Ar = values_of(r, ar), x_x = values_of(x, x), Ar_Ar = values_of(ar, ar);
   space.fill_zero(ar);
   const auto norm_a = space.operator_norm(), u2 = space.values_of(space.solution2(x));  // ‖A‖ and u without their scale
   const auto definite = space.surely_definite();
@@ -59,16 +60,8 @@ void accept_by_energy(Space& space, Method& method, typename Space::States& stat
       continue;
     }
     s.returned = Returned::kLast;
-    const Energies e{.xb = xb[i],
-                     .xr = xr[i],
-                     .rb = rb[i],
-                     .rr = rr[i],
-                     .bb = bb[i],
-                     .x_ar = x_ar[i],
-                     .r_ar = r_ar[i],
-                     .xx = xx[i],
-                     .ar2 = ar2[i],
-                     .largest = norm_a[i] * std::sqrt(u2[i] * xx[i])};
+    const double norm_A_x_x = norm_a[i] * std::sqrt(u2[i] * x_x[i]);
+    const InnerProducts e{x_b[i], x_r[i], r_b[i], r_r[i], b_b[i], x_Ar[i], r_Ar[i], x_x[i], Ar_Ar[i], norm_A_x_x};
     if (!energy_falls(e, space.epsilon(), definite[i])) s.status = SolveStatus::kDiverged;
   }
 }

@@ -8,23 +8,25 @@ namespace prdp::gpu {
 
 namespace {
 
-Trust trust_by_samples(const Operator& a, const at::Tensor& b, const at::Tensor& solution, const at::Tensor& residual) {
+Trust trust_by_residuals(const Operator& a, const at::Tensor& b, const at::Tensor& solution,
+                         const at::Tensor& residual) {
   constexpr double share = 0.25, roundings = 200.0, least = 1e-15, most = 1e15;
-  const auto size = sample_norms(b), whole = sample_norms(a.project(b)), u = sample_norms(solution);
-  const auto found = sample_norms(a.project(b - a.apply(solution))) / whole;
-  const auto told = residual.to(at::kDouble);
-  const auto rounding = roundings * epsilon_of(b) * (a.norm().to(at::kDouble).reshape({-1}) * u / whole + 1.0);
-  const auto judged = (size > least) & (size < most) & (u < most) & (whole > 1e-3 * size);
-  const auto wrong = judged & ((found - told).abs() <= share * told + rounding).logical_not();
+  const auto size = sample_norms(b), projected_norm = sample_norms(a.project(b)), u = sample_norms(solution);
+  const auto recomputed = sample_norms(a.project(b - a.apply(solution))) / projected_norm;
+  const auto reported = residual.to(at::kDouble);
+  const auto rounding = roundings * epsilon_of(b) * (a.norm().to(at::kDouble).reshape({-1}) * u / projected_norm + 1.0);
+  const auto judged = (size > least) & (size < most) & (u < most) & (projected_norm > 1e-3 * size);
+  const auto wrong = judged & ((recomputed - reported).abs() <= share * reported + rounding).logical_not();
   if (wrong.any().item<bool>()) return Trust::kNone;
   return judged.any().item<bool>() ? Trust::kGood : Trust::kUnknown;
 }
 
-/// Of samples that ended by a NaN or Inf, or by a zero where there may be none, as the kernel has it.
-Trust trust_by_failed(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
+/// For samples that the kernel reports as not finite or with a zero diagonal: solves them without kernels. kNone if one
+/// ends well there.
+Trust trust_by_solving_again(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
   try {
-    a.check_parameters(Checks::kAll);  // others may not be able to read it
-  } catch (const c10::Error&) {
+    a.check_parameters(Checks::kAll);
+  } catch (const c10::Error&) {  // the host refuses A: tensor operations could read beyond it
     return Trust::kUnknown;
   }
   const WithoutKernels by_others;
@@ -38,7 +40,7 @@ Trust verify_first_result(const Operator& a, const at::Tensor& b, const SolveReq
                           const SolveResult& result) {
   const at::NoGradGuard no_grad;
   const auto& info = result.info;
-  // Tensor operations may not be able to read the A of others.
+  // Compared by status, as tensor operations may not be able to read an A that was refused.
   const auto judged = [&](const at::Tensor& index, const auto& judge) {
     const auto chosen = index.numel() > 0 ? a.select(index) : nullptr;
     return chosen ? judge(*chosen, b.index_select(0, index)) : Trust::kUnknown;
@@ -47,14 +49,14 @@ Trust verify_first_result(const Operator& a, const at::Tensor& b, const SolveReq
   const auto is = [&](SolveStatus status) { return info.status == static_cast<int64_t>(status); };
   const auto ended_well = where(info.status >= static_cast<int64_t>(SolveStatus::kStagnated));
   const auto trust = judged(ended_well, [&](const Operator& of, const at::Tensor& rhs) {
-    return trust_by_samples(of, rhs, result.u.index_select(0, ended_well), info.residual.index_select(0, ended_well));
+    return trust_by_residuals(of, rhs, result.u.index_select(0, ended_well), info.residual.index_select(0, ended_well));
   });
   if (trust == Trust::kNone || ended_well.numel() == b.size(0)) return trust;
   const auto not_finite = where(is(SolveStatus::kOverflow) | is(SolveStatus::kZeroDiagonal) |
                                 is(SolveStatus::kNonfiniteInput) | is(SolveStatus::kNonfiniteOperator));
   const auto of_failed = judged(not_finite, [&](const Operator& of, const at::Tensor& rhs) {
     const auto x0 = request.x0.defined() ? request.x0.index_select(0, not_finite) : at::Tensor();
-    return trust_by_failed(of, rhs, {.solver = request.solver, .x0 = x0});
+    return trust_by_solving_again(of, rhs, {.solver = request.solver, .x0 = x0});
   });
   return of_failed == Trust::kNone ? of_failed : trust;
 }

@@ -9,6 +9,11 @@
 
 namespace prdp {
 
+constexpr ArraySizes arrays_of_gmres(int64_t m) {
+  const auto problem = arrays_of_hessenberg_problem(m);
+  return {m + 1, problem.numbers + 2 * (m + 1), problem.arrays + 3};  // u_; problem_, again_ and weights_
+}
+
 /// GMRES(m), restarted (Saad and Schultz 1986), for any operator. An iteration is a cycle: m products,
 /// then the least residual over their Krylov space, so that the residual never grows. Gram–Schmidt
 /// runs over all vectors at once, a second time where the first lost orthogonality; Givens rotations.

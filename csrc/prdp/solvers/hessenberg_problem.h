@@ -5,6 +5,11 @@
 
 namespace prdp {
 
+inline constexpr int64_t kNumbersOfColumn = 6;  // of HessenbergProblem::Column
+constexpr ArraySizes arrays_of_hessenberg_problem(int64_t m) {
+  return {.numbers = hessenberg_column(m) + kNumbersOfColumn * (m + 1) + 2 * m, .arrays = 4};
+}
+
 /// The small problem of a cycle of GMRES: y = argmin ‖‖r‖ e₁ - H y‖ for the Hessenberg matrix H of A v_j = Σ h_ij v_i,
 /// which Givens rotations turn into a triangle R as its columns come. `Numbers` has what space.h asks of numbers that
 /// may vanish.
@@ -40,8 +45,8 @@ class HessenbergProblem {
   PRDP_NOINLINE void add_column(int64_t j, const Scalar& length) {
     scale_ = numbers_.larger(scale_, length);
     // At sixteen units the space counts as exhausted, and goes on; at one, it ends.
-    exhausted_ = exhausted_ + numbers_.is_zero(numbers_.inverse(h(j + 1, j), scale_));
-    h(j + 1, j) = h(j + 1, j) * numbers_.is_not_zero(numbers_.inverse(h(j + 1, j), scale_ * kOneUnit));
+    exhausted_ = exhausted_ + vanishes(h(j + 1, j), scale_);
+    h(j + 1, j) = h(j + 1, j) * is_above(h(j + 1, j), scale_ * kOneUnit);
     const Scalar next = h(j + 1, j);
     rotate(j);
     columns_[j + 1].inverse_length = numbers_.inverse(next, rounding(columns_[j + 1].g));
@@ -54,7 +59,7 @@ class HessenbergProblem {
       c.y = c.g;
       PRDP_NO_UNROLL for (int64_t k = j + 1; k < columns; ++k) c.y = c.y - h(j, k) * columns_[k].y;
       c.y = c.y * c.inverse_diagonal;
-      short_enough = short_enough * numbers_.is_not_zero(numbers_.inverse(size, scale_ * c.y));
+      short_enough = short_enough * is_above(size, scale_ * c.y);
     }
     if (!numbers_.surely_all(short_enough)) damp(columns, short_enough);
   }
@@ -90,16 +95,18 @@ class HessenbergProblem {
     Scalar inverse_diagonal{};  // 1/R_jj, or zero
     Scalar g{}, y{};
   };
-  static constexpr int64_t kNumbersOfColumn = 6;  // solve_kernel_text.cpp counts the memory of a kernel by it
   static_assert(sizeof(Column) == kNumbersOfColumn * sizeof(Scalar));
   static constexpr double kOneUnit = 1.0 / 16;  // numbers vanish at sixteen units of rounding
   static constexpr double kSolved2 = 1e-6;      // a cycle that takes a thousandth off its residual solves
 
   Scalar& h(int64_t i, int64_t j) { return h_[hessenberg_column(j) + i]; }
 
-  /// What a number that belongs to residual g has to exceed: sixteen units of rounding, where a singular A and an
-  /// exhausted space leave noise, but one unit while the residual is not solved for: what is left of a nearly singular
-  /// A is in these numbers, and minimise() sees to it that y stays short.
+  /// Whether a is rounding beside s, as 1 or 0; and whether it is not.
+  Scalar vanishes(const Scalar& a, const Scalar& s) const { return numbers_.is_zero(numbers_.inverse(a, s)); }
+  Scalar is_above(const Scalar& a, const Scalar& s) const { return numbers_.is_not_zero(numbers_.inverse(a, s)); }
+  /// Below this scale a number counts as zero. Sixteen units of rounding, the noise of a singular A or an exhausted
+  /// space. But one unit while the residual g is large: a nearly singular A shows in numbers that small, and minimise()
+  /// damps a y that gets too long.
   Scalar rounding(const Scalar& g) const {
     return scale_ - numbers_.is_larger(g * g, solved2_) * scale_ * (1 - kOneUnit);
   }

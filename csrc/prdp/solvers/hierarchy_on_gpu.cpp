@@ -39,30 +39,30 @@ int64_t most_coarse_points(at::IntArrayRef shape) {
   for (size_t i = count(0); i-- > 0;)
     for (size_t j = count(1); j-- > 0;)
       for (size_t k = count(2); k-- > 0;) {
-        const auto then = [&](size_t a, size_t b, size_t c) {
+        const auto points_from = [&](size_t a, size_t b, size_t c) {
           if (a == count(0) || b == count(1) || c == count(2)) return int64_t{0};
           return sizes[0][a] * sizes[1][b] * sizes[2][c] + most[place(a, b, c)];
         };
-        most[place(i, j, k)] = std::max({then(i + 1, j, k), then(i, j + 1, k), then(i, j, k + 1)});
+        most[place(i, j, k)] = std::max({points_from(i + 1, j, k), points_from(i, j + 1, k), points_from(i, j, k + 1)});
       }
   return most[0];
 }
 
 template <class T>
-void launch(const HierarchyKernel& of, const at::Tensor& made) {
+void launch(const HierarchyKernel& kernel, const at::Tensor& hierarchy) {
   constexpr int64_t of_inverse = numbers_of_inverse(kMostOfCoarsest) * static_cast<int64_t>(sizeof(double));
-  const int64_t teams = std::min(made.size(0), of.kernel->teams());
-  const TeamMemory memory(of.blocks_of_team, teams, made.options(), teams * of_inverse);
+  const int64_t teams = std::min(hierarchy.size(0), kernel.kernel->teams());
+  const TeamMemory memory(kernel.blocks_of_team, teams, hierarchy.options(), teams * of_inverse);
   HierarchyArguments<T> arguments{};
-  arguments.a = arguments_of(of.a);
-  arguments.grids = grids_of(made);
-  arguments.numbers = numbers_of<T>(made);
-  arguments.numbers_of_sample = of.numbers_of_sample;
+  arguments.a = arguments_of(kernel.a);
+  arguments.grids = grids_of(hierarchy);
+  arguments.numbers = numbers_of<T>(hierarchy);
+  arguments.numbers_of_sample = kernel.numbers_of_sample;
   arguments.work = memory.own<double>();
-  arguments.samples = made.size(0);
-  arguments.nullity = of.nullity;
+  arguments.samples = hierarchy.size(0);
+  arguments.nullity = kernel.nullity;
   memory.put_into(arguments);
-  of.kernel->launch(teams, &arguments);
+  kernel.kernel->launch(teams, &arguments);
 }
 
 }  // namespace
@@ -91,9 +91,10 @@ HierarchyKernel hierarchy_kernel(Runtime& runtime, OperatorView a, const at::Ten
 
 at::Tensor make_hierarchy(const HierarchyKernel& kernel, const at::Tensor& b) {
   const auto of_grids = static_cast<int64_t>(sizeof(Grids) / b.element_size());
-  const auto made = at::empty({is_shared(kernel.a) ? 1 : b.size(0), of_grids + kernel.numbers_of_sample}, b.options());
-  (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, made);
-  return made;
+  const auto hierarchy =
+      at::empty({is_shared(kernel.a) ? 1 : b.size(0), of_grids + kernel.numbers_of_sample}, b.options());
+  (b.scalar_type() == at::kFloat ? launch<float> : launch<double>)(kernel, hierarchy);
+  return hierarchy;
 }
 
 CycleMemory memory_of_cycle(const at::Tensor& b) {

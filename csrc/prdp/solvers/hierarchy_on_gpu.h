@@ -29,7 +29,7 @@ inline int64_t numbers_of_sample(const at::Tensor& hierarchy) {
 /// Numbers of the vectors of a cycle on all grids but the finest: what they take at most, and what they take where
 /// every long axis is coarsened at once.
 struct CycleMemory {
-  int64_t most, usual;
+  int64_t at_most, if_all_axes;
 };
 CycleMemory memory_of_cycle(const at::Tensor& b);
 

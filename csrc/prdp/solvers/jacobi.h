@@ -7,6 +7,10 @@
 
 namespace prdp {
 
+/// Of how many iterations Chebyshev's method keeps the weights.
+inline constexpr int64_t kWeightsAtOnce = 64;
+constexpr ArraySizes arrays_of_chebyshev(int64_t) { return {.numbers = kWeightsAtOnce, .arrays = 1}; }
+
 /// u ← u + D⁻¹(b - A u). From zero the first iterate is D⁻¹ b for free; from then on one product an
 /// iteration. A product whose residual is looked at makes the next iterate as well.
 ///
@@ -69,8 +73,6 @@ class JacobiMethod {
         r_(space.vector()),
         omega_(space.template array<Scalar>(accelerated ? kWeightsAtOnce : 0)) {}
 
-  static constexpr int64_t kWeightsAtOnce = 64;
-
   /// ω of n iterations after the first `first`, which is at least one; null without acceleration.
   const Scalar* weights(int64_t first, int64_t n) {
     if (!accelerated_) return nullptr;
@@ -86,7 +88,9 @@ class JacobiMethod {
 
   Space& space_;
   bool accelerated_;
-  typename Space::Vector c_, next_, r_;  // D⁻¹ b; the iterate after x if `ready_`, else the one before it
+  typename Space::Vector c_;     // D⁻¹ b
+  typename Space::Vector next_;  // the iterate after x if ready_; else the one before it, for Chebyshev
+  typename Space::Vector r_;     // of recompute_residual()
   Scalar residual2_{};
   bool ready_ = false;  // next_ and residual2_ belong to x
   int64_t done_ = 0;

@@ -51,6 +51,7 @@ struct MethodTraits {
   bool has_tape = true;
   /// Its class and file, from which kernels of a GPU are made; empty: there is none.
   std::string_view kernel{}, kernel_header{};
+  ArraySizes (*arrays)(int64_t restart) = no_arrays;  // of its members
 };
 
 /// A row with the class that iterates.
@@ -88,6 +89,7 @@ inline constexpr std::tuple kMethods{
         .has_tape = false,
         .kernel = "ChebyshevMethod",
         .kernel_header = "jacobi.h",
+        .arrays = arrays_of_chebyshev,
     }},
     MethodRow<SteepestDescentMethod>{{
         .method = Method::kSteepestDescent,
@@ -133,6 +135,7 @@ inline constexpr std::tuple kMethods{
         .nanoseconds = 0.8,
         .kernel = "GmresMethod",
         .kernel_header = "gmres.h",
+        .arrays = arrays_of_gmres,
     }},
     MethodRow<MinresMethod>{{
         .method = Method::kMinres,
@@ -146,6 +149,7 @@ inline constexpr std::tuple kMethods{
         .has_tape = false,
         .kernel = "MinresMethod",
         .kernel_header = "minres.h",
+        .arrays = arrays_of_minres,
     }},
     MethodRow<MultigridMethod>{{
         .method = Method::kMultigrid,

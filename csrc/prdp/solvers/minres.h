@@ -8,6 +8,8 @@
 
 namespace prdp {
 
+constexpr ArraySizes arrays_of_minres(int64_t) { return {.vectors = 3, .numbers = 3, .arrays = 2}; }
+
 /// The minimal residual of symmetric operators, definite or not (MINRES, Paige and Saunders 1975): Lanczos vectors v of
 /// M⁻¹A, of length γ in the norm of M⁻¹, whose tridiagonal matrix is rotated into a triangle as it grows; x moves along
 /// directions w = (z/γ - α₂ w₋ - α₃ w₋₋)/α₁ with z = M⁻¹ v. Memory does not grow. M must be positive definite; then

@@ -26,10 +26,9 @@ double slack_of_floor(const SampleState& s, double rtol, double floor) {
   return rtol * std::sqrt(s.b2) <= (kIsExact<Method> ? 8.0 : 1.0) * floor ? 8.0 : 1.0;
 }
 
-/// The floors of the `doubtful` samples whose residual is at most slack_of_floor() of them; zero for the others. There
-/// a floor above ‖b‖/4 says nothing, nor does a residual above ‖b‖/10, as u is garbage then. In float64 no floor above
-/// 1e-5 ‖b‖ is taken for rounding: u is that of a singular system, which a null vector that nobody named has made
-/// large.
+/// Per sample: its floor, if it is `doubtful` and its residual is at most slack_of_floor() floors; else 0. Never a
+/// suspect: a residual above ‖b‖/10, as u is garbage then, or a floor above ‖b‖/4; in float64 above 1e-5 ‖b‖, which a u
+/// has that grew along a null vector that nobody named.
 template <class Space, class Method, class Predicate>
 auto floors_of_suspects(Space& space, const Method& method, const typename Space::States& states, double rtol,
                         const Predicate& doubtful) {
@@ -49,8 +48,8 @@ auto floors_of_suspects(Space& space, const Method& method, const typename Space
 inline constexpr double kRoundingsOfProduct = 64.0, kFewRoundings = 4.0;
 inline constexpr int64_t kManyEstimates = 8;  // at most kSignPatterns
 
-/// Whether a suspect's residual is rounding, by the p-th estimate of ε ‖|A| |u|‖. The first allows slack. As the
-/// largest of several estimates is less strict, the others allow none, and a few roundings.
+/// Whether a suspect's residual is rounding, by the p-th estimate of ε ‖|A| |u|‖. The first allows slack and many
+/// roundings. The others allow no slack and few roundings, as one sample then has several chances to pass.
 template <class Method>
 bool residual_is_rounding(const SampleState& s, double rtol, double floor, double rounding, int64_t p) {
   const double residual = std::sqrt(s.residual2);
@@ -58,10 +57,9 @@ bool residual_is_rounding(const SampleState& s, double rtol, double floor, doubl
   return residual <= floor && residual <= kFewRoundings * rounding;
 }
 
-/// Stops those of the `doubtful` samples whose residual is rounding: near the floor ε ‖A‖ ‖u‖, as above. As the floor
-/// overstates the rounding where columns of A differ in size, the residual must also be of the order of ε ‖|A| |u|‖,
-/// what a product rounds, by an estimate from below. It misses the strongest coupling of two unknowns every second
-/// time: more `estimates` find it.
+/// Stops the `doubtful` samples whose residual is rounding: near the floor ε ‖A‖ ‖u‖, as above, and of the order of
+/// ε ‖|A| |u|‖, what a product rounds, as the floor overstates that where columns of A differ in size. An estimate from
+/// below stands for it, and misses the strongest coupling of two unknowns every second time: more `estimates` find it.
 template <class Space, class Method, class Predicate>
 PRDP_NOINLINE void stop_at_rounding_floor(Space& space, const Method& method, typename Space::States& states,
                                           double rtol, const Predicate& doubtful, int64_t estimates = 1) {

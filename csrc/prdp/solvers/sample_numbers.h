@@ -1,7 +1,10 @@
 #pragma once
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <limits>
+
+#include "prdp/solvers/sample_state.h"
 
 namespace prdp {
 
@@ -26,6 +29,7 @@ template <class T>
 class SampleNumbers {
  public:
   using Scalar = T;
+  using States = std::array<SampleState, 1>;
 
   static constexpr double epsilon() { return std::numeric_limits<T>::epsilon() / 2; }
   void assign(Scalar from, Scalar& to) { to = from; }
@@ -75,6 +79,17 @@ class SampleNumbers {
   Scalar is_zero(Scalar value) const { return value == 0; }
   Scalar is_not_zero(Scalar value) const { return value != 0; }
   bool surely_all(Scalar value) const { return value != 0; }
+
+  // ---- what iterate.h asks for
+  static std::array<double, 1> values_of(Scalar value) { return {static_cast<double>(value)}; }
+  std::array<bool, 1> broken() const { return {broken_}; }
+  template <class Predicate>
+  void freeze_unless(const States&, const Predicate&) {}  // a lone sample stops by leaving the loop
+  template <class Function>
+  static auto map(const States& states, const Function& f) {
+    return std::array<decltype(f(states[0])), 1>{f(states[0])};
+  }
+  static T* select(const std::array<bool, 1>&, T*, T* remade) { return remade; }
 
  protected:
   bool broken_ = false;

@@ -25,7 +25,6 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
  public:
   using Vector = T*;
   using Scalar = T;
-  using States = std::array<SampleState, 1>;
 
   /// Vectors that the space itself keeps; two more where samples may have a start.
   static constexpr int64_t vectors(bool starts) { return starts ? 4 : 2; }
@@ -224,16 +223,7 @@ class SampleSpace : public SampleNumbers<T>, public SpaceDefaults<SampleSpace<T>
     if (where != 0) copy(from, to);
   }
 
-  std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
-  std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {system_.a().norm()}; }
-  template <class Predicate>
-  void freeze_unless(const States&, const Predicate&) {}  // a lone sample stops by leaving the loop
-  template <class Function>
-  auto map(const States& states, const Function& f) const {
-    return std::array{f(states[0])};
-  }
-  Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void reset() {
     broken_ = false;
     workspace_.clear(1);

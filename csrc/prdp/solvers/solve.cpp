@@ -126,7 +126,7 @@ SolveResult solve(const Operator& a, const at::Tensor& b, const SolveRequest& re
     a.jacobi_radius();  // raises
   auto found = gpu::solve(a, b, request);
   // A kernel looks at them on the device. None ran: the host does.
-  if (!found && gpu::takes(b, request.solver)) a.check_parameters(request.checks);
+  if (!found && gpu::may_run_kernel(b, request.solver)) a.check_parameters(request.checks);
   auto way = Way::kKernel;
   if (!found && b.is_cpu() && runs_on_loops(request.solver)) {
     way = Way::kLoops;

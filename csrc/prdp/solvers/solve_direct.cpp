@@ -35,6 +35,12 @@ at::Tensor largest_of(const at::Tensor& t) {
 }
 at::Tensor square_of(const at::Tensor& t) { return dot_in_order(t, t).view({-1}); }
 
+/// Which samples meet rtol by a u that is neither infinite nor subnormal, from numbers on the host.
+at::Tensor is_met(const at::Tensor& r2, const at::Tensor& b2, const at::Tensor& largest_of_u, double rtol,
+                  const at::Tensor& b) {
+  return r2.le(b2 * (rtol * rtol)) & largest_of_u.isfinite() & largest_of_u.ge(limits_of(b).least_normal);
+}
+
 /// Nothing if a sample is out of the ordinary or not solved. b is not scaled, which by powers of two changes no bit
 /// where no number leaves the range of the dtype.
 std::optional<SolveResult> solve_ordinary(const Operator& a, const at::Tensor& b, const SolveRequest& request) {
@@ -45,13 +51,12 @@ std::optional<SolveResult> solve_ordinary(const Operator& a, const at::Tensor& b
   const auto host = at::stack(told).to(at::kCPU, at::kDouble);
   const auto largest = host[0], b2 = host[1], r2 = host[2], largest_of_u = host[3];
   const double rtol = request.solver.rtol;
-  auto solved = largest.ge(least) & largest.le(most) & r2.le(b2 * (rtol * rtol)) & largest_of_u.isfinite() &
-                largest_of_u.ge(limits_of(b).least_normal);
+  auto solved = largest.ge(least) & largest.le(most) & is_met(r2, b2, largest_of_u, rtol, b);
   if (a.needs_projection()) {
     const double bound =
         b.scalar_type() == at::kFloat ? consistency_bound<float>(rtol) : consistency_bound<double>(rtol);
-    const auto whole = host[4].sqrt();
-    solved = solved & host[5].sqrt().le(bound * whole) & b2.sqrt().gt(epsilon_of(b) * whole);
+    const auto size_of_b = host[4].sqrt(), removed = host[5].sqrt();
+    solved = solved & removed.le(bound * size_of_b) & b2.sqrt().gt(epsilon_of(b) * size_of_b);
   }
   const auto zero = largest.eq(0) & largest_of_u.eq(0);
   if (!(solved | zero).all().item<bool>()) return std::nullopt;
@@ -68,12 +73,9 @@ std::optional<SolveResult> solve_scaled(const Operator& a, const at::Tensor& b, 
   const auto host = at::stack({number(batch.status), number(batch.inconsistent), square_of(batch.rhs), square_of(r),
                                number(largest_magnitude(u))})
                         .to(at::kCPU, at::kDouble);
-  const auto status = host[0].to(at::kLong), inconsistent = host[1], b2 = host[2], r2 = host[3], largest = host[4];
-  const auto solved = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter))
-                          .logical_and(inconsistent.eq(0))
-                          .logical_and(r2 <= b2 * (request.solver.rtol * request.solver.rtol))
-                          .logical_and(largest.isfinite())
-                          .logical_and(largest >= limits_of(b).least_normal);
+  const auto status = host[0].to(at::kLong), inconsistent = host[1], b2 = host[2], r2 = host[3], largest_of_u = host[4];
+  const auto solved = status.eq(static_cast<int64_t>(SolveStatus::kMaxIter)) & inconsistent.eq(0) &
+                      is_met(r2, b2, largest_of_u, request.solver.rtol, b);
   const auto zero = status.eq(static_cast<int64_t>(SolveStatus::kConverged));
   if (!solved.logical_or(zero).all().item<bool>()) return std::nullopt;
   if (zero.any().item<bool>()) u = at::where(per_sample(batch.takes_part, b), u, at::zeros_like(u));

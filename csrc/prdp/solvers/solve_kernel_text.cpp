@@ -15,19 +15,10 @@ namespace {
 /// Of GMRES: a thread keeps its triangle, so longer bases would fill the device with copies of it.
 constexpr int64_t kLongestBasis = 50;
 
-/// Bytes of the small arrays that a method's members take by array<X>(), each of whole eight bytes. A kernel traps
-/// where it takes more.
-int64_t bytes_of_arrays(Method method, int64_t restart, int64_t number) {
-  constexpr int64_t pointer = 8;
-  if (method == Method::kChebyshev) return 64 * number;        // the weights of as many sweeps
-  if (method == Method::kMinres) return 3 * pointer + 3 * 8;  // three vectors of its basis, and their weights
-  if (traits(method).counts != Counts::kCycles) return 0;
-  const int64_t columns = restart + 1;
-  constexpr int64_t of_column = 6;  // HessenbergProblem::kNumbersOfColumn
-  const int64_t of_triangle = hessenberg_column(restart), of_columns = of_column * columns;  // of HessenbergProblem
-  const int64_t of_rhs = 2 * restart, of_weights = 2 * columns;  // rhs_, damped_; again_, weights_ of GMRES
-  constexpr int64_t arrays = 8;  // those, u_ and products_
-  return columns * pointer + (of_triangle + of_columns + of_rhs + of_weights) * number + arrays * 8;
+/// Bytes of the arrays that a method's members take by array<X>(), each of whole eight bytes.
+int64_t bytes_of(const ArraySizes& sizes, int64_t number) {
+  constexpr int64_t pointer = 8, padding = 8;
+  return sizes.vectors * pointer + sizes.numbers * number + sizes.arrays * padding;
 }
 
 }  // namespace
@@ -52,19 +43,19 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
   // Coarse grids come first into the memory of the block, then the vectors of the finest one.
   const CycleMemory cycle = by_multigrid ? memory_of_cycle(b) : CycleMemory{};
   const int64_t of_block = blocks > 1 ? 0 : limits.block_memory / number;
-  const int64_t cycle_in_block = cycle.usual <= of_block ? cycle.usual : 0;
+  const int64_t cycle_in_block = cycle.if_all_axes <= of_block ? cycle.if_all_axes : 0;
   const int64_t in_block = std::min(vectors, (of_block - cycle_in_block) / unknowns);
 
   std::ostringstream text;
   text << "#include \"prdp/gpu/device/solve.h\"\n#include \"prdp/solvers/" << row.kernel_header << "\"\n"
        << "using namespace prdp::gpu;\n"
        << "using S = Setting<" << type_of(b.scalar_type()) << ", " << a.type << ", ";  // as setting.h names them
-  for (const int64_t n :
-       {blocks, threads, vectors, in_block, int64_t{solver.preconditioner.is_diagonal()},
-        int64_t{divides_by_diagonal(solver)}, bytes_of_arrays(solver.method, restart, number), restart})
+  for (const int64_t n : {blocks, threads, vectors, in_block, int64_t{solver.preconditioner.is_diagonal()},
+                          int64_t{divides_by_diagonal(solver)}, bytes_of(row.arrays(restart), number), restart})
     text << n << ", ";
   if (by_multigrid)
-    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.most << ">";
+    text << "CycleSetting<" << b.dim() - 2 << ", " << of_cycles << ", " << cycle_in_block << ", " << cycle.at_most
+         << ">";
   else text << "NoCycleSetting";
   text << ">;\nusing Method = prdp::" << row.kernel << "<BlockSpace<S>>;\n"
        << "using Arguments = SolveArguments<S::T>;\n"
@@ -72,7 +63,7 @@ SolveKernel solve_kernel(const OperatorView& a, bool is_saddle_point, const Solv
           "  PRDP_BLOCK_MEMORY(memory);\n"
           "  solve_batch<Method, S>(arguments, reinterpret_cast<S::T*>(memory));\n}\n";
   return {{text.str(), threads, (in_block * unknowns + cycle_in_block) * number, blocks},
-          (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.most};
+          (vectors - in_block) * unknowns + numbers_beyond(restart) + cycle.at_most};
 }
 
 }  // namespace prdp::gpu

@@ -2,8 +2,6 @@
 
 #include <ATen/core/grad_mode.h>
 
-#include <algorithm>
-
 #include "prdp/gpu/fall_back.h"
 #include "prdp/gpu/part_of.h"
 #include "prdp/gpu/team_memory.h"
@@ -45,9 +43,9 @@ NullSpaceArguments<T> arguments_of(const at::Tensor& basis, const at::Tensor& b,
 }
 
 /// A kernel, with all that its launch needs.
-struct Prepared {
+struct ReadyKernel {
   std::shared_ptr<const Kernel> kernel;
-  SolveKernel made;
+  SolveKernel spec;
   OperatorView a;
   at::Tensor hierarchy;  // undefined without cycles
 };
@@ -65,14 +63,12 @@ SolveInfo new_report(const at::Tensor& b, bool apart) {
 }
 
 template <class T>
-SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& request) {
-  const auto& [kernel, made, a, hierarchy] = of;
+SolveResult launch(const ReadyKernel& ready, const at::Tensor& b, const SolveRequest& request) {
+  const auto& [kernel, spec, a, hierarchy] = ready;
   const int64_t batch = b.size(0);
   SolveResult result{at::empty(b.sizes(), b.options()), new_report(b, request.report_apart)};
-  const int64_t blocks = made.source.blocks_of_team;
-  // Teams of several blocks meet, so all must be at work at once. Single blocks may queue.
-  const int64_t teams = std::min(batch, blocks > 1 ? kernel->teams() : 4 * kernel->teams());
-  const TeamMemory memory(blocks, teams, b.options(), teams * made.memory_of_team * b.element_size());
+  const int64_t blocks = spec.source.blocks_of_team, teams = kernel->teams_for(batch, blocks);
+  const TeamMemory memory(blocks, teams, b.options(), teams * spec.memory_of_team * b.element_size());
   const auto caps = request.caps ? request.caps->to(b.device(), at::kLong).contiguous() : at::Tensor();
   const auto x0 = request.x0.defined() ? request.x0.contiguous() : at::Tensor();
 
@@ -109,8 +105,8 @@ SolveResult launch(const Prepared& of, const at::Tensor& b, const SolveRequest& 
 }
 
 /// For A, or Aᵀ; `kept` may have its coarse grids, or keeps them. Nothing where there is no kernel.
-std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver,
-                                KeptHierarchy* kept) {
+std::optional<ReadyKernel> prepare(const Operator& a, bool transposed, const at::Tensor& b, const Solver& solver,
+                                   KeptHierarchy* kept) {
   auto* const runtime = runtime_of(b.device());
   if (!runtime || b.numel() == 0) return std::nullopt;
   const auto by_design = [](const std::string& reason) {
@@ -120,20 +116,20 @@ std::optional<Prepared> prepare(const Operator& a, bool transposed, const at::Te
   if (!has_kernel(solver)) return by_design(not_made(solver));
   auto view = a.gpu_view(b, transposed);
   if (!view) return by_design("this operator has no kernel");
-  return or_fall_back([&]() -> std::optional<Prepared> {
+  return or_fall_back([&]() -> std::optional<ReadyKernel> {
     const auto& m = solver.preconditioner;
     auto hierarchy = m.is_multigrid() && kept ? kept->get() : at::Tensor();
     std::optional<HierarchyKernel> maker;
     // The grids are those of the forward A, also where this is its transpose.
     if (m.is_multigrid() && !hierarchy.defined())
       maker = hierarchy_kernel(*runtime, *a.gpu_view(b, transposed != m.spec().transposed), b);
-    const auto made =
+    const auto spec =
         solve_kernel(*view, /*is_saddle_point=*/!a.has_coarse_grids(), solver, b, runtime->limits(b.device()));
-    auto kernel = runtime->kernel(b.device(), made.source);
+    auto kernel = runtime->kernel(b.device(), spec.source);
     note_made(std::string(traits(solver.method).label) + " of " + view->type);
     if (maker) hierarchy = make_hierarchy(*maker, b);
     if (maker && kept) kept->keep(hierarchy);
-    return Prepared{std::move(kernel), made, *std::move(view), std::move(hierarchy)};
+    return ReadyKernel{std::move(kernel), spec, *std::move(view), std::move(hierarchy)};
   });
 }
 
@@ -144,17 +140,17 @@ std::optional<SolveResult> solve(const Operator& a, const at::Tensor& b, const S
   if (!runtime) return std::nullopt;
   const at::NoGradGuard no_grad;
   const auto rhs = b.contiguous();
-  const auto prepared = prepare(a, /*transposed=*/false, rhs, request.solver, request.hierarchy);
-  if (!prepared) return std::nullopt;
-  const auto run = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
-  auto& trust = prepared->kernel->trust;
+  const auto ready = prepare(a, /*transposed=*/false, rhs, request.solver, request.hierarchy);
+  if (!ready) return std::nullopt;
+  const auto launch_as = rhs.scalar_type() == at::kFloat ? launch<float> : launch<double>;
+  auto& trust = ready->kernel->trust;
   return or_fall_back([&]() -> std::optional<SolveResult> {
     if (trust == Trust::kNone) throw Unavailable(kDisagrees);
-    auto found = run(*prepared, rhs, request);
-    constexpr int few = 3;  // a look waits for the device, and there may be nothing to judge, as where b is 0
-    const bool looks = trust == Trust::kUnknown && request.guarded && prepared->kernel->looks < few;
-    if (looks && !runtime->is_capturing(b.device())) {
-      ++prepared->kernel->looks;
+    auto found = launch_as(*ready, rhs, request);
+    constexpr int few = 3;  // a check waits for the device, and there may be nothing to judge, as where b is 0
+    const bool is_due = trust == Trust::kUnknown && request.guarded && ready->kernel->checks < few;
+    if (is_due && !runtime->is_capturing(b.device())) {
+      ++ready->kernel->checks;
       trust = verify_first_result(a, rhs, request, found);
       if (trust == Trust::kNone) throw Unavailable(kDisagrees);
     }
@@ -167,13 +163,13 @@ Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, 
   const Solver solver{Method::kMultigrid, 1, 0.0, kDefaultRestart, transposed ? m.transposed() : m};
   auto made = prepare(a, transposed, like, solver, /*kept=*/nullptr);
   if (!made || made->kernel->trust == Trust::kNone) return {};
-  return [prepared = *std::move(made), solver](const at::Tensor& v) {
-    const auto run = v.scalar_type() == at::kFloat ? launch<float> : launch<double>;
-    return run(prepared, v.contiguous(), {.solver = solver, .guarded = false}).u;
+  return [ready = *std::move(made), solver](const at::Tensor& v) {
+    const auto launch_as = v.scalar_type() == at::kFloat ? launch<float> : launch<double>;
+    return launch_as(ready, v.contiguous(), {.solver = solver, .guarded = false}).u;
   };
 }
 
-bool takes(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }
+bool may_run_kernel(const at::Tensor& b, const Solver& solver) { return runtime_of(b.device()) && has_kernel(solver); }
 
 void share_hierarchy(SolveOptions& options, const at::Tensor& b, int64_t solves) {
   if (options.hierarchy || !options.solver.preconditioner.is_multigrid() || !runtime_of(b.device())) return;

@@ -16,6 +16,6 @@ using Product = std::function<at::Tensor(const at::Tensor& v)>;
 Product make_cycle(const Operator& a, bool transposed, const Preconditioner& m, const at::Tensor& like);
 
 /// Whether solve() takes a kernel for vectors like b, if the operator has one: then the host need not wait for it.
-bool takes(const at::Tensor& b, const Solver& solver);
+bool may_run_kernel(const at::Tensor& b, const Solver& solver);
 
 }  // namespace prdp::gpu

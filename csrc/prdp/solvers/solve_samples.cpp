@@ -50,6 +50,44 @@ std::shared_ptr<const kernels::Factors<T>> factors_of(const kernels::Kernel<T>& 
   return traits(solver.method).is_direct ? a.factorise() : nullptr;
 }
 
+/// The samples that are to be iterated, from the first on: it reports on those in between.
+template <class T>
+class OpenSamples {
+ public:
+  OpenSamples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>* shared, const SampleBatch<T>& batch,
+              int64_t begin, int64_t end)
+      : kernels_(kernels), shared_(shared), batch_(batch), index_(begin - 1), end_(end) {}
+
+  /// Goes to the next one, and sets its system; false behind the last.
+  bool next() {
+    while (++index_ < end_) {
+      if (!shared_) own_ = kernels_.make(index_);
+      const auto* a = shared_ ? shared_->a.get() : own_.get();
+      given_ = given_sample(batch_, index_);
+      if (report_if_settled(batch_, index_, given_, a)) continue;
+      if (shared_ && is_set_) return true;
+      const auto& solver = batch_.solver;
+      is_set_ = system_.set(*a, solver.preconditioner, shared_ ? shared_->factors : factors_of(*a, solver));
+      if (is_set_) return true;
+      report(batch_, index_, zero_instead(SolveStatus::kZeroDiagonal));
+    }
+    return false;
+  }
+  int64_t index() const { return index_; }
+  const GivenSample<T>& given() const { return given_; }
+  const SampleSystem<T>& system() const { return system_; }
+
+ private:
+  const kernels::KernelBatch<T>& kernels_;
+  const SharedSystem<T>* shared_;
+  const SampleBatch<T>& batch_;
+  int64_t index_, end_;
+  std::unique_ptr<kernels::Kernel<T>> own_{};
+  GivenSample<T> given_{};
+  SampleSystem<T> system_{};
+  bool is_set_ = false;  // the system
+};
+
 }  // namespace
 
 template <class T>
@@ -68,49 +106,22 @@ std::unique_ptr<SharedSystem<T>> system_of(std::shared_ptr<const kernels::Kernel
 template <class T>
 void solve_samples(const kernels::KernelBatch<T>& kernels, const SharedSystem<T>* shared, const SampleBatch<T>& batch,
                    int64_t begin, int64_t end) {
-  std::unique_ptr<kernels::Kernel<T>> own;
-  SampleSystem<T> system;
-  const auto kernel_of = [&](int64_t s) -> const kernels::Kernel<T>* {
-    if (shared) return shared->a.get();
-    own = kernels.make(s);
-    return own.get();
-  };
-  int64_t s = begin;
-  GivenSample<T> sample{};
-  const kernels::Kernel<T>*a = nullptr, *in_system = nullptr;  // of sample s, and the one that the system is made of
-  const auto& solver = batch.solver;
-  // Goes to the next sample that is to be iterated, and sets its system; false behind the last.
-  const auto find_next = [&] {
-    for (; s < end; ++s) {
-      a = kernel_of(s);
-      sample = given_sample(batch, s);
-      if (report_if_settled(batch, s, sample, a)) continue;
-      if (shared && a == in_system) return true;
-      in_system = nullptr;
-      if (system.set(*a, solver.preconditioner, shared ? shared->factors : factors_of(*a, solver))) {
-        in_system = a;
-        return true;
-      }
-      report(batch, s, zero_instead(SolveStatus::kZeroDiagonal));
-    }
-    return false;
-  };
-  if (!find_next()) return;
-
+  OpenSamples<T> open(kernels, shared, batch, begin, end);
+  if (!open.next()) return;
   auto& workspace = kernels::Workspace<T>::local();
-  const int64_t restart = std::min(solver.restart, batch.unknowns);
+  const auto method = batch.solver.method;
+  const int64_t restart = std::min(batch.solver.restart, batch.unknowns);
   const bool starts = batch.x0 != nullptr;
-  workspace.prepare(SampleSpace<T>::vectors(starts) + vectors_of(solver.method, restart), a->length(),
-                    a->layout().halo);
-  SampleSpace<T> space(system, workspace, starts);
-  with_method(solver.method, restart, space, [&](auto method) {
+  const auto& a = open.system().a();
+  workspace.prepare(SampleSpace<T>::vectors(starts) + vectors_of(method, restart), a.length(), a.layout().halo);
+  SampleSpace<T> space(open.system(), workspace, starts);
+  with_method(method, restart, space, [&](auto iteration) {
     do {
-      const auto outcome = solve_sample(space, method, sample);
-      report(batch, s, outcome);
+      const auto outcome = solve_sample(space, iteration, open.given());
+      report(batch, open.index(), outcome);
       // Whatever a failure left in the padding must not reach the next sample.
       if (is_failure(outcome.status)) space.clear();
-      ++s;
-    } while (find_next());
+    } while (open.next());
   });
 }
 

@@ -14,14 +14,20 @@
 /// What methods are written against. A space has vectors and one number per sample for each of its samples:
 /// one sample on the CPU (sample_space.h) or a GPU (gpu/device/block_space.h), or a batch of plain tensors
 /// (tensor_space.h). The iterate, the residual and the directions of samples that the loop around the method has frozen
-/// keep their values; results such as that of apply() may be overwritten. A new method needs none of them but those
-/// that it calls. A new space needs the operations of each group; those of SpaceDefaults it may leave to that class,
-/// until fusing them is worth its lines.
+/// keep their values; results such as that of apply() may be overwritten. A new method needs only the operations that
+/// it calls. A new space needs all groups; what SpaceDefaults offers it may leave out.
 namespace prdp {
 
 /// A few numbers or handles of vectors that a method keeps beside its vectors, as array<X>() of the space gives them.
 template <class Space, class X>
 using ArrayOf = decltype(std::declval<const Space&>().template array<X>(int64_t{}));
+
+/// The arrays that a method's members take: entries of those of vectors and of numbers, and how many arrays. A kernel
+/// of a GPU has memory for no more.
+struct ArraySizes {
+  int64_t vectors = 0, numbers = 0, arrays = 0;
+};
+constexpr ArraySizes no_arrays(int64_t) { return {}; }
 
 /// Where column j of a Hessenberg matrix begins, which has j + 2 numbers. The columns lie one behind the other: on a
 /// GPU, each thread has a copy.
@@ -34,9 +40,9 @@ concept Primitives =
              typename S::Vector r, typename S::Scalar alpha, typename S::Scalar beta) {
       /// A vector of zeros, which the method keeps.
       { s.vector() } -> std::convertible_to<typename S::Vector>;
-      /// The right-hand side, scaled to the order of one; with a start, the residual of the start. And the squared norm
-      /// of what b() is now; SampleState::b2 keeps that of the right-hand side.
+      /// The right-hand side, scaled to the order of one; with a start, the residual of the start.
       { s.b() } -> std::convertible_to<typename S::Vector>;
+      /// ‖b()‖² as it is now; the norm of the original right-hand side is SampleState::b2.
       { s.b2() } -> std::convertible_to<typename S::Scalar>;
       /// Entries of a vector; unit roundoff, which is half the ε of the comments below.
       { s.unknowns() } -> std::same_as<int64_t>;
@@ -79,7 +85,7 @@ concept FusedOperations =
       s.keep_in_range(x);
       /// y = M⁻¹ x ≈ A⁻¹ x, without the powers of two that TensorSpace puts into apply() and precondition(): a method
       /// that calls this calls neither.
-      s.correct(x, y);
+      s.apply_cycle(x, y);
     };
 
 /// Numbers, one per sample: quotients that tell a breakdown from nothing left to do, and choices per sample, as 1 or 0.
@@ -232,7 +238,7 @@ class SpaceDefaults {
     return found;
   }
   void keep_in_range(auto&&) {}
-  void correct(const auto& x, auto&& y) { self().precondition(x, y); }
+  void apply_cycle(const auto& x, auto&& y) { self().precondition(x, y); }
 
  private:
   Space& self() { return static_cast<Space&>(*this); }

@@ -108,7 +108,7 @@ TensorSpace::Scalar TensorSpace::precondition(const Vector& v, Vector& out) {
   return dot(v, z);
 }
 
-void TensorSpace::correct(const Vector& v, Vector& out) {
+void TensorSpace::apply_cycle(const Vector& v, Vector& out) {
   const auto z = laid_out(system_.inverse(v));
   out = keep_frozen(system_.a.needs_projection() ? system_.a.project_solution(z) : z, out);
 }

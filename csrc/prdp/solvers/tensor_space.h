@@ -85,7 +85,7 @@ class TensorSpace : public SpaceDefaults<TensorSpace> {
     return in_loops_ ? apply_along(v, v, out) : SpaceDefaults::apply_with_dots(v, out);
   }
   std::array<Scalar, 2> apply_along(const Vector& v, const Vector& w, Vector& out);
-  void correct(const Vector& v, Vector& out);
+  void apply_cycle(const Vector& v, Vector& out);
 
   // ---- numbers, one per sample
 

@@ -87,7 +87,7 @@ struct SolveArguments {
   int64_t *iterations, *status, *applications;
   T *residual, *floor;
   T* memory;            // vectors that do not fit into a block, and what damping needs, for each team
-  unsigned* arrived;    // of each team, 32 apart
+  unsigned* arrived;    // of each team
   double* parts;        // of the sums of each team
   int64_t batch, max_iter;
   double rtol;
@@ -110,5 +110,8 @@ inline constexpr int kVectorsOfCycle = 3;
 
 /// Blocks of a team keep their parts of so many sums at once.
 inline constexpr int kMostAtOnce = 4;
+
+/// Of each team in `arrived` and, for each of its blocks, in `parts`, where two sums take turns.
+inline constexpr int kArrivedOfTeam = 32, kPartsOfBlock = 2 * kMostAtOnce;
 
 }  // namespace prdp::gpu

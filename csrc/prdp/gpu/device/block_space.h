@@ -33,7 +33,6 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   using A = typename S::A;
   using Vector = T*;
   using Scalar = T;
-  using States = std::array<SampleState, 1>;
   using typename Vectors::TeamOfSample;
   using Vectors::add;
   using Vectors::copy;
@@ -213,8 +212,6 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
   std::array<bool, 1> definite_factors() const { return {false}; }
 
   // ---- what iterate.h asks for
-  std::array<double, 1> values_of(Scalar value) const { return {static_cast<double>(value)}; }
-  std::array<bool, 1> broken() const { return {broken_}; }
   std::array<double, 1> operator_norm() const { return {norm_}; }
   std::array<bool, 1> surely_definite() {
     if constexpr (requires { a_.row_sum(0); })
@@ -222,13 +219,6 @@ class BlockSpace : public BlockVectors<S>, public SampleNumbers<typename S::T>, 
               largest_over_rows([&](int i) { return a_.row_sum(i); }) > 0};
     else return {false};
   }
-  template <class Predicate>
-  void freeze_unless(const States&, const Predicate&) {}
-  template <class Function>
-  auto map(const States& states, const Function& f) const {
-    return std::array<decltype(f(states[0])), 1>{f(states[0])};
-  }
-  Vector select(const std::array<bool, 1>&, Vector, Vector remade) const { return remade; }
   void reset() { broken_ = false; }
 
  private:

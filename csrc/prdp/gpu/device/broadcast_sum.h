@@ -4,8 +4,8 @@
 /// Sums over what samples, channels and points share.
 namespace prdp::gpu {
 
-/// Numbers (batch, channels, z, y, x), of which a tensor has an entry for each along the axes that are its own: those
-/// along the others add up. A sum of many is left in parts, in an order that the sizes alone tell.
+/// Sums an array (batch, channels, z, y, x) over the axes along which a tensor is broadcast. A long sum is left in
+/// `parts` partial sums, whose order depends on the sizes alone.
 struct BroadcastSum {
   static constexpr int kAxes = 5;
   int n[kAxes];

@@ -74,23 +74,28 @@ struct CoarsenedAxis {
     return k < between() ? k : -1;
   }
 
+  /// Entry `at` of line (o, k), which runs along the axis in a field of this extent; and the weights of point b
+  /// between.
+  int entry_of(int o, int at, int extent, int k) const { return (o * extent + at) * inner + k; }
+  int weight_of(int o, int b, int k) const { return entry_of(o % outer, b, between(), k); }
+
   /// At a coarse entry, the fine one there and its two neighbours with their weights.
   template <class V, class T>
   T restricted(const V& fine, const T* left, const T* right, int entry) const {
     const int k = entry % inner, row = entry / inner, j = row % coarse, o = row / coarse;
     const auto term = [&](const T* weight, int b) {
       if (b < 0) return T(0);
-      return weight[(o % outer * between() + b) * inner + k] * fine[(o * n + of_between(b)) * inner + k];
+      return weight[weight_of(o, b, k)] * fine[entry_of(o, of_between(b), n, k)];
     };
-    return fine[(o * n + of_coarse(j)) * inner + k] + term(right, before(j)) + term(left, after(j));
+    return fine[entry_of(o, of_coarse(j), n, k)] + term(right, before(j)) + term(left, after(j));
   }
   /// At a fine entry, what it takes of the coarse ones.
   template <class V, class T>
   T interpolated(const V& of_coarse, const T* left, const T* right, int entry) const {
-    const int k = entry % inner, row = entry / inner, a = row % n, o = row / n, half = a / 2;
-    const auto at = [&](int j) { return of_coarse[(o * coarse + j) * inner + k]; };
-    if (a % 2 == (periodic ? 0 : 1)) return at(half);
-    const int weight = (o % outer * between() + half) * inner + k;
+    const int k = entry % inner, row = entry / inner, place = row % n, o = row / n, half = place / 2;
+    const auto at = [&](int j) { return of_coarse[entry_of(o, j, coarse, k)]; };
+    if (place % 2 == (periodic ? 0 : 1)) return at(half);
+    const int weight = weight_of(o, half, k);
     const int before = periodic ? half : half - 1, after = periodic ? (half + 1) % coarse : half;
     return (before >= 0 ? left[weight] * at(before) : T(0)) + (after < coarse ? right[weight] * at(after) : T(0));
   }

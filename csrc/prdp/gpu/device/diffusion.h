@@ -10,7 +10,7 @@ inline constexpr int kZeroSide = 0, kPeriodicSide = 2, kRobinSide = 3;
 /// The same for each channel. The sides are those of z, y and x, the low one first. Numbers: the shift; 1/h along z, y
 /// and x; h of each side where that is a number. Tensors, where they are there: κ, the shift, h of each side.
 template <class T, class G, int kChannels, bool kHarmonic, int... kSides>
-class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, T> {
+class Diffusion : public OperatorRows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, T> {
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
 
@@ -39,7 +39,7 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   /// NaN where κ is not allowed.
   T largest_in_row(int i) const {
     const bool allowed = !(kappa_[i % G::kPoints] <= T(0));
-    return allowed ? Rows<Diffusion, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
+    return allowed ? OperatorRows<Diffusion, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
   }
   template <class F>
   void for_each_entry(int i, const F& f) const {
@@ -53,14 +53,14 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
   template <class F>
   void for_each_offset(int point, const F& f) const {
     T through = 0;
-    const auto couple = [&](T c, int axis, int cells) {
+    const auto report = [&](T c, int axis, int cells) {
       f(-c, axis == 0 ? cells : 0, axis == 1 ? cells : 0, axis == 2 ? cells : 0);
     };
     const auto inside = [&](T c, int, int axis, int cells) {
       through += c;
-      couple(c, axis, cells);
+      report(c, axis, cells);
     };
-    const T row_sum = for_each_face(point, inside, couple);
+    const T row_sum = for_each_face(point, inside, report);
     f(row_sum + through, 0, 0, 0);
   }
   /// Of row i: the shift and what the sides add. A is definite if that is never negative, and not always zero.
@@ -87,20 +87,20 @@ class Diffusion : public Rows<Diffusion<T, G, kChannels, kHarmonic, kSides...>, 
     const int point = i % G::kPoints;
     const G at(point);
     T row_sum = (shift_ ? shift_[point] : shift_number_) + T(0) * kappa_[point];  // NaN where κ is not finite
-    row_sum += couple<0, 0>(at, i, f, beyond) + couple<0, 1>(at, i, f, beyond);
-    row_sum += couple<1, 0>(at, i, f, beyond) + couple<1, 1>(at, i, f, beyond);
-    row_sum += couple<2, 0>(at, i, f, beyond) + couple<2, 1>(at, i, f, beyond);
+    row_sum += face<0, 0>(at, i, f, beyond) + face<0, 1>(at, i, f, beyond);
+    row_sum += face<1, 0>(at, i, f, beyond) + face<1, 1>(at, i, f, beyond);
+    row_sum += face<2, 0>(at, i, f, beyond) + face<2, 1>(at, i, f, beyond);
     return row_sum;
   }
   template <int axis, int end, class F, class Beyond>
-  T couple(const G& at, int i, const F& f, const Beyond& beyond) const {
+  T face(const G& at, int i, const F& f, const Beyond& beyond) const {
     constexpr int sides[] = {kSides...};
     constexpr int side = sides[2 * axis + end], extents[] = {G::kZ, G::kY, G::kX}, n = extents[axis];
     const int here = axis == 0 ? at.z : axis == 1 ? at.y : at.x, point = at.point();
     const T scale = inverse_width_[axis] * inverse_width_[axis];
     constexpr int cells = end == 0 ? -1 : 1;
-    constexpr bool closed = side == kPeriodicSide && n > 1;
-    const int next = moved<n, cells, closed>(here);
+    constexpr bool wraps = side == kPeriodicSide && n > 1;
+    const int next = moved<n, cells, wraps>(here);
     if (next >= 0) {
       constexpr int stride = axis == 0 ? G::kY * G::kX : axis == 1 ? G::kX : 1;
       const int there = point + (next - here) * stride;

@@ -26,20 +26,20 @@ struct DiffusionProductRule {
   double inverse_width[3];
   bool harmonic;
   const T* kappa;
-  T* of_kappa;
+  T* kappa_out;
   SideField<T> robin[6];
   BroadcastSum sums[kSums];  // the shift's, and each side's; of a side, the axis across it has one point
-  double* of_sums[kSums];
+  double* sums_out[kSums];
 
   void operator()(int i) const {
     const int entries = batch / pair.samples * pair.points;
     if (i < entries) {
-      of_kappa[i] = kappa_bar(i / pair.points, i % pair.points);
+      kappa_out[i] = kappa_bar(i / pair.points, i % pair.points);
       return;
     }
     i -= entries;
     for (int k = 0; k < kSums; ++k) {
-      if (i >= 0 && i < sums[k].count) of_sums[k][i] = k == 0 ? shift_bar(i) : robin_bar(k - 1, i);
+      if (i >= 0 && i < sums[k].count) sums_out[k][i] = k == 0 ? shift_bar(i) : robin_bar(k - 1, i);
       i -= sums[k].count;
     }
   }

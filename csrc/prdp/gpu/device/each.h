@@ -15,7 +15,7 @@ template <class Of>
 struct EachSample {
   Of of;
   int batch;
-  unsigned* arrived;  // of each team, 32 apart
+  unsigned* arrived;  // of each team
   double* parts;      // of the sums of each team
 };
 

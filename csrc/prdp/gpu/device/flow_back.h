@@ -11,13 +11,13 @@ struct FlowReverse {
   FlowField<const T> change_bar;
 
   /// The cotangent of the tendency at a face.
-  T given(int s, int c, const FlowPlace& p) const {
+  T tendency_bar(int s, int c, const FlowPlace& p) const {
     const T g = change_bar.at(s, c, p) * static_cast<T>(terms.dt);
     return terms.free ? g * terms.free.at(s, c, p) : g;
   }
   kernels::AdvectionBars<T> bars(int s, int c, int axis, const FlowPlace& p) const {
     const auto read = terms.point(s, c, axis, p);
-    const T diffusion = terms.diffusion(axis), quarter_dx = terms.quarter_dx(axis), g = given(s, c, p);
+    const T diffusion = terms.diffusion(axis), quarter_dx = terms.quarter_dx(axis), g = tendency_bar(s, c, p);
     return terms.upwind ? kernels::advected_back<true>(read, diffusion, quarter_dx, g)
                         : kernels::advected_back<false>(read, diffusion, quarter_dx, g);
   }
@@ -27,38 +27,38 @@ struct FlowReverse {
     const auto& grid = terms.grid;
     const int own = 2 - c;
     T sum = 0;
-    const auto from = [&](int channel, int axis, const FlowPlace& reader, auto&& part) {
+    const auto add_reader = [&](int channel, int axis, const FlowPlace& reader, auto&& part) {
       if (grid.has(reader)) sum += part(bars(s, channel, axis, reader));
     };
     using Bars = kernels::AdvectionBars<T>;
     for (int a = grid.first_axis(); a < 3; ++a) {
       const bool is_own = a == own;
-      from(c, a, q.moved(a, 1), [&](const Bars& b) { return is_own ? b.before + b.low : b.before; });
-      from(c, a, q, [&](const Bars& b) { return is_own ? b.here + (b.low + b.high) : b.here; });
-      from(c, a, q.moved(a, -1), [&](const Bars& b) { return is_own ? b.after + b.high : b.after; });
+      add_reader(c, a, q.moved(a, 1), [&](const Bars& b) { return is_own ? b.before + b.low : b.before; });
+      add_reader(c, a, q, [&](const Bars& b) { return is_own ? b.here + (b.low + b.high) : b.here; });
+      add_reader(c, a, q.moved(a, -1), [&](const Bars& b) { return is_own ? b.after + b.high : b.after; });
       if (is_own) continue;
       // c carries the component along a through edges along its own axis.
       const auto low = [](const Bars& b) { return b.low; };
       const auto high = [](const Bars& b) { return b.high; };
       const int carried = 2 - a;
-      from(carried, own, q, low);
-      from(carried, own, q.moved(a, 1), low);
-      from(carried, own, q.moved(own, -1), high);
-      from(carried, own, q.moved(own, -1).moved(a, 1), high);
+      add_reader(carried, own, q, low);
+      add_reader(carried, own, q.moved(a, 1), low);
+      add_reader(carried, own, q.moved(own, -1), high);
+      add_reader(carried, own, q.moved(own, -1).moved(a, 1), high);
     }
     return sum;
   }
 
-  /// Of a value, with those of the ghosts that were made of it along the axes that `fold` says.
-  T with_ghosts(int s, int c, const FlowPlace& q, const bool (&fold)[3]) const {
+  /// Of a value, with those of the ghosts that were made of it along the axes that `reflects` marks.
+  T with_ghosts(int s, int c, const FlowPlace& q, const bool (&reflects)[3]) const {
     const auto& grid = terms.grid;
     T sum = 0;
-    for (int images = 0; images < 8; ++images) {
+    for (int reflected_axes = 0; reflected_axes < 8; ++reflected_axes) {
       T factor = 1;
       auto image = q;
       bool exists = true;
       for (int a = 0; a < 3 && exists; ++a)
-        if (images >> a & 1) exists = fold[a] && a >= grid.first_axis() && reflect(a, c, image, factor);
+        if (reflected_axes >> a & 1) exists = reflects[a] && a >= grid.first_axis() && reflect(a, c, image, factor);
       if (exists && factor != T(0)) sum += factor * of_padded(s, c, image);
     }
     return sum;
@@ -97,7 +97,7 @@ struct FlowStateBars {
   T of_velocity(int s, int c, const FlowPlace& p) const {
     const auto& terms = reverse.terms;
     T sum = velocity_bar.at(s, c, p) + reverse.with_ghosts(s, c, p, {true, true, true});
-    if (terms.friction) sum -= terms.nu.value() * (terms.friction.at(s, c, p) * reverse.given(s, c, p));
+    if (terms.friction) sum -= terms.nu.value() * (terms.friction.at(s, c, p) * reverse.tendency_bar(s, c, p));
     return sum;
   }
 };
@@ -108,7 +108,7 @@ struct FlowEndBars {
   FlowField<const T> inlet;  // of an inflow
   int axis;
   bool high;
-  bool fold[3];  // the axes whose ghosts were made of those here
+  bool reflects[3];  // the axes whose ghosts were made of those here
   FlowField<T> out;
   int count;
 
@@ -118,7 +118,7 @@ struct FlowEndBars {
     faces.n[axis] = 1;
     const int cells = faces.cells(), field = i / cells, s = field / faces.dim, c = field % faces.dim;
     const auto p = faces.place(i % cells);
-    T sum = 2 * state.reverse.with_ghosts(s, c, p.moved(axis, high ? last : -1), fold);
+    T sum = 2 * state.reverse.with_ghosts(s, c, p.moved(axis, high ? last : -1), reflects);
     if (inlet) sum += inlet.at(s, c, p) * state.of_velocity(s, c, p);
     out.at(s, c, p) = sum;
   }
@@ -141,7 +141,7 @@ struct FlowViscosityBars {
     for (int a = grid.first_axis(); a < 3; ++a)
       sum += static_cast<double>(reverse.bars(s, c, a, p).diffusion) / (grid.dx[a] * grid.dx[a]);
     if (terms.friction)
-      sum -= static_cast<double>(terms.friction.at(s, c, p) * reverse.given(s, c, p)) *
+      sum -= static_cast<double>(terms.friction.at(s, c, p) * reverse.tendency_bar(s, c, p)) *
              static_cast<double>(terms.point(s, c, 2 - c, p).here);
     if (!diffused) return sum;
     const double bar = static_cast<double>(lambda.at(s, c, p)), nu = static_cast<double>(terms.nu.value());
@@ -190,7 +190,8 @@ struct FlowBars {
     const auto& reverse = state.reverse;
     using At = int[BroadcastSum::kAxes];
     if (i < force.count) {
-      force_out[i] = force.sum(i, [&](const At& at) { return reverse.given(at[0], at[1], {{at[2], at[3], at[4]}}); });
+      force_out[i] =
+          force.sum(i, [&](const At& at) { return reverse.tendency_bar(at[0], at[1], {{at[2], at[3], at[4]}}); });
       return;
     }
     i -= force.count;

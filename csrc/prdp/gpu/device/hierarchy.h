@@ -164,7 +164,7 @@ class HierarchyMaker {
   /// The fine point of weight w: it lies between two coarse ones.
   static int point_of_weight(const CoarsenedAxis& line, int w) {
     const int row = w / line.inner, at = line.of_between(row % line.between());
-    return (row / line.between() * line.n + at) * line.inner + w % line.inner;
+    return line.entry_of(row / line.between(), at, line.n, w % line.inner);
   }
 
   /// Of a symmetric operator, interpolation and restriction are the same; else interpolation comes from the symmetric
@@ -230,7 +230,7 @@ class HierarchyMaker {
           before(line.before(j)),
           after(line.after(j)) {
       for (int p = 0; p < 3; ++p)
-        fine[p] = (outer * line.n + (line.of_coarse(j) + p - 1 + line.n) % line.n) * line.inner + inner;
+        fine[p] = line.entry_of(outer, (line.of_coarse(j) + p - 1 + line.n) % line.n, line.n, inner);
     }
   };
 
@@ -240,7 +240,7 @@ class HierarchyMaker {
     const auto weight = shared(weights);
     const int of_left = 0, of_right = line.weights(), restriction = symmetric_ ? 0 : 2 * line.weights();
     const auto restrict_by = [&](int field, int between) {
-      return weight[restriction + field + (at.outer * line.between() + between) * line.inner + at.inner];
+      return weight[restriction + field + line.weight_of(at.outer, between, at.inner)];
     };
     const auto interpolate_by = [&](int field, int between) {
       const int index = weight_of_column(a, line, axis, at.fine[1], offset, between);
@@ -321,15 +321,13 @@ class HierarchyMaker {
   bool symmetric_ = true;  // the operator; interpolation and restriction then have the same weights
 };
 
-/// The body of a kernel: each team takes one sample after the other.
+/// The body of a kernel.
 template <class S>
 void make_hierarchies(const HierarchyArguments<typename S::T>& of) {
-  const int team = static_cast<int>(blockIdx.x) / S::kBlocks, rank = static_cast<int>(blockIdx.x) % S::kBlocks;
-  Team<S::kBlocks, S::kThreads> threads(rank, of.arrived + 32 * team, of.parts + 2 * kMostAtOnce * S::kBlocks * team);
-  for (int64_t sample = team; sample < of.samples; sample += static_cast<int>(gridDim.x) / S::kBlocks) {
-    HierarchyMaker<S> maker(threads, of, sample, of.work + numbers_of_inverse(kMostOfCoarsest) * team);
+  for_samples_of_team<S::kBlocks, S::kThreads>(of, of.samples, [&](int64_t sample, auto& team, int number) {
+    HierarchyMaker<S> maker(team, of, sample, of.work + numbers_of_inverse(kMostOfCoarsest) * number);
     maker.make(typename S::A(of.a, sample));
-  }
+  });
 }
 
 }  // namespace prdp::gpu

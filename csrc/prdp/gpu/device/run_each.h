@@ -13,9 +13,8 @@ void run(const EachPoint<Of>& loop) {
 
 template <int kBlocks, int kThreads, class Of>
 void run(const EachSample<Of>& loop) {
-  const int number = static_cast<int>(blockIdx.x) / kBlocks, rank = static_cast<int>(blockIdx.x) % kBlocks;
-  Team<kBlocks, kThreads> team(rank, loop.arrived + 32 * number, loop.parts + 2 * kMostAtOnce * kBlocks * number);
-  for (int sample = number; sample < loop.batch; sample += static_cast<int>(gridDim.x) / kBlocks) loop.of(sample, team);
+  for_samples_of_team<kBlocks, kThreads>(
+      loop, loop.batch, [&](int64_t sample, auto& team, int) { loop.of(static_cast<int>(sample), team); });
 }
 
 }  // namespace prdp::gpu

@@ -37,24 +37,22 @@ SampleOutcome solve_sample_of(const SolveArguments<typename S::T>& of, int64_t s
   return solve_sample(space, method, given);
 }
 
-/// The body of a kernel: each team takes one sample after the other.
+/// The body of a kernel.
 template <class Method, class S>
 void solve_batch(const SolveArguments<typename S::T>& of, typename S::T* in_block) {
   using T = typename S::T;
   using Space = BlockSpace<S>;
-  const int team = static_cast<int>(blockIdx.x) / S::kBlocks, rank = static_cast<int>(blockIdx.x) % S::kBlocks;
-  typename Space::TeamOfSample threads(rank, of.arrived + 32 * team, of.parts + 2 * kMostAtOnce * S::kBlocks * team);
-  for (int64_t sample = team; sample < of.batch; sample += static_cast<int>(gridDim.x) / S::kBlocks) {
-    Space space(threads, typename S::A(of.a, sample), of, sample, in_block, of.memory + Space::kNumbersBeyond * team);
+  for_samples_of_team<S::kBlocks, S::kThreads>(of, of.batch, [&](int64_t sample, auto& team, int number) {
+    Space space(team, typename S::A(of.a, sample), of, sample, in_block, of.memory + Space::kNumbersBeyond * number);
     const SampleOutcome outcome = solve_sample_of<Method, S>(of, sample, space);
     if (outcome.is_zero) space.fill_zero(of.u + sample * Space::unknowns());
-    if (!threads.leads()) continue;
+    if (!team.leads()) return;
     of.iterations[sample] = outcome.iterations;
     of.status[sample] = static_cast<int64_t>(outcome.status);
     of.applications[sample] = outcome.applications;
     of.residual[sample] = static_cast<T>(outcome.residual);
     of.floor[sample] = static_cast<T>(outcome.floor);
-  }
+  });
 }
 
 }  // namespace prdp::gpu

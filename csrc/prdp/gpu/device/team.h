@@ -154,4 +154,15 @@ class Team {
   int turn_ = 0;
 };
 
+/// The body of a kernel: f(sample, team, its number) for each of the samples, one after the other for each team.
+/// `arguments` say where the blocks of teams meet.
+template <int kBlocks, int kThreads, class Arguments, class F>
+void for_samples_of_team(const Arguments& arguments, int64_t samples, const F& f) {
+  const int number = static_cast<int>(blockIdx.x) / kBlocks, rank = static_cast<int>(blockIdx.x) % kBlocks;
+  Team<kBlocks, kThreads> team(rank, arguments.arrived + kArrivedOfTeam * number,
+                               arguments.parts + kPartsOfBlock * kBlocks * number);
+  for (int64_t sample = number; sample < samples; sample += static_cast<int>(gridDim.x) / kBlocks)
+    f(sample, team, number);
+}
+
 }  // namespace prdp::gpu

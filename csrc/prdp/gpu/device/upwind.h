@@ -74,7 +74,7 @@ class Upwind {
 
 /// The same block for every channel; its winds are means at the faces.
 template <class T, class G, int kChannels, bool kTransposed>
-class Burgers : public Rows<Burgers<T, G, kChannels, kTransposed>, T> {
+class Burgers : public OperatorRows<Burgers<T, G, kChannels, kTransposed>, T> {
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
 
@@ -151,7 +151,7 @@ class PressureLaplacian {
 /// [[C₁, 0, G₁], [0, C₂, G₂], [D₁, D₂, 0]] on a staggered grid: u₁ on the left faces, u₂ on the bottom faces, p in the
 /// centres of the cells.
 template <class T, class G, bool kTransposed>
-class NavierStokes : public Rows<NavierStokes<T, G, kTransposed>, T> {
+class NavierStokes : public OperatorRows<NavierStokes<T, G, kTransposed>, T> {
  public:
   static constexpr int kUnknowns = 3 * G::kPoints;
 

@@ -130,7 +130,7 @@ class Laplacian {
 /// An operator that says which entries stand in a row: for_each_entry(i, f) calls f(a_ij, j), where several may have
 /// the same j.
 template <class View, class T>
-class Rows {
+class OperatorRows {
  public:
   static constexpr bool kKnowsRadius = false;
   static constexpr bool kIsScaled = false;
@@ -170,7 +170,8 @@ class Rows {
 /// or (Aᵀ v)[i] = Σ_k c_k[i - offset_k] v[i - offset_k].
 template <class T, class G, int kChannels, bool kTransposed, bool periodic_z, bool periodic_y, bool periodic_x,
           class... Offsets>
-class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, periodic_y, periodic_x, Offsets...>, T> {
+class Stencil
+    : public OperatorRows<Stencil<T, G, kChannels, kTransposed, periodic_z, periodic_y, periodic_x, Offsets...>, T> {
  public:
   static constexpr int kUnknowns = kChannels * G::kPoints;
 
@@ -230,7 +231,7 @@ class Stencil : public Rows<Stencil<T, G, kChannels, kTransposed, periodic_z, pe
 
 /// Tensors: A, n rows of n entries.
 template <class T, int n, bool kTransposed>
-class Dense : public Rows<Dense<T, n, kTransposed>, T> {
+class Dense : public OperatorRows<Dense<T, n, kTransposed>, T> {
  public:
   static constexpr int kUnknowns = n;
 
@@ -249,7 +250,7 @@ class Dense : public Rows<Dense<T, n, kTransposed>, T> {
 
 /// Tensors: the ends of the rows, n + 1 from 0 on; columns; values. Number: how many values are stored.
 template <class T, int n>
-class Csr : public Rows<Csr<T, n>, T> {
+class Csr : public OperatorRows<Csr<T, n>, T> {
  public:
   static constexpr int kUnknowns = n;
 
@@ -261,7 +262,7 @@ class Csr : public Rows<Csr<T, n>, T> {
 
   /// NaN where the row has no place among the stored values, or a column none in A: nothing reads such an A.
   T largest_in_row(int i) const {
-    return is_row(i) ? Rows<Csr, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
+    return is_row(i) ? OperatorRows<Csr, T>::largest_in_row(i) : std::numeric_limits<T>::quiet_NaN();
   }
 
   template <class F>

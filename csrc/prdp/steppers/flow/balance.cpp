@@ -25,7 +25,7 @@ Projected balance(const FlowEquation& e, const at::Tensor& change, const SolveOp
   if (!is_incremental(e)) return {change, {}};
   const double limit = largest_viscosity(e);
   if (flow_kernels::can_run(change)) {
-    const ByKernels by{
+    const ProjectionLaunch by{
         {.added = {change}}, {.added = {change}, .share_by_nu = e.nu, .largest_nu = limit}, {.factor = -1.0}};
     if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u, found->potential};
   }
@@ -41,10 +41,11 @@ FlowParts change_back(const FlowEquation& e, const FlowParts& cotangent, const a
                       const SolveOptions& options, CombinedInfo& info) {
   const double limit = largest_viscosity(e);
   if (flow_kernels::can_run(cotangent[0])) {
-    const ByKernels by{{.added = cotangent, .potential_bar = potential_bar, .share_by_nu = e.nu, .largest_nu = limit},
-                       {.added = cotangent},
-                       {.factor = scale_of_pressure(*e.box)},
-                       /*reverse=*/true};
+    const ProjectionLaunch by{
+        {.added = cotangent, .potential_bar = potential_bar, .share_by_nu = e.nu, .largest_nu = limit},
+        {.added = cotangent},
+        {.factor = scale_of_pressure(*e.box)},
+        /*reverse=*/true};
     if (const auto found = project_by_kernels(*e.box, by, options, info)) return {found->u};
   }
   const auto& free = e.box->fields(cotangent[0].options()).free;

@@ -7,8 +7,9 @@ namespace prdp {
 /// The change of the velocity by the explicit part, without the pressure that balances it, and dt times this pressure:
 /// undefined where it is left to the projection after the diffusion. Differentiable.
 ///
-/// A change that is all pressure, as that of a steady flow, must not be diffused: beside walls, what is left of a
-/// gradient after diffusion is none. Where all faces are free, the two commute, and the step is the same without this.
+/// A change that is a pure pressure gradient, as in a steady flow, must be removed first: next to walls, diffusion
+/// turns a gradient into something that projection does not remove. Where all faces are free, diffusion and projection
+/// commute, and the step is the same without this.
 Projected balance(const FlowEquation& equation, const at::Tensor& change, const SolveOptions& options,
                   CombinedInfo& info);
 

@@ -32,7 +32,7 @@ SolveInfo CombinedInfo::info(const at::Tensor& refused) const {
   return all;
 }
 
-at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info) {
+at::Tensor counted_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info) {
   // Within a node of autograd there is nothing to record, and what is kept between solves does not cross a dispatcher.
   const bool at_once = !at::GradMode::is_enabled() && is_plain(b) && all_plain(a.tensors) && !has_tangent(b) &&
                        all_plain(options.solver.preconditioner.spec().tensors);
@@ -41,8 +41,8 @@ at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions&
   return result.u;
 }
 
-SystemVjp solve_vjp(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
-                    const SolveOptions& options, CombinedInfo& info) {
+SystemVjp counted_adjoint_solve(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
+                                const SolveOptions& options, CombinedInfo& info) {
   std::vector<int64_t> needed(a.tensors.size() + 1, 0);
   needed[0] = 1;
   needed[1] = u.defined();

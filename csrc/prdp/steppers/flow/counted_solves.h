@@ -16,12 +16,12 @@ class CombinedInfo {
 };
 
 /// A u = b, differentiable in b and the tensors of A.
-at::Tensor solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info);
+at::Tensor counted_solve(const OperatorSpec& a, const at::Tensor& b, const SolveOptions& options, CombinedInfo& info);
 /// The cotangent of b from that of u, by one adjoint solve; and that of the first tensor of A where `u` is given.
 struct SystemVjp {
   at::Tensor b, coefficients;
 };
-SystemVjp solve_vjp(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
-                    const SolveOptions& options, CombinedInfo& info);
+SystemVjp counted_adjoint_solve(const OperatorSpec& a, const at::Tensor& cotangent, const at::Tensor& u,
+                                const SolveOptions& options, CombinedInfo& info);
 
 }  // namespace prdp

@@ -34,7 +34,8 @@ FlowParts diffuse(const FlowEquation& equation, const std::vector<OperatorSpec>&
   const auto width = change.size(1) / static_cast<int64_t>(operators.size());
   FlowParts parts;
   for (size_t k = 0; k < operators.size(); ++k)
-    parts.push_back(solve(operators[k], change.narrow(1, static_cast<int64_t>(k) * width, width), options, info));
+    parts.push_back(
+        counted_solve(operators[k], change.narrow(1, static_cast<int64_t>(k) * width, width), options, info));
   const auto& free = equation.box->fields(change.options()).free;
   if (flow_kernels::can_run(change)) return parts;
   const auto all = joined(parts);
@@ -52,7 +53,7 @@ DiffuseVjp diffuse_vjp(const FlowEquation& equation, const std::vector<OperatorS
     const auto of_system = [&](const at::Tensor& t) {
       return t.defined() ? t.narrow(1, static_cast<int64_t>(k) * width, width) : t;
     };
-    const auto found = solve_vjp(operators[k], of_system(cotangent), of_system(result), options, info);
+    const auto found = counted_adjoint_solve(operators[k], of_system(cotangent), of_system(result), options, info);
     parts.push_back(found.b);
     if (!found.coefficients.defined()) continue;
     const auto share = total(found.coefficients * patterns[k]) * equation.dt;

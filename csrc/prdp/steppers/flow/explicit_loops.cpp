@@ -16,11 +16,11 @@ namespace {
 using kernels::AdvectionTerm;
 
 /// A field with ghosts in memory: axes z, y, x; in 2D there is one plane without ghosts.
-struct PaddedGrid {
+struct GhostedGrid {
   int64_t n[3], stride[3], field;
   int64_t first;  // of the cells
 
-  explicit PaddedGrid(const FlowBox& box) : n{1, 1, 1}, first(0) {
+  explicit GhostedGrid(const FlowBox& box) : n{1, 1, 1}, first(0) {
     int64_t size = 1;
     for (int64_t a = 2; a >= 0; --a) {
       const int64_t axis = a - (3 - box.dim());
@@ -43,7 +43,7 @@ struct PaddedGrid {
 
 /// f(component's channel, channel of the velocity along the axis, the term, 1/dx²) for all terms.
 template <class T, class F>
-void for_each_term(const FlowEquation& e, const PaddedGrid& grid, double nu, const F& f) {
+void for_each_term(const FlowEquation& e, const GhostedGrid& grid, double nu, const F& f) {
   const auto& box = *e.box;
   const int64_t d = box.dim();
   for (int64_t along = 0; along < d; ++along)
@@ -72,7 +72,7 @@ void add_back(const AdvectionTerm<T>& t, const T* bars, T* c_bar, T* w_bar, int6
 
 template <class T>
 void run(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out) {
-  const PaddedGrid grid(*e.box);
+  const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells();
   const double nu = e.nu.item<double>();
   const T* given = padded.const_data_ptr<T>();
@@ -91,7 +91,7 @@ void run(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& out)
 
 template <class T>
 double run_back(const FlowEquation& e, const at::Tensor& padded, const at::Tensor& g, const at::Tensor& bar) {
-  const PaddedGrid grid(*e.box);
+  const GhostedGrid grid(*e.box);
   const int64_t d = e.box->dim(), cells = grid.cells(), n = grid.n[2];
   const double nu = e.nu.item<double>();
   const T *values = padded.const_data_ptr<T>(), *cotangents = g.const_data_ptr<T>();
@@ -163,7 +163,7 @@ at::Tensor courant_numbers_by_loops(const FlowEquation& equation, const at::Tens
   AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "courant_numbers", [&] {
     const auto* values = given.const_data_ptr<scalar_t>();
     auto* found = out.mutable_data_ptr<scalar_t>();
-    const int64_t cells = PaddedGrid(*equation.box).cells(), d = equation.box->dim();
+    const int64_t cells = GhostedGrid(*equation.box).cells(), d = equation.box->dim();
     for_each_sample(u, [&](int64_t s) { run_courant(equation, values + s * d * cells, cells, found + s); });
   });
   return out;

@@ -30,8 +30,8 @@ SolveOptions without_log(SolveOptions options) {
 at::Tensor flow_project(const FlowEquation& equation, const at::Tensor& u, const SolveOptions& options) {
   equation.check(u);
   CombinedInfo info;
-  return project(*equation.box, with_boundary_values(equation.for_state(u), u), /*added=*/{}, /*potential=*/{},
-                 without_log(options), info)
+  return project_sum(*equation.box, with_boundary_values(equation.for_state(u), u), /*added=*/{}, /*potential=*/{},
+                     without_log(options), info)
       .u;
 }
 

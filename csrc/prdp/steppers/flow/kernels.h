@@ -55,8 +55,8 @@ at::Tensor diffusion_coefficients(const FlowEquation& equation, const at::Tensor
 /// The reports of solves as one; `refused` as above. Undefined parts where there is no kernel.
 std::optional<SolveInfo> joined_reports(const std::vector<SolveInfo>& infos, const at::Tensor& refused);
 
-/// What ν acted on after the explicit part: a change of the velocity, what balance() made of it with which potential,
-/// and what diffuse() made of that; λ and the cotangent of the potential are what comes back. Empty: it did not.
+/// What the gradient of ν needs of the implicit diffusion. Forward: the change, the result of balance() with its
+/// potential, the result of diffuse(). Backward: λ and the cotangent of the potential. Empty if diffusion is explicit.
 struct ImplicitPart {
   at::Tensor change = {}, balanced = {}, potential = {};
   FlowParts diffused = {}, lambda = {};

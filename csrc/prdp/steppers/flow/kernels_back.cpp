@@ -55,11 +55,11 @@ gpu::FlowEndBars<T> end_bars_of(const FlowBox& box, const End& end) {
   gpu::FlowEndBars<T> of{.inlet = field_of<const T>(is_inflow ? box.fields(end.bar.options()).inlet : at::Tensor()),
                          .axis = static_cast<int>(end.axis + 3 - box.dim()),
                          .high = end.high,
-                         .fold = {},
+                         .reflects = {},
                          .out = field_of<T>(end.bar),
                          .count = static_cast<int>(end.bar.numel())};
   for (int64_t other = 0; other < box.dim(); ++other)  // with_ghosts() makes the open axis' ghosts first
-    of.fold[other + 3 - box.dim()] =
+    of.reflects[other + 3 - box.dim()] =
         is_inflow ? other != end.axis : other > end.axis && box.boundary(other) != FlowBoundary::kOpen;
   return of;
 }

@@ -91,28 +91,29 @@ at::Tensor flow_divergence(const FlowBox& box, const at::Tensor& u, double facto
   return masked(sum.unsqueeze(1), cells);
 }
 
-std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ByKernels& by,
+std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ProjectionLaunch& by,
                                                           const SolveOptions& options, CombinedInfo& info) {
   const double factor = by.reverse ? 1.0 : -scale_of_pressure(box);
-  const auto b = flow_kernels::divergence(box, by.given, factor, /*for_a_solve=*/true);
+  const auto b = flow_kernels::divergence(box, by.to_project, factor, /*for_a_solve=*/true);
   if (!b.defined()) return std::nullopt;
   const auto a = pressure_operator(box, b);
   const auto o = for_pressure(box, b, options);
-  const auto found = by.reverse ? solve_vjp(a, b, {}, o, info).b : solve(a, b, o, info);
-  return flow_kernels::correct(box, by.corrected, found, by.how);
+  const auto found = by.reverse ? counted_adjoint_solve(a, b, {}, o, info).b : counted_solve(a, b, o, info);
+  return flow_kernels::correct(box, by.to_correct, found, by.how);
 }
 
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info) {
   const auto& fields = box.fields(u.options());
   const auto b = flush_subnormals(without_means(box, flow_divergence(box, u, -scale_of_pressure(box))));
   // A preconditioner may leave something in the cells of solids.
-  const auto found = masked(solve(pressure_operator(box, u), b, for_pressure(box, b, options), info), fields.cells);
+  const auto found =
+      masked(counted_solve(pressure_operator(box, u), b, for_pressure(box, b, options), info), fields.cells);
   const auto phi = without_means(box, found);
   return {add_gradient(box, u, phi, -1.0, fields.free), phi};
 }
 
-Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
-                  const SolveOptions& options, CombinedInfo& info) {
+Projected project_sum(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
+                      const SolveOptions& options, CombinedInfo& info) {
   const bool by_kernels = flow_kernels::can_run(u);
   if (by_kernels) {
     const flow_kernels::UncorrectedVelocity of{.base = u, .added = added};
@@ -132,10 +133,10 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   if (flow_kernels::can_run(cotangent)) {
     const flow_kernels::CorrectionOptions how{scale_of_pressure(box), /*on_all_faces=*/true,
                                               /*wants_on_free_faces=*/true};
-    const ByKernels by{{.added = {cotangent}, .potential_bar = potential_bar, .refused = refused},
-                       {.base = cotangent, .refused = refused},
-                       how,
-                       /*reverse=*/true};
+    const ProjectionLaunch by{{.added = {cotangent}, .potential_bar = potential_bar, .refused = refused},
+                              {.base = cotangent, .refused = refused},
+                              how,
+                              /*reverse=*/true};
     if (const auto found = project_by_kernels(box, by, options, info)) return {found->u, found->on_free_faces};
     const auto to_clear = refused.defined() ? refused.ne(0) : at::Tensor();
     cotangent = cleared(cotangent, to_clear);
@@ -148,7 +149,8 @@ ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor pote
   if (potential_bar.defined()) phi_bar = without_means(box, phi_bar);
   phi_bar = flush_subnormals(phi_bar);
   const auto a = pressure_operator(box, cotangent);
-  const auto b_bar = without_means(box, solve_vjp(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
+  const auto b_bar =
+      without_means(box, counted_adjoint_solve(a, phi_bar, {}, for_pressure(box, phi_bar, options), info).b);
   const auto u_bar = add_gradient(box, cotangent, masked(b_bar, fields.cells), scale_of_pressure(box), {});
   return {u_bar, masked(u_bar, fields.free)};
 }

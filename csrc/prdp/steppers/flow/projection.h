@@ -16,8 +16,8 @@ struct Projected {
 Projected project(const FlowBox& box, const at::Tensor& u, const SolveOptions& options, CombinedInfo& info);
 /// The projection of u + added, where `added` is zero on the faces that are not free; `potential` is added to φ. Both
 /// may be absent.
-Projected project(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
-                  const SolveOptions& options, CombinedInfo& info);
+Projected project_sum(const FlowBox& box, const at::Tensor& u, const FlowParts& added, const at::Tensor& potential,
+                      const SolveOptions& options, CombinedInfo& info);
 /// The cotangent of u from that of the projected one, the same projection, and from that of φ, if it is defined: by one
 /// adjoint solve. `refused`: samples whose status is not 0 have none; undefined: there are none.
 struct ProjectVjp {
@@ -26,14 +26,14 @@ struct ProjectVjp {
 ProjectVjp project_vjp(const FlowBox& box, at::Tensor cotangent, at::Tensor potential_bar, const at::Tensor& refused,
                        const SolveOptions& options, CombinedInfo& info);
 
-/// A projection of which all but the solve are two launches; nothing where there are no kernels. `given` is projected,
-/// `corrected` what the gradient is added to. In reverse by an adjoint solve.
-struct ByKernels {
-  flow_kernels::UncorrectedVelocity given, corrected;
+/// A projection of which all but the solve are two launches; nothing where there are no kernels. The gradient is
+/// added to `to_correct`. In reverse by an adjoint solve.
+struct ProjectionLaunch {
+  flow_kernels::UncorrectedVelocity to_project, to_correct;
   flow_kernels::CorrectionOptions how;
   bool reverse = false;
 };
-std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ByKernels& by,
+std::optional<flow_kernels::Corrected> project_by_kernels(const FlowBox& box, const ProjectionLaunch& by,
                                                           const SolveOptions& options, CombinedInfo& info);
 /// The equation of the pressure is that of grad and div multiplied by this.
 double scale_of_pressure(const FlowBox& box);

@@ -10,9 +10,9 @@ namespace prdp {
 namespace {
 
 /// The rows along x of a field (z, y, x), and their neighbours; in 2D there is one plane.
-class Rows {
+class GridRows {
  public:
-  explicit Rows(const FlowBox& box) : box_(box), first_(3 - box.dim()) {
+  explicit GridRows(const FlowBox& box) : box_(box), first_(3 - box.dim()) {
     for (const auto axis : c10::irange(box.dim())) n_[first_ + axis] = box.shape()[axis];
   }
   int64_t length() const { return n_[2]; }
@@ -50,7 +50,7 @@ void add_difference(T k, const T* here, const T* after, T* out, int64_t n) {
 
 template <class T>
 void divergence(const FlowBox& box, const T* u, double factor, T* out) {
-  const Rows rows(box);
+  const GridRows rows(box);
   const int64_t n = rows.length();
   const std::vector<T> zeros(n);
   std::fill_n(out, rows.cells(), T(0));
@@ -70,7 +70,7 @@ void divergence(const FlowBox& box, const T* u, double factor, T* out) {
 
 template <class T>
 void add_gradient(const FlowBox& box, const T* p, double factor, T* u) {
-  const Rows rows(box);
+  const GridRows rows(box);
   const int64_t n = rows.length();
   const std::vector<T> zeros(n);
   rows.for_each_axis([&](int64_t axis, int64_t channel, bool along) {
@@ -96,7 +96,7 @@ at::Tensor divergence_by_loops(const FlowBox& box, const at::Tensor& u, double f
   AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "divergence_by_loops", [&] {
     const auto* values = given.const_data_ptr<scalar_t>();
     auto* result = out.mutable_data_ptr<scalar_t>();
-    const int64_t cells = Rows(box).cells();
+    const int64_t cells = GridRows(box).cells();
     for_each_sample(u, [&](int64_t s) { divergence(box, values + s * box.dim() * cells, factor, result + s * cells); });
   });
   return out;
@@ -109,7 +109,7 @@ at::Tensor add_gradient_by_loops(const FlowBox& box, const at::Tensor& u, const 
   AT_DISPATCH_FLOATING_TYPES(u.scalar_type(), "add_gradient_by_loops", [&] {
     const auto* values = given.const_data_ptr<scalar_t>();
     auto* result = out.mutable_data_ptr<scalar_t>();
-    const int64_t cells = Rows(box).cells();
+    const int64_t cells = GridRows(box).cells();
     for_each_sample(u,
                     [&](int64_t s) { add_gradient(box, values + s * cells, factor, result + s * box.dim() * cells); });
   });

@@ -23,7 +23,7 @@ FlowStep flow_step(const FlowEquation& equation, const at::Tensor& u, const Solv
   const auto diffused = e.is_diffused_implicitly()
                             ? diffuse(e, diffusion_operators(e, change), balanced.u, options, info)
                             : FlowParts{change};
-  const auto [next, potential] = project(*e.box, velocity, diffused, balanced.potential, options, info);
+  const auto [next, potential] = project_sum(*e.box, velocity, diffused, balanced.potential, options, info);
   const bool none_refused = host_looks && !refused.mask.defined();
   return {cleared(next, beginning.to_clear()), cleared(potential, beginning.to_clear()),
           info.info(none_refused ? at::Tensor() : beginning.status())};
