@@ -234,10 +234,8 @@ std::string inconsistent(const SolveRole& role, const Operator& a, const at::Ten
     const auto fields = outside.dim() > 1 ? outside.flatten(1) : outside.unsqueeze(0);
     const bool is_constant =
         norm_of(fields - fields.mean(1, /*keepdim=*/true)) <= std::sqrt(epsilon_of(b)) * norm_of(outside);
-    return share + (role.adjoint ? "the cotangent" : "b") + " lies outside the range of " +
-           (role.adjoint ? "Aᵀ" : "A") +
-           (is_constant ? ", which maps the constant to zero; take the mean off " : "; take that part off ") +
-           (role.adjoint ? "the u that the loss is made of" : "b");
+    return share + "b lies outside the range of A" +
+           (is_constant ? ", which maps the constant to zero; take the mean off b" : "; take a b without that part");
   }
   if (role.adjoint)
     return share +
